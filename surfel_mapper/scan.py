@@ -1,0 +1,77 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scan: one sweep of a sensor, as arrays.
+
+Coordinates stay in the type they came in (float32, or float64 where the cloud has it), because
+the map quantises a point once, in float64; rounding it before would be a second quantisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scan:
+    """
+    The points of one sweep in the frame of the sensor.
+
+    Attributes
+    ----------
+    points : (N, 3) float32 or float64, m
+        In ``frame_id``. May hold nan and inf; whoever uses the points leaves those out.
+    stamp_ns : int
+        Time of the sweep in nanoseconds, of the message's header.
+    frame_id : str
+        The sensor's coordinate frame.
+    columns : mapping of str to array of length N
+        What else the points carry (intensity, ring, time, ...), one row a point.
+
+    Raises
+    ------
+    ValueError
+        If the points are not (N, 3) floating point or a column is not of length N.
+
+    """
+
+    points: npt.NDArray[Any]
+    stamp_ns: int
+    frame_id: str
+    columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        points = self.points
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
+        if points.dtype not in (np.float32, np.float64):
+            raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
+        for name, column in self.columns.items():
+            if len(column) != len(points):
+                raise ValueError(
+                    f'column {name}: {len(column)} rows, expected one for each of '
+                    f'{len(points)} points'
+                )
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.points)
+
+    def select(self, rows: npt.NDArray[Any]) -> Scan:
+        """
+        Return the scan with some of its points, their columns with them.
+
+        Parameters
+        ----------
+        rows : (N,) bool or (K,) int
+            A mask over the points, or the indices of those wanted in the order wanted.
+
+        """
+        columns = {name: column[rows] for name, column in self.columns.items()}
+        return replace(self, points=self.points[rows], columns=columns)
