@@ -12,11 +12,11 @@ a ConfigError.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 import dataclasses
+from dataclasses import dataclass, field
 import difflib
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +156,10 @@ class PoseConfig(Stage):
         live=True,
     )
     max_waiting_scans: int = setting(
-        20, 'At most this many scans wait for their pose; the oldest is dropped.', low=1, high=10**6
+        20,
+        'At most this many scans wait for their pose; the oldest is dropped.',
+        low=1,
+        high=10**6,
     )
 
 
@@ -201,7 +204,8 @@ class InputConfig(Stage):
     )
     reset_after_s: float = setting(
         1.0,
-        'A stamp that goes back by more than this clears the map, s; by less, the scan is dropped.',
+        'A stamp that goes back by more than this clears the map, s; '
+        'by less, the scan is dropped.',
         low=0.0,
         high=1e9,
     )
@@ -289,7 +293,7 @@ class Config:
             stage, _, key = name.rpartition('.')
             stages.setdefault(stage, {})[key] = value
         classes = {f.name: f.default_factory for f in dataclasses.fields(cls)}
-        return cls(**{stage: classes[stage](**values) for stage, values in stages.items()})  # type: ignore[misc,operator]
+        return cls(**{stage: classes[stage](**values) for stage, values in stages.items()})  # type: ignore[operator]
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
@@ -405,7 +409,7 @@ def checked(name: str, value: Any, declared: dataclasses.Field[Any]) -> Any:
         if isinstance(value, str) or not hasattr(value, '__iter__'):
             raise ConfigError(f'{name}: {value!r}, expected a list of numbers')
         return tuple(checked_number(name, item, float) for item in value)
-    if isinstance(expected, bool) or isinstance(expected, str):
+    if isinstance(expected, (bool, str)):
         if not isinstance(value, type(expected)):
             raise ConfigError(f'{name}: {value!r}, expected a {type(expected).__name__}')
     else:
@@ -432,4 +436,5 @@ def checked_number(name: str, value: Any, kind: type) -> Any:
         return float(value)
     if kind is int and whole:
         return value
-    raise ConfigError(f'{name}: {value!r}, expected {"a number" if kind is float else "a whole number"}')
+    wanted = 'a number' if kind is float else 'a whole number'
+    raise ConfigError(f'{name}: {value!r}, expected {wanted}')

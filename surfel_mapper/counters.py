@@ -9,11 +9,11 @@ of the diagnostics add up: scans received = mapped + gated + dropped + waiting.
 
 from __future__ import annotations
 
-import time
 from collections import Counter, deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+import time
 from typing import Any
 
 import numpy as np

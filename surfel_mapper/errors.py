@@ -4,16 +4,16 @@
 Every exception that this package raises on purpose.
 
     SurfelMapperError
-      ConfigError            a setting is unknown, of the wrong type or out of bounds  (ValueError)
-      CloudFormatError       a PointCloud2 that cannot be decoded                       (ValueError)
-      PoseError              no pose for a scan, and waiting will not bring one
-        PoseNotYetError      the transforms needed are older than the stamp: wait
-      MapError               an operation that a surfel map cannot carry out
-        MapLimitError        a voxel index or a count beyond what the integers hold     (ValueError)
-        NotInMapError        removing moments that the map does not hold                (ValueError)
-      BagError               a bag that cannot be read, or lacks what is asked of it
-      FileFormatError        any other file that cannot be read or is damaged           (ValueError)
-      DependencyError        an optional package is missing; says how to install it     (ImportError)
+      ConfigError          a setting is unknown, of the wrong type or out of bounds  (ValueError)
+      CloudFormatError     a PointCloud2 that cannot be decoded                       (ValueError)
+      PoseError            no pose for a scan, and waiting will not bring one
+        PoseNotYetError    the transforms needed are older than the stamp: wait
+      MapError             an operation that a surfel map cannot carry out
+        MapLimitError      a voxel index or a count beyond what the integers hold     (ValueError)
+        NotInMapError      removing moments that the map does not hold                (ValueError)
+      BagError             a bag that cannot be read, or lacks what is asked of it
+      FileFormatError      any other file that cannot be read or is damaged           (ValueError)
+      DependencyError      an optional package is missing; says how to install it     (ImportError)
 
 A caller that only wants to go on with the next scan catches SurfelMapperError.
 """
