@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+TransformBuffer: the tree of coordinate frames over time, asked for one transform at a stamp.
+
+Every frame has at most one parent, so an edge is known by its child. A dynamic edge holds its
+transforms sorted by stamp, a static one a single transform for all time. Node and replay use this
+one class: a lookup depends only on the transforms held, not on the order they came in, and is
+composed in a fixed order (geometry.py), so both compute the same pose to the last bit. Nothing is
+extrapolated: a robot that turns by 1 rad/s moves a point at 50 m by 5 m in the 0.1 s of a sweep.
+
+Two causes of failure are told apart because callers act on them: PoseNotYetError says that data
+yet to come can answer the lookup, so the scan should wait; any other PoseError says that none
+can, so it should be dropped.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.geometry import compose, interpolate, inverse, Transform
+
+NS_PER_S = 1_000_000_000
+
+MAX_SKEW = 1e-6
+"""R R^T of a transform differs from the identity by no more; float32 gives some 1e-7."""
+
+MAX_NAMES = 12
+"""So many frames are named in a message."""
+
+
+@dataclass(slots=True)
+class _Edge:
+    """The transforms of one child frame in its parent, by ascending stamp; one where static."""
+
+    parent: str
+    child: str
+    is_static: bool
+    stamps: list[int] = field(default_factory=list)
+    transforms: list[Transform] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        if self.is_static:
+            return f'{self.parent} -> {self.child} (static)'
+        oldest, newest = _seconds(self.stamps[0]), _seconds(self.stamps[-1])
+        return f'{self.parent} -> {self.child} (held from {oldest} to {newest} s)'
+
+    def insert(self, stamp_ns: int, T_parent_child: Transform) -> None:
+        """Put a transform where its stamp belongs, in the place of one of the same stamp."""
+        row = bisect_left(self.stamps, stamp_ns)
+        if row < len(self.stamps) and self.stamps[row] == stamp_ns:
+            self.transforms[row] = T_parent_child
+        else:
+            self.stamps.insert(row, stamp_ns)
+            self.transforms.insert(row, T_parent_child)
+
+    def forget_before(self, stamp_ns: int) -> None:
+        """Drop the transforms older than a stamp."""
+        row = bisect_left(self.stamps, stamp_ns)
+        del self.stamps[:row], self.transforms[:row]
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return the transform at a stamp within those held."""
+        if self.is_static:
+            return self.transforms[0]
+        row = bisect_left(self.stamps, stamp_ns)
+        newer = self.stamps[row]
+        if newer == stamp_ns:
+            return self.transforms[row]
+        older = self.stamps[row - 1]
+        alpha = (stamp_ns - older) / (newer - older)
+        return interpolate(self.transforms[row - 1], self.transforms[row], alpha)
+
+
+class TransformBuffer:
+    """
+    The transforms between coordinate frames over time.
+
+    Parameters
+    ----------
+    history_s : float
+        Of every dynamic edge, the transforms at most this much older than its newest are held.
+        At 1 kHz, 60 s are 60,000 transforms, some 20 MB.
+    reset_after_s : float
+        A transform older than the newest of its edge by more than this means that time was set
+        back: what the edge holds is forgotten. One older by less is put where it belongs.
+
+    Raises
+    ------
+    ValueError
+        If a duration is negative or not finite.
+
+    """
+
+    def __init__(self, history_s: float = 60.0, reset_after_s: float = 1.0) -> None:
+        for name, value in (('history_s', history_s), ('reset_after_s', reset_after_s)):
+            if not 0.0 <= value < math.inf:
+                raise ValueError(f'{name}: {value}, expected zero or more seconds, finite')
+        self._history_ns = round(history_s * NS_PER_S)
+        self._reset_after_ns = round(reset_after_s * NS_PER_S)
+        self._edges: dict[str, _Edge] = {}
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp of any dynamic edge; None while there is none."""
+        newest = [edge.stamps[-1] for edge in self._edges.values() if not edge.is_static]
+        return max(newest, default=None)
+
+    def add(self, parent: str, child: str, stamp_ns: int, T_parent_child: Transform) -> None:
+        """
+        Add the transform of an edge at one stamp.
+
+        Parameters
+        ----------
+        parent, child : str
+            Names of the frames.
+        stamp_ns : int
+            Time of the transform.
+        T_parent_child : (4, 4) float64
+            Takes points in the child frame to the parent frame; copied.
+
+        Raises
+        ------
+        PoseError
+            If a name is empty, the transform is not rigid or not finite, the child has another
+            parent or a static transform already, or the edge would close a loop. The buffer
+            is unchanged then.
+
+        """
+        edge = self._edge(parent, child, is_static=False)
+        transform = _rigid(parent, child, T_parent_child)
+        if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
+            edge.stamps.clear()
+            edge.transforms.clear()
+        edge.insert(stamp_ns, transform)
+        edge.forget_before(edge.stamps[-1] - self._history_ns)
+        self._edges[child] = edge
+
+    def add_static(self, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Set the transform of an edge for all time, in the place of an earlier one; see add."""
+        edge = self._edge(parent, child, is_static=True)
+        edge.transforms = [_rigid(parent, child, T_parent_child)]
+        self._edges[child] = edge
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
+        """
+        Return the transform that takes points in one frame to another at a stamp.
+
+        A stored transform is returned bit for bit at its own stamp; between two stamps it is
+        interpolated. Two equal names give the identity, known or not.
+
+        Returns
+        -------
+        (4, 4) float64
+            T_target_source, a copy.
+
+        Raises
+        ------
+        PoseNotYetError
+            If a frame was never seen, no edges lead from one to the other, or the newest
+            transform of an edge between them is older than the stamp: each may still come.
+        PoseError
+            If the stamp is before the oldest transform held of an edge between them.
+
+        """
+        asked = f'{target} <- {source} at {_seconds(stamp_ns)} s'
+        up, down = list(self._edges_above(source)), list(self._edges_above(target))
+        # Both lists end at the root; what they share at the end cancels.
+        while up and down and up[-1] is down[-1]:
+            up.pop()
+            down.pop()
+        if (up[-1].parent if up else source) != (down[-1].parent if down else target):
+            raise PoseNotYetError(f'{asked}: {self._why_not_connected(target, source)}')
+        _check_held(asked, [*up, *down], stamp_ns)
+        T_common_source, T_common_target = _chained(up, stamp_ns), _chained(down, stamp_ns)
+        if T_common_target is None:
+            return np.eye(4) if T_common_source is None else np.array(T_common_source)
+        T_target_common = inverse(T_common_target)
+        if T_common_source is None:
+            return T_target_common
+        return compose(T_target_common, T_common_source)
+
+    def clear(self) -> None:
+        """Forget the dynamic edges; static ones stay."""
+        self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}
+
+    def _edge(self, parent: str, child: str, *, is_static: bool) -> _Edge:
+        """Return the edge of a child, a new one if there is none; refuse what is no tree."""
+        name = f'transform {parent!r} -> {child!r}'
+        if not parent or not child:
+            raise PoseError(f'{name}: the name of a frame is empty')
+        if parent == child:
+            raise PoseError(f'{name}: a frame cannot be its own parent')
+        edge = self._edges.get(child)
+        if edge is None:
+            # a frame without an edge above it is a root: of its own tree, or of the parent's
+            below = [lower.child for lower in self._edges_above(parent)]
+            if below and self._edges[below[-1]].parent == child:
+                raise PoseError(f'{name}: closes the loop {" -> ".join([child, *below[::-1], child])}')
+            return _Edge(parent, child, is_static)
+        if edge.parent != parent:
+            raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')
+        if edge.is_static != is_static:
+            found, came = ('static', 'dynamic') if edge.is_static else ('dynamic', 'static')
+            raise PoseError(f'{name}: known as {found}, a {came} transform came')
+        return edge
+
+    def _edges_above(self, frame: str) -> Iterator[_Edge]:
+        """Yield the edges from a frame up to the root of its tree."""
+        edge = self._edges.get(frame)
+        while edge is not None:
+            yield edge
+            edge = self._edges.get(edge.parent)
+
+    def _why_not_connected(self, target: str, source: str) -> str:
+        """Return which of two frames is unknown, or that they are in two trees."""
+        seen = set(self._edges) | {edge.parent for edge in self._edges.values()}
+        names = ', '.join(sorted(seen)[:MAX_NAMES]) + (', ...' if len(seen) > MAX_NAMES else '')
+        unseen = ' and '.join(frame for frame in (target, source) if frame not in seen)
+        if unseen:
+            return f'no transform of {unseen} yet; frames seen: {names or "none"}'
+        return f'no transforms lead from one to the other yet; frames seen: {names}'
+
+
+def _check_held(asked: str, edges: list[_Edge], stamp_ns: int) -> None:
+    """Raise if a dynamic edge does not reach to a stamp; too old weighs more than too new."""
+    dynamic = [edge for edge in edges if not edge.is_static]
+    for edge in dynamic:
+        if stamp_ns < edge.stamps[0]:
+            raise PoseError(f'{asked}: older than all of {edge}')
+    for edge in dynamic:
+        if stamp_ns > edge.stamps[-1]:
+            raise PoseNotYetError(f'{asked}: newer than all of {edge}')
+
+
+def _chained(edges: list[_Edge], stamp_ns: int) -> Transform | None:
+    """Return the product of edges that lead upwards, from the lowest on; None without any."""
+    product: Transform | None = None
+    for edge in edges:
+        T_parent_child = edge.at(stamp_ns)
+        product = T_parent_child if product is None else compose(T_parent_child, product)
+    return product
+
+
+def _rigid(parent: str, child: str, T_parent_child: Transform) -> Transform:
+    """Return a copy of a transform, or raise PoseError if it is not rigid."""
+    transform = np.array(T_parent_child, dtype=np.float64)
+    name = f'transform {parent!r} -> {child!r}'
+    if transform.shape != (4, 4):
+        raise PoseError(f'{name}: shape {transform.shape}, expected (4, 4)')
+    if not np.isfinite(transform).all():
+        raise PoseError(f'{name}: not finite, {transform[:3].tolist()}')
+    if not _is_rotation(transform[:3, :3]) or transform[3].tolist() != [0, 0, 0, 1]:
+        raise PoseError(f'{name}: not a rotation and a translation, {transform.tolist()}')
+    return transform
+
+
+def _is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
+    """Return whether a finite (3, 3) matrix is orthogonal but for rounding, and no mirror."""
+    if np.abs(matrix).max() > 2.0:
+        return False  # and its square may overflow
+    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(skew <= MAX_SKEW and np.linalg.det(matrix) > 0.0)
+
+
+def _seconds(stamp_ns: int) -> str:
+    """Return a stamp in seconds with all its digits."""
+    whole, rest = divmod(abs(stamp_ns), NS_PER_S)
+    return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'

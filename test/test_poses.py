@@ -1,0 +1,372 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The buffer of transforms: what it returns bit for bit, what it interpolates, what it refuses.
+
+The twin below knows nothing of edges in time or of common ancestors: it multiplies 4 by 4
+matrices from the root to each of two frames and solves for what lies between, with scipy's slerp.
+"""
+
+import math
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.geometry import compose, inverse, pose_matrix
+from surfel_mapper.poses import TransformBuffer
+
+S = 1_000_000_000
+EPOCH = 1_700_000_000 * S
+
+
+def some_pose(seed):
+    rng = np.random.default_rng(seed)
+    q = rng.normal(size=4)
+    return pose_matrix(rng.uniform(-10, 10, 3), q / np.linalg.norm(q))
+
+
+def moved(x):
+    return pose_matrix([x, 0, 0], [0, 0, 0, 1])
+
+
+def drive(**durations):
+    """Return a buffer of odom -> base at 0, 1, 2, 3 s, x = 10 times that, and base -> lidar."""
+    buffer = TransformBuffer(**durations)
+    for second in range(4):
+        buffer.add('odom', 'base', EPOCH + second * S, moved(10.0 * second))
+    buffer.add_static('base', 'lidar', some_pose(1))
+    return buffer
+
+
+def not_yet(buffer, *asked):
+    with pytest.raises(PoseNotYetError) as caught:
+        buffer.lookup(*asked)
+    return str(caught.value)
+
+
+def never(buffer, *asked):
+    with pytest.raises(PoseError) as caught:
+        buffer.lookup(*asked)
+    assert not isinstance(caught.value, PoseNotYetError)
+    return str(caught.value)
+
+
+# What is found
+
+
+def test_a_lookup_at_a_stored_stamp_returns_the_stored_bits():
+    buffer = TransformBuffer()
+    poses = [some_pose(seed) for seed in range(50)]
+    for k, pose in enumerate(poses):
+        buffer.add('odom', 'base', EPOCH + 37 * k, pose)
+
+    for k, pose in enumerate(poses):
+        assert buffer.lookup('odom', 'base', EPOCH + 37 * k).tobytes() == pose.tobytes()
+
+
+def test_static_edges_are_composed_from_the_source_upwards():
+    buffer = drive()
+    buffer.add_static('lidar', 'optical', some_pose(2))
+
+    T_base_optical = compose(some_pose(1), some_pose(2))
+    expected = compose(moved(20.0), T_base_optical)
+    assert buffer.lookup('odom', 'optical', EPOCH + 2 * S).tobytes() == expected.tobytes()
+    assert buffer.lookup('base', 'optical', 0).tobytes() == T_base_optical.tobytes()
+
+
+def test_a_lookup_downwards_is_the_inverse_of_the_one_upwards():
+    buffer = drive()
+
+    upwards = buffer.lookup('odom', 'lidar', EPOCH + S // 3)
+
+    assert buffer.lookup('lidar', 'odom', EPOCH + S // 3).tobytes() == inverse(upwards).tobytes()
+
+
+def test_what_two_frames_share_above_them_is_not_asked_for():
+    buffer = drive()
+    buffer.add_static('base', 'camera', some_pose(2))
+
+    found = buffer.lookup('camera', 'lidar', EPOCH + 1000 * S)
+
+    assert found.tobytes() == compose(inverse(some_pose(2)), some_pose(1)).tobytes()
+
+
+def test_between_two_stamps_the_pose_lies_between():
+    assert drive().lookup('odom', 'base', EPOCH + S // 4)[0, 3] == 2.5
+
+
+def test_nanoseconds_count_at_the_times_of_today():
+    buffer = TransformBuffer()
+    buffer.add('odom', 'base', EPOCH, moved(0.0))
+    buffer.add('odom', 'base', EPOCH + 4, moved(4.0))
+
+    assert [buffer.lookup('odom', 'base', EPOCH + k)[0, 3] for k in range(5)] == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize('frame', ['odom', 'base', 'never seen'])
+def test_a_frame_in_itself_is_the_identity_at_any_time(frame):
+    np.testing.assert_array_equal(drive().lookup(frame, frame, 0), np.eye(4))
+
+
+def test_what_is_returned_and_what_was_given_may_be_written_to():
+    buffer, pose = TransformBuffer(), some_pose(3)
+    buffer.add('odom', 'base', 5, pose)
+    buffer.add_static('base', 'lidar', pose)
+    pose[:] = np.nan
+
+    for target, source in [('odom', 'base'), ('base', 'lidar'), ('odom', 'lidar')]:
+        expected = buffer.lookup(target, source, 5)
+        buffer.lookup(target, source, 5)[:] = np.nan
+        np.testing.assert_array_equal(buffer.lookup(target, source, 5), expected)
+
+
+@given(st.data())
+def test_any_tree_gives_what_a_slow_twin_gives(data):
+    num_frames = data.draw(st.integers(2, 7))
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32)))
+    stamps = np.sort(rng.choice(1000, size=6, replace=False))
+    asked_at = int(rng.integers(stamps[0], stamps[-1] + 1))
+    buffer = TransformBuffer()
+    T_root_frame = [np.eye(4)]
+    for child in range(1, num_frames):
+        parent = int(rng.integers(child))
+        turns, places = Rotation.from_quat(rng.normal(size=(6, 4))), rng.uniform(-10, 10, (6, 3))
+        poses = [pose_matrix(p, q) for p, q in zip(places, turns.as_quat(), strict=True)]
+        T_parent_child = np.eye(4)
+        if rng.random() < 0.3:
+            buffer.add_static(str(parent), str(child), poses[0])
+            T_parent_child = poses[0]
+        else:
+            for k in rng.permutation(6):
+                buffer.add(str(parent), str(child), int(stamps[k]), poses[k])
+            T_parent_child[:3, :3] = Slerp(stamps, turns)(asked_at).as_matrix()
+            for axis in range(3):
+                T_parent_child[axis, 3] = np.interp(asked_at, stamps, places[:, axis])
+        T_root_frame.append(T_root_frame[parent] @ T_parent_child)
+    target, source = (int(v) for v in rng.integers(num_frames, size=2))
+
+    found = buffer.lookup(str(target), str(source), asked_at)
+
+    expected = np.linalg.solve(T_root_frame[target], T_root_frame[source])
+    # up to 12 products of numbers below 100; a slerp of almost half a turn amplifies rounding
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
+
+
+# In which order, and what is held
+
+
+@given(st.permutations(range(8)))
+def test_the_order_of_arrival_within_the_tolerated_lateness_makes_no_difference(order):
+    in_order, mixed = TransformBuffer(), TransformBuffer()
+    for buffer, ranks in ((in_order, range(8)), (mixed, order)):
+        for k in ranks:
+            buffer.add('odom', 'base', EPOCH + k * 10**8, some_pose(k))
+
+    for stamp in range(EPOCH, EPOCH + 7 * 10**8 + 1, 35 * 10**6):
+        expected = in_order.lookup('odom', 'base', stamp)
+        assert mixed.lookup('odom', 'base', stamp).tobytes() == expected.tobytes()
+    assert mixed.newest_ns == EPOCH + 7 * 10**8
+
+
+def test_the_same_stamp_again_replaces():
+    buffer = drive()
+    buffer.add('odom', 'base', EPOCH + 2 * S, moved(-1.0))
+
+    assert buffer.lookup('odom', 'base', EPOCH + 2 * S)[0, 3] == -1.0
+    assert buffer.lookup('odom', 'base', EPOCH + 3 * S)[0, 3] == 30.0
+
+
+def test_a_static_transform_again_replaces():
+    buffer = drive()
+    buffer.add_static('base', 'lidar', moved(7.0))
+
+    np.testing.assert_array_equal(buffer.lookup('base', 'lidar', EPOCH), moved(7.0))
+
+
+def test_a_stamp_back_by_no_more_than_the_limit_is_inserted():
+    buffer = drive(reset_after_s=2.5)
+    buffer.add('odom', 'base', EPOCH + 3 * S - 2_500_000_000, moved(77.0))
+
+    assert buffer.lookup('odom', 'base', EPOCH + S // 2)[0, 3] == 77.0
+    assert buffer.lookup('odom', 'base', EPOCH + 3 * S)[0, 3] == 30.0
+
+
+def test_a_stamp_back_by_more_than_the_limit_forgets_that_edge_only():
+    buffer = drive(reset_after_s=2.5)
+    buffer.add('map', 'odom', EPOCH + 9 * S, moved(1.0))
+    buffer.add('odom', 'base', EPOCH + 3 * S - 2_500_000_001, moved(77.0))
+
+    assert buffer.lookup('odom', 'base', EPOCH + 499_999_999)[0, 3] == 77.0
+    not_yet(buffer, 'odom', 'base', EPOCH + 3 * S)
+    never(buffer, 'odom', 'base', EPOCH)
+    assert buffer.lookup('map', 'odom', EPOCH + 9 * S)[0, 3] == 1.0
+
+
+def test_the_history_reaches_back_from_the_newest_by_its_length():
+    buffer = drive(history_s=2.0)
+
+    assert buffer.lookup('odom', 'base', EPOCH + S)[0, 3] == 10.0
+    never(buffer, 'odom', 'base', EPOCH + S - 1)
+
+
+def test_the_history_stays_bounded():
+    buffer = TransformBuffer(history_s=0.5)
+    for k in range(2000):
+        buffer.add('odom', 'base', k * 10**7, moved(0.0))
+
+    assert len(buffer._edges['base'].stamps) == len(buffer._edges['base'].transforms) == 51
+
+
+def test_without_history_only_the_newest_is_known():
+    buffer = drive(history_s=0.0)
+
+    assert buffer.lookup('odom', 'base', EPOCH + 3 * S)[0, 3] == 30.0
+    never(buffer, 'odom', 'base', EPOCH + 3 * S - 1)
+
+
+def test_clearing_forgets_dynamic_edges_and_keeps_static_ones():
+    buffer = drive()
+    buffer.clear()
+
+    assert buffer.newest_ns is None
+    np.testing.assert_array_equal(buffer.lookup('base', 'lidar', 0), some_pose(1))
+    not_yet(buffer, 'odom', 'lidar', EPOCH)
+    buffer.add('map', 'base', 5, moved(1.0))
+    assert buffer.lookup('map', 'base', 5)[0, 3] == 1.0
+
+
+def test_the_newest_stamp_is_that_of_any_dynamic_edge():
+    buffer = TransformBuffer()
+    assert buffer.newest_ns is None
+    buffer.add_static('base', 'lidar', moved(0.0))
+    assert buffer.newest_ns is None
+    buffer.add('odom', 'base', 7, moved(0.0))
+    buffer.add('map', 'odom', 5, moved(0.0))
+    assert buffer.newest_ns == 7
+
+
+# What is not there
+
+
+def test_newer_than_the_newest_is_not_there_yet_and_says_what_is():
+    message = not_yet(drive(), 'odom', 'lidar', EPOCH + 3 * S + 1)
+
+    assert message == (
+        'odom <- lidar at 1700000003.000000001 s: newer than all of odom -> base '
+        '(held from 1700000000.000000000 to 1700000003.000000000 s)'
+    )
+
+
+def test_older_than_the_oldest_is_never_there_and_says_what_is():
+    message = never(drive(), 'odom', 'lidar', EPOCH - 1)
+
+    assert message == (
+        'odom <- lidar at 1699999999.999999999 s: older than all of odom -> base '
+        '(held from 1700000000.000000000 to 1700000003.000000000 s)'
+    )
+
+
+def test_waiting_is_no_use_where_one_edge_is_too_old_and_another_not_there_yet():
+    buffer = drive()
+    buffer.add('map', 'odom', EPOCH + 10 * S, moved(0.0))
+
+    assert 'older than all of map -> odom' in never(buffer, 'map', 'lidar', EPOCH + 5 * S)
+
+
+def test_a_frame_never_seen_may_still_come():
+    message = not_yet(drive(), 'map', 'radar', EPOCH)
+
+    assert 'no transform of map and radar yet; frames seen: base, lidar, odom' in message
+    assert 'frames seen: none' in not_yet(TransformBuffer(), 'odom', 'base', 0)
+
+
+def test_the_edge_between_two_known_trees_may_still_come():
+    buffer = TransformBuffer()
+    buffer.add_static('map', 'odom', some_pose(1))
+    buffer.add_static('base', 'lidar', some_pose(2))
+    assert 'no transforms lead' in not_yet(buffer, 'map', 'lidar', EPOCH)
+
+    buffer.add('odom', 'base', EPOCH, some_pose(3))
+    buffer.lookup('map', 'lidar', EPOCH)
+
+
+def test_many_frames_are_not_all_named():
+    buffer = TransformBuffer()
+    for k in range(1000):
+        buffer.add_static('base', f'wheel_{k}', some_pose(0))
+
+    assert len(not_yet(buffer, 'odom', 'base', EPOCH)) < 500
+
+
+# What is refused
+
+
+ADDERS = [
+    lambda buffer, parent, child, pose: buffer.add(parent, child, EPOCH, pose),
+    lambda buffer, parent, child, pose: buffer.add_static(parent, child, pose),
+]
+
+
+@pytest.mark.parametrize('add', ADDERS, ids=['dynamic', 'static'])
+@pytest.mark.parametrize(
+    ('parent', 'child', 'named'),
+    [
+        ('', 'base', 'empty'),
+        ('odom', '', 'empty'),
+        ('odom', 'odom', 'own parent'),
+        ('map', 'base', "'base' has the parent 'odom' already"),
+        ('map', 'lidar', "'lidar' has the parent 'base' already"),
+        ('lidar', 'odom', 'closes the loop odom -> base -> lidar -> odom'),
+        ('base', 'odom', 'closes the loop odom -> base -> odom'),
+    ],
+)
+def test_an_edge_that_is_no_part_of_a_tree_is_refused(add, parent, child, named):
+    buffer = drive()
+
+    with pytest.raises(PoseError, match=named):
+        add(buffer, parent, child, moved(0.0))
+
+    assert buffer.lookup('odom', 'base', EPOCH + S)[0, 3] == 10.0
+
+
+def test_a_static_child_takes_no_dynamic_transform_and_the_reverse():
+    buffer = drive()
+
+    with pytest.raises(PoseError, match='known as static'):
+        buffer.add('base', 'lidar', EPOCH, moved(0.0))
+    with pytest.raises(PoseError, match='known as dynamic'):
+        buffer.add_static('odom', 'base', moved(0.0))
+
+
+@pytest.mark.parametrize('add', ADDERS, ids=['dynamic', 'static'])
+@pytest.mark.parametrize(
+    ('pose', 'named'),
+    [
+        (np.full((4, 4), np.nan), 'not finite'),
+        (np.diag([1.0, 1.0, np.inf, 1.0]), 'not finite'),
+        (np.eye(3), r'shape \(3, 3\)'),
+        (np.zeros((4, 4)), 'not a rotation'),
+        (np.diag([1.0, 1.0, -1.0, 1.0]), 'not a rotation'),
+        (np.diag([1.0, 1.0, 1.00001, 1.0]), 'not a rotation'),
+        (np.diag([1e200, 1.0, 1.0, 1.0]), 'not a rotation'),
+        (np.diag([1.0, 1.0, 1.0, 2.0]), 'not a rotation'),
+    ],
+)
+def test_what_is_no_rigid_transform_is_refused_and_changes_nothing(add, pose, named):
+    buffer = TransformBuffer()
+
+    with pytest.raises(PoseError, match=named):
+        add(buffer, 'odom', 'base', pose)
+
+    assert 'frames seen: none' in not_yet(buffer, 'odom', 'base', EPOCH)
+
+
+@pytest.mark.parametrize('value', [-1.0, math.nan, math.inf])
+@pytest.mark.parametrize('name', ['history_s', 'reset_after_s'])
+def test_a_duration_that_is_none_is_refused(name, value):
+    with pytest.raises(ValueError, match=name):
+        TransformBuffer(**{name: value})
