@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""PLY: what is written is read back equal, by this package and by plyfile; damage is named."""
+
+import os
+from pathlib import Path
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.io.ply import read_points, write_points, write_surfels
+
+NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
+
+
+def make_surfels(number):
+    rng = np.random.default_rng(1)
+    return SimpleNamespace(
+        position=np.array([5e6, -4e5, 100.0]) + rng.uniform(-1.0, 1.0, (number, 3)),
+        normal=rng.normal(size=(number, 3)),
+        planarity=rng.uniform(size=number),
+        curvature=rng.uniform(size=number),
+        num_points=rng.integers(1, 2**31, number, endpoint=True),
+    )
+
+
+def assert_equals_surfels(columns, surfels):
+    np.testing.assert_array_equal(np.stack([columns[n] for n in 'xyz'], 1), surfels.position)
+    normal = np.stack([columns[n] for n in ('nx', 'ny', 'nz')], 1)
+    np.testing.assert_array_equal(normal, surfels.normal.astype(np.float32))
+    for name in ('planarity', 'curvature'):
+        np.testing.assert_array_equal(columns[name], getattr(surfels, name).astype(np.float32))
+    np.testing.assert_array_equal(columns['num_points'], surfels.num_points)
+
+
+def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
+    surfels = SimpleNamespace(
+        position=np.array([[1e6, 2.0, 3.0]]),
+        normal=np.array([[0.0, 0.0, 1.0]]),
+        planarity=np.array([0.5]),
+        curvature=np.array([0.25]),
+        num_points=np.array([7]),
+    )
+    write_surfels(tmp_path / 'map.ply', surfels)
+    header = (
+        b'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        b'element vertex 1\nproperty double x\nproperty double y\nproperty double z\n'
+        b'property float nx\nproperty float ny\nproperty float nz\n'
+        b'property float planarity\nproperty float curvature\nproperty uint num_points\n'
+        b'end_header\n'
+    )
+    row = struct.pack('<3d5fI', 1e6, 2.0, 3.0, 0.0, 0.0, 1.0, 0.5, 0.25, 7)
+    assert (tmp_path / 'map.ply').read_bytes() == header + row
+
+
+@pytest.mark.parametrize('number', [0, 1, 1000])
+def test_surfels_come_back_equal(tmp_path, number):
+    surfels = make_surfels(number)
+    write_surfels(tmp_path / 'map.ply', surfels)
+    columns = read_points(tmp_path / 'map.ply')
+    assert list(columns) == NAMES
+    assert_equals_surfels(columns, surfels)
+
+
+def test_plyfile_reads_the_same(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    surfels = make_surfels(100)
+    write_surfels(tmp_path / 'map.ply', surfels)
+    vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
+    assert [p.name for p in vertex.properties] == NAMES
+    assert_equals_surfels(vertex, surfels)
+
+
+@pytest.mark.parametrize('order', ['<', '>'])
+def test_what_plyfile_writes_is_read(tmp_path, order):
+    plyfile = pytest.importorskip('plyfile')
+    dtype = [('x', 'f4'), ('ring', 'u2'), ('t', 'f8'), ('a', 'i1'), ('b', 'u1'), ('c', 'i4')]
+    table = np.array([(1.5, 2, 3.25, -4, 5, -6), (-1.5, 65535, 1e300, 7, 255, 9)], dtype)
+    elements = [
+        plyfile.PlyElement.describe(table, 'vertex'),
+        plyfile.PlyElement.describe(np.array([([0, 1, 0],)], [('v', 'i4', (3,))]), 'face'),
+    ]
+    plyfile.PlyData(elements, byte_order=order, comments=['c'], obj_info=['i']).write(
+        tmp_path / 'points.ply'
+    )
+    columns = read_points(tmp_path / 'points.ply')
+    assert list(columns) == [name for name, _ in dtype]
+    for name in columns:
+        assert columns[name].dtype == table.dtype[name]
+        np.testing.assert_array_equal(columns[name], table[name])
+
+
+def test_columns_of_every_type_come_back_equal(tmp_path):
+    kinds = ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8', '>f4']
+    columns = {f'c{i}': np.arange(5).astype(kind) for i, kind in enumerate(kinds)}
+    write_points(tmp_path / 'points.ply', columns)
+    back = read_points(tmp_path / 'points.ply')
+    assert list(back) == list(columns)
+    for name in columns:
+        assert back[name].dtype == columns[name].dtype.newbyteorder('=')
+        np.testing.assert_array_equal(back[name], columns[name])
+
+
+HEADER = 'ply\nformat binary_little_endian 1.0\n'
+
+
+@pytest.mark.parametrize(
+    ('content', 'expected'),
+    [
+        ('', 'no header of a PLY file'),
+        ('solid stl\nend_header\n', 'no header'),
+        (HEADER + 'element vertex 1\nproperty float x\n', 'no header'),
+        (HEADER + 'end_header\n', 'not a binary PLY'),
+        (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
+        (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a binary PLY'),
+        (HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n', 'not a binary PLY'),
+        (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a binary PLY'),
+        (HEADER + 'element vertex -1\nproperty float x\nend_header\n', '-1 x vertex'),
+        (HEADER + 'element face 1\nproperty float x\nend_header\n', '1 x face'),
+        (HEADER + 'element vertex 1\n' + 'property float x\n' * 2 + 'end_header\n', 'not a '),
+        ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'binary'),
+        ('ply\nformat binary_big_endian 2.0\nelement vertex 1\nproperty int x\nend_header\n',
+         'version 2.0'),
+        (HEADER + 'element vertex 2\nproperty float x\nend_header\n1234567',
+         '7 bytes after the header, expected 8 for 2 vertices'),
+        (HEADER + f'element vertex {10**30}\nproperty double x\nend_header\n', 'truncated'),
+    ],
+)
+def test_what_is_no_whole_file_of_points_is_refused(tmp_path, content, expected):
+    path = tmp_path / 'bad.ply'
+    path.write_bytes(content.encode())
+    with pytest.raises(FileFormatError, match=rf'bad\.ply: .*{expected}'):
+        read_points(path)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileFormatError, match=r'absent\.ply: cannot be read: No such file'):
+        read_points(tmp_path / 'absent.ply')
+
+
+def test_scans_of_real_lidars_are_read_like_plyfile_reads_them():
+    if 'SURFEL_MAPPER_TEST_DATA' not in os.environ:
+        pytest.skip('SURFEL_MAPPER_TEST_DATA is not set: no real scans')
+    plyfile = pytest.importorskip('plyfile')
+    paths = sorted(Path(os.environ['SURFEL_MAPPER_TEST_DATA'], 'data/scans').glob('*.ply'))
+    assert paths
+    for path in paths:
+        columns, vertex = read_points(path), plyfile.PlyData.read(path)['vertex']
+        assert list(columns) == [p.name for p in vertex.properties]
+        for name, values in columns.items():
+            np.testing.assert_array_equal(values, vertex[name])
