@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The topics of a bag, and choosing among them.
+
+A topic that was not named is guessed only where there is no other: a map made of the wrong one
+of two lidars looks right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from pathlib import Path
+
+from surfel_mapper.errors import BagError
+
+CLOUD = 'sensor_msgs/msg/PointCloud2'
+ODOMETRY = 'nav_msgs/msg/Odometry'
+POSE = 'geometry_msgs/msg/PoseStamped'
+TF = 'tf2_msgs/msg/TFMessage'
+
+SAME_AS = {'tf/msg/tfMessage': TF}
+"""What early ROS 1 called a type of the same content."""
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """A topic of a bag, and how many messages of which type its index states."""
+
+    name: str
+    type: str
+    count: int
+
+
+class Topics(list[Topic]):
+    """The topics of one bag."""
+
+    def __init__(self, path: Path, topics: Collection[Topic]) -> None:
+        """Hold the topics of the bag at a path, which errors name."""
+        super().__init__(topics)
+        self._path = path
+
+    def num_messages(self, names: Collection[str]) -> int:
+        """Return how many messages some topics have by the index."""
+        return sum(topic.count for topic in self if topic.name in names)
+
+    def of_type(self, type_: str) -> list[str]:
+        """Return the names of the topics of a type."""
+        return [topic.name for topic in self if topic.type == type_]
+
+    def choose(self, type_: str, name: str | None = None, default: str | None = None) -> str:
+        """
+        Return the topic to read: the one named, else the default, else the only one of its type.
+
+        Parameters
+        ----------
+        type_ : str
+            The type it must have, such as sensor_msgs/msg/PointCloud2.
+        name : str, optional
+            What the user asked for.
+        default : str, optional
+            Taken where nothing was asked for and the bag has it.
+
+        Raises
+        ------
+        BagError
+            If there is no such topic, it has another type, or there are several to choose from.
+
+        """
+        found = self.of_type(type_)
+        short = type_.rpartition('/')[2]
+        offers = f'{short} topics: {", ".join(found) or "none"}'
+        if name is not None:
+            if name in found:
+                return name
+            types = [topic.type for topic in self if topic.name == name]
+            problem = f'{name} is of type {types[0]}, not {short}' if types else f'no topic {name}'
+            raise BagError(f'{self._path}: {problem}; {offers}')
+        if default is not None and default in found:
+            return default
+        if len(found) == 1:
+            return found[0]
+        if found:
+            raise BagError(f'{self._path}: several topics to choose from, name one; {offers}')
+        every = ', '.join(topic.name for topic in self)
+        raise BagError(f'{self._path}: no topic of type {type_}; its topics: {every}')
