@@ -1,0 +1,60 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+
+# Everything runs in .venv, which is made at the first call. Where a ROS 2 is sourced the
+# environment sees the packages of the system and uses that ROS; elsewhere it has its own from
+# PyPI. The two do not mix, so that sourcing ROS later makes the environment anew.
+
+PYTHON ?= python3
+PYTEST_ARGS ?=
+
+VENV := .venv
+BIN := $(VENV)/bin
+ifeq ($(and $(ROS_DISTRO),$(shell $(PYTHON) -c 'import rclpy; print("found")' 2>/dev/null)),)
+KIND := pypi
+OTHER := system
+EXTRAS := test,lint,ros
+else
+KIND := system
+OTHER := pypi
+EXTRAS := test,lint
+VENV_FLAGS := --system-site-packages
+endif
+STAMP := $(VENV)/.ready-$(KIND)
+
+.PHONY: demo test boundscheck bench lint settings clean
+
+demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
+	$(BIN)/python examples/demo.py
+
+test: $(STAMP)  ## all tests
+	$(BIN)/python -m pytest -q --durations=5 $(PYTEST_ARGS)
+
+# Compiled code reads past the end of an array in silence. Compiled anew with checks it cannot;
+# the cache is thrown away, because cached kernels keep the setting they were compiled with.
+boundscheck: $(STAMP)  ## the tests of the kernels, with every index checked
+	cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
+	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" \
+	$(BIN)/python -m pytest -q $(wildcard test/kernels test/mapping) $(PYTEST_ARGS)
+
+bench: $(STAMP)  ## milliseconds a scan
+	$(BIN)/python -m test.bench
+
+lint: $(STAMP)  ## style, types, layers
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -q test/test_layering.py
+
+settings: $(STAMP)  ## write default.yaml and the table of README.md from config.py
+	$(BIN)/python -m test.settings
+
+clean:  ## remove the environment and everything built
+	rm -rf $(VENV) build install log dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	find surfel_mapper test -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(STAMP): setup.py pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
+	touch $@

@@ -1,0 +1,82 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What pip and colcon install.
+
+pip makes ``surfel-mapper`` in bin/. The executables ``node`` and ``replay``, which ``ros2 run``
+starts, are installed as data into lib/surfel_mapper and nowhere else: a script called node in
+the bin/ of an environment would hide Node.js. An editable install has no data, so there only
+``surfel-mapper node`` works.
+
+Everything is stated here and nothing in pyproject.toml, which colcon reads only in part.
+"""
+
+from glob import glob
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+NAME = 'surfel_mapper'
+
+REQUIRED = [
+    # The lower bounds are what Ubuntu 24.04 has, the system of ROS 2 Jazzy, so that its apt
+    # packages are kept; of numba and rosbags, which it lacks, the oldest that the tests pass with.
+    'numpy>=1.26',  # arrays; 1.26 is what the messages of ROS from apt are compiled for
+    'scipy>=1.11',  # rotations and spatial search beyond the kernels
+    'numba>=0.61',  # compiles the kernels; 0.61 is the first for Python 3.13
+    'rosbags>=0.11',  # reads bags of ROS 1 and 2 without ROS; 0.11 has the readers' present names
+    'PyYAML>=6.0',  # settings
+    'tqdm>=4.66',  # progress on a terminal
+    'matplotlib>=3.6',  # map.png
+]
+
+# Jazzy from PyPI, for machines without a ROS of their own; never beside one from apt. The wheels
+# are for this machine alone; elsewhere nothing is installed, and the node says what it misses.
+WHEELS = 'platform_machine == "x86_64" and python_version < "3.14"'
+ROS = [
+    f'ros-jazzy-rclpy[fastrtps]>=7.1; {WHEELS}',  # the extra is the middleware
+    f'ros-jazzy-common-interfaces>=5.3; {WHEELS}',  # all messages but tf2_msgs, which PyPI lacks
+]
+
+TEST = [
+    'pytest>=7.4,<9',  # 9 drops what colcon test relies on
+    'pytest-timeout>=2.2',  # a test that hangs names itself
+    'hypothesis>=6.98',  # random sequences of adds and removes
+    'plyfile>=1.0',  # an independent reader of what we write
+]
+
+LINT = [
+    'ruff>=0.12',  # style; its rules are in .ruff.toml
+    'mypy>=1.11',  # types; configured in setup.cfg
+]
+
+setup(
+    name=NAME,
+    version='0.1.0',
+    description='Turns point clouds into a map of surfels: discs with a normal and a planarity',
+    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description_content_type='text/markdown',
+    maintainer='surfel_mapper contributors',
+    maintainer_email='maintainers@surfel-mapper.example',
+    license='Apache-2.0',
+    keywords=['ROS', 'lidar', 'point cloud', 'surfel', 'mapping'],
+    classifiers=[
+        'Intended Audience :: Science/Research',
+        'Operating System :: POSIX :: Linux',
+        'Programming Language :: Python :: 3',
+        'Topic :: Scientific/Engineering',
+    ],
+    python_requires='>=3.10',
+    packages=find_packages(include=[NAME, f'{NAME}.*']),
+    package_data={NAME: ['py.typed']},
+    install_requires=REQUIRED,
+    extras_require={'ros': ROS, 'test': TEST, 'lint': LINT},
+    entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),
+        (f'share/{NAME}', ['package.xml']),
+        (f'share/{NAME}/launch_configs', sorted(glob('launch_configs/*.*'))),
+        (f'lib/{NAME}', ['scripts/node', 'scripts/replay']),
+    ],
+    zip_safe=False,  # colcon asks for it: data files are read from the disk
+)

@@ -1,0 +1,269 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The configuration: what is accepted, the edges of every bound, and what is refused and how."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from surfel_mapper.config import Config, declarations, load_config, MapConfig, WindowConfig
+from surfel_mapper.errors import ConfigError
+
+DECLARATIONS = {declared.name: declared for declared in declarations()}
+BOUNDED = [declared for declared in declarations() if declared.low is not None]
+QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
+
+# A stage may refuse together what each bound accepts alone; these companions keep them apart.
+COMPANIONS = {'input.min_range_m': {'input.max_range_m': 0.0}}
+
+
+def configured(name, value):
+    """Return the configuration with one setting, and what it needs beside it."""
+    return Config.from_mapping({**COMPANIONS.get(name, {}), name: value})
+
+
+def written(tmp_path, text):
+    """Return the path of a YAML file with some text."""
+    path = tmp_path / 'config.yaml'
+    path.write_text(text, encoding='utf-8')
+    return path
+
+
+def test_nothing_given_gives_the_defaults():
+    assert Config.from_mapping({}) == Config() == load_config()
+    expected = {name: declared.default for name, declared in DECLARATIONS.items()}
+    assert Config().to_mapping() == expected
+
+
+def test_settings_may_be_dotted_nested_or_both():
+    dotted = {'map.voxel_size_m': 0.2, 'map.min_points': 3, 'window.max_scans': 7}
+    nested = {'map': {'voxel_size_m': 0.2, 'min_points': 3}, 'window': {'max_scans': 7}}
+    both = {'map': {'voxel_size_m': 0.2}, 'map.min_points': 3, 'window': {'max_scans': 7}}
+    config = Config.from_mapping(dotted)
+    assert config == Config.from_mapping(nested) == Config.from_mapping(both)
+    assert (config.map.voxel_size_m, config.map.min_points, config.window.max_scans) == (0.2, 3, 7)
+
+
+def test_a_configuration_survives_the_way_to_a_mapping_and_back():
+    config = Config.from_mapping({'frames.base_to_sensor': QUARTER_TURN, 'pose.source': 'pose'})
+    assert Config.from_mapping(config.to_mapping()) == config
+
+
+def test_replacing_changes_what_is_named_and_keeps_the_rest():
+    config = Config.from_mapping({'map.voxel_size_m': 0.2, 'window.max_scans': 7})
+    changed = config.replace({'window': {'max_scans': 8}})
+    assert changed.window.max_scans == 8
+    assert changed.map == config.map
+    assert config.window.max_scans == 7
+
+
+def test_replacing_is_checked_too():
+    with pytest.raises(ConfigError, match=r'window\.max_scans: -1'):
+        Config().replace({'window.max_scans': -1})
+
+
+def test_a_configuration_cannot_be_changed_in_place():
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().map.voxel_size_m = 1.0
+
+
+def test_a_whole_number_stands_for_a_float_and_becomes_one():
+    value = configured('map.voxel_size_m', 1).map.voxel_size_m
+    assert (value, type(value)) == (1.0, float)
+
+
+def test_a_list_becomes_a_tuple_of_floats():
+    value = configured('frames.base_to_sensor', [1, 2, 3, 0, 0, 0, 1]).frames.base_to_sensor
+    assert value == (1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0)
+    assert {type(number) for number in value} == {float}
+
+
+def test_a_stage_checks_itself_without_the_rest():
+    with pytest.raises(ConfigError, match=r'map\.voxel_size_m: 0'):
+        MapConfig(voxel_size_m=0.0)
+    assert WindowConfig(max_scans=3).max_scans == 3
+
+
+@pytest.mark.parametrize('declared', declarations(), ids=lambda declared: declared.name)
+def test_every_declaration_is_complete(declared):
+    assert declared.name == f'{declared.stage}.{declared.key}'
+    assert declared.meaning.endswith('.')
+    numeric = isinstance(declared.default, (int, float)) and not isinstance(declared.default, bool)
+    assert (declared.low is not None, declared.high is not None) == (numeric, numeric)
+    if isinstance(declared.default, float):
+        assert declared.key.rpartition('_')[2] in {'m', 's', 'deg', 'hz'}
+
+
+@pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
+def test_a_bound_is_allowed_and_what_lies_beyond_is_not(declared):
+    stage, key = declared.stage, declared.key
+    whole = isinstance(declared.default, int)
+    for bound, outwards in ((declared.low, -math.inf), (declared.high, math.inf)):
+        value = bound
+        assert getattr(getattr(configured(declared.name, value), stage), key) == bound
+        beyond = bound + (1 if outwards > 0 else -1) if whole else math.nextafter(bound, outwards)
+        with pytest.raises(ConfigError, match=rf'^{stage}\.{key}: .* expected a value in \['):
+            configured(declared.name, beyond)
+
+
+@pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
+@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, '1', None, True, [1.0], {}])
+def test_what_is_no_finite_number_is_refused_by_name(declared, value):
+    stage = type(getattr(Config(), declared.stage))
+    with pytest.raises(ConfigError, match=rf'^{declared.stage}\.{declared.key}: .*expected a'):
+        stage(**{declared.key: value})
+
+
+@pytest.mark.parametrize('name', ['map.min_points', 'window.max_scans', 'publish.max_markers'])
+def test_a_float_does_not_stand_for_a_whole_number(name):
+    with pytest.raises(ConfigError, match=f'{name}: 5.0, expected a whole number'):
+        configured(name, 5.0)
+
+
+@pytest.mark.parametrize('value', [1, 0, 'true', None])
+def test_only_true_and_false_are_boolean(value):
+    with pytest.raises(ConfigError, match=r'window\.keep_points: .* expected a bool'):
+        configured('window.keep_points', value)
+
+
+@pytest.mark.parametrize('value', [1, None, True, ['odom']])
+def test_a_name_has_to_be_text(value):
+    with pytest.raises(ConfigError, match=r'frames\.fixed: .* expected a str'):
+        configured('frames.fixed', value)
+
+
+@pytest.mark.parametrize(
+    ('name', 'near'),
+    [
+        ('window.max_scan', 'window.max_scans'),
+        ('map.voxel_size', 'map.voxel_size_m'),
+        ('frame.fixed', 'frames.fixed'),
+    ],
+)
+def test_a_misspelt_setting_is_refused_with_the_nearest_one(name, near):
+    with pytest.raises(ConfigError, match=f'^{name}: no such setting; did you mean {near}\\?$'):
+        Config.from_mapping({name: 1})
+
+
+def test_a_setting_like_no_other_is_refused_without_a_guess():
+    with pytest.raises(ConfigError, match=r'^zzz: no such setting$'):
+        Config.from_mapping({'zzz': 1})
+
+
+def test_an_unknown_pose_source_is_refused_with_the_known_ones():
+    with pytest.raises(ConfigError, match=r"pose\.source: 'odom', expected one of tf, odometry"):
+        configured('pose.source', 'odom')
+
+
+@pytest.mark.parametrize('name', ['frames.fixed', 'frames.base', 'output.directory'])
+def test_an_empty_name_is_refused(name):
+    with pytest.raises(ConfigError, match=f'{name}: empty'):
+        configured(name, '')
+
+
+@pytest.mark.parametrize('value', [[], QUARTER_TURN, [0, 0, 0, 0, 0, 0, -1]])
+def test_a_rigid_transform_or_none_places_the_sensor(value):
+    assert configured('frames.base_to_sensor', value).frames.base_to_sensor == tuple(value)
+
+
+@pytest.mark.parametrize(
+    ('value', 'message'),
+    [
+        ([0.0] * 6, '6 values, expected 7'),
+        ([0.0] * 8, '8 values, expected 7'),
+        ([0.0] * 7, 'norm 0, expected 1'),
+        ([0, 0, 0, 0, 0, 0, 1.002], 'norm 1.002, expected 1'),
+        ([math.nan, 0, 0, 0, 0, 0, 1], 'nan, expected a finite number'),
+        ([0, 0, 0, 0, 0, 0, '1'], "'1', expected a number"),
+        ('0 0 0 0 0 0 1', 'expected a list of numbers'),
+        (7, 'expected a list of numbers'),
+    ],
+)
+def test_what_does_not_place_the_sensor_is_refused(value, message):
+    with pytest.raises(ConfigError, match=rf'frames\.base_to_sensor: .*{message}'):
+        configured('frames.base_to_sensor', value)
+
+
+@pytest.mark.parametrize('farthest', [0.05, 0.1])
+def test_a_range_without_points_is_refused(farthest):
+    with pytest.raises(ConfigError, match=r'input\.max_range_m: .* more than input\.min_range_m'):
+        Config.from_mapping({'input.min_range_m': 0.1, 'input.max_range_m': farthest})
+
+
+def test_a_farthest_range_of_zero_means_no_limit():
+    config = Config.from_mapping({'input.min_range_m': 5.0, 'input.max_range_m': 0.0})
+    assert config.input.max_range_m == 0.0
+
+
+@pytest.mark.parametrize('name', ['', '.', '..', '.map', 'a/b', '/etc/map', 'a\\b', 'a\0b'])
+def test_a_map_name_that_could_leave_its_directory_is_refused(name):
+    with pytest.raises(ConfigError, match=r'output\.map_name: .* expected a plain file name'):
+        configured('output.map_name', name)
+
+
+@pytest.mark.parametrize('name', ['map', 'hall 3', 'hall..3', 'Gebaeude-1_b'])
+def test_a_plain_map_name_is_accepted(name):
+    assert configured('output.map_name', name).output.map_name == name
+
+
+@pytest.mark.parametrize(
+    'text',
+    [
+        '/**:\n  ros__parameters:\n    window: {max_scans: 7}\n',
+        '/**:\n  ros__parameters:\n    window.max_scans: 7\n',
+        'surfel_mapper:\n  ros__parameters:\n    window: {max_scans: 7}\n',
+        'window:\n  max_scans: 7\n',
+        'window.max_scans: 7\n',
+    ],
+)
+def test_a_file_may_be_of_ros_parameters_or_of_the_stages_alone(tmp_path, text):
+    assert load_config(written(tmp_path, text)) == Config.from_mapping({'window.max_scans': 7})
+
+
+def test_what_a_file_tells_the_node_alone_is_passed_over(tmp_path):
+    text = (
+        '/**:\n  ros__parameters:\n    use_sim_time: true\n'
+        '    qos_overrides: {/points: {subscription: {reliability: reliable}}}\n'
+        '    map: {min_points: 3}\n'
+    )
+    assert load_config(written(tmp_path, text)) == Config.from_mapping({'map.min_points': 3})
+
+
+@pytest.mark.parametrize('text', ['', '# nothing\n', '/**:\n  ros__parameters:\n'])
+def test_an_empty_file_gives_the_defaults(tmp_path, text):
+    assert load_config(written(tmp_path, text)) == Config()
+
+
+@pytest.mark.parametrize(
+    ('text', 'message'),
+    [
+        ('- 1\n', 'a list, expected a mapping'),
+        ('7\n', 'a int, expected a mapping'),
+        ('map: [', 'not YAML'),
+        ('map:\n  voxel_size_m: -1.0\n', r'map\.voxel_size_m: -1'),
+        ('map:\n  voxel_size_m: 0,5\n', r"map\.voxel_size_m: '0,5', expected a number"),
+        ('/**:\n  ros__parameters: 7\n', 'expected a mapping'),
+        ('windows:\n  max_scans: 7\n', r'windows\.max_scans: no such setting'),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_refused_by_name(tmp_path, text, message):
+    path = written(tmp_path, text)
+    with pytest.raises(ConfigError, match=f'^{path}: .*{message}'):
+        load_config(path)
+
+
+def test_a_file_that_is_not_text_is_refused(tmp_path):
+    path = tmp_path / 'config.yaml'
+    path.write_bytes(b'\xff\xfe\x00')
+    with pytest.raises(ConfigError, match='not YAML'):
+        load_config(path)
+
+
+@pytest.mark.parametrize('name', ['missing.yaml', '.'])
+def test_a_file_that_cannot_be_read_is_refused_by_name(tmp_path, name):
+    path = tmp_path / name
+    with pytest.raises(ConfigError, match=f'^{path}: cannot be read'):
+        load_config(path)

@@ -1,0 +1,110 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The files that repeat the settings say what the code says, to us and to ROS."""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+from pathlib import Path
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import pytest
+import yaml
+
+from surfel_mapper.config import Config, declarations, load_config
+from test import settings
+
+LAUNCH_CONFIGS = settings.DEFAULT_YAML.parent
+
+
+def test_default_yaml_has_every_setting_at_its_default_and_nothing_else():
+    content = yaml.safe_load(settings.DEFAULT_YAML.read_text(encoding='utf-8'))
+    stages = content['/**']['ros__parameters']
+    found = {
+        f'{stage}.{key}': value for stage, keys in stages.items() for key, value in keys.items()
+    }
+    assert found == {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in Config().to_mapping().items()
+    }
+    assert load_config(settings.DEFAULT_YAML) == Config()
+
+
+@pytest.mark.parametrize('declared', declarations(), ids=lambda declared: declared.name)
+def test_a_number_keeps_its_type_in_default_yaml(declared):
+    content = yaml.safe_load(settings.DEFAULT_YAML.read_text(encoding='utf-8'))
+    value = content['/**']['ros__parameters'][declared.stage][declared.key]
+    expected = list if isinstance(declared.default, tuple) else type(declared.default)
+    assert type(value) is expected  # 1 for 1.0 would be refused by ROS
+
+
+def test_default_yaml_and_readme_are_as_make_settings_writes_them():
+    assert settings.DEFAULT_YAML.read_text(encoding='utf-8') == settings.default_yaml()
+    readme = settings.README.read_text(encoding='utf-8')
+    assert readme == settings.with_table(readme)
+
+
+def test_a_readme_without_markers_is_refused():
+    with pytest.raises(ValueError, match='markers'):
+        settings.with_table('# surfel_mapper\n')
+
+
+def test_ros_reads_default_yaml_as_we_do():
+    pytest.importorskip('rclpy', reason='ROS 2 is not installed')
+    code = (
+        'import json, sys, rclpy\n'
+        'from rcl_interfaces.msg import ParameterDescriptor\n'
+        'rclpy.init(args=sys.argv)\n'
+        'node = rclpy.create_node("surfel_mapper")\n'
+        'as_given = ParameterDescriptor(dynamic_typing=True)\n'
+        'names = json.loads(sys.argv[1])\n'
+        'found = {name: node.declare_parameter(name, None, as_given).value for name in names}\n'
+        'print(json.dumps(found))\n'
+    )
+    names = json.dumps([declared.name for declared in declarations()])
+    done = subprocess.run(
+        [sys.executable, '-c', code, names, '--ros-args', '--params-file', settings.DEFAULT_YAML],
+        env={**os.environ, 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'OFF'},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    found = json.loads(done.stdout)
+    # ROS has no type for an empty list: it takes the parameter as not set.
+    assert found.pop('frames.base_to_sensor') is None
+    expected = Config().to_mapping()
+    assert expected.pop('frames.base_to_sensor') == ()
+    assert {name: (type(value), value) for name, value in found.items()} == {
+        name: (type(value), value) for name, value in expected.items()
+    }
+
+
+@pytest.mark.parametrize('path', sorted(LAUNCH_CONFIGS.glob('*.yaml')), ids=lambda path: path.name)
+def test_every_yaml_file_is_accepted(path):
+    load_config(path)
+
+
+@pytest.mark.parametrize('path', sorted(LAUNCH_CONFIGS.glob('*.py')), ids=lambda path: path.name)
+def test_every_launch_file_compiles_and_offers_a_description(path):
+    tree = ast.parse(path.read_text(encoding='utf-8'), filename=str(path))
+    functions = [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]
+    assert 'generate_launch_description' in functions
+
+
+def test_shared_memory_holds_a_large_cloud_several_times():
+    root = ElementTree.parse(LAUNCH_CONFIGS / 'fastdds_shm.xml').getroot()
+    found = [node.text for node in root.iter() if node.tag.endswith('}segment_size')]
+    assert found == [str(64 * 2**20)]
+
+
+def test_the_readme_links_to_files_that_are_there():
+    root = Path(settings.README).parent
+    readme = settings.README.read_text(encoding='utf-8')
+    links = [part.partition(')')[0] for part in readme.split('](')[1:]]
+    assert links
+    missing = [link for link in links if '://' not in link and not (root / link).exists()]
+    assert missing == []

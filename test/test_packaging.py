@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What installs the package says the same everywhere, and the executables start."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import re
+import shutil
+import subprocess
+import sys
+from xml.etree import ElementTree
+
+import pytest
+
+import surfel_mapper
+
+ROOT = Path(__file__).parents[1]
+MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
+SETUP = (ROOT / 'setup.py').read_text(encoding='utf-8')
+APT_NAMES = {'pyyaml': 'yaml'}  # python3-yaml
+NO_RULE = {'numba'}  # no rosdep rule for Ubuntu 24.04
+
+
+def test_the_version_is_the_same_everywhere():
+    in_setup = re.search(r"version='([^']+)'", SETUP).group(1)
+    assert {in_setup, MANIFEST.findtext('version')} == {surfel_mapper.__version__}
+
+
+def test_the_changelog_begins_with_what_is_to_come_or_with_this_version():
+    changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
+    headings = re.findall(r'^(.+)\n-{3,}$', changelog, flags=re.MULTILINE)
+    assert headings[0] == 'Forthcoming' or headings[0].startswith(surfel_mapper.__version__)
+
+
+def test_everything_pip_requires_is_known_to_rosdep_too():
+    required = re.search(r'REQUIRED = \[(.*?)\n\]', SETUP, flags=re.DOTALL).group(1)
+    names = {name.lower() for name in re.findall(r"^ *'([A-Za-z]+)", required, flags=re.MULTILINE)}
+    keys = {node.text for node in MANIFEST.iter('exec_depend') if 'python3-' in node.text}
+    known = {key.removeprefix('python3-').removesuffix('-pip') for key in keys}
+    assert known == {APT_NAMES.get(name, name) for name in names - NO_RULE}
+
+
+def test_every_ros_package_imported_is_a_dependency():
+    from test.test_layering import HOMES, imports, MODULES, PACKAGE
+
+    imported = {name.split('.')[0] for module in MODULES for name in imports(PACKAGE / module)}
+    ros = {name for name in imported if HOMES.get(name) == 'ros/'}
+    assert ros <= {node.text for node in MANIFEST.iter('exec_depend')}
+
+
+def test_every_file_carries_the_licence():
+    ours = [
+        path
+        for folder in ('surfel_mapper', 'test', 'launch_configs', 'scripts', 'examples', '.ci')
+        for path in sorted((ROOT / folder).rglob('*'))
+        if path.is_file() and path.suffix in {'.py', '.yaml', '.xml', ''}
+    ]
+    assert len(ours) > 20
+    without = [
+        path.relative_to(ROOT).as_posix()
+        for path in [*ours, ROOT / 'setup.py', ROOT / 'Makefile', ROOT / 'package.xml']
+        if 'SPDX-License-Identifier: Apache-2.0' not in path.read_text(encoding='utf-8')[:400]
+    ]
+    assert without == []
+
+
+@pytest.mark.parametrize('name', ['node', 'replay'])
+@pytest.mark.parametrize('python_in_prefix', [True, False])
+def test_an_executable_runs_its_verb_with_the_python_of_its_prefix_or_else_of_the_shell(
+    tmp_path, name, python_in_prefix
+):
+    prefix, shell = tmp_path / 'a prefix', tmp_path / 'shell'
+    executable = prefix / 'lib' / 'surfel_mapper' / name
+    executable.parent.mkdir(parents=True)
+    shutil.copy(ROOT / 'scripts' / name, executable)  # with its mode, as the installers do
+    for folder, is_there in ((prefix / 'bin', python_in_prefix), (shell, True)):
+        if is_there:
+            folder.mkdir()
+            python = folder / 'python3'
+            says = f'echo from {folder.name}'
+            python.write_text(f'#!/bin/sh\n{says}\nexec "{sys.executable}" "$@"\n')
+            python.chmod(0o755)
+
+    done = subprocess.run(
+        [executable, '--help'],
+        env={**os.environ, 'PATH': f'{shell}:{os.environ["PATH"]}', 'PYTHONPATH': str(ROOT)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+
+    assert done.stdout.startswith(f'from {"bin" if python_in_prefix else "shell"}\n')
+    assert f'surfel-mapper {name}' in done.stdout

@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What is public, and what importing the package loads: no ROS, no bags, no compiler."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+import surfel_mapper
+
+ROOT = Path(__file__).parents[1]
+
+HEAVY = ('dask', 'matplotlib', 'numba', 'numpy', 'rclpy', 'rosbags', 'scipy', 'yaml')
+
+
+def loaded_by(code: str) -> set[str]:
+    """Return the top-level modules that a fresh Python holds after running some code."""
+    script = f'{code}\nimport sys\nprint(*{{name.split(".")[0] for name in sys.modules}})'
+    done = subprocess.run(
+        [sys.executable, '-c', script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    return set(done.stdout.split())
+
+
+def test_all_is_sorted_and_without_repetition():
+    assert surfel_mapper.__all__ == sorted(set(surfel_mapper.__all__))
+
+
+def test_all_is_what_type_checkers_see():
+    tree = ast.parse(Path(surfel_mapper.__file__).read_text(encoding='utf-8'))
+    typed = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module.startswith('surfel_mapper')
+        for alias in node.names
+    }
+    assert sorted([*typed, '__version__']) == surfel_mapper.__all__
+    for name, module in typed.items():
+        assert inspect.getmodule(getattr(surfel_mapper, name)).__name__ == module
+
+
+@pytest.mark.parametrize('name', surfel_mapper.__all__)
+def test_every_public_name_is_there_listed_and_the_same_each_time(name):
+    assert getattr(surfel_mapper, name) is getattr(surfel_mapper, name)
+    assert name in dir(surfel_mapper)
+
+
+@pytest.mark.parametrize('name', sorted(set(surfel_mapper.__all__) - {'__version__'}))
+def test_every_public_name_says_what_it_is(name):
+    assert inspect.getdoc(getattr(surfel_mapper, name))
+
+
+def test_an_unknown_name_is_refused_by_name():
+    with pytest.raises(AttributeError, match=r"'surfel_mapper' has no attribute 'SurfelMop'"):
+        surfel_mapper.SurfelMop  # noqa: B018
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    assert not loaded_by('import surfel_mapper') & set(HEAVY)
+
+
+def test_importing_all_public_names_loads_neither_ros_nor_bags_nor_pictures():
+    loaded = loaded_by('from surfel_mapper import *')
+    assert {'numba', 'numpy'} <= loaded
+    assert not loaded & {'dask', 'matplotlib', 'rclpy', 'rosbags'}
+
+
+def test_without_numba_the_error_says_how_to_install_it():
+    code = (
+        'import sys\n'
+        'sys.modules["numba"] = None\n'  # what Python does for a module that is not there
+        'from surfel_mapper.errors import DependencyError\n'
+        'try:\n'
+        '    import surfel_mapper.kernels\n'
+        'except DependencyError as error:\n'
+        '    print(error)\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert 'pip install numba' in done.stdout
+    assert 'Ubuntu 24.04' in done.stdout
+    assert '--break-system-packages' in done.stdout
+    assert '--system-site-packages' in done.stdout
