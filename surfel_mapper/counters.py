@@ -29,8 +29,12 @@ class Counters:
 
     Attributes
     ----------
-    received, mapped, gated, evicted : int
-        Scans that came in, entered the map, were left out by the motion gate, left the map.
+    received, mapped, gated : int
+        Scans that came in, entered the map, were left out by the motion gate.
+    evicted : Counter of str
+        Scans that left the map again, by the limit reached.
+    resets : int
+        How often the map was cleared because time went back.
     dropped : Counter of str
         Scans dropped, by cause.
     points : int
@@ -47,9 +51,9 @@ class Counters:
     received: int = 0
     mapped: int = 0
     gated: int = 0
-    evicted: int = 0
     resets: int = 0
     points: int = 0
+    evicted: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     points_left_out: Counter[str] = field(default_factory=Counter)
     messages_ignored: Counter[str] = field(default_factory=Counter)
@@ -82,7 +86,7 @@ class Counters:
                 'received': self.received,
                 'mapped': self.mapped,
                 'gated': self.gated,
-                'evicted': self.evicted,
+                'evicted': dict(self.evicted),
                 'dropped': dict(self.dropped),
             },
             'resets': self.resets,

@@ -1,0 +1,159 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The hash table of a map: voxel key to row of the slab.
+
+The table is a directory of segments (extendible hashing), because one large table stops the
+world when it grows: here a full segment of 512 buckets splits on its own. The directory is
+indexed by the highest bits of a 32-bit hash, the bucket within a segment by the lowest; within
+a segment probing is linear and a removal shifts later buckets back, so no tombstones remain.
+
+A bucket is one int64: the hash in the upper 32 bits and row + 1 in the lower, 0 where empty.
+Splitting and shifting need the hash only, never the rows; a lookup that finds an equal hash
+confirms it by the key in the row, which is about to be used anyway.
+
+The kernels take the table as one tuple: directory (2^depth,) int32, the segment of each prefix of
+the hash; buckets (S * 512,) int64; held (S,) int32, rows in each segment; local_depth (S,) int8,
+how many bits of the hash all rows of a segment share. Its depth is in the map's state.
+
+Source: Fagin et al. 1979, Extendible hashing; deletion after Knuth, vol. 3, 6.4, algorithm R.
+"""
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.layout import KEY
+
+SEGMENT = 512
+"""Buckets of a segment: 4 KiB."""
+
+FULL = SEGMENT * 3 // 4
+"""A segment that holds so many splits before the next insertion."""
+
+# Scalars of a map that kernels write: an int64 array of these.
+FREE_ROW = 0
+"""First row of the chain of free rows, -1 where there is none."""
+ROWS_USED = 1
+"""Rows ever used; rows from here on are untouched."""
+VOXELS = 2
+SEGMENTS = 3
+DEPTH = 4
+"""The directory has 2^DEPTH entries."""
+POINTS = 5
+CHANGED = 6
+"""Rows that the operation under way has changed so far."""
+STATE = 7
+
+_LOW = np.int64(0xFFFFFFFF)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def hash_key(key):
+    """Return the 32-bit hash of a voxel key, an int64 in [0, 2^32)."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    mixed ^= mixed >> np.uint64(32)
+    mixed *= np.uint64(0xD6E8FEB86659FD93)
+    return np.int64(mixed >> np.uint64(32))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def first_bucket(hashed, directory, depth):
+    """Return the bucket where the search for a hash starts: segment times 512 plus place."""
+    segment = np.int64(directory[hashed >> (32 - depth)])
+    return segment * SEGMENT + (hashed & (SEGMENT - 1))
+
+
+@njit(cache=True, nogil=True, inline='always')
+def next_bucket(bucket):
+    """Return the bucket after this one, round within its segment."""
+    return (bucket & ~(SEGMENT - 1)) | ((bucket + 1) & (SEGMENT - 1))
+
+
+@njit(cache=True, nogil=True)
+def find_row(key, rows, table, depth):
+    """
+    Return the row of a voxel, or -1 if the map has none.
+
+    rows  (R, 16) int64, the slab
+    """
+    directory, buckets, _, _ = table
+    hashed = hash_key(key)
+    bucket = first_bucket(hashed, directory, depth)
+    entry = buckets[bucket]
+    while entry != 0:
+        if (entry >> 32) & _LOW == hashed:
+            row = (entry & _LOW) - 1
+            if rows[row, KEY] == key:
+                return row
+        bucket = next_bucket(bucket)
+        entry = buckets[bucket]
+    return np.int64(-1)
+
+
+@njit(cache=True, nogil=True)
+def insert_row(hashed, row, table, depth):
+    """Put the row of a voxel that is not in the table into the first empty bucket."""
+    directory, buckets, held, _ = table
+    bucket = first_bucket(hashed, directory, depth)
+    held[bucket // SEGMENT] += 1
+    while buckets[bucket] != 0:
+        bucket = next_bucket(bucket)
+    buckets[bucket] = (hashed << 32) | (row + 1)
+
+
+@njit(cache=True, nogil=True)
+def remove_row(key, row, table, depth):
+    """
+    Take the row of a voxel out of the table and close the gap.
+
+    A later bucket moves into the gap unless its search starts behind the gap.
+    """
+    directory, buckets, held, _ = table
+    bucket = first_bucket(hash_key(key), directory, depth)
+    held[bucket // SEGMENT] -= 1
+    while (buckets[bucket] & _LOW) - 1 != row:
+        bucket = next_bucket(bucket)
+    mask = SEGMENT - 1
+    gap = bucket
+    bucket = next_bucket(bucket)
+    while buckets[bucket] != 0:
+        home = (buckets[bucket] >> 32) & mask
+        if ((bucket - home) & mask) >= ((bucket - gap) & mask):
+            buckets[gap] = buckets[bucket]
+            gap = bucket
+        bucket = next_bucket(bucket)
+    buckets[gap] = 0
+
+
+@njit(cache=True, nogil=True)
+def split_segment(hashed, table, state):
+    """
+    Divide the segment of a hash in two by its next bit; return whether there was room.
+
+    hashed  int64, any hash of the segment
+    state   (STATE,) int64
+
+    Without room for one more segment, or when the directory would have to double, nothing is
+    changed and the result is False.
+    """
+    directory, buckets, held, local_depth = table
+    depth = state[DEPTH]
+    old = np.int64(directory[hashed >> (32 - depth)])
+    bits = np.int64(local_depth[old])
+    new = state[SEGMENTS]
+    if bits == depth or new == len(held):
+        return False
+    state[SEGMENTS] = new + 1
+    local_depth[old] = local_depth[new] = bits + 1
+    entries = buckets[old * SEGMENT : (old + 1) * SEGMENT].copy()
+    buckets[old * SEGMENT : (old + 1) * SEGMENT] = 0
+    buckets[new * SEGMENT : (new + 1) * SEGMENT] = 0
+    # The entries of the directory that share the old prefix: the upper half gets the new one.
+    span = 1 << (depth - bits)
+    first = (hashed >> (32 - bits)) << (depth - bits) if bits > 0 else 0
+    directory[first + span // 2 : first + span] = new
+    held[old] = held[new] = 0
+    for entry in entries:
+        if entry != 0:
+            insert_row((entry >> 32) & _LOW, (entry & _LOW) - 1, table, depth)
+    return True

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the moments of voxels say: mean, eigenvalues, normal, planarity, curvature.
+
+Moments are first moved, in integers, from the voxel centre to the lattice point nearest to the
+mean. Only then are they made float64, so that nothing cancels: points that are all equal give a
+scatter of exactly 0 wherever in the voxel they lie. Voxels are gathered in chunks that stay in
+the cache and are decomposed several at a time.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.eigen3 import decompose
+from surfel_mapper.kernels.layout import (
+    COUNT,
+    INDEX_BITS,
+    INDEX_MASK,
+    INDEX_OFFSET,
+    KEY,
+    PRODUCT,
+    ROW,
+    SUM,
+    VERSION,
+    VIEW,
+)
+from surfel_mapper.kernels.prefetch import prefetch
+
+CHUNK = 256
+AHEAD = 16
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def derive_surfels(rows, chosen, voxel_size, bits, outputs):
+    """
+    Derive the surfels of some rows of the slab.
+
+    rows        (R, 16) int64
+    chosen      (K,) int32 or int64, rows to derive; each holds at least one point
+    voxel_size  float64, m
+    bits        a voxel is 2^bits lattice units wide
+    outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
+                eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32
+
+    One point, or all equal: eigenvalues 0; normal, planarity and curvature nan.
+    """
+    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
+    unit = voxel_size / (1 << bits)
+    scatter = np.empty((6, CHUNK))
+    values = np.empty((3, CHUNK))
+    normals = np.empty((3, CHUNK))
+    for start in range(0, len(chosen), CHUNK):
+        num = min(CHUNK, len(chosen) - start)
+        part = slice(start, start + num)
+        gather(rows, chosen[part], scatter, num_points[part], voxel_index[part])
+        place_means(rows, chosen[part], voxel_size, bits, position[part])
+        decompose(scatter, num, values, normals)
+        for i in range(num):
+            out = start + i
+            row = np.int64(chosen[out])
+            n = num_points[out]
+            e0, e1, e2 = values[0, i], values[1, i], values[2, i]
+            trace = (e0 + e1) + e2
+            nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
+            if not trace > 0.0:
+                nx = ny = nz = math.nan
+            elif looks_away(nx, ny, nz, rows[row]):
+                nx, ny, nz = -nx, -ny, -nz
+            normal[out, 0], normal[out, 1], normal[out, 2] = nx, ny, nz
+            planarity[out] = 2.0 * (e1 - e0) / trace  # 0 / 0 is nan, as it should be
+            curvature[out] = e0 / trace
+            scale = unit * unit / (n - 1) if n > 1 else 0.0
+            for j in range(3):
+                eigenvalues[out, j] = values[j, i] * scale
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gather(rows, chosen, scatter, num_points, voxel_index):
+    """
+    Collect count, voxel index and scatter of a chunk.
+
+    scatter  (6, CHUNK) float64, out: sum of products of deviations from the mean, lattice units
+    """
+    flat = rows.ravel()
+    for i in range(len(chosen)):
+        if i + AHEAD < len(chosen):
+            prefetch(flat, np.int64(chosen[i + AHEAD]) * ROW)
+            prefetch(flat, np.int64(chosen[i + AHEAD]) * ROW + ROW // 2)
+        row = np.int64(chosen[i])
+        n = rows[row, COUNT]
+        sx, sy, sz = rows[row, SUM], rows[row, SUM + 1], rows[row, SUM + 2]
+        inverse = 1.0 / n
+        cx, cy, cz = np.int64(sx * inverse), np.int64(sy * inverse), np.int64(sz * inverse)
+        # about the lattice point c near the mean, still in integers
+        dx, dy, dz = sx - n * cx, sy - n * cy, sz - n * cz
+        fx, fy, fz = np.float64(dx), np.float64(dy), np.float64(dz)
+        scatter[0, i] = (rows[row, PRODUCT] - cx * (sx + dx)) - fx * fx * inverse
+        scatter[1, i] = (rows[row, PRODUCT + 1] - cx * sy - cy * dx) - fx * fy * inverse
+        scatter[2, i] = (rows[row, PRODUCT + 2] - cx * sz - cz * dx) - fx * fz * inverse
+        scatter[3, i] = (rows[row, PRODUCT + 3] - cy * (sy + dy)) - fy * fy * inverse
+        scatter[4, i] = (rows[row, PRODUCT + 4] - cy * sz - cz * dy) - fy * fz * inverse
+        scatter[5, i] = (rows[row, PRODUCT + 5] - cz * (sz + dz)) - fz * fz * inverse
+        key = rows[row, KEY]
+        num_points[i] = n
+        voxel_index[i, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        voxel_index[i, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        voxel_index[i, 2] = (key & INDEX_MASK) - INDEX_OFFSET
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def place_means(rows, chosen, voxel_size, bits, position):
+    """Write the means of a chunk, (K, 3) float64, m."""
+    cell = 1.0 / (1 << bits)
+    half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
+    for i in range(len(chosen)):
+        row = np.int64(chosen[i])
+        key = rows[row, KEY]
+        n = np.float64(rows[row, COUNT])
+        kx = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        kz = (key & INDEX_MASK) - INDEX_OFFSET
+        position[i, 0] = (kx + (rows[row, SUM] / n + half) * cell) * voxel_size
+        position[i, 1] = (ky + (rows[row, SUM + 1] / n + half) * cell) * voxel_size
+        position[i, 2] = (kz + (rows[row, SUM + 2] / n + half) * cell) * voxel_size
+
+
+@njit(cache=True, nogil=True, inline='always')
+def looks_away(nx, ny, nz, row):
+    """
+    Return whether a normal has to be turned.
+
+    It points to the side from which the voxel was seen. Where that is unknown or exactly
+    sideways, the component of largest magnitude is positive; of equal ones the first counts.
+    """
+    towards = (nx * row[VIEW] + ny * row[VIEW + 1]) + nz * row[VIEW + 2]
+    if towards == 0.0:
+        if abs(nx) >= abs(ny) and abs(nx) >= abs(nz):
+            towards = nx
+        elif abs(ny) >= abs(nz):
+            towards = ny
+        else:
+            towards = nz
+    return towards < 0.0
+
+
+@njit(cache=True, nogil=True)
+def rows_changed_at(rows, changed, version, min_points):
+    """Return the rows whose last change was at a version and that hold at least so many points."""
+    kept = np.empty(len(changed), np.int32)
+    num = 0
+    for row in changed:
+        if rows[row, VERSION] == version and rows[row, COUNT] >= min_points:
+            kept[num] = row
+            num += 1
+    return kept[:num]
+
+
+@njit(cache=True, nogil=True)
+def rows_changed_after(rows, used, version, min_points):
+    """Return the rows changed after a version that hold at least so many points."""
+    kept = np.empty(used, np.int32)
+    num = 0
+    for row in range(used):
+        if rows[row, VERSION] > version and rows[row, COUNT] >= min_points:
+            kept[num] = row
+            num += 1
+    return kept[:num].copy()

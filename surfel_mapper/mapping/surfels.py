@@ -1,0 +1,98 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Surfels: what a map says about its voxels, as arrays.
+
+Derived from the exact moments in float64 whenever they are asked for, and only for the voxels
+asked for; a map stores none of it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.kernels.surfels import derive_surfels
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surfels:
+    """
+    Surfels of K voxels, one row each, in the frame of the map.
+
+    Attributes
+    ----------
+    position : (K, 3) float64, m
+        Mean of the points.
+    normal : (K, 3) float64
+        Unit eigenvector of the smallest eigenvalue, turned towards the sensor that saw the
+        voxel; where that is unknown, the component of largest magnitude is positive. nan for
+        one point and for points that are all equal.
+    planarity : (K,) float64
+        2 (e1 - e0) / (e0 + e1 + e2) in [0, 1]; nan where the normal is.
+    curvature : (K,) float64
+        e0 / (e0 + e1 + e2) in [0, 1/3] (Pauly et al. 2002); nan where the normal is.
+    eigenvalues : (K, 3) float64, m^2
+        Of the covariance scatter / (n - 1), ascending; 0 for one point.
+    num_points : (K,) int64
+        How many points.
+    voxel_index : (K, 3) int32
+        floor(point / voxel size).
+
+    """
+
+    position: npt.NDArray[np.float64]
+    normal: npt.NDArray[np.float64]
+    planarity: npt.NDArray[np.float64]
+    curvature: npt.NDArray[np.float64]
+    eigenvalues: npt.NDArray[np.float64]
+    num_points: npt.NDArray[np.int64]
+    voxel_index: npt.NDArray[np.int32]
+
+    def __len__(self) -> int:
+        """Return the number of surfels."""
+        return len(self.num_points)
+
+    def select(self, rows: npt.NDArray[Any]) -> Surfels:
+        """Return some of the surfels: by a mask (K,) bool, or by their row numbers."""
+        return Surfels(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+
+
+def derive(
+    rows: npt.NDArray[np.int64],
+    chosen: npt.NDArray[np.int32],
+    voxel_size_m: float,
+    bits: int,
+) -> Surfels:
+    """
+    Derive the surfels of some rows of a map's slab.
+
+    Parameters
+    ----------
+    rows : (R, 16) int64
+        Laid out as kernels/layout.py says.
+    chosen : (K,) int32
+        Rows that hold points.
+    voxel_size_m : float
+        Edge of a voxel, m.
+    bits : int
+        A voxel is 2^bits lattice units wide.
+
+    """
+    num = len(chosen)
+    surfels = Surfels(
+        position=np.empty((num, 3)),
+        normal=np.empty((num, 3)),
+        planarity=np.empty(num),
+        curvature=np.empty(num),
+        eigenvalues=np.empty((num, 3)),
+        num_points=np.empty(num, np.int64),
+        voxel_index=np.empty((num, 3), np.int32),
+    )
+    outputs = tuple(getattr(surfels, field.name) for field in dataclasses.fields(surfels))
+    derive_surfels(rows, chosen, voxel_size_m, bits, outputs)
+    return surfels

@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+SlidingWindow: which scans a map holds, and which leave it when a new one comes.
+
+The window keeps the moments of every scan; a scan that leaves is subtracted from the map, so
+the map is at any time the sum of the scans in the window, to the bit. A new scan is added
+before old ones leave, so that a voxel seen by both never comes and goes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import WindowConfig
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class WindowedScan:
+    """
+    A scan in the window.
+
+    Attributes
+    ----------
+    moments : ScanMoments
+        What the map holds of it.
+    stamp_ns : int
+        Time of the scan.
+    T_map_sensor : (4, 4) float64
+        The pose it was added at.
+    points : (N, 3) float32 or float64, m, optional
+        Its points in the sensor frame, where they are kept.
+
+    """
+
+    moments: ScanMoments
+    stamp_ns: int
+    T_map_sensor: npt.NDArray[np.float64]
+    points: npt.NDArray[Any] | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of moments and points."""
+        return self.moments.nbytes + (0 if self.points is None else self.points.nbytes)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Eviction:
+    """
+    A scan that left the window.
+
+    Attributes
+    ----------
+    scan : WindowedScan
+    limit : str
+        The limit that it had reached: max_scans, max_age_s, max_distance_m, max_bytes or
+        max_voxels.
+    emptied : (E, 3) int32
+        Indices of the voxels that went with it.
+
+    """
+
+    scan: WindowedScan
+    limit: str
+    emptied: npt.NDArray[np.int32]
+
+
+class SlidingWindow:
+    """
+    The scans of a map, oldest first.
+
+    Parameters
+    ----------
+    surfel_map : SurfelMap
+        Scans are added to it and removed from it by the window alone.
+    config : WindowConfig, optional
+        The limits; may be replaced at any time and hold from the next scan on.
+    max_voxels : int
+        The oldest scans leave while the map holds more voxels; 0: no such limit.
+
+    """
+
+    def __init__(
+        self,
+        surfel_map: SurfelMap,
+        config: WindowConfig | None = None,
+        *,
+        max_voxels: int = 0,
+    ) -> None:
+        """Make an empty window."""
+        self.config = config or WindowConfig()
+        self.max_voxels = max_voxels
+        self._map = surfel_map
+        self._scans: deque[tuple[WindowedScan, float]] = deque()
+        self._travelled_m = 0.0
+        self._nbytes = 0
+
+    def __len__(self) -> int:
+        """Return the number of scans."""
+        return len(self._scans)
+
+    def __iter__(self) -> Iterator[WindowedScan]:
+        """Iterate over the scans, oldest first."""
+        return (scan for scan, _ in self._scans)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all scans in the window."""
+        return self._nbytes
+
+    @property
+    def newest(self) -> WindowedScan | None:
+        """The scan added last."""
+        return self._scans[-1][0] if self._scans else None
+
+    def insert(self, scan: WindowedScan) -> list[Eviction]:
+        """
+        Add a scan to the map and remove those that are beyond a limit now.
+
+        The newest scan stays, whatever the limits are.
+
+        Raises
+        ------
+        MapError
+            If the map refuses the scan; nothing has changed then.
+
+        """
+        self._map.insert(scan.moments)
+        if self._scans:
+            step = scan.T_map_sensor[:3, 3] - self._scans[-1][0].T_map_sensor[:3, 3]
+            self._travelled_m += float(np.sqrt((step * step).sum()))
+        self._scans.append((scan, self._travelled_m))
+        self._nbytes += scan.nbytes
+        evicted = []
+        while len(self._scans) > 1 and (limit := self._limit_reached()):
+            evicted.append(self._evict(limit))
+        return evicted
+
+    def clear(self) -> None:
+        """Forget all scans and clear the map."""
+        self._scans.clear()
+        self._nbytes = 0
+        self._travelled_m = 0.0
+        self._map.clear()
+
+    def _evict(self, limit: str) -> Eviction:
+        scan, _ = self._scans[0]
+        emptied = self._map.remove(scan.moments)
+        self._scans.popleft()
+        self._nbytes -= scan.nbytes
+        return Eviction(scan=scan, limit=limit, emptied=emptied)
+
+    def _limit_reached(self) -> str:
+        """Return the name of a limit that the oldest scan is beyond, or an empty string."""
+        config = self.config
+        (oldest, travelled_m), (newest, _) = self._scans[0], self._scans[-1]
+        age_ns = newest.stamp_ns - oldest.stamp_ns
+        limits = {
+            'max_scans': (len(self._scans), config.max_scans),
+            'max_age_s': (age_ns, round(config.max_age_s * 1e9)),
+            'max_distance_m': (self._travelled_m - travelled_m, config.max_distance_m),
+            'max_bytes': (self._nbytes, config.max_bytes),
+            'max_voxels': (self._map.num_voxels, self.max_voxels),
+        }
+        reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
+        return next(reached, '')

@@ -1,0 +1,383 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Mapper: the pipeline from scans and poses to a windowed map of surfels.
+
+Node and replay drive this one class and only carry messages in and results out, so what they
+map is the same to the bit. Time is the stamps of the data alone, never the clock: a scan waits
+for its pose until newer data is more than ``pose.max_wait_s`` ahead of it, which a bag replayed
+at any speed does alike.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+import logging
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import Config, declarations
+from surfel_mapper.counters import Counters
+from surfel_mapper.errors import ConfigError, MapError, PoseError, PoseNotYetError
+from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
+from surfel_mapper.poses import TransformBuffer
+from surfel_mapper.scan import Scan
+
+_log = logging.getLogger(__name__)
+
+WARN_EVERY_S = 1.0
+"""A warning of one cause is logged at most this often; all are counted."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Update:
+    """
+    What one scan did to the map.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the scan.
+    frame_id : str
+        The fixed frame, in which the surfels are.
+    T_fixed_sensor : (4, 4) float64
+        Pose of the sensor.
+    num_points : int
+        Points of the scan that entered the map.
+    changed : Surfels
+        Every voxel that the scan or an eviction changed and that has ``map.min_points``.
+    removed_voxel_index : (K, 3) int32
+        Voxels that left the map.
+    evictions : tuple of Eviction
+        The scans that left, oldest first.
+    milliseconds : dict of str to float
+        Time by stage: reduce, insert (evictions included), normals, total.
+
+    """
+
+    stamp_ns: int
+    frame_id: str
+    T_fixed_sensor: npt.NDArray[np.float64]
+    num_points: int
+    changed: Surfels
+    removed_voxel_index: npt.NDArray[np.int32]
+    evictions: tuple[Eviction, ...]
+    milliseconds: dict[str, float]
+
+
+class Mapper:
+    """
+    Maps scans at the poses that belong to them.
+
+    Parameters
+    ----------
+    config : Config, optional
+        All settings; the defaults without it.
+
+    Raises
+    ------
+    ConfigError
+        If ``pose.source`` is registration, which this version cannot do.
+
+    """
+
+    def __init__(self, config: Config | None = None) -> None:
+        """Make an empty map with the settings of a configuration."""
+        self.config = config or Config()
+        if self.config.pose.source == 'registration':
+            raise ConfigError(
+                'pose.source: registration is not available in this version; '
+                'expected tf, odometry, pose or identity'
+            )
+        self.counters = Counters()
+        self.map = SurfelMap(self.config.map.voxel_size_m)
+        self.window = SlidingWindow(
+            self.map, self.config.window, max_voxels=self.config.map.max_voxels
+        )
+        self.transforms = TransformBuffer(reset_after_s=self.config.input.reset_after_s)
+        self._waiting: deque[Scan] = deque()
+        self._newest_ns: dict[str, int] = {}
+        self._mounted: set[str] = set()
+        self._warned: dict[str, float] = {}
+
+    def add_pose(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        xyz: Any,
+        q_xyzw: Any,
+        *,
+        static: bool = False,
+    ) -> None:
+        """
+        Add the pose of one frame in another; a bad one is counted and warned about.
+
+        Parameters
+        ----------
+        parent, child : str
+            Names of the frames; the pose takes points of the child to the parent.
+        stamp_ns : int
+            Its time; has no meaning where it is static.
+        xyz : (3,) float, m
+            Position of the child in the parent.
+        q_xyzw : (4,) float
+            Its orientation, a unit quaternion.
+        static : bool
+            Whether it holds for all time.
+
+        """
+        try:
+            transform = pose_matrix(xyz, q_xyzw)
+            if static:
+                self.transforms.add_static(parent, child, transform)
+            else:
+                self.transforms.add(parent, child, stamp_ns, transform)
+        except (PoseError, ValueError) as error:
+            self.counters.messages_ignored['bad_pose'] += 1
+            self._warn('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+
+    def add_scan(self, scan: Scan) -> None:
+        """
+        Queue a scan until its pose is there; ``insert_ready`` maps it.
+
+        A scan without points or frame, or with a stamp that is not newer than the last of its
+        frame, is dropped and counted. A stamp that goes back by more than
+        ``input.reset_after_s`` clears the map first.
+        """
+        self.counters.received += 1
+        if not scan.frame_id:
+            self._drop(scan, 'empty_frame_id', 'its header has no frame_id')
+        elif len(scan) == 0:
+            self._drop(scan, 'no_points', 'it has no points')
+        elif self._in_order(scan):
+            self._mount(scan.frame_id)
+            self._waiting.append(scan)
+            while len(self._waiting) > self.config.pose.max_waiting_scans:
+                self._drop(
+                    self._waiting.popleft(),
+                    'queue_full',
+                    f'{self.config.pose.max_waiting_scans} newer scans wait for their poses',
+                )
+
+    def insert_ready(self) -> Iterator[Update]:
+        """
+        Map the waiting scans whose poses are there, in order; yield what each did.
+
+        A scan whose pose cannot come any more, or did not in time, is dropped and counted.
+        """
+        while self._waiting:
+            scan = self._waiting[0]
+            try:
+                pose = self._lookup(scan)
+            except PoseNotYetError as error:
+                waited_s = (self._now_ns() - scan.stamp_ns) / 1e9
+                if waited_s <= self.config.pose.max_wait_s:
+                    return
+                self._waiting.popleft()
+                self._drop(scan, 'no_pose', f'no pose within {waited_s:.3f} s: {error}')
+                continue
+            except PoseError as error:
+                self._waiting.popleft()
+                self._drop(scan, 'no_pose', str(error))
+                continue
+            self._waiting.popleft()
+            update = self._insert(scan, pose)
+            if update is not None:
+                yield update
+
+    def finish(self) -> None:
+        """End the input: what still waits for a pose is dropped and counted."""
+        while self._waiting:
+            self._drop(self._waiting.popleft(), 'no_pose', 'no pose until the end of the input')
+
+    def clear(self) -> None:
+        """Forget all scans, waiting ones too (counted); poses and counts stay."""
+        while self._waiting:
+            self._drop(self._waiting.popleft(), 'cleared', 'the map was cleared')
+        self.window.clear()
+
+    def reconfigure(self, config: Config) -> None:
+        """
+        Take new settings while running; they hold from the next scan on.
+
+        Raises
+        ------
+        ConfigError
+            If a setting differs that only a new start can change. Nothing has changed then.
+
+        """
+        old, new = self.config.to_mapping(), config.to_mapping()
+        for declared in declarations():
+            if not declared.live and old[declared.name] != new[declared.name]:
+                raise ConfigError(
+                    f'{declared.name}: cannot change while running; set it at the start'
+                )
+        self.config = config
+        self.window.config = config.window
+        self.window.max_voxels = config.map.max_voxels
+
+    def warm_up(self) -> None:
+        """Compile every kernel that mapping needs, for all types that scans may have."""
+        for dtype in (np.float32, np.float64):
+            surfel_map = SurfelMap(self.config.map.voxel_size_m)
+            moments = surfel_map.add(np.zeros((1, 3), dtype))
+            surfel_map.surfels_changed(since=0)
+            surfel_map.remove(moments)
+            many = surfel_map.add(np.zeros((1 << 16, 3), dtype))  # sums in int64
+            surfel_map.remove(many)
+        surfel_map.digest()
+
+    def summary(self) -> dict[str, Any]:
+        """Return counts and times, and what the map is: for files, reports and diagnostics."""
+        return {
+            **self.counters.summary(),
+            'voxel_size_m': self.map.voxel_size_m,
+            'window_scans': len(self.window),
+            'voxels': self.map.num_voxels,
+            'surfels': len(self.map.surfels(self.config.map.min_points)),
+            'digest': self.map.digest(),
+        }
+
+    def _in_order(self, scan: Scan) -> bool:
+        """Return whether a scan may enter; clear the map where time was set back."""
+        newest = max(self._newest_ns.values(), default=scan.stamp_ns)
+        back_s = (newest - scan.stamp_ns) / 1e9
+        if back_s > self.config.input.reset_after_s:
+            _log.warning(
+                'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
+                '(%g s): the map is cleared',
+                scan.frame_id,
+                back_s,
+                self.config.input.reset_after_s,
+            )
+            self.counters.resets += 1
+            self.clear()
+            self._newest_ns.clear()
+        last = self._newest_ns.get(scan.frame_id)
+        if last is not None and scan.stamp_ns <= last:
+            behind_s = (last - scan.stamp_ns) / 1e9
+            cause = 'stamp_back' if behind_s else 'stamp_repeated'
+            self._drop(scan, cause, f'its stamp is {behind_s:.3f} s before the one before it')
+            return False
+        self._newest_ns[scan.frame_id] = scan.stamp_ns
+        return True
+
+    def _now_ns(self) -> int:
+        """Return the newest stamp of all data seen."""
+        stamps = list(self._newest_ns.values())
+        newest_pose = self.transforms.newest_ns
+        return max(stamps if newest_pose is None else [*stamps, newest_pose])
+
+    def _mount(self, frame_id: str) -> None:
+        """Enter the configured extrinsics of a sensor when its frame is first seen."""
+        values, base = self.config.frames.base_to_sensor, self.config.frames.base
+        if values and frame_id != base and frame_id not in self._mounted:
+            self._mounted.add(frame_id)
+            self.add_pose(base, frame_id, 0, values[:3], values[3:], static=True)
+
+    def _lookup(self, scan: Scan) -> npt.NDArray[np.float64]:
+        """Return T_fixed_sensor at the stamp of a scan."""
+        if self.config.pose.source == 'identity':
+            return np.eye(4)
+        return self.transforms.lookup(self.config.frames.fixed, scan.frame_id, scan.stamp_ns)
+
+    def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
+        """Map a scan; None where the motion gate or the map leaves it out."""
+        if self._stands_still(pose):
+            self.counters.gated += 1
+            return None
+        start, version = time.perf_counter(), self.map.version
+        try:
+            windowed = self._reduce(scan, pose)
+            reduced = time.perf_counter()
+            if not len(windowed.moments):
+                self._drop(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
+                return None
+            evictions = self.window.insert(windowed)
+        except MapError as error:
+            self._drop(scan, 'map_limit', str(error))
+            return None
+        inserted = time.perf_counter()
+        changed = self.map.surfels_changed(version, self.config.map.min_points)
+        end = time.perf_counter()
+        times = {
+            'reduce': (reduced - start) * 1e3,
+            'insert': (inserted - reduced) * 1e3,
+            'normals': (end - inserted) * 1e3,
+            'total': (end - start) * 1e3,
+        }
+        self._count(windowed, evictions, times)
+        emptied = [eviction.emptied for eviction in evictions]
+        return Update(
+            stamp_ns=scan.stamp_ns,
+            frame_id=self.config.frames.fixed,
+            T_fixed_sensor=pose,
+            num_points=windowed.moments.num_points,
+            changed=changed,
+            removed_voxel_index=np.concatenate(emptied) if emptied else np.empty((0, 3), np.int32),
+            evictions=tuple(evictions),
+            milliseconds=times,
+        )
+
+    def _reduce(self, scan: Scan, pose: npt.NDArray[np.float64]) -> WindowedScan:
+        """Reduce a scan to its moments; where the sensor is unknown, normals stay unturned."""
+        limits = self.config.input
+        moments = self.map.reduce(
+            scan.points,
+            pose,
+            origin=None if self.config.pose.source == 'identity' else pose[:3, 3],
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m or np.inf,
+        )
+        self.counters.points_left_out.update(moments.left_out)
+        return WindowedScan(
+            moments=moments,
+            stamp_ns=scan.stamp_ns,
+            T_map_sensor=pose,
+            points=scan.points if self.config.window.keep_points else None,
+        )
+
+    def _count(
+        self, scan: WindowedScan, evictions: list[Eviction], times: dict[str, float]
+    ) -> None:
+        self.counters.mapped += 1
+        self.counters.points += scan.moments.num_points
+        self.counters.evicted.update(eviction.limit for eviction in evictions)
+        for stage, milliseconds in times.items():
+            self.counters.add_time(stage, milliseconds)
+
+    def _stands_still(self, pose: npt.NDArray[np.float64]) -> bool:
+        """Return whether the sensor moved too little since the last scan that was mapped."""
+        gate, last = self.config.window, self.window.newest
+        if last is None or not (gate.gate_distance_m or gate.gate_angle_deg):
+            return False
+        motion = compose(inverse(last.T_map_sensor), pose)
+        distance_m = float(np.sqrt((motion[:3, 3] ** 2).sum()))
+        angle_deg = float(np.degrees(rotation_angle(motion)))
+        moved = 0.0 < gate.gate_distance_m <= distance_m
+        turned = 0.0 < gate.gate_angle_deg <= angle_deg
+        return not (moved or turned)
+
+    def _drop(self, scan: Scan, cause: str, reason: str) -> None:
+        self.counters.dropped[cause] += 1
+        self._warn(
+            cause,
+            f'scan at {scan.stamp_ns / 1e9:.6f} s in frame {scan.frame_id!r} dropped: {reason} '
+            f'({self.counters.dropped[cause]} dropped for this cause)',
+        )
+
+    def _warn(self, cause: str, message: str) -> None:
+        """Log a warning, unless one of the same cause was logged just before."""
+        now = time.monotonic()
+        if now - self._warned.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+            self._warned[cause] = now
+            _log.warning('%s', message)
