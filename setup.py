@@ -50,11 +50,14 @@ LINT = [
     'mypy>=1.11',  # types; configured in setup.cfg
 ]
 
+# colcon build --symlink-install runs a link to this file, beside which there is no README.md.
+README = Path(__file__).resolve().with_name('README.md')
+
 setup(
     name=NAME,
     version='0.1.0',
     description='Turns point clouds into a map of surfels: discs with a normal and a planarity',
-    long_description=Path(__file__).with_name('README.md').read_text(encoding='utf-8'),
+    long_description=README.read_text(encoding='utf-8'),
     long_description_content_type='text/markdown',
     maintainer='surfel_mapper contributors',
     maintainer_email='maintainers@surfel-mapper.example',
