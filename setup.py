@@ -24,7 +24,7 @@ REQUIRED = [
     'numpy>=1.26',  # arrays; 1.26 is what the messages of ROS from apt are compiled for
     'scipy>=1.11',  # rotations and spatial search beyond the kernels
     'numba>=0.61',  # compiles the kernels; 0.61 is the first for Python 3.13
-    'rosbags>=0.11',  # reads bags of ROS 1 and 2 without ROS; 0.11 has the readers' present names
+    'rosbags>=0.11.6',  # bags of ROS 1 and 2 without ROS; 0.11.5 leaves out damaged topics
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
     'matplotlib>=3.6',  # map.png
@@ -42,7 +42,7 @@ TEST = [
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
     'pytest-timeout>=2.2',  # a test that hangs names itself
     'hypothesis>=6.98',  # random sequences of adds and removes
-    'plyfile>=1.0',  # an independent reader of what we write
+    'plyfile>=1.0.1',  # an independent reader of what we write
 ]
 
 LINT = [
