@@ -39,7 +39,7 @@ class Topics(list[Topic]):
     def __init__(self, path: Path, topics: Collection[Topic]) -> None:
         """Hold the topics of the bag at a path, which errors name."""
         super().__init__(topics)
-        self._path = path
+        self.path = path
 
     def num_messages(self, names: Collection[str]) -> int:
         """Return how many messages some topics have by the index."""
@@ -76,12 +76,12 @@ class Topics(list[Topic]):
                 return name
             types = [topic.type for topic in self if topic.name == name]
             problem = f'{name} is of type {types[0]}, not {short}' if types else f'no topic {name}'
-            raise BagError(f'{self._path}: {problem}; {offers}')
+            raise BagError(f'{self.path}: {problem}; {offers}')
         if default is not None and default in found:
             return default
         if len(found) == 1:
             return found[0]
         if found:
-            raise BagError(f'{self._path}: several topics to choose from, name one; {offers}')
+            raise BagError(f'{self.path}: several topics to choose from, name one; {offers}')
         every = ', '.join(topic.name for topic in self)
-        raise BagError(f'{self._path}: no topic of type {type_}; its topics: {every}')
+        raise BagError(f'{self.path}: no topic of type {type_}; its topics: {every}')

@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper info``: what a bag holds, and how to configure a replay of it."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from datetime import datetime, timezone
+import json
+from pathlib import Path
+import sys
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.offline.survey import Offer, Survey
+
+SUMMARY = 'Show the topics, rates and frames of a bag, and which poses its clouds have.'
+
+EXAMPLE = 'surfel-mapper info street.mcap'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        'bag', type=Path, metavar='BAG', help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag'
+    )
+    parser.add_argument('--json', action='store_true', help='print as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Read a bag and report."""
+    from tqdm import tqdm
+
+    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.offline.survey import offers, survey, surveyed_topics
+
+    with BagReader(args.bag) as reader:
+        total = reader.topics.num_messages(surveyed_topics(reader))
+        hidden = not sys.stderr.isatty()
+        with tqdm(total=total, unit='message', disable=hidden, leave=False) as bar:
+            found = survey(reader, bar.update)
+        made = offers(found)
+        content = as_mapping(reader, found, made)
+    print(json.dumps(content) if args.json else report(content, made))
+    return 0
+
+
+def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
+    """Return everything as plain values."""
+    return {
+        'bag': str(reader.path),
+        'format': 'ROS 1' if reader.is_ros1 else 'ROS 2',
+        'start_ns': reader.start_ns,
+        'seconds': (reader.end_ns - reader.start_ns) / 1e9,
+        'topics': [
+            {
+                'topic': name,
+                'type': seen.topic.type,
+                'messages': seen.topic.count,
+                'rate_hz': seen.rate_hz,
+                'frames': seen.frames,
+            }
+            for name, seen in found.topics.items()
+        ],
+        'undecodable': found.undecodable,
+        'poses': [dataclasses.asdict(offer) for offer in made],
+    }
+
+
+def report(content: dict[str, Any], made: list[Offer]) -> str:
+    """Return what was found for people."""
+    start = datetime.fromtimestamp(content['start_ns'] / 1e9, timezone.utc)
+    messages = sum(topic['messages'] for topic in content['topics'])
+    lines = [
+        f'{content["bag"]}: {content["format"]}, from {start:%Y-%m-%d %H:%M:%S} UTC, '
+        f'{content["seconds"]:.1f} s, {messages} messages',
+        *table(content['topics']),
+    ]
+    if content['undecodable']:
+        lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
+    for clouds in dict.fromkeys(offer.clouds for offer in made):
+        lines += ['', f'clouds of {clouds} with a pose, and the settings for --config:']
+        for offer in made:
+            lines += offered(offer) if offer.clouds == clouds else []
+    if not made:
+        lines += ['', 'no poses; clouds that are in a fixed frame map with pose.source: identity']
+    return '\n'.join(lines)
+
+
+def table(topics: list[dict[str, Any]]) -> list[str]:
+    """Return a line for every topic, in columns."""
+    rows = [
+        (
+            topic['topic'],
+            topic['type'],
+            str(topic['messages']),
+            '-' if topic['rate_hz'] is None else f'{topic["rate_hz"]:.1f} Hz',
+            ', '.join(topic['frames']),
+        )
+        for topic in topics
+    ]
+    width = [max(len(row[column]) for row in rows) for column in range(4)]
+    return [
+        f'  {row[0]:{width[0]}}  {row[1]:{width[1]}}  {row[2]:>{width[2]}}  '
+        f'{row[3]:>{width[3]}}  {row[4]}'.rstrip()
+        for row in rows
+    ]
+
+
+def offered(offer: Offer) -> list[str]:
+    """Return how many clouds have a pose in one source, and the settings to use it."""
+    import yaml
+
+    from surfel_mapper.config import Config
+
+    default = Config().to_mapping()
+    stages: dict[str, dict[str, Any]] = {}
+    for name, value in offer.settings.items():
+        if value and (value != default[name] or name == 'pose.source'):
+            stage, _, key = name.partition('.')
+            stages.setdefault(stage, {})[key] = value
+    text = yaml.safe_dump(stages, default_flow_style=None, sort_keys=False, width=1000)
+    fixed = offer.settings['frames.fixed']
+    lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}']
+    if offer.missing:
+        lines.append(f'    {offer.missing}')
+    return [*lines, *(f'      {line}' for line in text.splitlines())]

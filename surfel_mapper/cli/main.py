@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``surfel-mapper VERB ...``: finds the verb, runs it, and turns errors into messages.
+
+A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_arguments(parser)`` and
+``run(args) -> int``. It loads what it needs inside ``run``, so that help comes at once and a
+replay loads no ROS. What the verb prints on stdout is its result; all else goes to stderr.
+
+Exit code 0: done; 1: refused, with a message; 2: usage; 130: interrupted.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from importlib import import_module
+import logging
+import os
+import sys
+from types import ModuleType
+
+import surfel_mapper
+from surfel_mapper.errors import SurfelMapperError
+
+VERBS = ('replay', 'info', 'simulate')
+
+EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """
+    Run the command line and return its exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        The arguments; those of the process without.
+
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    args = parser_of(arguments).parse_args(arguments)
+    logging.basicConfig(format=f'surfel-mapper {args.verb}: %(message)s', level=logging.WARNING)
+    try:
+        code = int(args.run(args))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever read the result has seen enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (SurfelMapperError, OSError) as error:
+        print(f'surfel-mapper {args.verb}: {error}', file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
+        return 130
+
+
+def parser_of(arguments: Sequence[str]) -> argparse.ArgumentParser:
+    """Return the parser for some arguments; it loads all verbs only where none is named."""
+    about = str(surfel_mapper.__doc__).strip().partition('\n\n')[0]
+    parser = argparse.ArgumentParser(prog='surfel-mapper', description=about, epilog=EPILOG)
+    version = f'surfel-mapper {surfel_mapper.__version__}'
+    parser.add_argument('--version', action='version', version=version)
+    verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
+    named = [arguments[0]] if arguments and arguments[0] in VERBS else VERBS
+    for verb in named:
+        module = import_module(f'surfel_mapper.cli.{verb}')
+        add_verb(verbs, verb, module)
+    return parser
+
+
+def add_verb(
+    verbs: argparse._SubParsersAction[argparse.ArgumentParser], verb: str, module: ModuleType
+) -> None:
+    """Add the parser of one verb."""
+    parser = verbs.add_parser(
+        verb,
+        help=module.SUMMARY,
+        description=module.SUMMARY,
+        epilog=f'example:\n  {module.EXAMPLE}',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    module.add_arguments(parser)
+    parser.set_defaults(run=module.run)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``surfel-mapper replay``: a bag into map.ply, map.png and summary.json.
+
+The files are written when the whole bag is mapped, each whole or not at all; summary.json comes
+last, so where it is new the others are. A replay that maps nothing is refused, for an empty map
+looks like a result.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import sys
+import time
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.offline.replay import PoseTopics
+    from surfel_mapper.pipeline import Mapper
+
+SUMMARY = 'Map the clouds of a bag and write the map, a picture and figures.'
+
+EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
+
+NS_PER_S = 1e9
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        'bag', type=Path, metavar='BAG', help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag'
+    )
+    parser.add_argument('--topic', help='PointCloud2 topic (the only one, if there is one)')
+    parser.add_argument('--pose-topic', help='topic of the poses (/tf, /odom or /pose)')
+    parser.add_argument('--config', type=Path, metavar='FILE', help='YAML file of settings')
+    parser.add_argument(
+        '--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)'
+    )
+    parser.add_argument(
+        '--window',
+        action='store_true',
+        help="let scans leave the map by the configuration's window, as the node does",
+    )
+    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Map a bag and report."""
+    from surfel_mapper.config import load_config
+    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.io.bag_topics import CLOUD
+    from surfel_mapper.offline.replay import ALL_SCANS, pose_topics
+    from surfel_mapper.pipeline import Mapper
+
+    config = load_config(args.config)
+    mapper = Mapper(config if args.window else config.replace(ALL_SCANS))
+    output = output_directory(args.bag, args.output)
+    with BagReader(args.bag) as reader:
+        topic = reader.topics.choose(CLOUD, args.topic)
+        poses = pose_topics(reader.topics, mapper.config, args.pose_topic)
+        mapper.warm_up()
+        start = time.perf_counter()
+        trajectory = map_bag(reader, mapper, topic, poses)
+        seconds = time.perf_counter() - start
+        recorded_s = (reader.end_ns - reader.start_ns) / NS_PER_S
+    refuse_empty(args.bag, topic, mapper)
+    summary = {
+        'bag': str(args.bag),
+        'topic': topic,
+        'pose_topics': [*poses.kinds, *poses.static],
+        'window': args.window,
+        'recorded_s': recorded_s,
+        'replay_s': seconds,
+        **mapper.summary(),
+        'settings': mapper.config.to_mapping(),
+    }
+    write(output, args.bag, mapper, trajectory, summary)
+    print(json.dumps(summary) if args.json else report(summary, output))
+    return 0
+
+
+def output_directory(bag: Path, wanted: Path | None) -> Path:
+    """Return where to write, having refused a name that a file has already."""
+    from surfel_mapper.errors import FileFormatError
+
+    name = bag.resolve().stem if bag.is_file() else bag.resolve().name
+    directory = wanted or Path(f'{name}_surfels')
+    if directory.exists() and not directory.is_dir():
+        raise FileFormatError(f'{directory}: a file, expected a directory to write to')
+    return directory
+
+
+def map_bag(
+    reader: BagReader, mapper: Mapper, topic: str, poses: PoseTopics
+) -> npt.NDArray[np.float64]:
+    """Map all clouds of a topic with a progress bar; return where the sensor was, (S, 3) m."""
+    import numpy as np
+    from tqdm import tqdm
+    from tqdm.contrib.logging import logging_redirect_tqdm
+
+    from surfel_mapper.offline.replay import replay
+
+    positions = []
+    total = reader.topics.num_messages([topic])
+    hidden = not sys.stderr.isatty()
+    with logging_redirect_tqdm(), tqdm(total=total, unit='scan', disable=hidden) as bar:
+        for update in replay(reader, mapper, topic, poses):
+            positions.append(update.T_fixed_sensor[:3, 3])
+            bar.update(mapper.counters.received - bar.n)
+    return np.array(positions).reshape(-1, 3)
+
+
+def refuse_empty(bag: Path, topic: str, mapper: Mapper) -> None:
+    """Raise if no scan was mapped, with the causes."""
+    from surfel_mapper.errors import BagError
+
+    counters = mapper.counters
+    if not counters.mapped:
+        raise BagError(
+            f'{bag}: none of {counters.received} clouds of {topic} was mapped '
+            f'({causes(counters.dropped)}); `surfel-mapper info {bag}` shows what poses it has'
+        )
+
+
+def write(
+    output: Path,
+    bag: Path,
+    mapper: Mapper,
+    trajectory: npt.NDArray[np.float64],
+    summary: dict[str, Any],
+) -> None:
+    """Write the map, its picture and the summary."""
+    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.io.ply import write_surfels
+    from surfel_mapper.viz.picture import draw_map
+
+    output.mkdir(parents=True, exist_ok=True)
+    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    write_surfels(output / 'map.ply', surfels)
+    title = (
+        f'{bag.resolve().name}: {summary["scans"]["mapped"]} scans, '
+        f'{rounded(summary["points"])} points, '
+        f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
+    )
+    draw_map(surfels, output / 'map.png', title, trajectory=trajectory)
+    with replace_file(output / 'summary.json') as file:
+        file.write((json.dumps(summary, indent=2) + '\n').encode())
+
+
+def report(summary: dict[str, Any], output: Path) -> str:
+    """Return the summary in a few lines for people."""
+    scans, times = summary['scans'], summary['milliseconds']
+    out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
+    gated = f' ({scans["gated"]} left out by the motion gate)'
+    stages = '   '.join(
+        f'{stage} {times[stage]["median"]:.1f} ms'
+        for stage in ('decode', 'reduce', 'insert', 'normals', 'total')
+    )
+    speed = summary['recorded_s'] / summary['replay_s']
+    return (
+        f'scans {scans["received"]}{out if scans["dropped"] else ""}'
+        f'{gated if scans["gated"] else ""}   points {rounded(summary["points"])}   '
+        f'surfels {summary["surfels"]}\n'
+        f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
+        f'digest {summary["digest"]}\n'
+        f'{output / "map.ply"}   {output / "map.png"}   {output / "summary.json"}'
+    )
+
+
+def causes(counts: dict[str, int]) -> str:
+    """Return counts by cause for people: no pose 4, no points 1."""
+    return ', '.join(f'{cause.replace("_", " ")} {count}' for cause, count in counts.items())
+
+
+def rounded(number: int) -> str:
+    """Return a number with three digits and k or M."""
+    for factor, letter in ((10**9, 'G'), (10**6, 'M'), (10**3, 'k')):
+        if number >= factor:
+            return f'{number / factor:.3g} {letter}'
+    return str(number)

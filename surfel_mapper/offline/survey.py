@@ -1,0 +1,263 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a bag offers: its topics with rates and frames, and which poses its clouds have.
+
+Every source of poses is tried on every cloud with the TransformBuffer that mapping uses, so what
+is promised here is what a replay finds, but for scans whose poses come later than
+``pose.max_wait_s``. Of clouds only the headers are read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Any
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import BagError, CloudFormatError, PoseError
+from surfel_mapper.geometry import pose_matrix, q_xyzw
+from surfel_mapper.io.bag import BagMessage, BagReader
+from surfel_mapper.io.bag_topics import CLOUD, ODOMETRY, POSE, TF, Topic
+from surfel_mapper.io.pose_messages import poses_in, stamp_ns, StampedPose
+from surfel_mapper.offline.replay import static_topics
+from surfel_mapper.poses import TransformBuffer
+
+SOURCES = {TF: 'tf', ODOMETRY: 'odometry', POSE: 'pose'}
+"""The pose.source that reads each type."""
+
+ALL_TIME_S = 1e9
+"""A survey holds every transform of a bag."""
+
+DEFAULTS = Config()
+
+
+@dataclass(slots=True)
+class TopicSurvey:
+    """
+    What was seen of a topic.
+
+    Attributes
+    ----------
+    topic : Topic
+    first_ns, last_ns : int, optional
+        Record time of the first and last message, of clouds and poses only.
+    frames : list of str
+        Frames of clouds, and 'parent -> child' of poses, each once.
+
+    """
+
+    topic: Topic
+    first_ns: int | None = None
+    last_ns: int | None = None
+    frames: list[str] = field(default_factory=list)
+
+    def add(self, record_ns: int, frames: Iterable[str]) -> None:
+        """Take note of a message."""
+        self.first_ns = record_ns if self.first_ns is None else self.first_ns
+        self.last_ns = record_ns
+        self.frames += [name for name in dict.fromkeys(frames) if name not in self.frames]
+
+    @property
+    def rate_hz(self) -> float | None:
+        """Messages a second from the first to the last; None where that is not known."""
+        if self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
+            return None
+        return (self.topic.count - 1) * 1e9 / (self.last_ns - self.first_ns)
+
+
+@dataclass(slots=True)
+class Survey:
+    """
+    What was read of a bag.
+
+    Attributes
+    ----------
+    topics : dict of str to TopicSurvey
+    stamps : dict of (str, str) to list of int
+        Stamps of the clouds, ns, by topic and frame.
+    poses : dict of str to list of StampedPose
+        By topic.
+    static : list of StampedPose
+        Those that hold for all time.
+    undecodable : int
+        Messages of clouds and poses that are damaged.
+
+    """
+
+    topics: dict[str, TopicSurvey]
+    stamps: dict[tuple[str, str], list[int]] = field(default_factory=dict)
+    poses: dict[str, list[StampedPose]] = field(default_factory=dict)
+    static: list[StampedPose] = field(default_factory=list)
+    undecodable: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Offer:
+    """
+    A source of poses, tried on the clouds of a topic.
+
+    Attributes
+    ----------
+    clouds, poses : str
+        The topics.
+    covered, total : int
+        Clouds that have a pose at their stamp, and all.
+    settings : dict of str
+        What the configuration has to say for it.
+    missing : str
+        Why there is none for the last cloud that has none; empty where all have one.
+
+    """
+
+    clouds: str
+    poses: str
+    covered: int
+    total: int
+    settings: dict[str, Any]
+    missing: str = ''
+
+
+def survey(reader: BagReader, on_message: Callable[[], object] = lambda: None) -> Survey:
+    """
+    Read all clouds and poses of a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    on_message : callable
+        Called after every message read, for a progress bar.
+
+    Raises
+    ------
+    BagError
+        If the bag is damaged.
+
+    """
+    found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics})
+    for message in reader.messages(surveyed_topics(reader)):
+        try:
+            frames = note_message(found, reader, message)
+        except (BagError, CloudFormatError):
+            found.undecodable += 1
+            frames = []
+        found.topics[message.topic].add(message.record_ns, frames)
+        on_message()
+    return found
+
+
+def surveyed_topics(reader: BagReader) -> list[str]:
+    """Return the topics of clouds and poses."""
+    return [topic.name for topic in reader.topics if topic.type in (CLOUD, *SOURCES)]
+
+
+def note_message(found: Survey, reader: BagReader, message: BagMessage) -> list[str]:
+    """Add a message to a survey and return the frames that it names."""
+    decoded = reader.decode(message)
+    if message.type == CLOUD:
+        frame = decoded.header.frame_id
+        found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
+        return [frame]
+    poses = list(poses_in(SOURCES[message.type], decoded, DEFAULTS.frames.base))
+    if message.topic in static_topics(reader.topics):
+        found.static += poses
+    else:
+        found.poses.setdefault(message.topic, []).extend(poses)
+    return [f'{pose.parent} -> {pose.child}' for pose in poses]
+
+
+def offers(found: Survey) -> list[Offer]:
+    """Return every source of poses tried on every topic of clouds, the best of each first."""
+    sources = [
+        Source(topic, SOURCES[found.topics[topic].topic.type], poses)
+        for topic, poses in found.poses.items()
+    ]
+    if found.static and 'tf' not in [source.kind for source in sources]:
+        sources.append(Source('/tf_static', 'tf', []))  # a sensor at rest
+    made = [
+        tried(source, found.static, clouds, frame, stamps)
+        for (clouds, frame), stamps in found.stamps.items()
+        for source in sources
+    ]
+    kinds = list(SOURCES.values())
+    return sorted(
+        made, key=lambda o: (o.clouds, -o.covered, kinds.index(o.settings['pose.source']))
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A topic of poses: what pose.source calls it, and all that it says."""
+
+    topic: str
+    kind: str
+    poses: list[StampedPose]
+
+
+def tried(
+    source: Source, static: list[StampedPose], clouds: str, frame: str, stamps: list[int]
+) -> Offer:
+    """Look the pose of every cloud up in one source."""
+    if source.kind == 'tf':
+        fixed, base = fixed_frame([*source.poses, *static], frame), DEFAULTS.frames.base
+    else:
+        fixed, base = source.poses[0].parent, source.poses[0].child
+    settings: dict[str, Any] = {'pose.source': source.kind, 'frames.fixed': fixed}
+    buffer, missing = transforms(source.poses, static), ''
+    if source.kind != 'tf' and base != frame:
+        mount = mounting(static, base, frame)
+        settings |= {'frames.base': base, 'frames.base_to_sensor': mount}
+        if not mount:
+            missing = f'the place of {frame} in {base} is not in the bag, measure it'
+            frame = base
+    covered = 0
+    for stamp in stamps:
+        try:
+            buffer.lookup(fixed, frame, stamp)
+            covered += 1
+        except PoseError as error:
+            missing = str(error)
+    return Offer(clouds, source.topic, covered, len(stamps), settings, missing)
+
+
+def transforms(poses: list[StampedPose], static: list[StampedPose]) -> TransformBuffer:
+    """Return a buffer of all poses; those that mapping would ignore are left out."""
+    buffer = TransformBuffer(ALL_TIME_S, ALL_TIME_S)
+    for pose, is_static in [*((p, True) for p in static), *((p, False) for p in poses)]:
+        with suppress(PoseError, ValueError):
+            transform = pose_matrix(pose.xyz, pose.q_xyzw)
+            if is_static:
+                buffer.add_static(pose.parent, pose.child, transform)
+            else:
+                buffer.add(pose.parent, pose.child, pose.stamp_ns, transform)
+    return buffer
+
+
+def fixed_frame(poses: list[StampedPose], frame: str) -> str:
+    """Return the frame to map in: odom or map if the tree has it above a frame, else its root."""
+    parents = {pose.child: pose.parent for pose in poses}
+    above: list[str] = []
+    while frame in parents and parents[frame] not in above:
+        frame = parents[frame]
+        above.append(frame)
+    customary = [name for name in ('odom', 'map') if name in above]
+    return (customary or above[-1:] or [DEFAULTS.frames.fixed])[0]
+
+
+def mounting(static: list[StampedPose], base: str, frame: str) -> list[float]:
+    """
+    Return the pose of a sensor in its base as frames.base_to_sensor wants it; empty if unknown.
+
+    The numbers of a direct transform are handed on as they are, so that mapping with them gives
+    the same bits.
+    """
+    direct = [pose for pose in static if (pose.parent, pose.child) == (base, frame)]
+    if direct:
+        return [*direct[-1].xyz, *direct[-1].q_xyzw]
+    try:
+        transform = transforms([], static).lookup(base, frame, 0)
+    except PoseError:
+        return []
+    return [float(value) for value in (*transform[:3, 3], *q_xyzw(transform))]
