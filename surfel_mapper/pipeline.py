@@ -248,20 +248,11 @@ class Mapper:
         }
 
     def _in_order(self, scan: Scan) -> bool:
-        """Return whether a scan may enter; clear the map where time was set back."""
+        """Return whether a scan may enter; start anew where time was set back."""
         newest = max(self._newest_ns.values(), default=scan.stamp_ns)
         back_s = (newest - scan.stamp_ns) / 1e9
         if back_s > self.config.input.reset_after_s:
-            _log.warning(
-                'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
-                '(%g s): the map is cleared',
-                scan.frame_id,
-                back_s,
-                self.config.input.reset_after_s,
-            )
-            self.counters.resets += 1
-            self.clear()
-            self._newest_ns.clear()
+            self._start_anew(scan, back_s)
         last = self._newest_ns.get(scan.frame_id)
         if last is not None and scan.stamp_ns <= last:
             behind_s = (last - scan.stamp_ns) / 1e9
@@ -270,6 +261,23 @@ class Mapper:
             return False
         self._newest_ns[scan.frame_id] = scan.stamp_ns
         return True
+
+    def _start_anew(self, scan: Scan, back_s: float) -> None:
+        """Forget what was mapped before time was set back, and the poses of that time."""
+        reset_after_s = self.config.input.reset_after_s
+        _log.warning(
+            'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
+            '(%g s): the map is cleared',
+            scan.frame_id,
+            back_s,
+            reset_after_s,
+        )
+        self.counters.resets += 1
+        self.clear()
+        self._newest_ns.clear()
+        newest_pose = self.transforms.newest_ns
+        if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
+            self.transforms.clear()  # else the scan would be mapped where the robot was then
 
     def _now_ns(self) -> int:
         """Return the newest stamp of all data seen."""

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import deque
 import hashlib
+from itertools import takewhile
 import math
 import struct
 from typing import Any
@@ -228,7 +229,9 @@ class SurfelMap:
         MapError
             If they are for another voxel size.
         NotInMapError
-            If the map does not hold them. Nothing has changed then.
+            If a voxel holds fewer points, or as many with other sums. Nothing has changed then.
+            Moments that were not added go unnoticed only where other scans have more points
+            than they in every one of their voxels.
 
         """
         self._check_lattice(moments)
@@ -289,8 +292,7 @@ class SurfelMap:
             return self._derive(self._changed_after(since, min_points))
         parts = [
             rows_changed_at(self._rows.array, changed, version, max(min_points, 1))
-            for version, changed in self._log
-            if version > since
+            for version, changed in takewhile(lambda entry: entry[0] > since, reversed(self._log))
         ]
         return self._derive(np.concatenate(parts) if parts else np.empty(0, np.int32))
 
@@ -351,6 +353,8 @@ class SurfelMap:
 
     def _remember(self, changed: npt.NDArray[np.int32]) -> None:
         """Log the rows that the present version changed; forget the oldest beyond a bound."""
+        if not len(changed):
+            return
         self._log.append((self.version, changed))
         self._logged += len(changed)
         while self._logged > max(LOGGED, self.num_voxels):
