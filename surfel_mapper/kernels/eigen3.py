@@ -86,18 +86,11 @@ def decompose(scatter, num, eigenvalues, normals):
         ux, uy, uz = 1.0 + sign * vx * vx * a, sign * b, -sign * vx
         wx, wy, wz = b, sign + vy * vy * a, -vy
 
-        # B on each
+        # B across v: the 2 by 2 matrix [[uu, uw], [uw, ww]], where uu + ww = -t
         pux, puy = (bxx * ux + bxy * uy) + bxz * uz, (bxy * ux + byy * uy) + byz * uz
         puz = (bxz * ux + byz * uy) + bzz * uz
-        pwx, pwy = (bxx * wx + bxy * wy) + bxz * wz, (bxy * wx + byy * wy) + byz * wz
-        pwz = (bxz * wx + byz * wy) + bzz * wz
-        pvx, pvy = (bxx * vx + bxy * vy) + bxz * vz, (bxy * vx + byy * vy) + byz * vz
-        pvz = (bxz * vx + byz * vy) + bzz * vz
-        uu, ww = (ux * pux + uy * puy) + uz * puz, (wx * pwx + wy * pwy) + wz * pwz
-        uw, t = (ux * pwx + uy * pwy) + uz * pwz, (vx * pvx + vy * pvy) + vz * pvz
-
-        # the 2 by 2 matrix [[uu, uw], [uw, ww]]
-        middle, d = 0.5 * (uu + ww), 0.5 * (uu - ww)
+        uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
+        middle, d = -0.5 * t, uu + 0.5 * t
         radius = math.sqrt(d * d + uw * uw)
         low, high = middle - radius, middle + radius
         first, second = (-uw if d >= 0.0 else radius - d), (d + radius if d >= 0.0 else -uw)

@@ -22,9 +22,6 @@ INDEX_OFFSET = 1 << (INDEX_BITS - 1)
 
 INDEX_MASK = (1 << INDEX_BITS) - 1
 
-LATTICE_LIMIT = float(INDEX_OFFSET << BITS)
-"""Lattice coordinates lie in [-LATTICE_LIMIT, LATTICE_LIMIT)."""
-
 MAX_SCAN_COUNT = 1 << 23
 """Points in one voxel of one scan: up to here float64 sums of the moments are exact."""
 

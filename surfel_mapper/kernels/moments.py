@@ -5,8 +5,10 @@ Reduce the points of one scan to exact moments by voxel.
 
 A point is quantised once, to the lattice of unit voxel_size / 65536; everything after is sums
 of integers. They are formed in float64, which holds them exactly up to 2^23 points a voxel and
-is faster than int64 (0.79 against 1.17 ms for 131,072 points), in one pass: consecutive points
-of one voxel are summed in registers, and only the end of such a run touches memory.
+is faster than int64 (0.79 against 1.17 ms for 131,072 points). Points are worked on in chunks:
+quantised several at once, cut into runs of one voxel, which the points of a sweep come in, and
+summed run by run in registers. Coordinates are taken as three arrays, because x y z x y z takes
+three times as long to quantise (1.1 against 0.35 ms).
 
 Source: exactness by integer arithmetic is our own; the hash is Fibonacci hashing (Knuth, The
 Art of Computer Programming, vol. 3, 6.4) with linear probing.
@@ -23,12 +25,18 @@ from surfel_mapper.kernels.layout import (
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
-    LATTICE_LIMIT,
     VIEW_SCALE,
 )
+from surfel_mapper.kernels.prefetch import prefetch
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: why points do not enter."""
+
+CHUNK = 1024
+"""Points worked on at once; their keys and places stay in the first-level cache."""
+
+AHEAD = 8
+"""So many runs ahead the entry of the table is asked for."""
 
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
@@ -43,97 +51,160 @@ def hash_shift(size):
     return shift
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def reduce_points(points, pose, scale, range_sq, table, keys, sums, left_out):
-    """
-    Sum the points of a scan by voxel; return how many voxels, or -1 if they do not fit.
+@njit(cache=True, nogil=True, inline='always')
+def home(key, shift):
+    """Return where the search for a key starts."""
+    return np.int64((np.uint64(key) * _MIX) >> shift)
 
-    points    (N, 3) float32 or float64, sensor frame, m
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
+    """
+    Sum the points of a scan by voxel; return how many voxels, or -1 if they may not fit.
+
+    xyz       (3, N) float32 or float64, sensor frame, m
     pose      (3, 4) float64, takes points of the sensor frame to the map frame
     scale     float64, 65536 / voxel size
     range_sq  (2,) float64, m^2: smallest and largest squared distance from the sensor
-    table     (B,) int32, B a power of two, all -1; row of each voxel by hash; -1 again at the end
-    keys      (E,) int64, out: voxel keys in the order of first appearance, E <= B / 2
-    sums      (E, 10) float64, out: count, sum (3), products (6: xx xy xz yy yz zz) of the
-              places in the voxel, in lattice units about its centre
+    scratch   table (B,) int32, B a power of two, all -1 before and after;
+              keys (E,) int64, out: voxel keys in the order of first appearance, E <= B / 2;
+              sums (E, 10) float64, out: count, sum (3), products (6: xx xy xz yy yz zz) of
+              the places in the voxel, in lattice units about its centre
     left_out  (4,) int64, out: points not finite, too near, too far, beyond the voxel indices
 
-    If it returns -1, more than E voxels are hit: call again with larger arrays.
+    If it returns -1, call again with larger arrays.
+    """
+    table, keys, sums = scratch
+    chunk_keys = np.empty(CHUNK, np.int64)
+    places = np.empty((3, CHUNK))
+    starts = np.empty(CHUNK + 1, np.int32)
+    run_rows = np.empty(CHUNK, np.int32)
+    left_out[:] = 0
+    num_rows = 0
+    all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
+    for start in range(0, len(all_x), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
+        quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
+        num_runs = find_runs(chunk_keys, len(x), starts)
+        if num_rows + num_runs > len(keys):
+            clear_table(table, keys, num_rows)
+            return -1
+        num_rows = find_run_rows(chunk_keys, starts, num_runs, scratch, num_rows, run_rows)
+        for run in range(num_runs):
+            if run_rows[run] >= 0:
+                add_run(places, starts[run], starts[run + 1], sums, run_rows[run])
+            else:
+                for i in range(starts[run], starts[run + 1]):
+                    left_out[reason(x[i], y[i], z[i], range_sq)] += 1
+    clear_table(table, keys, num_rows)
+    return num_rows
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def quantise(x, y, z, pose, scale, range_sq, keys, places):
+    """
+    Quantise the points of a chunk; without branches, so that it is done for several at once.
+
+    x, y, z  (C,) float32 or float64, sensor frame, m
+    keys     (CHUNK,) int64, out: voxel keys, -1 for points that do not enter
+    places   (3, CHUNK) float64, out: place in the voxel, whole numbers in [-32768, 32768)
     """
     r00, r01, r02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     r20, r21, r22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
     near_sq, far_sq = range_sq[0], range_sq[1]
-    left_out[:] = 0
+    qx, qy, qz = places[0], places[1], places[2]
+    voxel = float(1 << BITS)
+    limit = float(INDEX_OFFSET)
+    for i in range(len(x)):
+        px, py, pz = np.float64(x[i]), np.float64(y[i]), np.float64(z[i])
+        distance_sq = (px * px + py * py) + pz * pz
+        fx = np.floor((((r00 * px + r01 * py) + r02 * pz) + t0) * scale)
+        fy = np.floor((((r10 * px + r11 * py) + r12 * pz) + t1) * scale)
+        fz = np.floor((((r20 * px + r21 * py) + r22 * pz) + t2) * scale)
+        # X >> 16 and X & 65535 in float64: exact for whole numbers below 2^53
+        kx, ky, kz = np.floor(fx / voxel), np.floor(fy / voxel), np.floor(fz / voxel)
+        enters = (  # all comparisons are false for nan
+            (distance_sq >= near_sq)
+            & (distance_sq <= far_sq)
+            & (abs(kx + 0.5) < limit)
+            & (abs(ky + 0.5) < limit)
+            & (abs(kz + 0.5) < limit)
+        )
+        ix = np.int64(np.int32(kx if enters else 0.0)) + INDEX_OFFSET
+        iy = np.int64(np.int32(ky if enters else 0.0)) + INDEX_OFFSET
+        iz = np.int64(np.int32(kz if enters else 0.0)) + INDEX_OFFSET
+        key = (ix << (2 * INDEX_BITS)) | (iy << INDEX_BITS) | iz
+        keys[i] = key if enters else -1
+        qx[i] = (fx - kx * voxel) - HALF
+        qy[i] = (fy - ky * voxel) - HALF
+        qz[i] = (fz - kz * voxel) - HALF
+
+
+@njit(cache=True, nogil=True)
+def find_runs(keys, num, starts):
+    """
+    Find where consecutive points of one voxel begin; return how many such runs.
+
+    keys    (CHUNK,) int64, of which num count
+    starts  (CHUNK + 1,) int32, out: first point of each run, and num after the last
+    """
+    num_runs = 0
+    previous = np.int64(-2)
+    for i in range(num):
+        starts[num_runs] = i
+        num_runs += keys[i] != previous
+        previous = keys[i]
+        # of a run only the first i stays: later ones are overwritten by the next run
+    starts[num_runs] = num
+    return num_runs
+
+
+@njit(cache=True, nogil=True)
+def find_run_rows(chunk_keys, starts, num_runs, scratch, num_rows, run_rows):
+    """
+    Look up the row of each run's voxel, adding rows of zeros for new ones; return their number.
+
+    run_rows  (CHUNK,) int32, out: row in keys and sums, -1 for runs of points left out
+
+    What is needed next is asked for ahead: at 0.2 m a third of the time, as measured.
+    """
+    table, keys, sums = scratch
+    flat = sums.ravel()
     shift = hash_shift(len(table))
     mask = len(table) - 1
-    num_rows = 0
-    run_key = np.int64(-1)
-    n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(len(points) + 1):
-        key = np.int64(-2)
-        qx = qy = qz = 0.0
-        if i < len(points):
-            x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-            distance_sq = x * x + y * y + z * z
-            fx = np.floor((((r00 * x + r01 * y) + r02 * z) + t0) * scale)
-            fy = np.floor((((r10 * x + r11 * y) + r12 * z) + t1) * scale)
-            fz = np.floor((((r20 * x + r21 * y) + r22 * z) + t2) * scale)
-            if not (  # false for nan and inf too
-                near_sq <= distance_sq <= far_sq
-                and abs(fx + 0.5) < LATTICE_LIMIT
-                and abs(fy + 0.5) < LATTICE_LIMIT
-                and abs(fz + 0.5) < LATTICE_LIMIT
-            ):
-                if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-                    left_out[NOT_FINITE] += 1
-                elif distance_sq < near_sq:
-                    left_out[TOO_NEAR] += 1
-                elif distance_sq > far_sq:
-                    left_out[TOO_FAR] += 1
-                else:
-                    left_out[BEYOND] += 1
-                continue
-            ix, iy, iz = np.int64(fx), np.int64(fy), np.int64(fz)
-            key = (
-                (((ix >> BITS) + INDEX_OFFSET) << (2 * INDEX_BITS))
-                | (((iy >> BITS) + INDEX_OFFSET) << INDEX_BITS)
-                | ((iz >> BITS) + INDEX_OFFSET)
-            )
-            low = (1 << BITS) - 1
-            qx = np.float64((ix & low) - HALF)
-            qy = np.float64((iy & low) - HALF)
-            qz = np.float64((iz & low) - HALF)
-        if key != run_key:
-            if n > 0.0:
-                place = np.int64((np.uint64(run_key) * _MIX) >> shift)
-                row = table[place]
-                while row >= 0 and keys[row] != run_key:
-                    place = (place + 1) & mask
-                    row = table[place]
-                if row < 0:
-                    if num_rows == len(keys):
-                        clear_table(table, keys, num_rows)
-                        return -1
-                    row = num_rows
-                    num_rows += 1
-                    table[place] = row
-                    keys[row] = run_key
-                    for column in range(10):
-                        sums[row, column] = 0.0
-                sums[row, 0] += n
-                sums[row, 1] += sx
-                sums[row, 2] += sy
-                sums[row, 3] += sz
-                sums[row, 4] += xx
-                sums[row, 5] += xy
-                sums[row, 6] += xz
-                sums[row, 7] += yy
-                sums[row, 8] += yz
-                sums[row, 9] += zz
-            run_key = key
-            n = sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-        n += 1.0
+    for run in range(num_runs):
+        if run + AHEAD < num_runs:
+            prefetch(table, home(chunk_keys[starts[run + AHEAD]], shift))
+        key = chunk_keys[starts[run]]
+        if key < 0:
+            run_rows[run] = -1
+            continue
+        place = home(key, shift)
+        row = np.int64(table[place])
+        while row >= 0 and keys[row] != key:
+            place = (place + 1) & mask
+            row = np.int64(table[place])
+        if row < 0:
+            row = num_rows
+            num_rows += 1
+            table[place] = row
+            keys[row] = key
+            sums[row, :] = 0.0
+        else:
+            prefetch(flat, row * 10)
+            prefetch(flat, row * 10 + 9)
+        run_rows[run] = row
+    return num_rows
+
+
+@njit(cache=True, nogil=True)
+def add_run(places, start, end, sums, row):
+    """Add count, sums and products of the places of points start to end to a row of sums."""
+    sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+    for i in range(start, end):
+        qx, qy, qz = places[0, i], places[1, i], places[2, i]
         sx += qx
         sy += qy
         sz += qz
@@ -143,8 +214,28 @@ def reduce_points(points, pose, scale, range_sq, table, keys, sums, left_out):
         yy += qy * qy
         yz += qy * qz
         zz += qz * qz
-    clear_table(table, keys, num_rows)
-    return num_rows
+    sums[row, 0] += np.float64(end - start)
+    sums[row, 1] += sx
+    sums[row, 2] += sy
+    sums[row, 3] += sz
+    sums[row, 4] += xx
+    sums[row, 5] += xy
+    sums[row, 6] += xz
+    sums[row, 7] += yy
+    sums[row, 8] += yz
+    sums[row, 9] += zz
+
+
+@njit(cache=True, nogil=True)
+def reason(x, y, z, range_sq):
+    """Return why a point does not enter."""
+    px, py, pz = np.float64(x), np.float64(y), np.float64(z)
+    distance_sq = (px * px + py * py) + pz * pz
+    if not (math.isfinite(px) and math.isfinite(py) and math.isfinite(pz)):
+        return NOT_FINITE
+    if distance_sq < range_sq[0]:
+        return TOO_NEAR
+    return TOO_FAR if distance_sq > range_sq[1] else BEYOND
 
 
 @njit(cache=True, nogil=True)
@@ -159,7 +250,7 @@ def clear_table(table, keys, num_rows):
     shift = hash_shift(len(table))
     mask = len(table) - 1
     for row in range(num_rows):
-        place = np.int64((np.uint64(keys[row]) * _MIX) >> shift)
+        place = home(keys[row], shift)
         while table[place] >= 0:
             table[place] = -1
             place = (place + 1) & mask

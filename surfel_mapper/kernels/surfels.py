@@ -55,46 +55,43 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
         part = slice(start, start + num)
-        gather(rows, chosen[part], scatter, num_points[part], voxel_index[part])
-        place_means(rows, chosen[part], voxel_size, bits, position[part])
+        gather(rows, chosen, start, num, scatter)
+        place_means(rows, chosen[part], voxel_size, bits, outputs, start)
         decompose(scatter, num, values, normals)
+        derive_shape(values, num, num_points[part], unit, planarity[part], curvature[part])
         for i in range(num):
             out = start + i
             row = np.int64(chosen[out])
-            n = num_points[out]
-            e0, e1, e2 = values[0, i], values[1, i], values[2, i]
-            trace = (e0 + e1) + e2
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
-            if not trace > 0.0:
+            if math.isnan(planarity[out]):
                 nx = ny = nz = math.nan
             elif looks_away(nx, ny, nz, rows[row]):
                 nx, ny, nz = -nx, -ny, -nz
             normal[out, 0], normal[out, 1], normal[out, 2] = nx, ny, nz
-            planarity[out] = 2.0 * (e1 - e0) / trace  # 0 / 0 is nan, as it should be
-            curvature[out] = e0 / trace
-            scale = unit * unit / (n - 1) if n > 1 else 0.0
             for j in range(3):
-                eigenvalues[out, j] = values[j, i] * scale
+                eigenvalues[out, j] = values[j, i]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def gather(rows, chosen, scatter, num_points, voxel_index):
+def gather(rows, chosen, start, num, scatter):
     """
-    Collect count, voxel index and scatter of a chunk.
+    Collect the scatter of num voxels from start on.
 
     scatter  (6, CHUNK) float64, out: sum of products of deviations from the mean, lattice units
     """
     flat = rows.ravel()
-    for i in range(len(chosen)):
-        if i + AHEAD < len(chosen):
-            prefetch(flat, np.int64(chosen[i + AHEAD]) * ROW)
-            prefetch(flat, np.int64(chosen[i + AHEAD]) * ROW + ROW // 2)
-        row = np.int64(chosen[i])
+    for i in range(num):
+        if start + i + AHEAD < len(chosen):
+            prefetch(flat, np.int64(chosen[start + i + AHEAD]) * ROW)
+            prefetch(flat, np.int64(chosen[start + i + AHEAD]) * ROW + ROW // 2)
+        row = np.int64(chosen[start + i])
         n = rows[row, COUNT]
         sx, sy, sz = rows[row, SUM], rows[row, SUM + 1], rows[row, SUM + 2]
         inverse = 1.0 / n
-        cx, cy, cz = np.int64(sx * inverse), np.int64(sy * inverse), np.int64(sz * inverse)
-        # about the lattice point c near the mean, still in integers
+        # about the lattice point c nearest to the mean, still in integers
+        cx = np.int64(np.rint(sx * inverse))
+        cy = np.int64(np.rint(sy * inverse))
+        cz = np.int64(np.rint(sz * inverse))
         dx, dy, dz = sx - n * cx, sy - n * cy, sz - n * cz
         fx, fy, fz = np.float64(dx), np.float64(dy), np.float64(dz)
         scatter[0, i] = (rows[row, PRODUCT] - cx * (sx + dx)) - fx * fx * inverse
@@ -103,28 +100,47 @@ def gather(rows, chosen, scatter, num_points, voxel_index):
         scatter[3, i] = (rows[row, PRODUCT + 3] - cy * (sy + dy)) - fy * fy * inverse
         scatter[4, i] = (rows[row, PRODUCT + 4] - cy * sz - cz * dy) - fy * fz * inverse
         scatter[5, i] = (rows[row, PRODUCT + 5] - cz * (sz + dz)) - fz * fz * inverse
-        key = rows[row, KEY]
-        num_points[i] = n
-        voxel_index[i, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        voxel_index[i, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        voxel_index[i, 2] = (key & INDEX_MASK) - INDEX_OFFSET
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def place_means(rows, chosen, voxel_size, bits, position):
-    """Write the means of a chunk, (K, 3) float64, m."""
+def place_means(rows, chosen, voxel_size, bits, outputs, start):
+    """Write position, count and voxel index of a chunk, from row start of the outputs on."""
+    position, _, _, _, _, num_points, voxel_index = outputs
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     for i in range(len(chosen)):
+        out = start + i
         row = np.int64(chosen[i])
         key = rows[row, KEY]
-        n = np.float64(rows[row, COUNT])
+        n = rows[row, COUNT]
+        num_points[out] = n
+        inverse = 1.0 / n
         kx = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
         ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
         kz = (key & INDEX_MASK) - INDEX_OFFSET
-        position[i, 0] = (kx + (rows[row, SUM] / n + half) * cell) * voxel_size
-        position[i, 1] = (ky + (rows[row, SUM + 1] / n + half) * cell) * voxel_size
-        position[i, 2] = (kz + (rows[row, SUM + 2] / n + half) * cell) * voxel_size
+        voxel_index[out, 0], voxel_index[out, 1], voxel_index[out, 2] = kx, ky, kz
+        position[out, 0] = (kx + (rows[row, SUM] * inverse + half) * cell) * voxel_size
+        position[out, 1] = (ky + (rows[row, SUM + 1] * inverse + half) * cell) * voxel_size
+        position[out, 2] = (kz + (rows[row, SUM + 2] * inverse + half) * cell) * voxel_size
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def derive_shape(values, num, num_points, unit, planarity, curvature):
+    """
+    Write planarity and curvature of a chunk, (num,) each; turn scatter into covariance.
+
+    values  (3, CHUNK) float64: eigenvalues of the scatter, lattice units; out: of the
+            covariance, m^2
+    """
+    for i in range(num):
+        e0, e1, e2 = values[0, i], values[1, i], values[2, i]
+        inverse = 1.0 / ((e0 + e1) + e2)
+        planarity[i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as it should be
+        curvature[i] = e0 * inverse
+        scale = unit * unit / max(np.float64(num_points[i] - 1), 1.0)
+        values[0, i] = e0 * scale
+        values[1, i] = e1 * scale
+        values[2, i] = e2 * scale
 
 
 @njit(cache=True, nogil=True, inline='always')

@@ -34,9 +34,8 @@ AHEAD = 16
 
 
 @njit(cache=True, nogil=True, inline='always')
-def ask_ahead(keys, place, rows, table, depth):
+def ask_ahead(keys, place, flat, directory, buckets, depth):
     """Ask for the bucket of the voxel AHEAD of place and for the row of one half as far."""
-    directory, buckets, _, _ = table
     if place + AHEAD < len(keys):
         hashed = hash_key(keys[place + AHEAD])
         prefetch(buckets, first_bucket(hashed, directory, depth))
@@ -44,8 +43,8 @@ def ask_ahead(keys, place, rows, table, depth):
         hashed = hash_key(keys[place + AHEAD // 2])
         row = (buckets[first_bucket(hashed, directory, depth)] & 0xFFFFFFFF) - 1
         if row >= 0:  # a guess: the voxel may be in a later bucket
-            prefetch(rows.ravel(), row * ROW)
-            prefetch(rows.ravel(), row * ROW + ROW // 2)
+            prefetch(flat, row * ROW)
+            prefetch(flat, row * ROW + ROW // 2)
 
 
 @njit(cache=True, nogil=True)
@@ -56,9 +55,11 @@ def find_rows(keys, rows, table, state, found):
     keys   (K,) int64
     found  (K,) int32, out: row, -1 where the map has no such voxel
     """
+    directory, buckets, _, _ = table
+    flat = rows.ravel()
     depth = state[DEPTH]
     for place in range(len(keys)):
-        ask_ahead(keys, place, rows, table, depth)
+        ask_ahead(keys, place, flat, directory, buckets, depth)
         found[place] = find_row(keys[place], rows, table, depth)
 
 
@@ -76,10 +77,11 @@ def add_moments(moments, view_weight, rows, table, state, version, start, change
     make room and go on from there.
     """
     keys, count, total, product, view = moments
-    directory, _, held, _ = table
+    directory, buckets, held, _ = table
+    flat = rows.ravel()
     depth = state[DEPTH]
     for place in range(start, len(keys)):
-        ask_ahead(keys, place, rows, table, depth)
+        ask_ahead(keys, place, flat, directory, buckets, depth)
         key = keys[place]
         row = find_row(key, rows, table, depth)
         if row < 0:

@@ -132,9 +132,8 @@ class Reducer:
         self._reserve(2048)
 
     def _reserve(self, num_voxels: int) -> None:
-        self._table = np.full(2 * num_voxels, -1, np.int32)
-        self._keys = np.empty(num_voxels, np.int64)
-        self._sums = np.empty((num_voxels, 10))
+        table = np.full(2 * num_voxels, -1, np.int32)
+        self._scratch = (table, np.empty(num_voxels, np.int64), np.empty((num_voxels, 10)))
         self._left_out = np.zeros(4, np.int64)
 
     def reduce(
@@ -173,24 +172,16 @@ class Reducer:
         scale = (1 << BITS) / self.voxel_size_m
         while True:
             num = int(
-                reduce_points(
-                    points,
-                    pose,
-                    scale,
-                    range_sq,
-                    self._table,
-                    self._keys,
-                    self._sums,
-                    self._left_out,
-                )
+                reduce_points(points.T, pose, scale, range_sq, self._scratch, self._left_out)
             )
             if num >= 0:
                 return num
-            self._reserve(2 * len(self._keys))
+            self._reserve(len(self._scratch[0]))
 
     def _pack(self, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
         """Turn the scratch memory into integers."""
-        key, sums = self._keys[:num].copy(), self._sums[:num]
+        _, keys, sums = self._scratch
+        key, sums = keys[:num].copy(), sums[:num]
         largest = sums[:, 0].max(initial=0.0)
         if largest > MAX_SCAN_COUNT:
             raise MapLimitError(
@@ -231,7 +222,11 @@ class Reducer:
 
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
-    """Return points as the kernels take them: (N, 3) float32 or float64, C order, writeable."""
+    """
+    Return points as the kernels take them: (N, 3) float32 or float64, column by column.
+
+    Arrays that are so already (Fortran order, writeable) are not copied.
+    """
     array = np.asarray(points)
     if array.size == 0 and array.ndim < 2:
         array = array.reshape(0, 3)
@@ -240,7 +235,7 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     if array.dtype.kind not in 'fiu':
         raise ValueError(f'points: dtype {array.dtype}, expected numbers')
     dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
-    return np.require(array, dtype, ['C', 'A', 'W'])
+    return np.require(array, dtype, ['F', 'A', 'W'])
 
 
 def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
