@@ -25,7 +25,8 @@ class Scan:
     Attributes
     ----------
     points : (N, 3) float32 or float64, m
-        In ``frame_id``. May hold nan and inf; whoever uses the points leaves those out.
+        In ``frame_id``. May hold nan and inf; whoever uses the points leaves those out. In
+        Fortran order the map takes them without a copy.
     stamp_ns : int
         Time of the sweep in nanoseconds, of the message's header.
     frame_id : str
