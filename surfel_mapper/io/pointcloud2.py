@@ -233,8 +233,9 @@ def coordinates(points: Points, xyz: list[Field]) -> npt.NDArray[Any]:
     together = [f.offset for f in xyz] == [start, start + size, start + 2 * size]
     if together and all(v.dtype == dtype for v in views) and not views[0].flags.aligned:
         triples = points.view(start, np.dtype((np.void, 3 * size))).copy()
-        return np.asfortranarray(triples.view(dtype).reshape(-1, 3))
-    packed = np.empty((3, *points.shape), dtype)
+        by_column: npt.NDArray[Any] = np.asfortranarray(triples.view(dtype).reshape(-1, 3))
+        return by_column
+    packed: npt.NDArray[Any] = np.empty((3, *points.shape), dtype)
     for axis, values in enumerate(views):
         packed[axis] = values
     return packed.reshape(3, -1).T

@@ -77,7 +77,7 @@ def assert_decodes(msg):
     xyz = [twin(msg, first[name]) for name in 'xyz']
     expected = np.stack(xyz, axis=1)  # float64 where one of them is
     assert scan.points.dtype == expected.dtype
-    assert scan.points.flags.c_contiguous
+    assert scan.points.flags.f_contiguous
     np.testing.assert_array_equal(scan.points, expected)
     assert set(scan.columns) == set(first) - {'x', 'y', 'z'}
     for name, column in scan.columns.items():
