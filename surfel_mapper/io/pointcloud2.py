@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+import math
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -233,12 +234,12 @@ def coordinates(points: Points, xyz: list[Field]) -> npt.NDArray[Any]:
     together = [f.offset for f in xyz] == [start, start + size, start + 2 * size]
     if together and all(v.dtype == dtype for v in views) and not views[0].flags.aligned:
         triples = points.view(start, np.dtype((np.void, 3 * size))).copy()
-        by_column: npt.NDArray[Any] = np.asfortranarray(triples.view(dtype).reshape(-1, 3))
-        return by_column
-    packed: npt.NDArray[Any] = np.empty((3, *points.shape), dtype)
+        packed: npt.NDArray[Any] = np.asfortranarray(triples.view(dtype).reshape(-1, 3))
+        return packed
+    packed = np.empty((math.prod(points.shape), 3), dtype, order='F')
     for axis, values in enumerate(views):
-        packed[axis] = values
-    return packed.reshape(3, -1).T
+        packed[:, axis].reshape(points.shape)[...] = values
+    return packed
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
