@@ -37,6 +37,12 @@ def decompose(scatter, num, eigenvalues, normals):
     for i in range(num):
         axx, axy, axz = scatter[0, i], scatter[1, i], scatter[2, i]
         ayy, ayz, azz = scatter[3, i], scatter[4, i], scatter[5, i]
+        # squares and cubes of tiny and of huge entries are no float64: take them to the middle
+        size = (axx + ayy) + azz
+        into = 2.0**700 if size < 2.0**-400 else (2.0**-600 if size > 2.0**400 else 1.0)
+        back = 2.0**-700 if size < 2.0**-400 else (2.0**600 if size > 2.0**400 else 1.0)
+        axx, axy, axz = axx * into, axy * into, axz * into
+        ayy, ayz, azz = ayy * into, ayz * into, azz * into
         trace = (axx + ayy) + azz
         mean = trace / 3.0
         bxx, byy, bzz = axx - mean, ayy - mean, azz - mean
@@ -110,9 +116,9 @@ def decompose(scatter, num, eigenvalues, normals):
         e1 = 0.0 if e1 < noise else e1
         e1 = e0 if e1 < e0 else e1
         e2 = e1 if e2 < e1 else e2
-        eigenvalues[0, i] = e0
-        eigenvalues[1, i] = e1
-        eigenvalues[2, i] = e2
+        eigenvalues[0, i] = e0 * back
+        eigenvalues[1, i] = e1 * back
+        eigenvalues[2, i] = e2 * back
         normals[0, i] = nx
         normals[1, i] = ny
         normals[2, i] = nz
