@@ -317,6 +317,15 @@ class SurfelMap:
 
         It covers voxel size, level, voxel indices and integer moments, sorted by voxel: equal
         digests mean equal maps, whatever way they came about.
+
+        Notes
+        -----
+        Of the text ``surfel map 1``, the voxel size as float64, level and number of voxels; then
+        of all voxels the keys, the counts, the sums (x y z), the products (xx xy xz yy yz zz)
+        and the sums of the views (x y z), array by array and sorted by key. All numbers but the
+        first are int64, all are little-endian. The key of voxel (i, j, k) is
+        ((i + 2^20) 2^21 + (j + 2^20)) 2^21 + (k + 2^20).
+
         """
         moments = self.moments()
         state = hashlib.sha256(b'surfel map 1')
