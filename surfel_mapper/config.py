@@ -197,10 +197,10 @@ class InputConfig(Stage):
     """What is taken of the clouds that come in."""
 
     min_range_m: float = setting(
-        0.1, 'Points nearer to the sensor are left out, m.', low=0.0, high=1e6
+        0.1, 'Points nearer to the origin of their frame are left out, m.', low=0.0, high=1e6
     )
     max_range_m: float = setting(
-        0.0, 'Points farther from the sensor are left out, m; 0: no such limit.', low=0.0, high=1e6
+        0.0, 'Points farther from it are left out, m; 0: no such limit.', low=0.0, high=1e6
     )
     reset_after_s: float = setting(
         1.0,

@@ -55,7 +55,7 @@ class Update:
     changed : Surfels
         Every voxel that the scan or an eviction changed and that has ``map.min_points``.
     removed_voxel_index : (K, 3) int32
-        Voxels that left the map.
+        Voxels that were surfels and, after an eviction, have too few points.
     evictions : tuple of Eviction
         The scans that left, oldest first.
     milliseconds : dict of str to float
@@ -310,7 +310,7 @@ class Mapper:
             if not len(windowed.moments):
                 self._drop(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
                 return None
-            evictions = self.window.insert(windowed)
+            evictions = self.window.insert(windowed, self.config.map.min_points)
         except MapError as error:
             self._drop(scan, 'map_limit', str(error))
             return None
@@ -324,14 +324,14 @@ class Mapper:
             'total': (end - start) * 1e3,
         }
         self._count(windowed, evictions, times)
-        emptied = [eviction.emptied for eviction in evictions]
+        fallen = [eviction.fallen for eviction in evictions]
         return Update(
             stamp_ns=scan.stamp_ns,
             frame_id=self.config.frames.fixed,
             T_fixed_sensor=pose,
             num_points=windowed.moments.num_points,
             changed=changed,
-            removed_voxel_index=np.concatenate(emptied) if emptied else np.empty((0, 3), np.int32),
+            removed_voxel_index=np.concatenate(fallen) if fallen else np.empty((0, 3), np.int32),
             evictions=tuple(evictions),
             milliseconds=times,
         )

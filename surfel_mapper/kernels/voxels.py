@@ -146,17 +146,22 @@ def first_missing(moments, view_weight, rows, found):
 
 
 @njit(cache=True, nogil=True)
-def subtract_moments(moments, view_weight, rows, table, state, version, found, emptied):
+def subtract_moments(
+    moments, view_weight, rows, table, state, version, found, min_points, fallen
+):
     """
-    Subtract moments that the map holds; free the rows that become empty; return how many.
+    Subtract moments that the map holds, and free the rows that become empty.
 
-    found    (K,) int32, row of each voxel
-    emptied  (K,) int64, out: keys of the voxels that are gone
+    found       (K,) int32, row of each voxel
+    min_points  from how many points on a voxel counts, at least 1
+    fallen      (K,) int64, out: keys of the voxels that counted before and do not any more
+
+    Returns how many voxels have fallen.
     """
     keys, count, total, product, view = moments
     depth = state[DEPTH]
     flat = rows.ravel()
-    num_emptied = 0
+    num_fallen = 0
     for place in range(len(keys)):
         if place + AHEAD < len(keys):
             prefetch(flat, np.int64(found[place + AHEAD]) * ROW)
@@ -165,15 +170,16 @@ def subtract_moments(moments, view_weight, rows, table, state, version, found, e
         n = np.int64(count[place])
         state[POINTS] -= n
         rows[row, VERSION] = version
+        key = keys[place]
+        if rows[row, COUNT] >= min_points > rows[row, COUNT] - n:
+            fallen[num_fallen] = key
+            num_fallen += 1
         if rows[row, COUNT] == n:
-            key = keys[place]
             remove_row(key, row, table, depth)
             state[VOXELS] -= 1
             rows[row, COUNT] = 0
             rows[row, KEY] = state[FREE_ROW]
             state[FREE_ROW] = row
-            emptied[num_emptied] = key
-            num_emptied += 1
             continue
         weight = n if view_weight == 0 else np.int64(1)
         rows[row, COUNT] -= n
@@ -182,4 +188,4 @@ def subtract_moments(moments, view_weight, rows, table, state, version, found, e
             rows[row, VIEW + axis] -= weight * view[place, axis]
         for pair in range(6):
             rows[row, PRODUCT + pair] -= product[place, pair]
-    return num_emptied
+    return num_fallen

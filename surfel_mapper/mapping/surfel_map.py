@@ -215,14 +215,21 @@ class SurfelMap:
                     raise
         self._remember(changed[: self._state[hashing.CHANGED]])
 
-    def remove(self, moments: ScanMoments) -> npt.NDArray[np.int32]:
+    def remove(self, moments: ScanMoments, min_points: int = 1) -> npt.NDArray[np.int32]:
         """
         Subtract moments that were added before: the exact inverse.
+
+        Parameters
+        ----------
+        moments : ScanMoments
+            As ``add`` returned them.
+        min_points : int
+            From how many points on a voxel counts for the result.
 
         Returns
         -------
         (E, 3) int32
-            Indices of the voxels that are gone, since no point is left in them.
+            Indices of the voxels that held ``min_points`` before and hold fewer now.
 
         Raises
         ------
@@ -244,8 +251,8 @@ class SurfelMap:
                 'removed; were these moments added to this map, and only removed once?'
             )
         self.version += 1
-        emptied = np.empty(len(moments), np.int64)
-        num_emptied = subtract_moments(
+        fallen = np.empty(len(moments), np.int64)
+        num_fallen = subtract_moments(
             moments.arrays,
             moments.view_is_sum,
             self._rows.array,
@@ -253,10 +260,11 @@ class SurfelMap:
             self._state,
             self.version,
             found,
-            emptied,
+            max(min_points, 1),
+            fallen,
         )
         self._remember(found)
-        return unpack_keys(emptied[:num_emptied])
+        return unpack_keys(fallen[:num_fallen])
 
     def merge(self, other: SurfelMap) -> None:
         """

@@ -63,14 +63,14 @@ class Eviction:
     limit : str
         The limit that it had reached: max_scans, max_age_s, max_distance_m, max_bytes or
         max_voxels.
-    emptied : (E, 3) int32
-        Indices of the voxels that went with it.
+    fallen : (E, 3) int32
+        Indices of the voxels that fell below the number of points that makes a surfel.
 
     """
 
     scan: WindowedScan
     limit: str
-    emptied: npt.NDArray[np.int32]
+    fallen: npt.NDArray[np.int32]
 
 
 class SlidingWindow:
@@ -100,20 +100,25 @@ class SlidingWindow:
         self.max_voxels = max_voxels
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
+        self._forget()
+
+    def _forget(self) -> None:
+        self._scans.clear()
+        self._num_settled = 0
         self._travelled_m = 0.0
         self._nbytes = 0
 
     def __len__(self) -> int:
-        """Return the number of scans."""
-        return len(self._scans)
+        """Return the number of scans that the map holds."""
+        return self._num_settled + len(self._scans)
 
     def __iter__(self) -> Iterator[WindowedScan]:
-        """Iterate over the scans, oldest first."""
+        """Iterate over the scans that are kept, oldest first; see ``insert``."""
         return (scan for scan, _ in self._scans)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of all scans in the window."""
+        """Bytes of the scans that are kept."""
         return self._nbytes
 
     @property
@@ -121,11 +126,20 @@ class SlidingWindow:
         """The scan added last."""
         return self._scans[-1][0] if self._scans else None
 
-    def insert(self, scan: WindowedScan) -> list[Eviction]:
+    def insert(self, scan: WindowedScan, min_points: int = 1) -> list[Eviction]:
         """
         Add a scan to the map and remove those that are beyond a limit now.
 
-        The newest scan stays, whatever the limits are.
+        The newest scan stays, whatever the limits are. Without any limit no scan will leave;
+        then, unless points are to be kept, only the newest is kept, and memory does not grow
+        with the number of scans.
+
+        Parameters
+        ----------
+        scan : WindowedScan
+            The newest scan.
+        min_points : int
+            From how many points on a voxel counts as a surfel, for what an eviction states.
 
         Raises
         ------
@@ -141,22 +155,30 @@ class SlidingWindow:
         self._nbytes += scan.nbytes
         evicted = []
         while len(self._scans) > 1 and (limit := self._limit_reached()):
-            evicted.append(self._evict(limit))
+            evicted.append(self._evict(limit, min_points))
+        while len(self._scans) > 1 and self._keeps_nothing:
+            self._nbytes -= self._scans.popleft()[0].nbytes
+            self._num_settled += 1
         return evicted
 
     def clear(self) -> None:
         """Forget all scans and clear the map."""
-        self._scans.clear()
-        self._nbytes = 0
-        self._travelled_m = 0.0
+        self._forget()
         self._map.clear()
 
-    def _evict(self, limit: str) -> Eviction:
+    @property
+    def _keeps_nothing(self) -> bool:
+        """Whether no scan can leave and none is wanted for anything else."""
+        config = self.config
+        limits = (config.max_scans, config.max_age_s, config.max_distance_m, config.max_bytes)
+        return not (any(limits) or self.max_voxels or config.keep_points)
+
+    def _evict(self, limit: str, min_points: int) -> Eviction:
         scan, _ = self._scans[0]
-        emptied = self._map.remove(scan.moments)
+        fallen = self._map.remove(scan.moments, min_points)
         self._scans.popleft()
         self._nbytes -= scan.nbytes
-        return Eviction(scan=scan, limit=limit, emptied=emptied)
+        return Eviction(scan=scan, limit=limit, fallen=fallen)
 
     def _limit_reached(self) -> str:
         """Return the name of a limit that the oldest scan is beyond, or an empty string."""
