@@ -15,23 +15,9 @@ from surfel_mapper.io.markers import (
     tangents,
     thinned,
 )
-from surfel_mapper.mapping.surfels import Surfels
+from test.io.examples import make_surfels
 
 CORNERS = 3 * (SEGMENTS - 2)
-
-
-def make_surfels(number, seed=1):
-    rng = np.random.default_rng(seed)
-    normal = rng.normal(size=(number, 3))
-    return Surfels(
-        position=rng.uniform(-50.0, 50.0, (number, 3)),
-        normal=normal / np.linalg.norm(normal, axis=1)[:, None],
-        planarity=rng.uniform(size=number),
-        curvature=rng.uniform(size=number),
-        eigenvalues=np.sort(rng.uniform(0.0, 0.02, (number, 3)), axis=1),
-        num_points=rng.integers(1, 1000, number),
-        voxel_index=rng.integers(-500, 500, (number, 3)).astype(np.int32),
-    )
 
 
 def draw(surfels, **settings):

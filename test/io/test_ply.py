@@ -5,26 +5,15 @@
 import os
 from pathlib import Path
 import struct
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.io.ply import read_points, write_points, write_surfels
+from test.io.examples import make_surfels
 
 NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
-
-
-def make_surfels(number):
-    rng = np.random.default_rng(1)
-    return SimpleNamespace(
-        position=np.array([5e6, -4e5, 100.0]) + rng.uniform(-1.0, 1.0, (number, 3)),
-        normal=rng.normal(size=(number, 3)),
-        planarity=rng.uniform(size=number),
-        curvature=rng.uniform(size=number),
-        num_points=rng.integers(1, 2**31, number, endpoint=True),
-    )
 
 
 def assert_equals_surfels(columns, surfels):
@@ -37,13 +26,7 @@ def assert_equals_surfels(columns, surfels):
 
 
 def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
-    surfels = SimpleNamespace(
-        position=np.array([[1e6, 2.0, 3.0]]),
-        normal=np.array([[0.0, 0.0, 1.0]]),
-        planarity=np.array([0.5]),
-        curvature=np.array([0.25]),
-        num_points=np.array([7]),
-    )
+    surfels = make_surfels(1)
     write_surfels(tmp_path / 'map.ply', surfels)
     header = (
         b'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
@@ -52,13 +35,16 @@ def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
         b'property float planarity\nproperty float curvature\nproperty uint num_points\n'
         b'end_header\n'
     )
-    row = struct.pack('<3d5fI', 1e6, 2.0, 3.0, 0.0, 0.0, 1.0, 0.5, 0.25, 7)
+    row = struct.pack(
+        '<3d5fI', *surfels.position[0], *surfels.normal[0], surfels.planarity[0],
+        surfels.curvature[0], surfels.num_points[0],
+    )  # fmt: skip
     assert (tmp_path / 'map.ply').read_bytes() == header + row
 
 
 @pytest.mark.parametrize('number', [0, 1, 1000])
 def test_surfels_come_back_equal(tmp_path, number):
-    surfels = make_surfels(number)
+    surfels = make_surfels(number, centre=(5e6, -4e5, 100.0))
     write_surfels(tmp_path / 'map.ply', surfels)
     columns = read_points(tmp_path / 'map.ply')
     assert list(columns) == NAMES
@@ -67,7 +53,7 @@ def test_surfels_come_back_equal(tmp_path, number):
 
 def test_plyfile_reads_the_same(tmp_path):
     plyfile = pytest.importorskip('plyfile')
-    surfels = make_surfels(100)
+    surfels = make_surfels(100, centre=(5e6, -4e5, 100.0))
     write_surfels(tmp_path / 'map.ply', surfels)
     vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
     assert [p.name for p in vertex.properties] == NAMES

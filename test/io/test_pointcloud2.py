@@ -20,6 +20,7 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import Field, from_columns, surfel_columns, to_scan
+from test.io.examples import make_surfels
 
 CODES = {1: 'b', 2: 'B', 3: 'h', 4: 'H', 5: 'i', 6: 'I', 7: 'f', 8: 'd'}
 NUMPY = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
@@ -331,22 +332,19 @@ def test_columns_that_are_no_table_are_refused(columns):
 
 
 def test_surfels_become_the_nine_columns_of_normals():
-    surfels = SimpleNamespace(
-        position=np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]),
-        normal=np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]]),
-        planarity=np.array([0.25, 0.5]),
-        curvature=np.array([0.125, 0.0]),
-        num_points=np.array([7, 2**31]),
-    )
+    surfels = make_surfels(2)
     cloud = from_columns(surfel_columns(surfels))
     assert ' '.join(f.name for f in cloud.fields) == (
         'x y z normal_x normal_y normal_z curvature planarity num_points'
     )
     assert [f.datatype for f in cloud.fields] == [7] * 8 + [6]
-    assert cloud.point_step == 36
-    first = struct.unpack_from('<8fI', cloud.data)
-    assert first == pytest.approx((1, 2, 3, 0, 0.6, 0.8, 0.125, 0.25, 7))
-    assert struct.unpack_from('<I', cloud.data, 36 + 32) == (2**31,)
+    assert cloud.data.tobytes() == b''.join(
+        struct.pack(
+            '<8fI', *surfels.position[i], *surfels.normal[i], surfels.curvature[i],
+            surfels.planarity[i], surfels.num_points[i],
+        )
+        for i in range(2)
+    )  # fmt: skip
 
 
 def test_messages_of_rclpy_decode_and_take_the_bytes():
