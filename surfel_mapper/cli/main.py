@@ -5,7 +5,8 @@
 
 A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_arguments(parser)`` and
 ``run(args) -> int``. It loads what it needs inside ``run``, so that help comes at once and a
-replay loads no ROS. What the verb prints on stdout is its result; all else goes to stderr.
+replay loads no ROS. What the verb prints on stdout is its result; all else goes to stderr. What
+follows --ros-args is ``args.ros_args``.
 
 Exit code 0: done; 1: refused, with a message; 2: usage; 130: interrupted.
 """
@@ -38,8 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         The arguments; those of the process without.
 
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
     args = parser_of(arguments).parse_args(arguments)
+    args.ros_args = ros_args
     logging.basicConfig(format=f'surfel-mapper {args.verb}: %(message)s', level=logging.WARNING)
     try:
         code = int(args.run(args))
@@ -54,6 +56,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """
+    Return the arguments for us and, from --ros-args on, those for ROS.
+
+    A launch file adds these to whatever it starts, so every verb takes them; the node uses them.
+    """
+    arguments = list(argv)
+    cut = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
+    return arguments[:cut], arguments[cut:]
 
 
 def parser_of(arguments: Sequence[str]) -> argparse.ArgumentParser:

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 import logging
+from typing import TYPE_CHECKING
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
@@ -19,7 +20,9 @@ from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
-from surfel_mapper.pipeline import Mapper, Update
+
+if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not need
+    from surfel_mapper.pipeline import Mapper, Update
 
 TYPES = {'tf': TF, 'odometry': ODOMETRY, 'pose': POSE}
 """Type of the messages that each pose.source reads."""
@@ -74,14 +77,20 @@ def pose_topics(topics: Topics, config: Config, name: str | None = None) -> Pose
             f'{topics.path}: pose.source is {source}, but no topic is of type {TYPES[source]}; '
             f'the bag offers {offered_sources(topics)}'
         )
-    if source != 'tf':
-        chosen = topics.choose(TYPES[source], name, DEFAULTS[source])
-        static = () if config.frames.base_to_sensor else static_topics(topics)
-        return PoseTopics({chosen: source}, static)
-    dynamic = [topic for topic in topics.of_type(TF) if topic not in static_topics(topics)]
-    if not dynamic and name is None:  # a sensor at rest
-        return PoseTopics({}, static_topics(topics))
-    return PoseTopics({topics.choose(TF, name, DEFAULTS['tf']): 'tf'}, static_topics(topics))
+    if source == 'tf':
+        return transform_topics(topics, name)
+    chosen = topics.choose(TYPES[source], name, DEFAULTS[source])
+    static = () if config.frames.base_to_sensor else static_topics(topics)
+    return PoseTopics({chosen: source}, static)
+
+
+def transform_topics(topics: Topics, name: str | None) -> PoseTopics:
+    """Return the topics of the tree of transforms; static ones alone do for a sensor at rest."""
+    static = static_topics(topics)
+    moving = [topic for topic in topics.of_type(TF) if topic not in static]
+    if name is None and len(moving) <= 1:
+        return PoseTopics(dict.fromkeys(moving, 'tf'), static)
+    return PoseTopics({topics.choose(TF, name, DEFAULTS['tf']): 'tf'}, static)
 
 
 def static_topics(topics: Topics) -> tuple[str, ...]:

@@ -45,6 +45,9 @@ discs of neighbours that are full of points leave no gaps between them.
 BEYOND = 0.5
 """The picture leaves out this many per cent of the surfels at either end of an axis."""
 
+FLATTEST = 0.08
+"""No axis is drawn shorter than this by the longest, so that the view of a plane has room."""
+
 WIDTH_INCH, HEIGHT_INCH, DPI = 11.0, 9.0, 160
 """The larger of the two views together takes so much of width or height; labels come on top."""
 
@@ -97,7 +100,7 @@ def draw_map(
     from matplotlib.figure import Figure
 
     drawn = surfels.select(np.isfinite(surfels.planarity))
-    low, high = limits(drawn.position)
+    low, high = limits(drawn)
     top, side = views(high - low)
     extent = high - low
     heights = [extent[top.up], extent[side.up]]
@@ -114,13 +117,21 @@ def draw_map(
         figure.savefig(file, format='png', bbox_inches='tight', pad_inches=0.15)
 
 
-def limits(position: Array) -> tuple[Array, Array]:
+def limits(surfels: Surfels) -> tuple[Array, Array]:
     """Return the corners of the box to be drawn, (3,) each; some box where there is no surfel."""
-    if not len(position):
+    if not len(surfels):
         return np.full(3, -5.0), np.full(3, 5.0)
-    low, high = np.percentile(position, [BEYOND, 100.0 - BEYOND], axis=0)
-    margin = 0.02 * (high - low).max()
+    low, high = np.percentile(surfels.position, [BEYOND, 100.0 - BEYOND], axis=0)
+    longest = (high - low).max() + float(np.median(sides_m(surfels)))
+    margin = np.maximum(0.02 * longest, 0.5 * (FLATTEST * longest - (high - low)))
     return low - margin, high + margin
+
+
+def sides_m(surfels: Surfels) -> Array:
+    """Return the side of the square that spreads as far as the points of each surfel."""
+    # along either side of a square the variance is a twelfth of the side squared
+    sides: Array = np.sqrt(6.0 * surfels.eigenvalues[:, 1:].sum(axis=1))
+    return sides
 
 
 def views(extent: Array) -> tuple[View, View]:
@@ -149,9 +160,7 @@ def draw_view(
     normal_right, normal_up, facing = view.seen(surfels.normal)
     order = np.argsort(view.seen(surfels.position)[2], kind='stable')
     order = order[facing[order] > FACING_AWAY]
-    # a square of points has 12 times the variance of either coordinate as its side squared
-    side_m = np.sqrt(6.0 * surfels.eigenvalues[order, 1:].sum(axis=1))
-    long_m = SPREAD * side_m
+    long_m = SPREAD * sides_m(surfels)[order]
     discs = EllipseCollection(
         widths=long_m,
         heights=long_m * np.maximum(np.abs(facing[order]), EDGE_ON),

@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper info`` prints what a bag holds and settings that work as they stand."""
+
+import json
+
+import pytest
+import yaml
+
+from surfel_mapper.cli.main import main
+from test.io.recorded import (
+    CLOUD,
+    drive,
+    MOUNT_M,
+    NUM_SCANS,
+    ODOMETRY,
+    ROS1,
+    write_ros1,
+    write_rosbag2,
+)
+
+
+@pytest.mark.parametrize('write', [write_rosbag2, write_ros1])
+def test_topics_and_poses_are_printed(tmp_path, capsys, write):
+    name, store = ('a', {}) if write is write_rosbag2 else ('a.bag', {'store': ROS1})
+    path = write(tmp_path / name, drive(**store))
+
+    assert main(['info', str(path)]) == 0
+
+    lines = capsys.readouterr().out.splitlines()
+    version = 'ROS 1' if store else 'ROS 2'
+    assert lines[0] == f'{path}: {version}, from 2023-11-14 22:13:20 UTC, 0.5 s, 25 messages'
+    assert lines[1].split() == [
+        *('/odom', ODOMETRY, str(NUM_SCANS), '10.0', 'Hz'),
+        *('odom', '->', 'base_link'),
+    ]
+    assert lines[2].split() == ['/points', CLOUD, str(NUM_SCANS), '10.0', 'Hz', 'lidar']
+    assert f'  /tf: {NUM_SCANS} of {NUM_SCANS}, in the frame odom' in lines
+
+
+def test_the_settings_printed_replay_the_bag(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', drive())
+    assert main(['info', str(path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+
+    start = lines.index(f'  /odom: {NUM_SCANS} of {NUM_SCANS}, in the frame odom') + 1
+    stop = next(i for i in range(start, len(lines)) if not lines[i].startswith('      '))
+    config = tmp_path / 'settings.yaml'
+    config.write_text('\n'.join(lines[start:stop]))
+
+    mount = [*MOUNT_M, 0.0, 0.0, 0.0, 1.0]
+    expected = {'pose': {'source': 'odometry'}, 'frames': {'base_to_sensor': mount}}
+    assert yaml.safe_load(config.read_text()) == expected
+    output = ['--output', str(tmp_path / 'out')]
+    assert main(['replay', str(path), '--config', str(config), *output]) == 0
+
+
+def test_json_holds_the_same(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', drive())
+
+    assert main(['info', str(path), '--json']) == 0
+
+    content = json.loads(capsys.readouterr().out)
+    assert {row['topic']: row['messages'] for row in content['topics']} == {
+        **dict.fromkeys(('/odom', '/points', '/pose', '/tf'), NUM_SCANS),
+        '/tf_static': 1,
+    }
+    assert [offer['settings']['pose.source'] for offer in content['poses']] == [
+        *('tf', 'odometry', 'pose')
+    ]
+
+
+def test_a_bag_without_poses_says_so(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] == CLOUD])
+
+    assert main(['info', str(path)]) == 0
+    assert 'no poses; clouds that are in a fixed frame map' in capsys.readouterr().out
+
+
+def test_a_mounting_that_is_missing_is_said(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', [r for r in drive() if r[1] in (CLOUD, ODOMETRY)])
+
+    assert main(['info', str(path)]) == 0
+    assert 'the place of lidar in base_link is not in the bag' in capsys.readouterr().out
+
+
+def test_no_bag_is_refused(tmp_path, capsys):
+    assert main(['info', str(tmp_path / 'none')]) == 1
+    assert 'none: no such file or directory' in capsys.readouterr().err

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The command line lists its verbs, turns errors into messages, and loads only what it needs."""
+
+from importlib import import_module
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+import surfel_mapper
+from surfel_mapper.cli import replay
+from surfel_mapper.cli.main import main, VERBS
+from surfel_mapper.errors import BagError
+from test.io.recorded import drive, write_rosbag2
+
+
+def usage_code(*arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    return stopped.value.code
+
+
+def test_the_version_is_that_of_the_package(capsys):
+    assert usage_code('--version') == 0
+    assert capsys.readouterr().out == f'surfel-mapper {surfel_mapper.__version__}\n'
+
+
+def test_help_lists_every_verb_with_its_summary(capsys):
+    assert usage_code('--help') == 0
+    text = ' '.join(capsys.readouterr().out.split())
+    for verb in VERBS:
+        assert f'{verb} {import_module(f"surfel_mapper.cli.{verb}").SUMMARY}' in text
+
+
+def test_every_module_of_the_folder_is_a_verb():
+    folder = Path(surfel_mapper.__file__).parent / 'cli'
+    assert {path.stem for path in folder.glob('*.py')} == {'__init__', 'main', *VERBS}
+
+
+@pytest.mark.parametrize('verb', VERBS)
+def test_the_help_of_a_verb_shows_an_example(verb, capsys):
+    example = import_module(f'surfel_mapper.cli.{verb}').EXAMPLE
+
+    assert usage_code(verb, '--help') == 0
+    assert f'example:\n  {example}' in capsys.readouterr().out
+    assert example.startswith(f'surfel-mapper {verb} ')
+
+
+@pytest.mark.parametrize('arguments', [(), ('fly',), ('replay',), ('replay', 'a', '--fly')])
+def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
+    assert usage_code(*arguments) == 2
+    assert 'usage: surfel-mapper' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ('error', 'code', 'says'),
+    [
+        (BagError('a.bag: odd'), 1, 'surfel-mapper replay: a.bag: odd\n'),
+        (OSError(28, 'No space left on device', 'a.ply'), 1, "No space left on device: 'a.ply'"),
+        (KeyboardInterrupt(), 130, 'surfel-mapper replay: interrupted\n'),
+    ],
+)
+def test_errors_become_messages_and_exit_codes(error, code, says, monkeypatch, capsys):
+    def fails(args):
+        raise error
+
+    monkeypatch.setattr(replay, 'run', fails)
+
+    assert main(['replay', 'a.bag']) == code
+    printed = capsys.readouterr()
+    assert says in printed.err
+    assert 'Traceback' not in printed.err
+    assert printed.out == ''
+
+
+def test_mistakes_of_our_own_keep_their_traceback(monkeypatch):
+    monkeypatch.setattr(replay, 'run', lambda args: 1 / 0)
+
+    with pytest.raises(ZeroDivisionError):
+        main(['replay', 'a.bag'])
+
+
+def test_what_follows_ros_args_is_not_read_as_options(monkeypatch):
+    seen = []
+    monkeypatch.setattr(replay, 'run', lambda args: seen.append(args) or 0)
+
+    assert main(['replay', 'a.bag', '--ros-args', '-r', '__node:=x']) == 0
+    assert seen[0].ros_args == ['--ros-args', '-r', '__node:=x']
+
+
+@pytest.mark.parametrize('arguments', [['--help'], ['replay', '--help'], ['info', '/no/bag']])
+def test_help_and_refusals_load_nothing_heavy(arguments):
+    program = (
+        'import sys\n'
+        'from surfel_mapper.cli.main import main\n'
+        'try:\n'
+        f'    main({arguments!r})\n'
+        'except SystemExit:\n'
+        '    pass\n'
+        "heavy = {'numba', 'matplotlib', 'rclpy', 'scipy', 'rosbags.typesys'}\n"
+        'print(sorted(heavy & set(sys.modules)), file=sys.stderr)\n'
+    )
+
+    done = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+
+    assert done.stderr.splitlines()[-1] == '[]'
+
+
+def test_a_reader_that_has_gone_is_no_error(tmp_path):
+    bag = write_rosbag2(tmp_path / 'drive', drive())
+    read_end, write_end = os.pipe()
+    os.close(read_end)
+    command = [sys.executable, '-m', 'surfel_mapper.cli.main', 'info', str(bag)]
+    try:
+        done = subprocess.run(command, stdout=write_end, stderr=subprocess.PIPE, text=True)
+    finally:
+        os.close(write_end)
+
+    assert (done.returncode, done.stderr) == (0, '')

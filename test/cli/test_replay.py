@@ -1,0 +1,178 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper replay`` writes map, picture and summary, or says why it does not."""
+
+import json
+import logging
+from pathlib import Path
+
+import numpy as np
+from plyfile import PlyData
+import pytest
+
+from surfel_mapper.cli.main import main
+from test.io.recorded import cut, drive, NUM_SCANS, write_rosbag2
+
+FILES = {'map.ply', 'map.png', 'summary.json'}
+PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_rosbag2(tmp_path_factory.mktemp('bags') / 'drive', drive())
+
+
+def settings_file(tmp_path, text):
+    path = tmp_path / 'settings.yaml'
+    path.write_text(text)
+    return str(path)
+
+
+def summary_of(output):
+    return json.loads((output / 'summary.json').read_text())
+
+
+def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
+    output = tmp_path / 'a' / 'b'
+
+    assert main(['replay', str(bag), '--output', str(output)]) == 0
+
+    assert {path.name for path in output.iterdir()} == FILES
+    summary = summary_of(output)
+    assert summary['scans']['received'] == summary['scans']['mapped'] == NUM_SCANS
+    assert summary['points'] == NUM_SCANS * 4500
+    vertices = PlyData.read(output / 'map.ply')['vertex']
+    assert vertices.count == summary['surfels'] > 100
+    # the floor is at z = 0 in odom, the wall at y = 3.1
+    on_floor, on_wall = np.abs(vertices['z']) < 1e-3, np.abs(vertices['y'] - 3.1) < 1e-3
+    assert (on_floor | on_wall).mean() > 0.9  # all but the voxels where they meet
+    np.testing.assert_allclose(vertices['nz'][on_floor & ~on_wall], 1.0, atol=1e-4)
+    np.testing.assert_allclose(vertices['ny'][on_wall & ~on_floor], -1.0, atol=1e-4)
+    assert (output / 'map.png').read_bytes().startswith(PNG_MAGIC)
+    printed = capsys.readouterr()
+    lines = printed.out.splitlines()
+    assert lines[0] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
+    assert lines[1].startswith('decode ')
+    assert lines[2] == f'digest {summary["digest"]}'
+    assert printed.err == ''  # no progress where there is no terminal
+
+
+def test_json_prints_the_summary_alone(bag, tmp_path, capsys):
+    assert main(['replay', str(bag), '--json', '--output', str(tmp_path)]) == 0
+
+    assert json.loads(capsys.readouterr().out) == summary_of(tmp_path)
+
+
+def test_the_default_output_is_named_after_the_bag(bag, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for path in (bag, bag / 'drive.mcap'):
+        assert main(['replay', str(path)]) == 0
+
+    assert [path.name for path in tmp_path.iterdir()] == ['drive_surfels']
+
+
+def test_all_scans_stay_unless_the_window_is_asked_for(bag, tmp_path):
+    config = settings_file(tmp_path, 'window: {max_scans: 2}')
+    for options, left in (([], NUM_SCANS), (['--window'], 2)):
+        arguments = ['replay', str(bag), '--config', config, '--output', str(tmp_path / 'out')]
+        assert main([*arguments, *options]) == 0
+        assert summary_of(tmp_path / 'out')['window_scans'] == left
+
+
+def test_topics_can_be_named(tmp_path, capsys):
+    entries = drive()
+    entries.cloud('/other', entries[-1][2] + 1, np.ones((9, 3)))
+    path = str(write_rosbag2(tmp_path / 'two', entries))
+    output = ['--output', str(tmp_path / 'out')]
+
+    assert main(['replay', path, *output]) == 1
+    assert 'PointCloud2 topics: /other, /points' in capsys.readouterr().err
+    assert main(['replay', path, '--topic', '/points', '--pose-topic', '/tf', *output]) == 0
+    assert main(['replay', path, '--topic', '/points', '--pose-topic', '/t', *output]) == 1
+    assert 'no topic /t; TFMessage topics: /tf, /tf_static' in capsys.readouterr().err
+
+
+def test_a_replay_that_maps_nothing_is_refused_with_the_causes(bag, tmp_path, capsys):
+    config = settings_file(tmp_path, 'frames: {fixed: map}')
+
+    code = main(['replay', str(bag), '--config', config, '--output', str(tmp_path / 'out')])
+
+    assert code == 1
+    assert 'none of 6 clouds of /points was mapped (no pose 6)' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()
+
+
+def test_dropped_scans_are_reported_by_cause(tmp_path, capsys):
+    entries = drive()
+    entries[4][3].header.frame_id = ''
+
+    bag = write_rosbag2(tmp_path / 'drive', entries)
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 0
+
+    assert capsys.readouterr().out.startswith('scans 6 (1 dropped: empty frame id 1)   points 22')
+
+
+@pytest.mark.parametrize(
+    'text', ['pose: {source: registration}', 'map: {voxel_size: 1}', 'map: {voxel_size_m: -1}']
+)
+def test_a_bad_configuration_is_refused(bag, tmp_path, capsys, text):
+    config = settings_file(tmp_path, text)
+
+    assert main(['replay', str(bag), '--config', config, '--output', str(tmp_path / 'out')]) == 1
+    assert capsys.readouterr().err.startswith('surfel-mapper replay: ')
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_damaged_bag_leaves_an_earlier_result_whole(tmp_path, capsys):
+    bag, output = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3'), tmp_path / 'out'
+    assert main(['replay', str(bag), '--output', str(output)]) == 0
+    before = {path.name: path.read_bytes() for path in output.iterdir()}
+
+    cut(bag / 'drive.db3', 0.8)
+
+    assert main(['replay', str(bag), '--output', str(output)]) == 1
+    assert 'drive' in capsys.readouterr().err
+    assert {path.name: path.read_bytes() for path in output.iterdir()} == before
+
+
+def test_an_output_that_is_a_file_is_refused_before_the_work(bag, tmp_path, capsys):
+    (tmp_path / 'out').write_text('mine')
+
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 1
+    assert 'out: a file, expected a directory' in capsys.readouterr().err
+    assert (tmp_path / 'out').read_text() == 'mine'
+
+
+def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
+    entries = drive()
+    entries[4][3].point_step = 15
+    bag = write_rosbag2(tmp_path / 'drive', entries)
+    with caplog.at_level(logging.WARNING):
+        assert main(['replay', str(bag), '--json', '--output', str(tmp_path / 'out')]) == 0
+
+    assert '/points: ' in caplog.text
+    assert json.loads(capsys.readouterr().out)['scans']['mapped'] == NUM_SCANS - 1
+
+
+REAL = ['hall_os0_full', 'hall_os0_long']
+MOUNT = """
+pose: {source: odometry}
+frames: {base_to_sensor: [0.0, 0.0, 0.03618, 0.0, 0.0, 1.0, 0.0]}
+"""
+
+
+@pytest.mark.parametrize('name', REAL)
+def test_a_real_bag_maps_whole_and_alike_with_transforms_and_odometry(name, data_folder, tmp_path):
+    bag = Path(data_folder, 'data', 'bags', name)
+    config = settings_file(tmp_path, MOUNT)
+
+    summaries = []
+    for options in ([], ['--config', config]):
+        assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), *options]) == 0
+        summaries.append(summary_of(tmp_path / 'out'))
+
+    for summary in summaries:
+        assert summary['scans']['mapped'] == summary['scans']['received'] > 20
+        assert summary['scans']['dropped'] == {}
+        assert summary['surfels'] > 5000
+    assert summaries[0]['digest'] == summaries[1]['digest']

@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a survey promises of a bag is what a replay with its settings finds."""
+
+from itertools import pairwise
+import sqlite3
+
+import pytest
+
+from surfel_mapper import Config, Mapper
+from surfel_mapper.io.bag import BagReader
+from surfel_mapper.offline.replay import ALL_SCANS, pose_topics, replay
+from surfel_mapper.offline.survey import offers, survey
+from test.io.recorded import (
+    CLOUD,
+    drive,
+    MOUNT_M,
+    NUM_SCANS,
+    ODOMETRY,
+    PERIOD_NS,
+    START_NS,
+    TF,
+    write_rosbag2,
+)
+
+
+def surveyed(path):
+    with BagReader(path) as reader:
+        found = survey(reader)
+    return found, offers(found)
+
+
+def test_topics_are_listed_with_frames_and_rates(tmp_path):
+    found, _ = surveyed(write_rosbag2(tmp_path / 'a', drive()))
+
+    assert {name: seen.frames for name, seen in found.topics.items()} == {
+        '/odom': ['odom -> base_link'],
+        '/points': ['lidar'],
+        '/pose': ['odom -> base_link'],
+        '/tf': ['odom -> base_link'],
+        '/tf_static': ['base_link -> lidar'],
+    }
+    assert found.topics['/points'].rate_hz == pytest.approx(1e9 / PERIOD_NS)
+    assert found.topics['/tf_static'].rate_hz is None
+
+
+def test_every_source_is_offered_and_its_settings_map_every_scan(tmp_path):
+    path = write_rosbag2(tmp_path / 'a', drive())
+
+    _, made = surveyed(path)
+
+    assert [offer.settings['pose.source'] for offer in made] == ['tf', 'odometry', 'pose']
+    for offer in made:
+        assert (offer.covered, offer.total, offer.missing) == (NUM_SCANS, NUM_SCANS, '')
+        mapper = Mapper(Config.from_mapping({**ALL_SCANS, **offer.settings}))
+        with BagReader(path) as reader:
+            poses = pose_topics(reader.topics, mapper.config, offer.poses)
+            assert sum(1 for _ in replay(reader, mapper, offer.clouds, poses)) == NUM_SCANS
+
+
+def test_the_mounting_is_taken_from_the_static_transforms(tmp_path):
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', drive()))
+
+    mounts = [offer.settings.get('frames.base_to_sensor') for offer in made]
+    assert mounts == [None, [*MOUNT_M, 0.0, 0.0, 0.0, 1.0], [*MOUNT_M, 0.0, 0.0, 0.0, 1.0]]
+
+
+def test_a_mounting_over_two_transforms_is_their_product(tmp_path):
+    entries = [row for row in drive() if row[0] != '/tf_static']
+    poles = drive(num_scans=0)
+    poles.clear()
+    poles.transform('/tf_static', START_NS, 'base_link', 'pole', (1.0, 2.0, 3.0))
+    poles.transform('/tf_static', START_NS, 'pole', 'lidar', (0.5, 0.25, 0.125))
+
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', [*poles, *entries]))
+
+    assert made[1].settings['frames.base_to_sensor'] == [1.5, 2.25, 3.125, 0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_mounting_that_is_not_in_the_bag_is_said_to_be_missing(tmp_path):
+    path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] in (CLOUD, ODOMETRY)])
+
+    _, (offer,) = surveyed(path)
+
+    assert offer.covered == NUM_SCANS
+    assert offer.settings['frames.base_to_sensor'] == []
+    assert offer.missing == 'the place of lidar in base_link is not in the bag, measure it'
+
+
+def test_clouds_outside_the_poses_are_counted_out(tmp_path):
+    entries = drive()
+    last_ns = START_NS + (NUM_SCANS - 1) * PERIOD_NS
+    cut = [row for row in entries if row[1] == CLOUD or START_NS < row[2] < last_ns]
+    cut = [*[row for row in entries if row[0] == '/tf_static'], *cut]
+
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', cut))
+
+    assert {offer.covered for offer in made} == {NUM_SCANS - 2}
+    assert all('newer than all of' in offer.missing for offer in made)
+
+
+def test_a_bag_without_poses_offers_none(tmp_path):
+    found, made = surveyed(write_rosbag2(tmp_path / 'a', [r for r in drive() if r[1] == CLOUD]))
+
+    assert made == []
+    assert list(found.stamps) == [('/points', 'lidar')]
+
+
+@pytest.mark.parametrize(
+    ('parents', 'fixed'),
+    [
+        (['lidar', 'base_link', 'odom', 'map', 'earth'], 'odom'),
+        (['lidar', 'base_link', 'map', 'earth'], 'map'),
+        (['lidar', 'vehicle', 'utm'], 'utm'),
+    ],
+)
+def test_the_fixed_frame_is_odom_or_map_or_the_root(tmp_path, parents, fixed):
+    entries = [row for row in drive() if row[1] != TF]
+    tree = drive(num_scans=0)
+    tree.clear()
+    for child, parent in pairwise(parents):
+        tree.transform('/tf_static', START_NS, parent, child, (1.0, 0.0, 0.0))
+
+    _, made = surveyed(write_rosbag2(tmp_path / 'a', [*tree, *entries]))
+
+    (offer,) = (offer for offer in made if offer.settings['pose.source'] == 'tf')
+    assert offer.settings['frames.fixed'] == fixed
+    assert offer.covered == NUM_SCANS
+
+
+def test_damaged_messages_are_counted(tmp_path):
+    entries = drive()
+    entries[4][3].fields[0].name = 'x'
+    path = write_rosbag2(tmp_path / 'a', entries, 'sqlite3')
+    with sqlite3.connect(path / 'a.db3') as database:
+        database.execute('UPDATE messages SET data = substr(data, 1, 30) WHERE id = 5')
+
+    found, _ = surveyed(path)
+
+    assert found.undecodable == 1
