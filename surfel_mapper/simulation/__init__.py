@@ -1,0 +1,19 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A lidar driving through an analytic world: scans, poses and bags with known truth.
+
+    simulation = Simulation(World.street(seed=1, length_m=50.0), Lidar(), num_scans=10)
+    simulation.scans()                          the scans, with the true surface of every point
+    simulation.drive.T_odom_sensor(stamp_ns)    where the sensor was
+    simulation.world.normal_at(positions)       true normals; the world's frame is odom
+    record(simulation, 'street')                all of it as a bag
+"""
+
+from surfel_mapper.simulation.drive import Drive, Simulation
+from surfel_mapper.simulation.lidar import Lidar
+from surfel_mapper.simulation.primitives import Primitive
+from surfel_mapper.simulation.recording import record
+from surfel_mapper.simulation.world import World
+
+__all__ = ['Drive', 'Lidar', 'Primitive', 'Simulation', 'World', 'record']

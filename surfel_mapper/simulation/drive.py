@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Drive: where the vehicle is at any time; Simulation: the scans that its lidar takes.
+
+The odom frame is the world's frame. The course is a sum of sines of the distance driven, so that
+the pose at any stamp is known exactly and a standing vehicle does not rock. A pose is position
+and quaternion first and a matrix second: whoever reads it from a message gets the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.geometry import (
+    compose,
+    inverse,
+    pose_matrix,
+    q_xyzw,
+    se3_exp,
+    se3_log,
+    Transform,
+)
+from surfel_mapper.scan import Scan
+from surfel_mapper.simulation.lidar import Lidar
+from surfel_mapper.simulation.world import World
+
+START_NS = 1_700_000_000_000_000_000
+"""Stamp of the first scan unless told otherwise."""
+
+TWIST_STEP_NS = 1_000_000
+"""The twist is the motion from so long before a stamp to so long after it."""
+
+WEAVE_M = ((1.0, 70.0), (0.5, 31.0))
+"""Amplitude and length of the curves to the side, m; together up to 11 deg off the road."""
+
+BUMPS_M = ((0.02, 9.0), (0.01, 3.7))
+"""Amplitude and length of the unevenness of the road, m."""
+
+ROLL_DEG, PITCH_DEG = (0.9, 17.0), (0.6, 13.0)
+"""Amplitude, deg, and length, m, of the rocking about x and y."""
+
+
+def base_to_sensor() -> tuple[float, ...]:
+    """Return the mounting of the lidar, x y z qx qy qz qw: on the roof, slightly askew."""
+    turn = np.deg2rad([0.0, 0.0, 0.0, 0.7, -1.1, 2.3])
+    return (0.85, 0.04, 1.9, *(float(v) for v in q_xyzw(se3_exp(turn))))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """
+    The course of a vehicle along a street, and where its lidar is mounted.
+
+    Attributes
+    ----------
+    start : (7,) float
+        Pose x y z (m) qx qy qz qw in odom from which it drives ahead, World.start.
+    speed_m_s : float
+        Along the road; the way along the curves is up to 2 % longer.
+    start_ns : int
+        Stamp at the start; before it the vehicle comes from behind.
+    base_to_sensor : (7,) float
+        Pose of the lidar on the vehicle, as in the setting frames.base_to_sensor.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of bounds or no pose.
+
+    """
+
+    start: tuple[float, ...]
+    speed_m_s: float = 5.0
+    start_ns: int = START_NS
+    base_to_sensor: tuple[float, ...] = field(default_factory=base_to_sensor)
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        if not 0.0 <= self.speed_m_s <= 100.0:
+            raise ConfigError(f'speed_m_s: {self.speed_m_s}, expected a value in [0, 100]')
+        if not 0 <= self.start_ns < 2**62:
+            raise ConfigError(f'start_ns: {self.start_ns}, expected a value in [0, 2^62)')
+        for name in ('start', 'base_to_sensor'):
+            pose = getattr(self, name)
+            try:
+                pose_matrix(pose[:3], pose[3:])
+            except ValueError as error:
+                raise ConfigError(f'{name}: {error}') from error
+
+    @property
+    def T_base_sensor(self) -> Transform:
+        """Pose of the lidar on the vehicle."""
+        return pose_matrix(self.base_to_sensor[:3], self.base_to_sensor[3:])
+
+    def pose(self, stamp_ns: int) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        """Return position (3,), m, and quaternion (4,) xyzw of base_link in odom at a stamp."""
+        along = self.speed_m_s * (stamp_ns - self.start_ns) * 1e-9
+        aside, slope = _sines(along, WEAVE_M)
+        up, _ = _sines(along, BUMPS_M)
+        roll, _ = _sines(along, (ROLL_DEG,))
+        pitch, _ = _sines(along, (PITCH_DEG,))
+        turn = np.array([0.0, 0.0, 0.0, math.radians(roll), math.radians(pitch), math.atan(slope)])
+        T_start_base = pose_matrix((along, aside, up), q_xyzw(se3_exp(turn)))
+        T_odom_base = compose(pose_matrix(self.start[:3], self.start[3:]), T_start_base)
+        return T_odom_base[:3, 3].copy(), q_xyzw(T_odom_base)
+
+    def T_odom_base(self, stamp_ns: int) -> Transform:
+        """Return the pose of the vehicle at a stamp."""
+        return pose_matrix(*self.pose(stamp_ns))
+
+    def T_odom_sensor(self, stamp_ns: int) -> Transform:
+        """Return the pose of the lidar at a stamp."""
+        return compose(self.T_odom_base(stamp_ns), self.T_base_sensor)
+
+    def twist(self, stamp_ns: int) -> npt.NDArray[np.float64]:
+        """Return the velocity of base_link in base_link (6,), m/s and then rad/s."""
+        before = self.T_odom_base(stamp_ns - TWIST_STEP_NS)
+        after = self.T_odom_base(stamp_ns + TWIST_STEP_NS)
+        return se3_log(compose(inverse(before), after)) / (2e-9 * TWIST_STEP_NS)
+
+
+@dataclass(frozen=True, slots=True)
+class Simulation:
+    """
+    A lidar on a drive through a world.
+
+    Attributes
+    ----------
+    world : World
+    lidar : Lidar
+    drive : Drive
+        Without one, a drive from the world's start.
+    num_scans : int
+    rolling : bool
+        Whether each column is seen from where the lidar is at its time; else a whole scan is
+        seen from where the lidar is at its stamp.
+
+    Raises
+    ------
+    ConfigError
+        If the number of scans is not positive.
+
+    """
+
+    world: World
+    lidar: Lidar = field(default_factory=Lidar)
+    drive: Drive = None  # type: ignore[assignment]  # filled in when made
+    num_scans: int = field(default=100, kw_only=True)
+    rolling: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        """Fill in the drive and check the number of scans."""
+        if self.drive is None:
+            object.__setattr__(self, 'drive', Drive(start=self.world.start))
+        if self.num_scans < 1:
+            raise ConfigError(f'scans: {self.num_scans}, expected one or more')
+
+    def stamp_ns(self, number: int) -> int:
+        """Return the stamp of a scan, which is when its turn begins."""
+        return self.drive.start_ns + round(number * 1e9 / self.lidar.rate_hz)
+
+    def scan(self, number: int, frame_id: str = 'lidar') -> Scan:
+        """Return a scan, the same whatever was simulated before; see Lidar.scan."""
+        stamp_ns = self.stamp_ns(number)
+        if self.rolling:
+            delays = np.rint(self.lidar.column_times() * 1e9).astype(np.int64).tolist()
+            pose = np.array([self.drive.T_odom_sensor(stamp_ns + delay) for delay in delays])
+        else:
+            pose = self.drive.T_odom_sensor(stamp_ns)
+        return self.lidar.scan(
+            self.world, pose, stamp_ns=stamp_ns, frame_id=frame_id, number=number
+        )
+
+    def scans(self) -> Iterator[Scan]:
+        """Yield all scans in order."""
+        for number in range(self.num_scans):
+            yield self.scan(number)
+
+
+def _sines(along: float, waves: tuple[tuple[float, float], ...]) -> tuple[float, float]:
+    """Return the sum of sines at a distance, and its slope."""
+    value = slope = 0.0
+    for amplitude, length in waves:
+        turn = 2.0 * math.pi / length
+        value += amplitude * math.sin(turn * along)
+        slope += amplitude * turn * math.cos(turn * along)
+    return value, slope

@@ -1,0 +1,124 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Primitive: one analytic thing of a simulated world, in terms a person writes down.
+
+The pose is kept as position and quaternion, not as a matrix, so that a world read back from its
+file casts the same rays to the last bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.kernels.surfaces import BOX, CYLINDER, RECTANGLE, SPHERE, TUBE
+
+KINDS = {
+    'rectangle': (RECTANGLE, ('x', 'y')),
+    'box': (BOX, ('x', 'y', 'z')),
+    'cylinder': (CYLINDER, ('radius', 'length')),
+    'tube': (TUBE, ('radius', 'length')),
+    'sphere': (SPHERE, ('radius',)),
+}
+"""Every kind with its number in the kernels and what its sizes are."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Primitive:
+    """
+    A surface or solid with a pose.
+
+    Attributes
+    ----------
+    kind : str
+        rectangle: bounded plane z = 0, outward is +z. box: solid. cylinder: about z, with caps;
+        tube: the same without them. sphere: solid.
+    size_m : tuple of float, m
+        rectangle: whole extent in x and y. box: in x, y and z. cylinder and tube: radius and
+        length. sphere: radius.
+    xyz : (3,) float, m
+        Where its centre is in the world.
+    q_xyzw : (4,) float
+        How its axes are turned in the world.
+    reflectivity : float
+        In [0, 1]: scales the intensity that a lidar sees.
+    label : str
+        What it stands for: ground, building, car, ...
+
+    Raises
+    ------
+    ValueError
+        If the kind is unknown, sizes are not as many as the kind has or not positive and finite,
+        the pose is none, or the reflectivity is out of bounds.
+
+    """
+
+    kind: str
+    size_m: tuple[float, ...]
+    xyz: tuple[float, ...] = (0.0, 0.0, 0.0)
+    q_xyzw: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+    reflectivity: float = 0.5
+    label: str = ''
+
+    def __post_init__(self) -> None:
+        """Check everything; sequences of numbers become tuples of float."""
+        if self.kind not in KINDS:
+            raise ValueError(f'kind: {self.kind!r}, expected one of {", ".join(KINDS)}')
+        for name in ('size_m', 'xyz', 'q_xyzw'):
+            object.__setattr__(self, name, tuple(float(v) for v in getattr(self, name)))
+        names = KINDS[self.kind][1]
+        if len(self.size_m) != len(names) or not all(0.0 < v < math.inf for v in self.size_m):
+            raise ValueError(
+                f'size_m of a {self.kind}: {self.size_m}, '
+                f'expected {" ".join(names)}, positive and finite'
+            )
+        if not 0.0 <= self.reflectivity <= 1.0:
+            raise ValueError(f'reflectivity: {self.reflectivity}, expected a value in [0, 1]')
+        pose_matrix(self.xyz, self.q_xyzw)
+
+    @property
+    def T_world_primitive(self) -> npt.NDArray[np.float64]:
+        """The pose, (4, 4) float64."""
+        return pose_matrix(self.xyz, self.q_xyzw)
+
+    @property
+    def half_m(self) -> tuple[float, float, float]:
+        """Half the extent along its own axes, m; 0 across a rectangle."""
+        first = self.size_m[0]
+        if self.kind == 'sphere':
+            return first, first, first
+        if self.kind in ('cylinder', 'tube'):
+            return first, first, self.size_m[1] / 2.0
+        depth = self.size_m[2] if self.kind == 'box' else 0.0
+        return first / 2.0, self.size_m[1] / 2.0, depth / 2.0
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all attributes as plain values, ready for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Primitive:
+        """
+        Return the primitive that to_mapping described.
+
+        Raises
+        ------
+        FileFormatError
+            If an attribute is unknown or missing, or a value is refused.
+
+        """
+        unknown = set(mapping) - {field.name for field in fields(cls)}
+        if unknown:
+            raise FileFormatError(f'{", ".join(sorted(unknown))}: no attribute of a primitive')
+        try:
+            return cls(**mapping)
+        except (TypeError, ValueError) as error:
+            raise FileFormatError(str(error)) from error

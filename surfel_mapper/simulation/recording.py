@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Record a simulation as a bag, with all that is needed to know its truth beside the messages.
+
+The bag holds /points (PointCloud2 in the frame lidar), /odom and /tf (odom to base_link, one of
+each at every scan's stamp), and /tf_static (base_link to lidar). Poses are recorded at their
+stamp and a cloud when its turn is over, as a driver would. The directory also holds world.json
+and simulation.json, from which load_simulation makes the same simulation again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+import heapq
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.io.bag_writer import BagWriter, StampedPose
+from surfel_mapper.io.pointcloud2 import CloudBytes, Field
+from surfel_mapper.scan import Scan
+from surfel_mapper.simulation.drive import Drive, Simulation
+from surfel_mapper.simulation.lidar import Lidar
+from surfel_mapper.simulation.world import World
+
+ODOM, BASE, SENSOR = 'odom', 'base_link', 'lidar'
+"""Names of the frames."""
+
+ODOMETRY_STEP_NS = 10_000_000
+"""A pose is recorded every so often, and at every scan's stamp."""
+
+DRIVER_DELAY_NS = 2_000_000
+"""From the end of a turn to the recording of its cloud."""
+
+WORLD_FILE, SIMULATION_FILE = 'world.json', 'simulation.json'
+
+POINT = np.dtype(
+    {
+        'names': ['x', 'y', 'z', 'intensity', 'ring', 'time'],
+        'formats': ['<f4', '<f4', '<f4', '<f4', '<u2', '<f4'],
+        'offsets': [0, 4, 8, 16, 20, 24],
+        'itemsize': 32,
+    }
+)
+"""A point as drivers lay it out, with padding."""
+
+FIELDS = (
+    Field('x', 0, 7, 1),
+    Field('y', 4, 7, 1),
+    Field('z', 8, 7, 1),
+    Field('intensity', 16, 7, 1),
+    Field('ring', 20, 4, 1),
+    Field('time', 24, 7, 1),
+)
+
+
+def record(
+    simulation: Simulation,
+    path: str | Path,
+    *,
+    storage: str = 'mcap',
+    overwrite: bool = False,
+    on_scan: Callable[[Scan], None] | None = None,
+) -> None:
+    """
+    Write a simulation as a rosbag2 directory, whole or not at all.
+
+    Parameters
+    ----------
+    simulation : Simulation
+        What to write.
+    path : str or Path
+        Directory of the bag.
+    storage : str
+        mcap or sqlite3.
+    overwrite : bool
+        Whether a bag of that name gives way.
+    on_scan : callable, optional
+        Called with each scan once it is written.
+
+    Raises
+    ------
+    BagError
+        If something is at the path that may not be overwritten, or writing fails.
+
+    """
+    with BagWriter(path, storage, overwrite=overwrite) as bag:
+        _write_description(simulation, bag.directory)
+        drive = simulation.drive
+        mount = drive.base_to_sensor
+        static = StampedPose(drive.start_ns, BASE, SENSOR, mount[:3], mount[3:])
+        bag.write_transform('/tf_static', drive.start_ns, static, latched=True)
+        for record_ns, number in heapq.merge(_pose_times(simulation), _scan_times(simulation)):
+            if number < 0:
+                pose = StampedPose(record_ns, ODOM, BASE, *drive.pose(record_ns))
+                bag.write_odometry('/odom', record_ns, pose, drive.twist(record_ns))
+                bag.write_transform('/tf', record_ns, pose)
+            else:
+                scan = simulation.scan(number, SENSOR)
+                cloud = cloud_bytes(scan, simulation.lidar.beams)
+                bag.write_cloud('/points', record_ns, scan.stamp_ns, SENSOR, cloud)
+                if on_scan is not None:
+                    on_scan(scan)
+
+
+def cloud_bytes(scan: Scan, beams: int) -> CloudBytes:
+    """Return an organised PointCloud2 of a simulated scan, one row a beam."""
+    points = np.zeros(len(scan), POINT)
+    for axis, name in enumerate('xyz'):
+        points[name] = scan.points[:, axis]
+    for name in ('intensity', 'ring', 'time'):
+        points[name] = scan.columns[name]
+    width = len(scan) // beams
+    return CloudBytes(
+        height=beams,
+        width=width,
+        fields=FIELDS,
+        is_bigendian=False,
+        point_step=POINT.itemsize,
+        row_step=POINT.itemsize * width,
+        data=points.view(np.uint8),
+        is_dense=bool(np.isfinite(scan.points).all()),
+    )
+
+
+def load_simulation(path: str | Path) -> Simulation:
+    """
+    Return the simulation that a bag was recorded from.
+
+    Parameters
+    ----------
+    path : str or Path
+        Directory of the bag.
+
+    Raises
+    ------
+    FileFormatError
+        If its world.json or simulation.json is missing or damaged.
+
+    """
+    world = World.load(Path(path) / WORLD_FILE)
+    file = Path(path) / SIMULATION_FILE
+    try:
+        found = json.loads(file.read_text(encoding='utf-8'))
+        lidar, drive = Lidar(**_tuples(found['lidar'])), Drive(**_tuples(found['drive']))
+        return Simulation(
+            world, lidar, drive, num_scans=found['num_scans'], rolling=found['rolling']
+        )
+    except OSError as error:
+        raise FileFormatError(f'{file}: cannot be read: {error.strerror}') from error
+    except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
+        raise FileFormatError(f'{file}: {type(error).__name__} {error}') from error
+
+
+def _write_description(simulation: Simulation, directory: Path) -> None:
+    """Write world.json and simulation.json."""
+    simulation.world.save(directory / WORLD_FILE)
+    description = {
+        'lidar': asdict(simulation.lidar),
+        'drive': asdict(simulation.drive),
+        'num_scans': simulation.num_scans,
+        'rolling': simulation.rolling,
+    }
+    text = json.dumps(description, indent=1) + '\n'
+    (directory / SIMULATION_FILE).write_text(text, encoding='utf-8')
+
+
+def _tuples(values: dict[str, Any]) -> dict[str, Any]:
+    """Return the values with lists, which JSON makes of tuples, turned back."""
+    return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+
+
+def _turn_ns(simulation: Simulation) -> int:
+    """Return how long a turn of the lidar takes."""
+    return round(1e9 / simulation.lidar.rate_hz)
+
+
+def _pose_times(simulation: Simulation) -> Iterator[tuple[int, int]]:
+    """Yield when poses are recorded, each once, until the last turn is over; and -1."""
+    start = simulation.drive.start_ns
+    scans = [simulation.stamp_ns(number) for number in range(simulation.num_scans)]
+    end = scans[-1] + _turn_ns(simulation)
+    steps = range(start, end + ODOMETRY_STEP_NS, ODOMETRY_STEP_NS)
+    for stamp_ns in sorted({*steps, *scans}):
+        yield stamp_ns, -1
+
+
+def _scan_times(simulation: Simulation) -> Iterator[tuple[int, int]]:
+    """Yield when clouds are recorded, and the number of the scan."""
+    delay = _turn_ns(simulation) + DRIVER_DELAY_NS
+    for number in range(simulation.num_scans):
+        yield simulation.stamp_ns(number) + delay, number

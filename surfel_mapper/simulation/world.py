@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+World: analytic primitives that rays can be cast against, and the truth about their surfaces.
+
+A surface is a number: a plane, the side of a cylinder, a sphere. The six faces of a box are six
+surfaces, so that points of one plane can be told from points of one thing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.kernels import raycast, surfaces
+from surfel_mapper.simulation.primitives import KINDS, Primitive
+from surfel_mapper.simulation.street import street_pose, street_primitives
+from surfel_mapper.simulation.tree import bounding_boxes, build_tree
+
+FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
+
+FORMAT = 'surfel_mapper world 1'
+"""First entry of a world's file."""
+
+
+class World:
+    """
+    A world of analytic primitives.
+
+    Parameters
+    ----------
+    primitives : sequence of Primitive
+        Solids may overlap; surfaces inside other solids are there all the same.
+    start : (7,) float
+        Pose x y z (m) qx qy qz qw from which drives begin: on the ground, x ahead, z up.
+
+    Raises
+    ------
+    ValueError
+        If the start is no pose.
+
+    """
+
+    def __init__(
+        self,
+        primitives: Sequence[Primitive],
+        start: Sequence[float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0),
+    ) -> None:
+        self.primitives = tuple(primitives)
+        self.start = tuple(float(value) for value in start)
+        self.T_world_start = pose_matrix(self.start[:3], self.start[3:])
+        self._kind = np.array([KINDS[p.kind][0] for p in self.primitives], dtype=np.int64)
+        poses = [p.T_world_primitive[:3] for p in self.primitives]
+        self._pose = np.array(poses, dtype=np.float64).reshape(-1, 3, 4)
+        halves = [p.half_m for p in self.primitives]
+        self._half = np.array(halves, dtype=np.float64).reshape(-1, 3)
+        tree = build_tree(bounding_boxes(self._pose, self._half))
+        self._tables = (self._kind, self._pose, self._half, tree.box, tree.next, tree.primitive)
+        self._reflectivity = np.array([p.reflectivity for p in self.primitives])
+
+    @classmethod
+    def street(cls, *, seed: int = 0, length_m: float = 200.0) -> World:
+        """
+        Return a street canyon, tilted and turned off the grid; the same for the same arguments.
+
+        Parameters
+        ----------
+        seed : int
+            Where things stand and how they are turned.
+        length_m : float
+            How far a drive can go; the street goes on beyond both ends.
+
+        Raises
+        ------
+        ConfigError
+            If the seed is negative or the length is not positive and finite.
+
+        """
+        return cls(street_primitives(seed, length_m), street_pose())
+
+    def raycast(
+        self, origins: npt.ArrayLike, directions: npt.ArrayLike, max_range_m: float = np.inf
+    ) -> tuple[FloatArray, IntArray, FloatArray]:
+        """
+        Return what rays hit first.
+
+        Parameters
+        ----------
+        origins : (N, 3) or (3,) float64, m
+            In the world.
+        directions : (N, 3) float64
+            Unit vectors in the world.
+        max_range_m : float
+            Nothing farther is hit.
+
+        Returns
+        -------
+        range_m : (N,) float64
+            Distance, inf where nothing is hit.
+        surface : (N,) int64
+            The surface, -1 where nothing is hit.
+        normal : (N, 3) float64
+            Its outward normal there, nan where nothing is hit. From inside a solid, and from
+            behind a rectangle, it points along the ray.
+
+        Raises
+        ------
+        ValueError
+            If shapes do not fit, a direction is no unit vector, or an origin is not finite.
+
+        """
+        start = _rows(origins, 'origins')
+        ahead = _rows(directions, 'directions')
+        if len(start) not in (1, len(ahead)):
+            raise ValueError(f'origins: {len(start)} rows for {len(ahead)} directions')
+        if not np.isfinite(start).all():
+            raise ValueError('origins: not all finite')
+        if not (np.abs(np.einsum('ij,ij->i', ahead, ahead) - 1.0) < 1e-6).all():
+            raise ValueError('directions: not all unit vectors')
+        range_m = np.full(len(ahead), max_range_m, dtype=np.float64)
+        surface = np.empty(len(ahead), dtype=np.int64)
+        raycast.cast(start, ahead, *self._tables, range_m, surface)
+        range_m[surface < 0] = np.inf
+        places = start + np.where(surface < 0, 0.0, range_m)[:, None] * ahead
+        return range_m, surface, self._normals(places, surface)
+
+    def surface_at(self, positions: npt.ArrayLike) -> tuple[IntArray, FloatArray, FloatArray]:
+        """
+        Return the surface nearest to each position.
+
+        Parameters
+        ----------
+        positions : (N, 3) float64, m
+            In the world, on either side of the surface or on it.
+
+        Returns
+        -------
+        surface : (N,) int64
+            -1 for positions that are not finite, and in an empty world.
+        distance_m : (N,) float64
+            How far it is, inf where there is none.
+        normal : (N, 3) float64
+            Its outward unit normal there, nan where there is none.
+
+        """
+        places = _rows(positions, 'positions')
+        surface = np.empty(len(places), dtype=np.int64)
+        distance_m = np.empty(len(places))
+        surfaces.nearest_surface(places, *self._tables, distance_m, surface)
+        return surface, distance_m, self._normals(places, surface)
+
+    def normal_at(self, positions: npt.ArrayLike) -> FloatArray:
+        """Return the (N, 3) outward normals of the surfaces nearest to (N, 3) positions, m."""
+        return self.surface_at(positions)[2]
+
+    def primitive_of(self, surface: IntArray) -> IntArray:
+        """Return the index of the primitive that each surface belongs to; -1 for -1."""
+        return np.where(surface < 0, -1, surface // surfaces.FACES)
+
+    def is_plane(self, surface: IntArray) -> npt.NDArray[np.bool_]:
+        """Return whether each surface is flat: rectangles, faces of boxes, caps; not -1."""
+        kind = np.append(self._kind, -1)[self.primitive_of(surface)]
+        cap = (kind == surfaces.CYLINDER) & (surface % surfaces.FACES > 0)
+        plane: npt.NDArray[np.bool_] = np.isin(kind, (surfaces.RECTANGLE, surfaces.BOX)) | cap
+        return plane
+
+    def reflectivity(self, surface: IntArray) -> FloatArray:
+        """Return the reflectivity of each surface in [0, 1], nan for -1."""
+        return np.append(self._reflectivity, np.nan)[self.primitive_of(surface)]
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the world as plain values, ready for JSON."""
+        primitives = [primitive.to_mapping() for primitive in self.primitives]
+        return {'format': FORMAT, 'start': list(self.start), 'primitives': primitives}
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> World:
+        """
+        Return the world that to_mapping described.
+
+        Raises
+        ------
+        FileFormatError
+            If it is no such description, or a value in it is refused.
+
+        """
+        found = mapping.get('format') if isinstance(mapping, Mapping) else type(mapping).__name__
+        if found != FORMAT:
+            raise FileFormatError(f'format: {found!r}, expected {FORMAT!r}')
+        try:
+            primitives = [Primitive.from_mapping(entry) for entry in mapping['primitives']]
+            return cls(primitives, mapping['start'])
+        except (KeyError, TypeError, AttributeError) as error:
+            raise FileFormatError(f'not a world: {type(error).__name__} {error}') from error
+        except ValueError as error:
+            raise FileFormatError(f'not a world: {error}') from error
+
+    def save(self, path: str | Path) -> None:
+        """Write the world to a JSON file."""
+        Path(path).write_text(json.dumps(self.to_mapping(), indent=1) + '\n', encoding='utf-8')
+
+    @classmethod
+    def load(cls, path: str | Path) -> World:
+        """
+        Read the world of a file that save wrote.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be read or holds no world.
+
+        """
+        try:
+            return cls.from_mapping(json.loads(Path(path).read_text(encoding='utf-8')))
+        except OSError as error:
+            raise FileFormatError(f'{path}: cannot be read: {error.strerror}') from error
+        except ValueError as error:
+            raise FileFormatError(f'{path}: {error}') from error
+
+    def _normals(self, places: FloatArray, surface: IntArray) -> FloatArray:
+        """Return the (N, 3) outward normals of surfaces at positions on or near them."""
+        normals = np.empty((len(places), 3))
+        surfaces.outward_normals(places, surface, self._kind, self._pose, normals)
+        return normals
+
+
+def _rows(values: npt.ArrayLike, name: str) -> FloatArray:
+    """Return (N, 3) float64, contiguous; a single triple is one row."""
+    rows = np.ascontiguousarray(np.atleast_2d(values), dtype=np.float64)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise ValueError(f'{name}: shape {rows.shape}, expected (N, 3)')
+    return rows
