@@ -20,26 +20,17 @@ import hashlib
 from itertools import takewhile
 import math
 import struct
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
-from surfel_mapper.kernels import hashing, layout
-from surfel_mapper.kernels.surfels import rows_changed_after, rows_changed_at
-from surfel_mapper.kernels.voxels import (
-    add_moments,
-    find_rows,
-    first_missing,
-    subtract_moments,
-)
+from surfel_mapper.kernels import layout
+from surfel_mapper.kernels.surfels import rows_changed_at
+from surfel_mapper.mapping.levels import coarse_moments
 from surfel_mapper.mapping.moments import Reducer, ScanMoments, unpack_keys
-from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.mapping.surfels import derive, Surfels
-
-MAX_DEPTH = 24
-"""The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
+from surfel_mapper.mapping.voxel_table import VoxelTable
 
 LOGGED = 1 << 18
 """At least so many changes are remembered, so that asking for the latest ones is quick."""
@@ -78,14 +69,7 @@ class SurfelMap:
         self._reset()
 
     def _reset(self) -> None:
-        self._rows = Slab(1024, layout.ROW)
-        self._buckets = Slab(1, hashing.SEGMENT)
-        self._directory = np.zeros(1, np.int32)
-        self._held = np.zeros(1, np.int32)
-        self._local_depth = np.zeros(1, np.int8)
-        self._state = np.zeros(hashing.STATE, np.int64)
-        self._state[hashing.FREE_ROW] = -1
-        self._state[hashing.SEGMENTS] = 1
+        self._table = VoxelTable()
         self._log: deque[tuple[int, npt.NDArray[np.int32]]] = deque()
         self._logged = 0
         self._log_start = self.version
@@ -98,19 +82,17 @@ class SurfelMap:
     @property
     def num_voxels(self) -> int:
         """Voxels that hold at least one point."""
-        return int(self._state[hashing.VOXELS])
+        return self._table.num_voxels
 
     @property
     def num_points(self) -> int:
         """Points in the map."""
-        return int(self._state[hashing.POINTS])
+        return self._table.num_points
 
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
-        rows = int(self._state[hashing.ROWS_USED]) * layout.ROW * 8
-        buckets = int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
-        return rows + buckets + self._directory.nbytes + self._held.nbytes
+        return self._table.nbytes
 
     def add(self, points: npt.ArrayLike, origin: npt.ArrayLike | None = None) -> ScanMoments:
         """
@@ -193,27 +175,7 @@ class SurfelMap:
         self._check_lattice(moments)
         self._check_counts(moments)
         self.version += 1
-        changed = np.empty(len(moments), np.int32)
-        self._state[hashing.CHANGED] = 0
-        done = 0
-        while done < len(moments):
-            done = add_moments(
-                moments.arrays,
-                moments.view_is_sum,
-                self._rows.array,
-                self._table,
-                self._state,
-                self.version,
-                done,
-                changed,
-            )
-            if done < len(moments):
-                try:
-                    self._make_room()
-                except MapLimitError:
-                    self.remove(moments.first(done))
-                    raise
-        self._remember(changed[: self._state[hashing.CHANGED]])
+        self._remember(self._table.add(moments, self.version))
 
     def remove(self, moments: ScanMoments, min_points: int = 1) -> npt.NDArray[np.int32]:
         """
@@ -242,8 +204,8 @@ class SurfelMap:
 
         """
         self._check_lattice(moments)
-        found = self._find(moments.key)
-        missing = first_missing(moments.arrays, moments.view_is_sum, self._rows.array, found)
+        found = self._table.find(moments.key)
+        missing = self._table.first_missing(moments, found)
         if missing >= 0:
             index = moments.voxel_index[missing].tolist()
             raise NotInMapError(
@@ -251,20 +213,9 @@ class SurfelMap:
                 'removed; were these moments added to this map, and only removed once?'
             )
         self.version += 1
-        fallen = np.empty(len(moments), np.int64)
-        num_fallen = subtract_moments(
-            moments.arrays,
-            moments.view_is_sum,
-            self._rows.array,
-            self._table,
-            self._state,
-            self.version,
-            found,
-            max(min_points, 1),
-            fallen,
-        )
+        fallen = self._table.subtract(moments, self.version, found, min_points)
         self._remember(found)
-        return unpack_keys(fallen[:num_fallen])
+        return unpack_keys(fallen)
 
     def merge(self, other: SurfelMap) -> None:
         """
@@ -278,9 +229,58 @@ class SurfelMap:
         """
         self.insert(other.moments())
 
+    def subtract(self, other: SurfelMap) -> None:
+        """
+        Remove all that another map of equal voxel size holds: the exact inverse of ``merge``.
+
+        Raises
+        ------
+        MapError
+            If the voxel sizes differ.
+        NotInMapError
+            If this map does not hold all of it. Nothing has changed then.
+
+        """
+        self.remove(other.moments())
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether two maps hold the same, to the bit."""
+        if not isinstance(other, SurfelMap):
+            return NotImplemented
+        return self.num_voxels == other.num_voxels and self.digest() == other.digest()
+
+    __hash__ = None  # type: ignore[assignment]  # a map changes
+
+    def coarsen(self, level: int) -> SurfelMap:
+        """
+        Return the map of voxels 2^level times larger, from the moments of this one alone.
+
+        The lattice unit stays that of the finer map, so count, sum and second moment are those
+        of the quantised points regrouped, to the bit. View sums are added as they are; they
+        were taken from the centres of the finer voxels.
+
+        Parameters
+        ----------
+        level : int
+            1 doubles the edge of a voxel; 0 copies the map.
+
+        Raises
+        ------
+        ValueError
+            If the level is negative or makes a voxel of more than 2^20 finer ones an axis.
+        MapLimitError
+            If a voxel would hold more than 2^31 / 4^level points.
+
+        """
+        if not 0 <= level <= layout.INDEX_BITS - 1:
+            raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
+        coarse = SurfelMap(self.voxel_size_m * 2**level, level=self.level + level)
+        coarse.insert(coarse_moments(self.moments(), level))
+        return coarse
+
     def surfels(self, min_points: int = 1) -> Surfels:
         """Return the surfels of all voxels with at least so many points, in no stated order."""
-        return self._derive(self._changed_after(-1, min_points))
+        return self._derive(self._table.changed_after(-1, min_points))
 
     def surfels_changed(self, since: int | None = None, min_points: int = 1) -> Surfels:
         """
@@ -297,17 +297,16 @@ class SurfelMap:
         if since is None:
             since, self._reported = self._reported, self.version
         if since < self._log_start:
-            return self._derive(self._changed_after(since, min_points))
+            return self._derive(self._table.changed_after(since, min_points))
         parts = [
-            rows_changed_at(self._rows.array, changed, version, max(min_points, 1))
+            rows_changed_at(self._table.rows, changed, version, max(min_points, 1))
             for version, changed in takewhile(lambda entry: entry[0] > since, reversed(self._log))
         ]
         return self._derive(np.concatenate(parts) if parts else np.empty(0, np.int32))
 
     def moments(self) -> ScanMoments:
         """Return the exact moments of all voxels, sorted by voxel; a copy."""
-        chosen = self._changed_after(-1, 1)
-        rows = self._rows.array[chosen]
+        rows = self._table.rows[self._table.changed_after(-1, 1)]
         rows = rows[np.argsort(rows[:, layout.KEY])]
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
@@ -347,26 +346,8 @@ class SurfelMap:
         self.version += 1
         self._reset()
 
-    @property
-    def _table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The hash table as the kernels take it."""
-        buckets = self._buckets.array.reshape(-1)
-        return self._directory, buckets, self._held, self._local_depth
-
     def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
-        return derive(self._rows.array, chosen, self.voxel_size_m, layout.BITS + self.level)
-
-    def _changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
-        used = int(self._state[hashing.ROWS_USED])
-        return np.asarray(
-            rows_changed_after(self._rows.array, used, version, max(min_points, 1))
-        )
-
-    def _find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-        """Return the row of each voxel, -1 where there is none."""
-        found = np.empty(len(key), np.int32)
-        find_rows(key, self._rows.array, self._table, self._state, found)
-        return found
+        return derive(self._table.rows, chosen, self.voxel_size_m, layout.BITS + self.level)
 
     def _remember(self, changed: npt.NDArray[np.int32]) -> None:
         """Log the rows that the present version changed; forget the oldest beyond a bound."""
@@ -377,24 +358,6 @@ class SurfelMap:
         while self._logged > max(LOGGED, self.num_voxels):
             self._log_start, forgotten = self._log.popleft()
             self._logged -= len(forgotten)
-
-    def _make_room(self) -> None:
-        """Enlarge what kept add_moments from placing a new voxel."""
-        rows, segments = self._rows.array, len(self._held)
-        if self._state[hashing.FREE_ROW] < 0 and self._state[hashing.ROWS_USED] == len(rows):
-            del rows
-            self._rows.grow(2 * int(self._state[hashing.ROWS_USED]))
-        elif self._state[hashing.SEGMENTS] == segments:
-            self._buckets.grow(2 * segments)
-            self._held = np.concatenate([self._held, np.zeros_like(self._held)])
-            self._local_depth = np.concatenate(
-                [self._local_depth, np.zeros_like(self._local_depth)]
-            )
-        else:
-            if self._state[hashing.DEPTH] == MAX_DEPTH:
-                raise MapLimitError(f'{self.num_voxels} voxels: the hash table is full')
-            self._directory = np.repeat(self._directory, 2)
-            self._state[hashing.DEPTH] += 1
 
     def _check_lattice(self, moments: ScanMoments) -> None:
         if (moments.voxel_size_m, moments.level) != (self.voxel_size_m, self.level):
@@ -408,8 +371,8 @@ class SurfelMap:
         limit = layout.MAX_MAP_COUNT >> (2 * self.level)
         if self.num_points + moments.num_points <= limit:
             return  # the usual case: not even all points together are too many
-        found = self._find(moments.key)
-        held = np.where(found >= 0, self._rows.array[found, layout.COUNT], 0)
+        found = self._table.find(moments.key)
+        held = np.where(found >= 0, self._table.rows[found, layout.COUNT], 0)
         largest = int((held + moments.count).max(initial=0))
         if largest > limit:
             raise MapLimitError(

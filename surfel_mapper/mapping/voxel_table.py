@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+VoxelTable: the memory of a map, one row of integers a voxel, found by hash.
+
+Owns the arrays that the kernels work on and makes them larger when a kernel asks for room. Rows
+and buckets grow without being copied and a full part of the hash table splits on its own, so
+that no scan waits for the whole map.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels import hashing, layout
+from surfel_mapper.kernels.surfels import rows_changed_after
+from surfel_mapper.kernels.voxels import (
+    add_moments,
+    find_rows,
+    first_missing,
+    subtract_moments,
+)
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.slab import Slab
+
+MAX_DEPTH = 24
+"""The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
+
+
+class VoxelTable:
+    """Rows of voxels, laid out as kernels/layout.py says, and the hash table that finds them."""
+
+    def __init__(self) -> None:
+        """Make an empty table."""
+        self._rows = Slab(1024, layout.ROW)
+        self._buckets = Slab(1, hashing.SEGMENT)
+        self._directory = np.zeros(1, np.int32)
+        self._held = np.zeros(1, np.int32)
+        self._local_depth = np.zeros(1, np.int8)
+        self._state = np.zeros(hashing.STATE, np.int64)
+        self._state[hashing.FREE_ROW] = -1
+        self._state[hashing.SEGMENTS] = 1
+
+    @property
+    def rows(self) -> npt.NDArray[np.int64]:
+        """The rows, (R, 16) int64; only until the table grows."""
+        return self._rows.array
+
+    @property
+    def num_voxels(self) -> int:
+        """Voxels that hold at least one point."""
+        return int(self._state[hashing.VOXELS])
+
+    @property
+    def num_points(self) -> int:
+        """Points of all voxels."""
+        return int(self._state[hashing.POINTS])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use for voxels and their hash table."""
+        rows = int(self._state[hashing.ROWS_USED]) * layout.ROW * 8
+        buckets = int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
+        return rows + buckets + self._directory.nbytes + self._held.nbytes
+
+    def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
+        """
+        Add moments to their voxels; return the rows changed, each once.
+
+        Raises
+        ------
+        MapLimitError
+            If there is no room for the voxels; the table holds what it held before.
+
+        """
+        changed = np.empty(len(moments), np.int32)
+        self._state[hashing.CHANGED] = 0
+        done = 0
+        while done < len(moments):
+            done = add_moments(
+                moments.arrays,
+                moments.view_is_sum,
+                self.rows,
+                self._hash_table,
+                self._state,
+                version,
+                done,
+                changed,
+            )
+            if done < len(moments):
+                self._make_room_or_undo(moments.first(done), version)
+        return changed[: self._state[hashing.CHANGED]]
+
+    def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+        """Return the row of each voxel key, -1 where there is none."""
+        found = np.empty(len(key), np.int32)
+        find_rows(key, self.rows, self._hash_table, self._state, found)
+        return found
+
+    def first_missing(self, moments: ScanMoments, found: npt.NDArray[np.int32]) -> int:
+        """Return the first voxel that does not hold its moments in its row found, or -1."""
+        return int(first_missing(moments.arrays, moments.view_is_sum, self.rows, found))
+
+    def subtract(
+        self,
+        moments: ScanMoments,
+        version: int,
+        found: npt.NDArray[np.int32],
+        min_points: int = 1,
+    ) -> npt.NDArray[np.int64]:
+        """Subtract moments from the rows found; return the keys that fell below min_points."""
+        fallen = np.empty(len(moments), np.int64)
+        num_fallen = subtract_moments(
+            moments.arrays,
+            moments.view_is_sum,
+            self.rows,
+            self._hash_table,
+            self._state,
+            version,
+            found,
+            max(min_points, 1),
+            fallen,
+        )
+        return fallen[:num_fallen]
+
+    def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
+        """Return the rows changed after a version that hold at least so many points."""
+        used = int(self._state[hashing.ROWS_USED])
+        return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
+
+    @property
+    def _hash_table(self) -> tuple[npt.NDArray[Any], ...]:
+        """The hash table as the kernels take it."""
+        buckets = self._buckets.array.reshape(-1)
+        return self._directory, buckets, self._held, self._local_depth
+
+    def _make_room_or_undo(self, added: ScanMoments, version: int) -> None:
+        """Make room for one more voxel; if that fails, take out again what was added."""
+        try:
+            self._make_room()
+        except MapLimitError:
+            self.subtract(added, version, self.find(added.key))
+            raise
+
+    def _make_room(self) -> None:
+        """Enlarge what kept add_moments from placing a new voxel."""
+        num_segments = len(self._held)
+        used = int(self._state[hashing.ROWS_USED])
+        if self._state[hashing.FREE_ROW] < 0 and used == len(self.rows):
+            self._rows.grow(2 * used)
+        elif self._state[hashing.SEGMENTS] == num_segments:
+            self._buckets.grow(2 * num_segments)
+            self._held = np.append(self._held, np.zeros_like(self._held))
+            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+        elif self._state[hashing.DEPTH] < MAX_DEPTH:
+            self._directory = np.repeat(self._directory, 2)
+            self._state[hashing.DEPTH] += 1
+        else:
+            raise MapLimitError(f'{self.num_voxels} voxels: the hash table is full')
