@@ -50,12 +50,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # whoever read the result has seen enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (SurfelMapperError, OSError) as error:
-        print(f'surfel-mapper {args.verb}: {error}', file=sys.stderr)
-        return 1
+    except SurfelMapperError as error:
+        return refused(args.verb, str(error))
+    except OSError as error:
+        named = error.filename and error.strerror
+        return refused(args.verb, f'{error.filename}: {error.strerror}' if named else str(error))
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130
+
+
+def refused(verb: str, message: str) -> int:
+    """Say why a verb ended without a result, and return the exit code of that."""
+    print(f'surfel-mapper {verb}: {message}', file=sys.stderr)
+    return 1
 
 
 def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:

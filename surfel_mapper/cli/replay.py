@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 from pathlib import Path
 import sys
 import time
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.config import load_config
     from surfel_mapper.io.bag import BagReader
     from surfel_mapper.io.bag_topics import CLOUD
+    from surfel_mapper.io.heap import keep_freed_memory
     from surfel_mapper.offline.replay import ALL_SCANS, pose_topics
     from surfel_mapper.pipeline import Mapper
 
@@ -65,6 +67,7 @@ def run(args: argparse.Namespace) -> int:
     with BagReader(args.bag) as reader:
         topic = reader.topics.choose(CLOUD, args.topic)
         poses = pose_topics(reader.topics, mapper.config, args.pose_topic)
+        keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
         mapper.warm_up()
         start = time.perf_counter()
         trajectory = map_bag(reader, mapper, topic, poses)
@@ -87,13 +90,17 @@ def run(args: argparse.Namespace) -> int:
 
 
 def output_directory(bag: Path, wanted: Path | None) -> Path:
-    """Return where to write, having refused a name that a file has already."""
+    """Return where to write; refuse what cannot be a directory before the work begins."""
     from surfel_mapper.errors import FileFormatError
 
     name = bag.resolve().stem if bag.is_file() else bag.resolve().name
     directory = wanted or Path(f'{name}_surfels')
-    if directory.exists() and not directory.is_dir():
-        raise FileFormatError(f'{directory}: a file, expected a directory to write to')
+    absolute = directory.absolute()
+    nearest = next(path for path in (absolute, *absolute.parents) if path.exists())
+    if not nearest.is_dir():
+        raise FileFormatError(f'{directory}: {nearest} is a file, expected a directory')
+    if not os.access(nearest, os.W_OK):
+        raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
 
 

@@ -59,7 +59,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
     ('error', 'code', 'says'),
     [
         (BagError('a.bag: odd'), 1, 'surfel-mapper replay: a.bag: odd\n'),
-        (OSError(28, 'No space left on device', 'a.ply'), 1, "No space left on device: 'a.ply'"),
+        (OSError(28, 'No space left', 'a.ply'), 1, 'surfel-mapper replay: a.ply: No space left'),
         (KeyboardInterrupt(), 130, 'surfel-mapper replay: interrupted\n'),
     ],
 )

@@ -4,6 +4,7 @@
 
 import json
 import logging
+import os
 from pathlib import Path
 
 import numpy as np
@@ -135,12 +136,23 @@ def test_a_damaged_bag_leaves_an_earlier_result_whole(tmp_path, capsys):
     assert {path.name: path.read_bytes() for path in output.iterdir()} == before
 
 
-def test_an_output_that_is_a_file_is_refused_before_the_work(bag, tmp_path, capsys):
+@pytest.mark.parametrize('name', ['out', 'out/a/b'])
+def test_an_output_that_cannot_be_a_directory_is_refused_before_the_work(
+    tmp_path, capsys, name
+):
     (tmp_path / 'out').write_text('mine')
 
-    assert main(['replay', str(bag), '--output', str(tmp_path / 'out')]) == 1
-    assert 'out: a file, expected a directory' in capsys.readouterr().err
+    assert main(['replay', str(tmp_path / 'no.bag'), '--output', str(tmp_path / name)]) == 1
+    assert 'out is a file, expected a directory' in capsys.readouterr().err
     assert (tmp_path / 'out').read_text() == 'mine'
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason='root may write anywhere')
+def test_an_output_without_permission_is_refused_before_the_work(tmp_path, capsys):
+    tmp_path.chmod(0o500)
+
+    assert main(['replay', str(tmp_path / 'no.bag'), '--output', str(tmp_path / 'out')]) == 1
+    assert 'no permission to write in' in capsys.readouterr().err
 
 
 def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
