@@ -206,11 +206,11 @@ def test_a_pose_has_the_same_bits_on_every_machine():
 
     # Written down once, for its bits; the tests above check the values. Only + - * / and sqrt in
     # a fixed order lead here, so a difference means a fused, reordered or approximate operation.
-    expected = '''
+    expected = """
         0x1.68ba9d12cdc74p-1 -0x1.555dc06091002p-1 -0x1.f1cc7a2f36d65p-3 0x1.8b30de5aaa500p-1
         0x1.7094131c03f77p-2 0x1.43080ff551a46p-1 -0x1.5fe5ddb1edc79p-1 -0x1.27fe93c5f14cep+2
         0x1.39239d13045cbp-1 0x1.964508ceb67bap-2 0x1.5e76764e75cd8p-1 -0x1.56a37af0af414p+2
-    '''
+    """
     assert [v.hex() for v in T_a_b[:3].ravel().tolist()] == expected.split()
 
 
