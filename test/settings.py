@@ -31,7 +31,7 @@ HEADER = """\
 
 # Every setting at its default, for the node (--params-file) and for replay (--config). Copy it
 # and keep only what you change. Written from surfel_mapper/config.py by `make settings`.
-# ROS is strict about types: write 2.0, not 2, where a number has a point here.
+# In a list write every number with a point: ROS refuses a file where 0 stands beside 0.5.
 
 /**:
   ros__parameters:
