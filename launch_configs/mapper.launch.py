@@ -25,7 +25,10 @@ ARGUMENTS = [
         'points', default_value='points', description='Topic of the clouds, PointCloud2.'
     ),
     DeclareLaunchArgument(
-        'odom', default_value='odom', description='Topic of the odometry or of the poses.'
+        'odom', default_value='odom', description='Topic of odometry, for pose.source odometry.'
+    ),
+    DeclareLaunchArgument(
+        'pose', default_value='pose', description='Topic of poses, for pose.source pose.'
     ),
     DeclareLaunchArgument(
         'fixed_frame',
@@ -57,7 +60,7 @@ def mapper_node(context: LaunchContext) -> list[Node]:
             name='surfel_mapper',
             output='screen',
             parameters=[values['config'], overrides],
-            remappings=[('points', values['points']), ('odom', values['odom'])],
+            remappings=[(topic, values[topic]) for topic in ('points', 'odom', 'pose')],
         )
     ]
 
