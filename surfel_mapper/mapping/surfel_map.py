@@ -278,6 +278,12 @@ class SurfelMap:
         coarse.insert(coarse_moments(self.moments(), level))
         return coarse
 
+    def copy(self) -> SurfelMap:
+        """Return a map of its own with the same content."""
+        other = SurfelMap(self.voxel_size_m, level=self.level)
+        other.insert(self.moments())
+        return other
+
     def surfels(self, min_points: int = 1) -> Surfels:
         """Return the surfels of all voxels with at least so many points, in no stated order."""
         return self._derive(self._table.changed_after(-1, min_points))

@@ -11,7 +11,7 @@ before old ones leave, so that a voxel seen by both never comes and goes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -148,11 +148,7 @@ class SlidingWindow:
 
         """
         self._map.insert(scan.moments)
-        if self._scans:
-            step = scan.T_map_sensor[:3, 3] - self._scans[-1][0].T_map_sensor[:3, 3]
-            self._travelled_m += float(np.sqrt((step * step).sum()))
-        self._scans.append((scan, self._travelled_m))
-        self._nbytes += scan.nbytes
+        self._append(scan)
         evicted = []
         while len(self._scans) > 1 and (limit := self._limit_reached()):
             evicted.append(self._evict(limit, min_points))
@@ -161,10 +157,32 @@ class SlidingWindow:
             self._num_settled += 1
         return evicted
 
+    def restore(self, scans: Iterable[WindowedScan]) -> None:
+        """
+        Take scans that the map holds already, oldest first, as a saved window.
+
+        Raises
+        ------
+        ValueError
+            If there are scans in the window.
+
+        """
+        if self._scans:
+            raise ValueError(f'{len(self._scans)} scans in the window, expected none')
+        for scan in scans:
+            self._append(scan)
+
     def clear(self) -> None:
         """Forget all scans and clear the map."""
         self._forget()
         self._map.clear()
+
+    def _append(self, scan: WindowedScan) -> None:
+        if self._scans:
+            step = scan.T_map_sensor[:3, 3] - self._scans[-1][0].T_map_sensor[:3, 3]
+            self._travelled_m += float(np.sqrt((step * step).sum()))
+        self._scans.append((scan, self._travelled_m))
+        self._nbytes += scan.nbytes
 
     @property
     def _keeps_nothing(self) -> bool:
