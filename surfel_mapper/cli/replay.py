@@ -30,8 +30,6 @@ SUMMARY = 'Map the clouds of a bag and write the map, a picture and figures.'
 
 EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
 
-NS_PER_S = 1e9
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -71,19 +69,16 @@ def run(args: argparse.Namespace) -> int:
         mapper.warm_up()
         start = time.perf_counter()
         trajectory = map_bag(reader, mapper, topic, poses)
-        seconds = time.perf_counter() - start
-        recorded_s = (reader.end_ns - reader.start_ns) / NS_PER_S
+        source = {
+            'bag': str(args.bag),
+            'topic': topic,
+            'pose_topics': [*poses.kinds, *poses.static],
+            'recorded_s': (reader.end_ns - reader.start_ns) / 1e9,
+            'replay_s': time.perf_counter() - start,
+            'window': args.window,
+        }
     refuse_empty(args.bag, topic, mapper)
-    summary = {
-        'bag': str(args.bag),
-        'topic': topic,
-        'pose_topics': [*poses.kinds, *poses.static],
-        'window': args.window,
-        'recorded_s': recorded_s,
-        'replay_s': seconds,
-        **mapper.summary(),
-        'settings': mapper.config.to_mapping(),
-    }
+    summary = {**source, **mapper.summary(), 'settings': mapper.config.to_mapping()}
     write(output, args.bag, mapper, trajectory, summary)
     print(json.dumps(summary) if args.json else report(summary, output))
     return 0
@@ -121,6 +116,7 @@ def map_bag(
         for update in replay(reader, mapper, topic, poses):
             positions.append(update.T_fixed_sensor[:3, 3])
             bar.update(mapper.counters.received - bar.n)
+        bar.update(mapper.counters.received - bar.n)
     return np.array(positions).reshape(-1, 3)
 
 

@@ -114,7 +114,7 @@ def replay(
     """
     Feed a bag to a mapper; yield what each scan did.
 
-    Clouds and poses that cannot be decoded are counted and warned about.
+    Clouds and poses that cannot be decoded are counted, the first of each is warned about.
 
     Raises
     ------
@@ -139,7 +139,8 @@ def add_cloud(reader: BagReader, mapper: Mapper, message: BagMessage) -> None:
     except CloudFormatError as error:
         mapper.counters.received += 1
         mapper.counters.dropped['bad_cloud'] += 1
-        log.warning('cloud recorded at %d ns dropped: %s', message.record_ns, error)
+        if mapper.counters.dropped['bad_cloud'] == 1:
+            log.warning('cloud dropped, others like it are only counted: %s', error)
         return
     mapper.add_scan(scan)
 
@@ -150,7 +151,8 @@ def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: Po
         decoded = reader.decode(message)
     except BagError as error:
         mapper.counters.messages_ignored['bad_message'] += 1
-        log.warning('message recorded at %d ns ignored: %s', message.record_ns, error)
+        if mapper.counters.messages_ignored['bad_message'] == 1:
+            log.warning('pose ignored, others like it are only counted: %s', error)
         return
     kind = topics.kinds.get(message.topic, 'tf')
     for pose in poses_in(kind, decoded, mapper.config.frames.base):
