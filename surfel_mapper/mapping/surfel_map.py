@@ -29,6 +29,7 @@ from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.surfels import rows_changed_at
 from surfel_mapper.mapping.levels import coarse_moments
 from surfel_mapper.mapping.moments import Reducer, ScanMoments, unpack_keys
+from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
@@ -287,6 +288,10 @@ class SurfelMap:
     def surfels(self, min_points: int = 1) -> Surfels:
         """Return the surfels of all voxels with at least so many points, in no stated order."""
         return self._derive(self._table.changed_after(-1, min_points))
+
+    def index(self, min_points: int = 1) -> SurfelIndex:
+        """Return the surfels with at least so many points, to be asked by place: a snapshot."""
+        return SurfelIndex(self.surfels(min_points), self.voxel_size_m, level=self.level)
 
     def surfels_changed(self, since: int | None = None, min_points: int = 1) -> Surfels:
         """

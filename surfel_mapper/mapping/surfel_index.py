@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+SurfelIndex: surfels that can be asked by place.
+
+A snapshot: it does not follow the map it was taken of, and any thread may ask it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.kernels.layout import BITS
+from surfel_mapper.kernels.queries import best_around, build_table, rows_at
+from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.surfels import Surfels
+
+
+class SurfelIndex:
+    """
+    Surfels of one map, found by place.
+
+    Parameters
+    ----------
+    surfels : Surfels
+        Those that are to be found; answers are row numbers of it.
+    voxel_size_m : float
+        Edge of a voxel of their map, m.
+    level : int
+        Level of their map.
+
+    """
+
+    def __init__(self, surfels: Surfels, voxel_size_m: float, *, level: int = 0) -> None:
+        """Build the hash table."""
+        self.surfels = surfels
+        self.voxel_size_m = voxel_size_m
+        self._bits = BITS + level
+        self._keys = pack_keys(surfels.voxel_index)
+        size = 1 << max(2 * len(surfels) - 1, 1).bit_length()
+        self._table = np.empty(size, np.int32)
+        build_table(self._keys, self._table)
+
+    def at(self, points: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """
+        Return the surfel of the voxel that each point lies in.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            In the frame of the map.
+
+        Returns
+        -------
+        (N,) int64
+            Rows of ``surfels``; -1 where there is none.
+
+        """
+        places = _places(points)
+        rows = np.empty(len(places), np.int64)
+        scale = (1 << self._bits) / self.voxel_size_m
+        rows_at(places, scale, self._bits, self._keys, self._table, rows)
+        return rows
+
+    def nearest(
+        self, points: npt.ArrayLike, max_distance_m: float
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """
+        Return the surfel whose position is nearest to each point.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            In the frame of the map.
+        max_distance_m : float
+            Surfels farther away do not count; the cost grows with its cube.
+
+        Returns
+        -------
+        rows : (N,) int64
+            Rows of ``surfels``; -1 where there is none.
+        distance : (N,) float64, m
+            To the position; inf where there is none.
+
+        """
+        places = _places(points)
+        rows = self._best(places, max_distance_m, 1, np.empty(0))[:, 0]
+        step = self._of(self.surfels.position, rows) - places
+        distance = np.sqrt((step * step).sum(axis=1))
+        return rows, np.where(rows >= 0, distance, math.inf)
+
+    def best_planar(
+        self, points: npt.ArrayLike, k: int, max_distance_m: float
+    ) -> npt.NDArray[np.int64]:
+        """
+        Return the most planar surfels around each point.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            In the frame of the map.
+        k : int
+            How many.
+        max_distance_m : float
+            From point to surfel position; the cost grows with its cube.
+
+        Returns
+        -------
+        (N, k) int64
+            Rows of ``surfels``, the most planar first; -1 where there are fewer. Surfels
+            without a planarity never count.
+
+        Raises
+        ------
+        ValueError
+            If k is not positive.
+
+        """
+        if k < 1:
+            raise ValueError(f'k: {k}, expected 1 or more')
+        return self._best(_places(points), max_distance_m, k, -self.surfels.planarity)
+
+    def in_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> npt.NDArray[np.int64]:
+        """Return the rows of the surfels in a box, m, faces included, in ascending order."""
+        position = self.surfels.position
+        lowest, highest = np.asarray(low, np.float64), np.asarray(high, np.float64)
+        if lowest.shape != (3,) or highest.shape != (3,):
+            raise ValueError('low, high: expected the corners of a box, x y z each')
+        return np.flatnonzero(((position >= lowest) & (position <= highest)).all(axis=1))
+
+    def in_radius(self, center: npt.ArrayLike, radius_m: float) -> npt.NDArray[np.int64]:
+        """Return the rows of the surfels at most so far from a point, in ascending order."""
+        step = self.surfels.position - _places(np.reshape(np.asarray(center), (1, 3)))
+        return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
+
+    def plane_distance(
+        self, points: npt.ArrayLike, max_distance_m: float = 0.0
+    ) -> npt.NDArray[np.float64]:
+        """
+        Return how far each point is from the plane of its surfel.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            In the frame of the map.
+        max_distance_m : float
+            0: the surfel of the voxel that the point lies in; else the nearest surfel whose
+            position is at most so far.
+
+        Returns
+        -------
+        (N,) float64, m
+            normal . (point - position), positive on the side from which the surfel was seen;
+            nan where there is no surfel, or it has no normal.
+
+        """
+        places = _places(points)
+        rows = self.nearest(places, max_distance_m)[0] if max_distance_m > 0 else self.at(places)
+        step = places - self._of(self.surfels.position, rows)
+        return np.asarray((step * self._of(self.surfels.normal, rows)).sum(axis=1))
+
+    def _best(
+        self, places: npt.NDArray[np.float64], radius_m: float, k: int, ranks: Any
+    ) -> npt.NDArray[np.int64]:
+        if not 0.0 <= radius_m < math.inf:
+            raise ValueError(f'max_distance_m: {radius_m}, expected zero or more, finite')
+        rows = np.empty((len(places), k), np.int64)
+        best_around(
+            places,
+            radius_m,
+            self.voxel_size_m,
+            self.surfels.position,
+            ranks,
+            self._keys,
+            self._table,
+            rows,
+        )
+        return rows
+
+    def _of(
+        self, values: npt.NDArray[np.float64], rows: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.float64]:
+        """Return values (M, 3) by row, nan for -1."""
+        if not len(values):
+            return np.full((len(rows), 3), math.nan)
+        return np.where((rows >= 0)[:, None], values[rows], math.nan)
+
+
+def _places(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return points as (N, 3) float64 in C order."""
+    places = np.require(points, np.float64, ['C', 'A', 'W'])
+    if places.ndim != 2 or places.shape[1] != 3:
+        raise ValueError(f'points: shape {places.shape}, expected (N, 3)')
+    return places

@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Queries by place, each against every surfel of the map looked at in turn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+VOXEL_M = 0.5
+
+
+@pytest.fixture(scope='module')
+def index():
+    rng = np.random.default_rng(4)
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(rng.normal(0.0, 2.0, (6000, 3)), origin=(0.0, 0.0, 9.0))
+    return surfel_map.index(min_points=2)
+
+
+@pytest.fixture(scope='module')
+def points():
+    rng = np.random.default_rng(5)
+    return np.concatenate([rng.normal(0.0, 2.5, (300, 3)), [[0.5, -0.5, 1.0], [90.0, 0, 0]]])
+
+
+def distances(index, point):
+    return np.sqrt(((index.surfels.position - point) ** 2).sum(axis=1))
+
+
+def test_at_gives_the_surfel_of_the_voxel_that_holds_the_point(index, points):
+    voxel_index = index.surfels.voxel_index.tolist()
+    for point, row in zip(points, index.at(points), strict=True):
+        expected = np.floor(point / VOXEL_M).astype(int).tolist()
+        assert (voxel_index[row] == expected) if row >= 0 else (expected not in voxel_index)
+    assert (index.at(points) >= 0).sum() > 100
+
+
+@pytest.mark.parametrize('radius_m', [0.0, 0.3, 0.5, 1.7])
+def test_nearest_is_nearest_of_all(index, points, radius_m):
+    rows, found_m = index.nearest(points, radius_m)
+    for point, row, distance_m in zip(points, rows, found_m, strict=True):
+        every = distances(index, point)
+        if every.min() > radius_m:
+            assert (row, distance_m) == (-1, np.inf)
+        else:
+            assert row == every.argmin()
+            assert distance_m == pytest.approx(every.min(), abs=1e-12)
+
+
+@pytest.mark.parametrize('k', [1, 4, 200])
+def test_best_planar_ranks_those_within_the_radius(index, points, k):
+    planarity = index.surfels.planarity
+    for point, rows in zip(points, index.best_planar(points, k, 1.1), strict=True):
+        within = np.flatnonzero((distances(index, point) <= 1.1) & ~np.isnan(planarity))
+        expected = within[np.lexsort((within, -planarity[within]))][:k]
+        assert rows.tolist() == expected.tolist() + [-1] * (k - len(expected))
+
+
+def test_in_box_and_in_radius_are_all_that_is_there(index):
+    position = index.surfels.position
+    inside = [i for i, p in enumerate(position) if all(p >= (-1, 0, -2)) and all(p <= (1, 3, 0))]
+    assert index.in_box((-1.0, 0.0, -2.0), (1.0, 3.0, 0.0)).tolist() == inside != []
+    near = np.flatnonzero(distances(index, (1.0, 1.0, 0.0)) <= 1.5).tolist()
+    assert index.in_radius((1.0, 1.0, 0.0), 1.5).tolist() == near != []
+
+
+def test_plane_distance_is_positive_on_the_side_of_the_sensor():
+    rng = np.random.default_rng(6)
+    floor = np.c_[rng.uniform(0.0, 2.0, (500, 2)), np.full(500, 0.2)]
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(floor, origin=(1.0, 1.0, 2.0))
+    index = surfel_map.index()
+    asked = [[1.1, 0.8, 0.3], [0.2, 0.9, 0.1], [1.1, 0.8, 0.9]]
+    lattice_m = VOXEL_M / 65536  # the floor is quantised
+
+    in_voxel = index.plane_distance(asked)
+    nearest = index.plane_distance(asked, max_distance_m=2.0)
+
+    np.testing.assert_allclose(in_voxel, [0.1, -0.1, np.nan], atol=lattice_m)
+    np.testing.assert_allclose(nearest, [0.1, -0.1, 0.7], atol=lattice_m)
+
+
+def test_a_coarser_level_is_asked_in_its_own_voxels(points):
+    rng = np.random.default_rng(7)
+    fine = SurfelMap(VOXEL_M)
+    fine.add(rng.normal(0.0, 2.0, (2000, 3)))
+    index = fine.coarsen(1).index()
+    rows = index.at(points)
+    expected = np.floor(points / 1.0).astype(int)[rows >= 0]
+    np.testing.assert_array_equal(index.surfels.voxel_index[rows[rows >= 0]], expected)
+    assert (rows >= 0).sum() > 100
+
+
+def test_an_empty_map_has_no_answers():
+    index = SurfelMap(VOXEL_M).index()
+    assert index.at([[0.0, 0.0, 0.0]]).tolist() == [-1]
+    assert index.nearest([[0.0, 0.0, 0.0]], 1.0)[0].tolist() == [-1]
+    assert index.best_planar([[0.0, 0.0, 0.0]], 2, 1.0).tolist() == [[-1, -1]]
+    assert np.isnan(index.plane_distance([[0.0, 0.0, 0.0]])).all()
+    assert index.in_box((-1, -1, -1), (1, 1, 1)).tolist() == []
+
+
+def test_points_that_are_nowhere_have_no_surfel(index):
+    nowhere = [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0, 1e30]]
+    assert index.at(nowhere).tolist() == [-1, -1, -1]
+    assert index.nearest(nowhere, 1.0)[0].tolist() == [-1, -1, -1]
+
+
+def test_wrong_questions_are_refused(index):
+    with pytest.raises(ValueError, match=r'points: shape \(3,\)'):
+        index.at([0.0, 0.0, 0.0])
+    with pytest.raises(ValueError, match='k: 0'):
+        index.best_planar([[0.0, 0.0, 0.0]], 0, 1.0)
+    with pytest.raises(ValueError, match='max_distance_m: nan'):
+        index.nearest([[0.0, 0.0, 0.0]], float('nan'))
