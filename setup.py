@@ -71,7 +71,7 @@ setup(
     ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed']},
+    package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml']},
     install_requires=REQUIRED,
     extras_require={'ros': ROS, 'test': TEST, 'lint': LINT},
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},

@@ -59,5 +59,9 @@ class FileFormatError(SurfelMapperError, ValueError):
     """A file other than a bag cannot be read: of another format or version, or damaged."""
 
 
+class SubscriberError(SurfelMapperError):
+    """Nobody subscribes to what is to be published."""
+
+
 class DependencyError(SurfelMapperError, ImportError):
     """A package that the requested feature needs is not installed."""

@@ -113,6 +113,11 @@ class BagReader:
         """Record time of the last message."""
         return max(reader.end_time for reader in self._readers if reader.message_count) - 1
 
+    def is_latched(self, name: str) -> bool:
+        """Return whether the publisher of a topic kept messages for those who came later."""
+        every = (connection for reader in self._readers for connection in reader.connections)
+        return any(latches(connection) for connection in every if connection.topic == name)
+
     def messages(self, names: Collection[str] | None = None) -> Iterator[BagMessage]:
         """
         Yield messages in the order of their record time.
@@ -257,6 +262,16 @@ class BagReader:
 def is_cdr(connection: Connection) -> bool:
     """Return whether the messages are serialised in the way of their ROS version."""
     return getattr(connection.ext, 'serialization_format', 'cdr') == 'cdr'
+
+
+def latches(connection: Connection) -> bool:
+    """Return whether a publisher offered its last messages to late subscribers."""
+    from rosbags.interfaces import ConnectionExtRosbag1
+
+    ext = connection.ext
+    if isinstance(ext, ConnectionExtRosbag1):
+        return bool(ext.latching)
+    return any(qos.durability.name == 'TRANSIENT_LOCAL' for qos in ext.offered_qos_profiles)
 
 
 def type_name(connection: Connection) -> str:

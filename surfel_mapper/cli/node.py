@@ -1,0 +1,26 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper node``: the live map, as ``ros2 run surfel_mapper node``."""
+
+from __future__ import annotations
+
+import argparse
+
+SUMMARY = 'Map clouds live from ROS 2 topics.'
+
+EXAMPLE = 'surfel-mapper node --ros-args --params-file my.yaml -r points:=/lidar/points'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments: none but those for ROS, which are cut off before."""
+    parser.usage = 'surfel-mapper node [-h] [--ros-args ...]'
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the node until it is told to end."""
+    from surfel_mapper.cli.ros import loading_ros
+
+    with loading_ros():
+        from surfel_mapper.ros.running import run_node
+    run_node(args.ros_args)
+    return 0

@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+rclpy from its start to its end.
+
+Signals are ours, not rclpy's: rclpy would end its context at once, after which nothing can be
+published, or logged where others see it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+import rclpy
+from rclpy.signals import SignalHandlerOptions
+
+from surfel_mapper.errors import ConfigError
+
+
+@contextmanager
+def context(ros_args: Sequence[str]) -> Iterator[None]:
+    """
+    Initialise rclpy for the time of a with-block.
+
+    Parameters
+    ----------
+    ros_args : sequence of str
+        What follows --ros-args on the command line, that included.
+
+    Raises
+    ------
+    ConfigError
+        If rclpy refuses an argument, or the file of parameters.
+
+    """
+    try:
+        rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
+    except RuntimeError as error:
+        reason = str(error).partition(', at /')[0]
+        raise ConfigError(f'arguments after --ros-args: {reason}') from error
+    try:
+        yield
+    finally:
+        rclpy.try_shutdown()

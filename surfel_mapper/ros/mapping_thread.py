@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The one thread that writes the map, and the bounded queue before it.
+
+Callbacks only put things in, so messages are taken from the middleware as they come: what waits
+there too long is overwritten without a word, what is dropped here is counted. Poses overtake
+clouds. They are small, and a backlog of clouds would otherwise be mapped before the poses that
+it needs, although these have arrived.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
+import logging
+import threading
+import time
+from typing import Any, NamedTuple, TypeVar
+
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pose_messages import StampedPose
+from surfel_mapper.pipeline import Mapper, Update
+
+log = logging.getLogger(__name__)
+
+MAX_CLOUDS = 20
+"""Clouds that may wait, 2 s of a lidar at 10 Hz and some 80 MB; the oldest is dropped."""
+
+MAX_POSES = 10_000
+"""Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
+
+WARN_EVERY_S = 1.0
+"""A warning is logged at most this often; everything is counted."""
+
+Result = TypeVar('Result')
+
+
+class Cloud(NamedTuple):
+    """A message that waits to be mapped."""
+
+    msg: Any
+    topic: str
+
+
+class Call(NamedTuple):
+    """A function that waits to be called, and who waits for its result, if anybody."""
+
+    function: Callable[[], Any]
+    future: Future[Any] | None = None
+
+
+class MappingThread:
+    """
+    Feeds a mapper from a queue.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        Used by this thread alone from ``start`` to ``stop``.
+    on_failure : callable
+        Called in this thread with an error that nobody foresaw; the thread ends with it.
+
+    Attributes
+    ----------
+    paused : bool
+        While set, clouds are dropped (and counted), poses are not.
+
+    """
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
+        """Make the thread; ``start`` starts it."""
+        self.paused = False
+        self._mapper = mapper
+        self._on_failure = on_failure
+        self._changed = threading.Condition()
+        self._poses: deque[tuple[StampedPose, bool]] = deque()
+        self._work: deque[Cloud | Call] = deque()
+        self._num_clouds = 0
+        self._clouds_lost = 0
+        self._poses_lost = 0
+        self._warned_s: dict[str, float] = {}
+        self._stopping = False
+        self._thread = threading.Thread(target=self._run, name='mapping', daemon=True)
+
+    def start(self, on_update: Callable[[Update], None]) -> None:
+        """Start the thread; it calls a function with what every scan did to the map."""
+        self._on_update = on_update
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread when all that waits is done."""
+        with self._changed:
+            self._stopping = True
+            self._changed.notify()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def put_poses(self, poses: Iterable[StampedPose], *, static: bool = False) -> None:
+        """Queue poses for the mapper."""
+        with self._changed:
+            self._poses.extend((pose, static) for pose in poses)
+            while len(self._poses) > MAX_POSES:
+                self._poses.popleft()
+                self._poses_lost += 1
+            self._changed.notify()
+
+    def put_cloud(self, msg: Any, topic: str) -> None:
+        """Queue a cloud; where too many wait, the oldest is dropped."""
+        with self._changed:
+            self._work.append(Cloud(msg, topic))
+            self._num_clouds += 1
+            if self._num_clouds > MAX_CLOUDS:
+                oldest = next(i for i, item in enumerate(self._work) if isinstance(item, Cloud))
+                del self._work[oldest]
+                self._num_clouds -= 1
+                self._clouds_lost += 1
+            self._changed.notify()
+
+    def call(self, function: Callable[[], Result]) -> Future[Result]:
+        """
+        Have a function called in this thread, after all clouds that came before.
+
+        The future is cancelled where the thread ends first.
+        """
+        future: Future[Result] = Future()
+        with self._changed:
+            if self._stopping:
+                future.cancel()
+            else:
+                self._work.append(Call(function, future))
+                self._changed.notify()
+        return future
+
+    def post(self, function: Callable[[], None]) -> None:
+        """Have a function called in this thread, unless it waits to be called already."""
+        call = Call(function)
+        with self._changed:
+            if call not in self._work:
+                self._work.append(call)
+                self._changed.notify()
+
+    def _run(self) -> None:
+        """Work until stopped; an error that is not ours to handle ends it."""
+        try:
+            while self._step():
+                pass
+        except BaseException as error:
+            self._on_failure(error)
+        with self._changed:
+            self._stopping = True
+            left, self._work = self._work, deque()
+        for item in left:
+            if isinstance(item, Call) and item.future:
+                item.future.cancel()
+
+    def _step(self) -> bool:
+        """Wait for something to do and do it; false at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._stopping or self._poses or self._work)
+            if not (self._poses or self._work):
+                return False
+            poses, self._poses = self._poses, deque()
+            item = self._work.popleft() if self._work else None
+            self._num_clouds -= isinstance(item, Cloud)
+            clouds_lost, self._clouds_lost = self._clouds_lost, 0
+            poses_lost, self._poses_lost = self._poses_lost, 0
+        self._count_lost(clouds_lost, poses_lost)
+        for pose, static in poses:
+            self._mapper.add_pose(*pose, static=static)
+        if isinstance(item, Cloud):
+            self._add(item)
+        elif item is not None:
+            fulfil(item)
+        for update in self._mapper.insert_ready():
+            self._on_update(update)
+        return True
+
+    def _count_lost(self, clouds: int, poses: int) -> None:
+        """Enter in the counts what the queue had to drop."""
+        counters = self._mapper.counters
+        if poses:
+            counters.messages_ignored['overload'] += poses
+        if clouds:
+            counters.received += clouds
+            counters.dropped['overload'] += clouds
+            self._warn(
+                'overload',
+                f'{clouds} clouds dropped: they come faster than they can be mapped; larger '
+                'voxels (map.voxel_size_m) or a shorter range (input.max_range_m) would help',
+            )
+
+    def _add(self, cloud: Cloud) -> None:
+        """Decode a cloud and give it to the mapper; a bad one is counted."""
+        counters = self._mapper.counters
+        if self.paused:
+            counters.received += 1
+            counters.dropped['paused'] += 1
+            return
+        try:
+            with counters.timed('decode'):
+                scan = to_scan(cloud.msg, cloud.topic)
+        except CloudFormatError as error:
+            counters.received += 1
+            counters.dropped['bad_cloud'] += 1
+            self._warn('bad_cloud', f'cloud in frame {cloud.msg.header.frame_id!r}: {error}')
+            return
+        self._mapper.add_scan(scan)
+
+    def _warn(self, cause: str, text: str) -> None:
+        """Log a warning unless one of its cause was just logged."""
+        now = time.monotonic()
+        if now - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+            self._warned_s[cause] = now
+            log.warning(text)
+
+
+def fulfil(call: Call) -> None:
+    """Call a function; its result or its error goes to whoever waits for it."""
+    if call.future is None:
+        call.function()
+        return
+    try:
+        call.future.set_result(call.function())
+    except Exception as error:
+        call.future.set_exception(error)

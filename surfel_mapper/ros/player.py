@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Publishing a bag over DDS at the pace of its record times.
+
+Messages go out as the bytes that lie in the bag. A subscriber loses nothing that was published
+once it was found, if it is reliable; so playing can wait for subscribers before the first
+message, and waits for the last to be taken in the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from importlib import import_module
+import logging
+import time
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from rosgraph_msgs.msg import Clock
+
+from surfel_mapper.errors import BagError, DependencyError, SubscriberError
+from surfel_mapper.io.bag import BagReader
+from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.ros.context import context
+from surfel_mapper.ros.messages import time_message
+from surfel_mapper.ros.shared_memory import enlarge_shared_memory
+
+log = logging.getLogger(__name__)
+
+DEPTH = 20
+"""Messages of a topic kept until everybody has them."""
+
+MAX_LATCHED = 100
+"""Messages kept for late subscribers of a latched topic; each may be of another publisher."""
+
+SETTLE_S = 0.5
+"""A publisher knows a subscriber before the subscriber knows it; a best-effort one misses what
+comes between."""
+
+CLOCK_PERIOD_S = 0.01
+
+
+def play(
+    reader: BagReader,
+    topics: Collection[str] | None = None,
+    *,
+    rate: float = 1.0,
+    loop: bool = False,
+    clock: bool = False,
+    wait_for: Collection[str] = (),
+    timeout_s: float = 60.0,
+    ros_args: Sequence[str] = (),
+) -> dict[str, Any]:
+    """
+    Publish the messages of a bag.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    topics : collection of str, optional
+        The topics to play; all whose types are installed without.
+    rate : float
+        Times the pace of the recording.
+    loop : bool
+        Begin anew at the end, until interrupted.
+    clock : bool
+        Publish the record time on /clock.
+    wait_for : collection of str
+        Begin when somebody subscribes to each of these.
+    timeout_s : float
+        How long to wait for that, s.
+    ros_args : sequence of str
+        What follows --ros-args on the command line, that included.
+
+    Returns
+    -------
+    dict
+        ``published``: messages by topic; ``skipped``: the reason by topic; ``seconds``.
+
+    Raises
+    ------
+    BagError
+        If the bag has no such topic, nothing to play, or is one of ROS 1.
+    SubscriberError
+        If nobody subscribes in time.
+
+    """
+    keep_freed_memory()
+    enlarge_shared_memory()
+    with context(ros_args):
+        node = Node('surfel_mapper_player')
+        try:
+            player = Player(node, reader, topics, rate=rate, clock=clock)
+            player.wait_for_subscribers(wait_for, timeout_s)
+            start = time.monotonic()
+            player.play()
+            while loop:
+                player.play()
+            player.flush()
+            seconds = time.monotonic() - start
+        finally:
+            node.destroy_node()
+    return {'published': player.published, 'skipped': player.skipped, 'seconds': seconds}
+
+
+class Player:
+    """
+    Publishers of the topics of a bag.
+
+    Attributes
+    ----------
+    published : dict of str to int
+        Messages published, by topic.
+    skipped : dict of str to str
+        Why a topic is not published.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        reader: BagReader,
+        topics: Collection[str] | None,
+        *,
+        rate: float,
+        clock: bool,
+    ) -> None:
+        """Make the publishers."""
+        if reader.is_ros1:
+            raise BagError(
+                f'{reader.path}: a bag of ROS 1, whose bytes ROS 2 cannot read; convert it: '
+                f'`rosbags-convert --src {reader.path} --dst {reader.path.stem}`'
+            )
+        self._reader = reader
+        self._rate = rate
+        self._clock = node.create_publisher(Clock, '/clock', 10) if clock else None
+        self.published: dict[str, int] = {}
+        self.skipped: dict[str, str] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self._make_publishers(node, topics)
+
+    def _make_publishers(self, node: Node, names: Collection[str] | None) -> None:
+        """Make a publisher for every topic whose type is installed."""
+        known = {topic.name: topic for topic in self._reader.topics}
+        for name in known if names is None else names:
+            if name not in known:
+                raise BagError(
+                    f'{self._reader.path}: no topic {name}; its topics: {", ".join(known)}'
+                )
+            try:
+                message = message_type(known[name].type)
+            except DependencyError as error:
+                self.skipped[name] = str(error)
+                continue
+            self._publishers[name] = node.create_publisher(message, name, self._qos(name))
+            self.published[name] = 0
+        if not self._publishers:
+            raise BagError(f'{self._reader.path}: no topic to play; skipped: {self.skipped}')
+
+    def _qos(self, name: str) -> QoSProfile:
+        """Return the quality of service to publish with: reliable, latched as recorded."""
+        if self._reader.is_latched(name):
+            return QoSProfile(depth=MAX_LATCHED, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        return QoSProfile(depth=DEPTH)
+
+    def wait_for_subscribers(self, names: Collection[str], timeout_s: float) -> None:
+        """Return when somebody subscribes to each of these topics."""
+        unknown = [name for name in names if name not in self._publishers]
+        if unknown:
+            raise BagError(
+                f'{self._reader.path}: nobody can subscribe to {", ".join(unknown)}; '
+                f'played are {", ".join(self._publishers)}'
+            )
+        end_s = time.monotonic() + timeout_s
+        while alone := [n for n in names if not self._publishers[n].get_subscription_count()]:
+            if time.monotonic() > end_s:
+                raise SubscriberError(
+                    f'nobody subscribed to {", ".join(alone)} within {timeout_s:g} s; is the '
+                    'subscriber running, with the same ROS_DOMAIN_ID and topic names?'
+                )
+            time.sleep(0.02)
+        if names:
+            time.sleep(SETTLE_S)
+
+    def play(self) -> None:
+        """Publish all messages once, each when its time has come."""
+        start_s, first_ns = time.monotonic(), None
+        for message in self._reader.messages(set(self._publishers)):
+            first_ns = message.record_ns if first_ns is None else first_ns
+            due_s = start_s + (message.record_ns - first_ns) / 1e9 / self._rate
+            self._sleep_until(due_s, message.record_ns)
+            self._publishers[message.topic].publish(bytes(message.raw))
+            self.published[message.topic] += 1
+
+    def _sleep_until(self, due_s: float, record_ns: int) -> None:
+        """Sleep until a message is due; meanwhile publish the time that it is in the bag."""
+        while True:
+            left_s = due_s - time.monotonic()
+            if self._clock is not None:
+                now_ns = record_ns - int(max(left_s, 0.0) * self._rate * 1e9)
+                self._clock.publish(Clock(clock=time_message(now_ns)))
+                time.sleep(min(max(left_s, 0.0), CLOCK_PERIOD_S))
+            elif left_s > 0.0:
+                time.sleep(left_s)
+            if left_s <= 0.0:
+                return
+
+    def flush(self) -> None:
+        """Wait until those who subscribe reliably have everything."""
+        for name, publisher in self._publishers.items():
+            if not publisher.wait_for_all_acked(Duration(seconds=5)):
+                log.warning('%s: a subscriber has not confirmed all messages after 5 s', name)
+        time.sleep(SETTLE_S)
+
+
+def message_type(name: str) -> Any:
+    """
+    Return the class of a message type such as nav_msgs/msg/Odometry.
+
+    Raises
+    ------
+    DependencyError
+        If its package is not installed.
+
+    """
+    package, _, rest = name.partition('/')
+    kind, _, message = rest.partition('/')
+    try:
+        return getattr(import_module(f'{package}.{kind}'), message)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise DependencyError(f'its type {name} is not installed ({error})') from error
