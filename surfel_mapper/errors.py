@@ -11,6 +11,7 @@ Every exception that this package raises on purpose.
       MapError             an operation that a surfel map cannot carry out
         MapLimitError      a voxel index or a count beyond what the integers hold     (ValueError)
         NotInMapError      removing moments that the map does not hold                (ValueError)
+      FilterError          a filter cannot work on a scan                             (ValueError)
       BagError             a bag that cannot be read, or lacks what is asked of it
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
       DependencyError      an optional package is missing; says how to install it     (ImportError)
@@ -49,6 +50,10 @@ class MapLimitError(MapError, ValueError):
 
 class NotInMapError(MapError, ValueError):
     """Moments to be removed are not, or not completely, in the map."""
+
+
+class FilterError(SurfelMapperError, ValueError):
+    """A filter cannot work on a scan: a column is missing, or coordinates are not what it takes."""
 
 
 class BagError(SurfelMapperError):

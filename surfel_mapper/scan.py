@@ -33,6 +33,9 @@ class Scan:
         The sensor's coordinate frame.
     columns : mapping of str to array of length N
         What else the points carry (intensity, ring, time, ...), one row a point.
+    T_base_sensor, T_fixed_sensor : (4, 4) float64, optional
+        Where the sensor is on the robot, and in the fixed frame at the stamp; None where that is
+        not known. Filters that look at the robot or at the vertical need them.
 
     Raises
     ------
@@ -45,6 +48,8 @@ class Scan:
     stamp_ns: int
     frame_id: str
     columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+    T_base_sensor: npt.NDArray[np.float64] | None = None
+    T_fixed_sensor: npt.NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes."""

@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Filter: what every filter is, and what filters share.
+
+A filter is a frozen dataclass whose fields are its parameters. It takes a scan and returns a
+scan; the one that comes in is never changed. Most say only which points stay (``keep``); those
+that make or move points or add columns implement ``apply``.
+
+A comparison with nan is false, and a point stays only where a comparison says so: a filter that
+looks at a coordinate drops the points for which it cannot decide.
+
+Chance depends on the seed and the stamp of the scan alone, not on what came before, so that node
+and replay keep the same points and any part of a bag is filtered as the whole is.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.parameters import cast, parameters_of
+from surfel_mapper.kernels.selection import compact
+from surfel_mapper.scan import Scan
+
+Mask = npt.NDArray[np.bool_]
+
+Array = npt.NDArray[Any]
+
+
+class Filter:
+    """
+    Base of all filters: checks every parameter against its declaration.
+
+    A filter implements ``keep`` or ``apply``. ``name`` and ``theirs`` are given by ``register``.
+    """
+
+    __slots__ = ()
+
+    name: ClassVar[str] = ''
+    """Name in a chain."""
+
+    theirs: ClassVar[str] = ''
+    """Name in libpointmatcher, empty where it has no such filter."""
+
+    def __post_init__(self) -> None:
+        """Check every value, and bring it into the declared type."""
+        for declared in parameters_of(type(self)):
+            where = f'{self.name or type(self).__name__}: {declared.name}'
+            value = cast(where, getattr(self, declared.name), declared)
+            object.__setattr__(self, declared.name, value)
+        self.check()
+
+    def check(self) -> None:
+        """Check what concerns several parameters; raise ConfigError."""
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay, (N,) bool."""
+        raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
+
+    def apply(self, scan: Scan) -> Scan:
+        """
+        Return the scan filtered.
+
+        Raises
+        ------
+        FilterError
+            If the scan lacks a column that is needed, or holds what the filter cannot take.
+
+        """
+        return select(scan, self.keep(scan))
+
+    def column(self, scan: Scan, name: str) -> Array:
+        """
+        Return a column that the filter needs.
+
+        Raises
+        ------
+        FilterError
+            If the scan has none of this name.
+
+        """
+        if name in scan.columns:
+            return scan.columns[name]
+        have = ', '.join(scan.columns) or 'none'
+        raise FilterError(f'{self.name}: needs the column {name!r}; the points have {have}')
+
+
+def select(scan: Scan, rows: Array) -> Scan:
+    """
+    Return the scan with some of its points, their columns with them.
+
+    Parameters
+    ----------
+    scan : Scan
+        Returned itself where all points stay.
+    rows : (N,) bool or (K,) int
+        A mask over the points, or the indices of those wanted in the order wanted.
+
+    """
+    if rows.dtype == np.bool_:
+        if rows.shape != (len(scan),):
+            raise FilterError(f'mask of shape {rows.shape}, expected ({len(scan)},)')
+        number = int(np.count_nonzero(rows))
+        if number == len(scan):
+            return scan
+        points = np.empty((number, 3), scan.points.dtype, order='F')
+        compact(scan.points.T, rows, points.T)
+        rows = np.flatnonzero(rows) if scan.columns else rows
+    else:
+        points = np.empty((len(rows), 3), scan.points.dtype, order='F')
+        for axis in range(3):
+            np.take(scan.points[:, axis], rows, out=points[:, axis], mode='raise')
+    columns = {name: np.take(column, rows, axis=0) for name, column in scan.columns.items()}
+    return dataclasses.replace(scan, points=points, columns=columns)
+
+
+def with_columns(scan: Scan, **columns: Array) -> Scan:
+    """Return the scan with columns added, or put in place of those of the same name."""
+    return dataclasses.replace(scan, columns={**scan.columns, **columns})
+
+
+def generator(scan: Scan, seed: int) -> np.random.Generator:
+    """Return random numbers that depend on the seed and the stamp of the scan alone."""
+    return np.random.default_rng([seed % 2**64, scan.stamp_ns % 2**64])

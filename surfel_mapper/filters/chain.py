@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Chain: filters one after another, and what each did to a scan.
+
+A chain is written as libpointmatcher writes it, a YAML list:
+
+    - RemoveNaNDataPointsFilter              a name: all parameters at their defaults
+    - VoxelGridDataPointsFilter:             or one name with parameters below it
+        vSizeX: 0.5
+    - range_limit: {min_m: 0.5}              our names, in any mixture
+
+Every scalar is read as text and cast by the parameter that it is for, as libpointmatcher does.
+Of a key that stands twice the last one counts, there and here.
+
+A chain may stand inside a larger file, as those of ICP configurations do: ``FILE#key`` takes the
+list under a key of the top level, ``FILE#key.key`` one further down.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+import time
+from typing import Any
+
+from surfel_mapper.errors import ConfigError, FilterError
+from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.parameters import values_of
+from surfel_mapper.filters.registry import find
+from surfel_mapper.scan import Scan
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """What one filter of a chain did to a scan."""
+
+    name: str
+    """Place in the chain and name: 2 voxel_grid."""
+
+    points_in: int
+    points_out: int
+    milliseconds: float
+
+
+class Chain:
+    """
+    Filters that a scan passes one after another.
+
+    Parameters
+    ----------
+    filters : iterable of Filter
+        In order; none at all leaves every scan as it is.
+
+    """
+
+    def __init__(self, filters: Iterable[Filter] = ()) -> None:
+        """Keep the filters and name them by their place."""
+        self.filters = tuple(filters)
+        self.names = tuple(
+            f'{place} {each.name or type(each).__name__}'
+            for place, each in enumerate(self.filters, start=1)
+        )
+
+    @classmethod
+    def from_list(cls, items: Any, where: str = 'filters') -> Chain:
+        """
+        Return the chain that a list describes, as it stands in YAML.
+
+        Parameters
+        ----------
+        items : list of (str, or mapping of one str to a mapping), or None
+            Names of filters, with or without parameters.
+        where : str
+            What the errors begin with.
+
+        Raises
+        ------
+        ConfigError
+            If it is no such list, or a filter, parameter or value is refused.
+
+        """
+        if items in (None, ''):
+            return cls()
+        if not isinstance(items, (list, tuple)):
+            raise ConfigError(
+                f'{where}: a {type(items).__name__}, expected a list of filters, '
+                'each item a name or `name: {parameters}`'
+            )
+        return cls(made(item, f'{where}: filter {i}') for i, item in enumerate(items, start=1))
+
+    @classmethod
+    def load(cls, path: str | Path) -> Chain:
+        """
+        Return the chain in a YAML file.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file; ``FILE#key.key`` is the list under a key of the file.
+
+        Raises
+        ------
+        ConfigError
+            If the file cannot be read, is not YAML, or holds no chain that can be built.
+
+        """
+        name, _, keys = str(path).partition('#')
+        content = read(name)
+        for key in filter(None, keys.split('.')):
+            if not isinstance(content, Mapping) or key not in content:
+                inside = ', '.join(content) if isinstance(content, Mapping) else 'none'
+                raise ConfigError(f'{path}: no key {key!r} there; keys: {inside}')
+            content = content[key]
+        if isinstance(content, Mapping):
+            lists = ' or '.join(f'{path}{"." if keys else "#"}{key}' for key in content)
+            raise ConfigError(
+                f'{path}: a mapping, expected a list of filters; '
+                f'if one of its keys holds the list, write {lists}'
+            )
+        return cls.from_list(content, str(path))
+
+    def __len__(self) -> int:
+        """Return the number of filters."""
+        return len(self.filters)
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan as it leaves the chain; see run."""
+        return self.run(scan)[0]
+
+    def run(self, scan: Scan) -> tuple[Scan, tuple[Step, ...]]:
+        """
+        Return the scan as it leaves the chain, and what every filter did.
+
+        Raises
+        ------
+        FilterError
+            If a filter cannot work on the scan; begins with its place and name.
+
+        """
+        steps = []
+        for name, each in zip(self.names, self.filters, strict=True):
+            start, points_in = time.perf_counter(), len(scan)
+            try:
+                scan = each.apply(scan)
+            except FilterError as error:
+                raise FilterError(f'filter {name}: {error}') from error
+            milliseconds = (time.perf_counter() - start) * 1e3
+            steps.append(Step(name, points_in, len(scan), milliseconds))
+        return scan, tuple(steps)
+
+
+def read(path: str) -> Any:
+    """Return the content of a YAML file, every scalar as text."""
+    import yaml
+
+    try:
+        return yaml.load(Path(path).read_text(encoding='utf-8'), yaml.BaseLoader)
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f'{path}: not YAML: {error}') from error
+
+
+def made(item: Any, where: str) -> Filter:
+    """Return the filter that one item of a list describes."""
+    name, given = item, None
+    if isinstance(item, Mapping):
+        if len(item) != 1:
+            raise ConfigError(
+                f'{where}: {len(item)} keys ({", ".join(map(str, item))}), expected one, the name '
+                'of the filter; parameters have to be indented deeper than the name'
+            )
+        name, given = next(iter(item.items()))
+    if not isinstance(name, str):
+        raise ConfigError(f'{where}: {name!r}, expected the name of a filter')
+    if given in (None, ''):
+        given = {}
+    if not isinstance(given, Mapping):
+        raise ConfigError(f'{where}, {name}: {given!r}, expected parameters, each `name: value`')
+    try:
+        cls = find(name)
+    except ConfigError as error:
+        raise ConfigError(f'{where}: {error}') from error
+    values = values_of(cls, given, f'{where}, {name}', theirs=name == cls.theirs)
+    try:
+        return cls(**values)
+    except ConfigError as error:  # what concerns several parameters
+        raise ConfigError(f'{where}: {error}') from error

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The registry: finds a filter by our name or by libpointmatcher's.
+
+Filters of this folder are registered when one is first asked for; those of other packages by the
+decorator, or by an entry point of the group ``surfel_mapper.filters`` that names the class. An
+entry point is loaded only when its name is asked for, so that a package that is broken spoils no
+chain which does without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import functools
+from importlib import import_module
+from importlib.metadata import entry_points
+import logging
+import pkgutil
+import re
+from typing import overload, TypeVar
+
+from surfel_mapper.config import near
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters.base import Filter
+
+GROUP = 'surfel_mapper.filters'
+"""Group of the entry points."""
+
+F = TypeVar('F', bound=type[Filter])
+
+_log = logging.getLogger(__name__)
+
+_FILTERS: dict[str, type[Filter]] = {}
+"""Every registered filter under each of its names."""
+
+
+@overload
+def register(cls: F) -> F: ...
+@overload
+def register(*, name: str = '', theirs: str = '') -> Callable[[F], F]: ...
+def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | Callable[[F], F]:
+    """
+    Register a filter; a decorator, above ``@dataclass``, with or without arguments.
+
+    Parameters
+    ----------
+    cls : type of Filter
+        A dataclass.
+    name : str
+        Name in a chain; by default that of the class, RangeLimit is range_limit.
+    theirs : str
+        Name in libpointmatcher, if it has this filter.
+
+    Raises
+    ------
+    ConfigError
+        If it is no filter, or another filter has the name.
+
+    """
+    if cls is None:
+        return functools.partial(_register, name=name, theirs=theirs)
+    return _register(cls, name=name, theirs=theirs)
+
+
+def _register(cls: F, *, name: str, theirs: str) -> F:
+    if not (isinstance(cls, type) and issubclass(cls, Filter)):
+        raise ConfigError(f'{cls!r}: expected a class derived from surfel_mapper.filters.Filter')
+    cls.name = name or re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', cls.__name__).lower()
+    cls.theirs = theirs
+    for each in filter(None, (cls.name, theirs)):
+        other = _FILTERS.setdefault(each, cls)
+        if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
+            raise ConfigError(
+                f'filter {each!r} of {cls.__module__}: {other.__module__} has one of this name'
+            )
+        _FILTERS[each] = cls  # a module that is loaded anew replaces its filters
+    return cls
+
+
+@functools.cache
+def load_built_in() -> None:
+    """Register the filters of this folder."""
+    package = import_module('surfel_mapper.filters')
+    for module in pkgutil.iter_modules(package.__path__):
+        import_module(f'surfel_mapper.filters.{module.name}')
+
+
+def find(name: str) -> type[Filter]:
+    """
+    Return the filter of a name, ours or libpointmatcher's.
+
+    Raises
+    ------
+    ConfigError
+        If there is none, with the nearest name; or an entry point of this name does not load.
+
+    """
+    load_built_in()
+    if name not in _FILTERS and not _load_entry_point(name):
+        points = [point.name for point in entry_points(group=GROUP)]
+        raise ConfigError(
+            f'{name}: no such filter{near(name, [*_FILTERS, *points])}; '
+            '`surfel-mapper filters` lists all'
+        )
+    return _FILTERS[name]
+
+
+def all_filters() -> list[type[Filter]]:
+    """Return every filter, sorted by name; what does not load is warned about."""
+    load_built_in()
+    for point in entry_points(group=GROUP):
+        try:
+            _load_entry_point(point.name)
+        except ConfigError as error:
+            _log.warning('%s', error)
+    return sorted(set(_FILTERS.values()), key=lambda cls: cls.name)
+
+
+def _load_entry_point(name: str) -> bool:
+    """Register what an entry point names; return whether there is one of this name."""
+    for point in entry_points(group=GROUP, name=name):
+        try:
+            cls = point.load()
+        except Exception as error:  # whatever the code of another package does
+            raise ConfigError(
+                f'filter {name!r}: entry point {point.value} does not load: {error!r}'
+            ) from error
+        if name not in _FILTERS:
+            _register(cls, name=name, theirs='')
+        return True
+    return False

@@ -1,0 +1,30 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Move the points that stay together.
+
+Every value is written, and the place to write to moves on only past those that stay: without a
+branch that a mask of noise would mispredict.
+"""
+
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def compact(values, keep, out):
+    """
+    Copy the items of each row that stay, in order.
+
+    values  (R, N) any type
+    keep    (N,) bool
+    out     (R, K) of the same type, K the number of items that stay
+    """
+    num_out = out.shape[1]
+    for r in range(values.shape[0]):
+        row, out_row = values[r], out[r]
+        k = 0
+        i = 0
+        while k < num_out:
+            out_row[k] = row[i]
+            k += keep[i]
+            i += 1
