@@ -203,7 +203,8 @@ class TransformBuffer:
             # a frame without an edge above it is a root: of its own tree, or of the parent's
             below = [lower.child for lower in self._edges_above(parent)]
             if below and self._edges[below[-1]].parent == child:
-                raise PoseError(f'{name}: closes the loop {" -> ".join([child, *below[::-1], child])}')
+                loop = ' -> '.join([child, *reversed(below), child])
+                raise PoseError(f'{name}: closes the loop {loop}')
             return _Edge(parent, child, is_static)
         if edge.parent != parent:
             raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')

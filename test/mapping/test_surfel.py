@@ -1,19 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfel against golden programs, against exact rational arithmetic, and at its edges.
+Surfel against exact rational arithmetic, on known shapes, and at its edges.
 
 Tolerances. EPS = 2^-52. One step of float64 may be off by a few EPS of the largest scatter held
-on the way (removing leaves the rounding of what was there), and steps add up as a random walk:
-``rounding(steps)`` = (4 + sqrt(steps)) EPS. From that follow the others, in units of the trace of
-what is left: eigenvalues as the entries of the matrix (Weyl) plus 4 EPS for the eigenvalue
-solvers on both sides, a normal by 3 entries over the gap e1 - e0 (Davis and Kahan), planarity by
-7 entries over the trace.
+on the way (removing leaves the rounding of what was there), and steps add up as a random walk of
+half an EPS each: ``rounding(steps)`` = (4 + sqrt(steps) / 2) EPS.
 """
 
 import copy
 from fractions import Fraction
-import json
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,7 +23,6 @@ pytestmark = pytest.mark.filterwarnings('error')
 
 EPS = np.finfo(np.float64).eps
 UNIT = 16 * EPS  # LAPACK's eigenvectors: 8.5 EPS were found in 10^4 examples
-ROWS, COLUMNS = [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]
 
 # The lattice of 2^-10 m: sums, and the shift to 10 km, are exact in float64.
 LATTICE = st.integers(-512, 512).map(lambda k: k / 1024)
@@ -37,7 +32,7 @@ FAR_M = np.array([6000.0, -6400.0, 4800.0])
 
 
 def rounding(steps):
-    return (4.0 + np.sqrt(steps)) * EPS
+    return (4.0 + np.sqrt(steps) / 2.0) * EPS
 
 
 def trace(surfel):
@@ -50,112 +45,6 @@ def assert_normal(normal, expected, tolerance):
     np.testing.assert_allclose(
         normal * np.sign(normal @ expected), expected, rtol=0, atol=tolerance
     )
-
-
-# Golden programs
-
-
-@pytest.fixture(scope='module')
-def golden(data_folder):
-    path = data_folder / 'golden' / 'surfel.json'
-    if not path.exists():
-        pytest.skip(f'{path} is not there')
-    with np.load(path.with_suffix('.npz')) as arrays:
-        return json.loads(path.read_text()), dict(arrays)
-
-
-class Program:
-    """A golden program run on Surfel: its registers, and of each the largest scatter so far."""
-
-    def __init__(self, arrays):
-        self.arrays, self.registers, self.largest, self.steps = arrays, {}, {}, 0
-
-    def points(self, op):
-        points = self.arrays[f'arrays/{op["array"]}']
-        return points[op['index']] if 'index' in op else points[op['start'] : op['stop']]
-
-    def run(self, op):
-        """Run one operation; the name of a method is that of the operation, or of its kind."""
-        name = op['op']
-        verb, _, operand = name.partition('_')
-        if verb == 'ctor' or name in ('new', 'copy', 'plus', 'minus'):
-            self.registers[op['reg']] = getattr(self, name)(op)
-            inputs = [op[key] for key in ('other', 'a', 'b') if key in op]
-        else:
-            given = self.registers[op['other']] if operand == 'surfel' else None
-            if given is None and 'array' in op:
-                given = self.points(op)
-            getattr(self, 'add_each' if name == 'add_each' else verb)(op['reg'], given)
-            inputs = [op['reg'], *([op['other']] if operand == 'surfel' else [])]
-        self.steps += 1
-        scatters = [self.largest.get(register, 0.0) for register in inputs]
-        self.largest[op['reg']] = max([trace(self.registers[op['reg']]), *scatters])
-
-    def new(self, op):
-        return Surfel()
-
-    def copy(self, op):
-        return self.registers[op['other']].copy()
-
-    def plus(self, op):
-        return self.registers[op['a']] + self.registers[op['b']]
-
-    def minus(self, op):
-        return self.registers[op['a']] - self.registers[op['b']]
-
-    def ctor_point(self, op):
-        return Surfel.from_points(self.points(op))
-
-    ctor_range = ctor_point
-
-    def ctor_raw(self, op):
-        return Surfel.from_stats(op['sum'], op['sum_squares'], op['num_points'])
-
-    def ctor_position_scatter(self, op):
-        return Surfel.from_position(op['position'], op['scatter'])
-
-    def add(self, register, given):
-        self.registers[register].add(given)
-
-    def add_each(self, register, given):
-        for point in given:
-            self.registers[register].add(point)
-        self.steps += len(given)
-
-    def remove(self, register, given):
-        self.registers[register].remove(given)
-
-    def iadd(self, register, given):
-        self.registers[register] += given
-
-    def isub(self, register, given):
-        self.registers[register] -= given
-
-    def clear(self, register, given):
-        self.registers[register].clear()
-
-
-def assert_equals_reference(surfel, reference, normal_well_defined, program, largest):
-    n = surfel.num_points
-    assert n == reference('num_points')
-    reach = np.sqrt(largest) if n > 1 else 0.0
-    mean = reference('mean')
-    tolerance = EPS * np.abs(mean) + rounding(program.steps) * reach
-    assert (np.abs(surfel.mean() - mean) <= tolerance).all()
-    if n < 2:
-        return  # surfel.md's rules hold, see assert_promises
-
-    e0, e1, e2 = reference('eigenvalues')
-    size = e0 + e1 + e2
-    entry = rounding(program.steps) * largest / (n - 1)
-    value = entry + 4 * EPS * size
-    np.testing.assert_allclose(surfel.covariance(), reference('covariance'), rtol=0, atol=entry)
-    np.testing.assert_allclose(surfel.eigenvalues(), [e0, e1, e2], rtol=0, atol=value)
-    if size > 0.0:
-        expected = reference('planarity')
-        assert surfel.planarity() == pytest.approx(expected, abs=7 * value / size)
-    if normal_well_defined:
-        assert_normal(surfel.normal(), reference('normal'), 3 * value / (e1 - e0))
 
 
 def assert_promises(surfel):
@@ -180,50 +69,6 @@ def assert_promises(surfel):
         assert (vectors.max(axis=0) >= -vectors.min(axis=0)).all()
         assert 0.0 <= surfel.planarity() <= 1.0
         assert 0.0 <= surfel.curvature() <= 1 / 3
-
-
-def test_all_golden_programs_give_the_exact_values(golden):
-    description, arrays = golden
-    num_compared = 0
-    for case in description['cases']:
-        program = Program(arrays)
-        for op in case['ops']:
-            if op['op'] not in ('snapshot', 'equal'):
-                program.run(op)
-                continue
-            name = f'{case["name"]}/{op["label"]}'
-            if op['op'] == 'equal':
-                # Where float32 tells two results apart, float64 may or may not.
-                if arrays[f'{name}/equal']:
-                    assert program.registers[op['a']] == program.registers[op['b']], name
-                continue
-            surfel = program.registers[op['reg']]
-            assert surfel.num_points == arrays[f'{name}/num_points'], name
-            assert_promises(surfel)
-            if f'{name}/ref_mean' in arrays:
-                well_defined = description['accuracy'][name].get('normal_well_defined', False)
-                assert_equals_reference(
-                    surfel,
-                    lambda key, name=name: arrays[f'{name}/ref_{key}'],
-                    well_defined and surfel.num_points > 1,
-                    program,
-                    program.largest[op['reg']],
-                )
-                num_compared += 1
-
-    assert len(description['cases']) == 53
-    assert num_compared == 60
-
-
-def test_golden_statistics_given_raw_are_kept(golden):
-    _, arrays = golden
-    for case in ('position_scatter_n2', 'position_scatter_n200', 'ctor_raw_n1', 'ctor_raw'):
-        ops = next(c for c in golden[0]['cases'] if c['name'] == case)['ops']
-        program = Program(arrays)
-        program.run(ops[0])
-        surfel = program.registers['a']
-        np.testing.assert_array_equal(surfel.sum, arrays[f'{case}/out/sum'])
-        np.testing.assert_array_equal(surfel.sum_squares, arrays[f'{case}/out/sum_squares'])
 
 
 # Exact arithmetic
