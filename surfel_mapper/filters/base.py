@@ -87,7 +87,7 @@ class Filter:
         if name in scan.columns:
             return scan.columns[name]
         have = ', '.join(scan.columns) or 'none'
-        raise FilterError(f'{self.name}: needs the column {name!r}; the points have {have}')
+        raise FilterError(f'needs the column {name!r}; the points have {have}')
 
 
 def select(scan: Scan, rows: Array) -> Scan:
