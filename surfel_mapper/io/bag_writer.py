@@ -86,6 +86,7 @@ class BagWriter:
         from rosbags.rosbag2 import StoragePlugin, Writer
         from rosbags.typesys import get_typestore, Stores
 
+        self._store = get_typestore(Stores.ROS2_JAZZY)
         with self._refusing():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             prefix = f'.{self.path.name}.'
@@ -93,8 +94,11 @@ class BagWriter:
             self.directory = self._hidden / self.path.name
             plugin = StoragePlugin[self.storage.upper()]
             self._writer = Writer(self.directory, version=9, storage_plugin=plugin)
-            self._writer.open()
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+            try:
+                self._writer.open()
+            except BaseException:
+                shutil.rmtree(self._hidden, ignore_errors=True)
+                raise
         return self
 
     def __exit__(
@@ -111,9 +115,7 @@ class BagWriter:
             with self._refusing():
                 self._writer.close()
                 self._check_free()
-                if self.path.exists():
-                    self.path.rename(self._hidden / 'replaced')
-                self.directory.rename(self.path)
+                self._take_name()
         finally:
             shutil.rmtree(self._hidden, ignore_errors=True)
             self.directory = self.path
@@ -192,6 +194,18 @@ class BagWriter:
             self._new('geometry_msgs/msg/TwistWithCovariance', motion, unknown),
         )
         self._write_message(topic, record_ns, message)
+
+    def _take_name(self) -> None:
+        """Put the bag under its name; what had the name comes back if that fails."""
+        replaced = self._hidden / 'replaced'
+        if self.path.exists():
+            self.path.rename(replaced)
+        try:
+            self.directory.rename(self.path)
+        except OSError:
+            if replaced.exists():
+                replaced.rename(self.path)
+            raise
 
     def _write_message(
         self, topic: str, record_ns: int, message: Any, *, latched: bool = False

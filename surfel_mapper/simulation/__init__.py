@@ -13,7 +13,7 @@ A lidar driving through an analytic world: scans, poses and bags with known trut
 from surfel_mapper.simulation.drive import Drive, Simulation
 from surfel_mapper.simulation.lidar import Lidar
 from surfel_mapper.simulation.primitives import Primitive
-from surfel_mapper.simulation.recording import record
+from surfel_mapper.simulation.recording import load_simulation, record
 from surfel_mapper.simulation.world import World
 
-__all__ = ['Drive', 'Lidar', 'Primitive', 'Simulation', 'World', 'record']
+__all__ = ['Drive', 'Lidar', 'Primitive', 'Simulation', 'World', 'load_simulation', 'record']

@@ -24,7 +24,7 @@ from surfel_mapper.simulation.primitives import Primitive
 STREET_XYZ = (3.7, -12.4, 1.3)
 """Where the street begins in the world, m."""
 
-STREET_TURN_DEG = (1.8, -1.3, 27.0)
+STREET_TURN_DEG = (2.6, -1.9, 27.0)
 """How the street is turned in the world, rotation vector."""
 
 BEYOND_M = 60.0
