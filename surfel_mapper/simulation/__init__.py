@@ -8,6 +8,7 @@ A lidar driving through an analytic world: scans, poses and bags with known trut
     simulation.drive.T_odom_sensor(stamp_ns)    where the sensor was
     simulation.world.normal_at(positions)       true normals; the world's frame is odom
     record(simulation, 'street')                all of it as a bag
+    load_simulation('street')                   the simulation of a bag, with its truth
 """
 
 from surfel_mapper.simulation.drive import Drive, Simulation
