@@ -21,13 +21,13 @@ import numpy.typing as npt
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.io.state import load_state, save_state
 from surfel_mapper.kernels.layout import HALF, MAX_MAP_COUNT
+from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 
 KIND = 'surfel map'
-NAMES = ('key', 'count', 'total', 'product', 'view')
-COLUMNS = {'key': (), 'count': (), 'total': (3,), 'product': (6,), 'view': (3,)}
+NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 
 def save_map(
@@ -72,6 +72,7 @@ def save_map(
         'kind': KIND,
         'voxel_size_m': surfel_map.voxel_size_m,
         'level': surfel_map.level,
+        'columns': surfel_map.columns,
         'digest': digest,
     }
     save_state(path, arrays, attributes, compress=compress)
@@ -114,10 +115,12 @@ def load_map(
             f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
         )
     try:
-        surfel_map = SurfelMap(found_m, level=attributes['level'])
+        surfel_map = SurfelMap(
+            found_m, columns=tuple(attributes['columns']), level=attributes['level']
+        )
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
         scans = [_scan(arrays, number, surfel_map) for number in range(_num_scans(arrays))]
-        held = SurfelMap(found_m, level=attributes['level'])
+        held = SurfelMap(found_m, columns=surfel_map.columns, level=surfel_map.level)
         for scan in scans:
             held.insert(scan.moments)
         surfel_map.copy().subtract(held)  # so that every scan can leave
@@ -156,11 +159,13 @@ def _moments(
     """Return moments from a file, which have to be possible: the kernels rely on it."""
     parts = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
     key, count = parts['key'], parts['count']
+    names = channel_names(surfel_map.columns)
+    widths = {'total': (3,), 'product': (6,), 'view': (3,), 'channels': (len(names),)}
     for name, array in parts.items():
-        if array.shape != (len(key), *COLUMNS[name]) or array.dtype.kind != 'i':
+        if array.shape != (len(key), *widths.get(name, ())) or array.dtype.kind != 'i':
             raise ValueError(f'{prefix}.{name}: {array.dtype} {array.shape}')
-    if key.dtype != np.int64 or parts['product'].dtype != np.int64:
-        raise ValueError(f'{prefix}: keys or products are not int64')
+    if any(parts[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
+        raise ValueError(f'{prefix}: keys, products or channels are not int64')
     if len(np.unique(key)) < len(key) or (key < 0).any():
         raise ValueError(f'{prefix}: a voxel stands twice, or is none')
     most = np.abs(parts['total']).max(axis=1, initial=0) / (HALF << surfel_map.level)
@@ -174,4 +179,6 @@ def _moments(
         total=parts['total'],
         product=parts['product'],
         view=parts['view'],
+        channel_names=names,
+        channels=parts['channels'],
     )

@@ -65,4 +65,5 @@ def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
         total=by_voxel(total + count[:, None] * shift),
         product=by_voxel(product),
         view=by_voxel(moments.view.astype(np.int64)),
+        channels=by_voxel(moments.channels) if moments.channel_names else moments.channels,
     )

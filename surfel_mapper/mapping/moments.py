@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels.channels import sum_channels
 from surfel_mapper.kernels.layout import (
     BITS,
     INDEX_BITS,
@@ -34,6 +35,8 @@ from surfel_mapper.kernels.moments import (
     TOO_FAR,
     TOO_NEAR,
 )
+from surfel_mapper.kernels.queries import build_table
+from surfel_mapper.mapping.channels import channel_names, quantised
 
 NARROW_COUNT = 1 << 16
 """Below so many points in every voxel the sums fit into int32."""
@@ -61,6 +64,10 @@ class ScanMoments:
     view : (K, 3) int16 or int64
         int16: 2^14 times the unit vector to the sensor, the same for all points of the voxel;
         int64: the sum of these over the points.
+    channel_names : tuple of str
+        Names of the channels, where the map has any: intensity, red, green, blue.
+    channels : (K, C) int64
+        Their sums over the points; see mapping/channels.py for the units.
     left_out : mapping of str to int
         Points that are not in here, by cause: not_finite, too_near, too_far, beyond_map.
 
@@ -73,7 +80,14 @@ class ScanMoments:
     total: npt.NDArray[Any]
     product: npt.NDArray[np.int64]
     view: npt.NDArray[Any]
+    channel_names: tuple[str, ...] = ()
+    channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Without channels every voxel has a row of none."""
+        if self.channels is None:
+            object.__setattr__(self, 'channels', np.empty((len(self.key), 0), np.int64))
 
     def __len__(self) -> int:
         """Return the number of voxels."""
@@ -97,7 +111,7 @@ class ScanMoments:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays."""
-        return sum(a.nbytes for a in self.arrays)
+        return sum(a.nbytes for a in self.arrays) + self.channels.nbytes
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
@@ -111,7 +125,7 @@ class ScanMoments:
 
     def first(self, num_voxels: int) -> ScanMoments:
         """Return the moments of the first so many voxels."""
-        names = ('key', 'count', 'total', 'product', 'view')
+        names = ('key', 'count', 'total', 'product', 'view', 'channels')
         return replace(self, **{name: getattr(self, name)[:num_voxels] for name in names})
 
 
@@ -123,12 +137,15 @@ class Reducer:
     ----------
     voxel_size_m : float
         Edge of a voxel.
+    columns : tuple of str
+        Columns of the points to sum as well.
 
     """
 
-    def __init__(self, voxel_size_m: float) -> None:
+    def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
         """Start with room for few voxels; it grows with the scans."""
         self.voxel_size_m = voxel_size_m
+        self._columns = columns
         self._reserve(2048)
 
     def _reserve(self, num_voxels: int) -> None:
@@ -144,6 +161,7 @@ class Reducer:
         origin: npt.ArrayLike | None = None,
         min_range_m: float = 0.0,
         max_range_m: float = math.inf,
+        columns: Mapping[str, npt.NDArray[Any]] | None = None,
     ) -> ScanMoments:
         """
         Return the moments of points; see SurfelMap.reduce.
@@ -151,7 +169,7 @@ class Reducer:
         Raises
         ------
         ValueError
-            If shapes or types are wrong, or pose or origin are not finite.
+            If shapes or types are wrong, pose or origin are not finite, or a column is missing.
         MapLimitError
             If a voxel gets more than 2^23 points of one scan.
 
@@ -164,8 +182,14 @@ class Reducer:
         if seen_from.shape != (3,) or (origin is not None and not np.isfinite(seen_from).all()):
             raise ValueError('origin: expected the finite position of the sensor, x y z')
         range_sq = np.array([min_range_m**2, max_range_m**2])
-        num = self._reduce(points, np.ascontiguousarray(pose[:3]), range_sq)
-        return self._pack(num, np.ascontiguousarray(seen_from))
+        values = quantised(columns or {}, self._columns, len(points)) if self._columns else None
+        pose = np.ascontiguousarray(pose[:3])
+        num = self._reduce(points, pose, range_sq)
+        moments = self._pack(num, np.ascontiguousarray(seen_from))
+        if values is None:
+            return moments
+        sums = self._sum_channels(points, pose, range_sq, moments.key, values)
+        return replace(moments, channel_names=channel_names(self._columns), channels=sums)
 
     def _reduce(self, points: npt.NDArray[Any], pose: Any, range_sq: Any) -> int:
         """Fill the scratch memory, made larger until the voxels fit; return their number."""
@@ -208,6 +232,23 @@ class Reducer:
             moments.view,
         )
         return moments
+
+    def _sum_channels(
+        self,
+        points: npt.NDArray[Any],
+        pose: Any,
+        range_sq: Any,
+        key: npt.NDArray[np.int64],
+        values: npt.NDArray[np.int32],
+    ) -> npt.NDArray[np.int64]:
+        """Return the sums of the channels of the points in each voxel, (K, C)."""
+        table = self._scratch[0]
+        build_table(key, table)
+        sums = np.empty((len(key), values.shape[1]), np.int64)
+        scale = (1 << BITS) / self.voxel_size_m
+        sum_channels(points.T, pose, scale, range_sq, key, table, values, sums)
+        table[:] = -1
+        return sums
 
     def _causes(self) -> dict[str, int]:
         """Return how many points were left out, by cause; causes that did not occur are not in."""

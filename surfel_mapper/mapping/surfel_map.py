@@ -16,10 +16,13 @@ Numbers that bound it: voxel indices within 21 signed bits an axis (524 km each 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from dataclasses import replace
 import hashlib
 from itertools import takewhile
 import math
 import struct
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,6 +30,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.surfels import rows_changed_at
+from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.levels import coarse_moments
 from surfel_mapper.mapping.moments import Reducer, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_index import SurfelIndex
@@ -48,6 +52,8 @@ class SurfelMap:
     ----------
     voxel_size_m : float
         Edge of a voxel, m.
+    columns : tuple of str
+        What else of the points is summed, exactly too: ``intensity``, ``rgb``.
     level : int
         The lattice unit is ``voxel_size_m / 2^(16 + level)``; other than 0 only in maps made
         from finer ones, which take the moments of no scan.
@@ -55,22 +61,26 @@ class SurfelMap:
     Raises
     ------
     ValueError
-        If the voxel size is not positive and finite.
+        If the voxel size is not positive and finite, or a column is none that can be summed.
 
     """
 
-    def __init__(self, voxel_size_m: float = 0.5, *, level: int = 0) -> None:
+    def __init__(
+        self, voxel_size_m: float = 0.5, *, columns: tuple[str, ...] = (), level: int = 0
+    ) -> None:
         """Make an empty map."""
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         self.voxel_size_m = float(voxel_size_m)
         self.level = level
         self.version = 0
-        self._reducer = Reducer(self.voxel_size_m)
+        self.columns = columns
+        self._channel_names = channel_names(columns)
+        self._reducer = Reducer(self.voxel_size_m, columns)
         self._reset()
 
     def _reset(self) -> None:
-        self._table = VoxelTable()
+        self._table = VoxelTable(len(self._channel_names))
         self._log: deque[tuple[int, npt.NDArray[np.int32]]] = deque()
         self._logged = 0
         self._log_start = self.version
@@ -95,7 +105,13 @@ class SurfelMap:
         """Bytes in use for voxels and their hash table."""
         return self._table.nbytes
 
-    def add(self, points: npt.ArrayLike, origin: npt.ArrayLike | None = None) -> ScanMoments:
+    def add(
+        self,
+        points: npt.ArrayLike,
+        origin: npt.ArrayLike | None = None,
+        *,
+        columns: Mapping[str, npt.NDArray[Any]] | None = None,
+    ) -> ScanMoments:
         """
         Add points and return their moments, which ``remove`` takes.
 
@@ -106,6 +122,8 @@ class SurfelMap:
             ``left_out`` of the result.
         origin : (3,) float, m, optional
             Where the sensor was; normals turn towards it.
+        columns : mapping of str to (N,) array, optional
+            What else the points carry; needed where the map has columns.
 
         Raises
         ------
@@ -116,7 +134,7 @@ class SurfelMap:
             has changed then.
 
         """
-        moments = self.reduce(points, origin=origin)
+        moments = self.reduce(points, origin=origin, columns=columns)
         beyond = moments.left_out.get('beyond_map', 0)
         if beyond:
             limit = layout.INDEX_OFFSET * self.voxel_size_m
@@ -135,6 +153,7 @@ class SurfelMap:
         origin: npt.ArrayLike | None = None,
         min_range_m: float = 0.0,
         max_range_m: float = math.inf,
+        columns: Mapping[str, npt.NDArray[Any]] | None = None,
     ) -> ScanMoments:
         """
         Return the moments that points have in this map, without adding them.
@@ -152,6 +171,8 @@ class SurfelMap:
             Where the sensor was, in the frame of the map.
         min_range_m, max_range_m : float
             Distances from the origin of the points' frame between which points enter.
+        columns : mapping of str to (N,) array, optional
+            What else the points carry; needed where the map has columns.
 
         """
         return self._reducer.reduce(
@@ -160,6 +181,7 @@ class SurfelMap:
             origin=origin,
             min_range_m=min_range_m,
             max_range_m=max_range_m,
+            columns=columns,
         )
 
     def insert(self, moments: ScanMoments) -> None:
@@ -275,13 +297,15 @@ class SurfelMap:
         """
         if not 0 <= level <= layout.INDEX_BITS - 1:
             raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
-        coarse = SurfelMap(self.voxel_size_m * 2**level, level=self.level + level)
+        coarse = SurfelMap(
+            self.voxel_size_m * 2**level, columns=self.columns, level=self.level + level
+        )
         coarse.insert(coarse_moments(self.moments(), level))
         return coarse
 
     def copy(self) -> SurfelMap:
         """Return a map of its own with the same content."""
-        other = SurfelMap(self.voxel_size_m, level=self.level)
+        other = SurfelMap(self.voxel_size_m, columns=self.columns, level=self.level)
         other.insert(self.moments())
         return other
 
@@ -317,8 +341,9 @@ class SurfelMap:
 
     def moments(self) -> ScanMoments:
         """Return the exact moments of all voxels, sorted by voxel; a copy."""
-        rows = self._table.rows[self._table.changed_after(-1, 1)]
-        rows = rows[np.argsort(rows[:, layout.KEY])]
+        chosen = self._table.changed_after(-1, 1)
+        chosen = chosen[np.argsort(self._table.rows[chosen, layout.KEY])]
+        rows = self._table.rows[chosen]
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
             level=self.level,
@@ -327,6 +352,8 @@ class SurfelMap:
             total=rows[:, layout.SUM : layout.SUM + 3].copy(),
             product=rows[:, layout.PRODUCT : layout.PRODUCT + 6].copy(),
             view=rows[:, layout.VIEW : layout.VIEW + 3].copy(),
+            channel_names=self._channel_names,
+            channels=self._table.channels(chosen),
         )
 
     def digest(self) -> str:
@@ -340,8 +367,9 @@ class SurfelMap:
         -----
         Of the text ``surfel map 1``, the voxel size as float64, level and number of voxels; then
         of all voxels the keys, the counts, the sums (x y z), the products (xx xy xz yy yz zz)
-        and the sums of the views (x y z), array by array and sorted by key. All numbers but the
-        first are int64, all are little-endian. The key of voxel (i, j, k) is
+        and the sums of the views (x y z), array by array and sorted by key; where the map has
+        columns, their names, a comma between each, and the sums of the channels. All numbers
+        but the first are int64, all are little-endian. The key of voxel (i, j, k) is
         ((i + 2^20) 2^21 + (j + 2^20)) 2^21 + (k + 2^20).
 
         """
@@ -350,6 +378,9 @@ class SurfelMap:
         state.update(struct.pack('<dqq', self.voxel_size_m, self.level, len(moments)))
         for array in moments.arrays:
             state.update(np.ascontiguousarray(array, dtype='<i8').data)
+        if self.columns:
+            state.update(','.join(self.columns).encode())
+            state.update(np.ascontiguousarray(moments.channels, dtype='<i8').data)
         return state.hexdigest()
 
     def clear(self) -> None:
@@ -358,7 +389,12 @@ class SurfelMap:
         self._reset()
 
     def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
-        return derive(self._table.rows, chosen, self.voxel_size_m, layout.BITS + self.level)
+        bits = layout.BITS + self.level
+        surfels = derive(self._table.rows, chosen, self.voxel_size_m, bits)
+        if not self._channel_names:
+            return surfels
+        sums = self._table.channels(chosen)
+        return replace(surfels, channels=means(sums, surfels.num_points, self._channel_names))
 
     def _remember(self, changed: npt.NDArray[np.int32]) -> None:
         """Log the rows that the present version changed; forget the oldest beyond a bound."""
@@ -375,6 +411,11 @@ class SurfelMap:
             raise MapError(
                 f'moments of voxel size {moments.voxel_size_m:g} m, level {moments.level}; '
                 f'this map has {self.voxel_size_m:g} m, level {self.level}'
+            )
+        if moments.channel_names != self._channel_names:
+            raise MapError(
+                f'moments with the channels {moments.channel_names}; '
+                f'this map has {self._channel_names}'
             )
 
     def _check_counts(self, moments: ScanMoments) -> None:

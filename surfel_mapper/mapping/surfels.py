@@ -9,8 +9,8 @@ asked for; a map stores none of it.
 
 from __future__ import annotations
 
-import dataclasses
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,8 @@ class Surfels:
         How many points.
     voxel_index : (K, 3) int32
         floor(point / voxel size).
+    channels : mapping of str to (K,) float64
+        Means of what else the map sums: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
 
     """
 
@@ -52,6 +54,7 @@ class Surfels:
     eigenvalues: npt.NDArray[np.float64]
     num_points: npt.NDArray[np.int64]
     voxel_index: npt.NDArray[np.int32]
+    channels: Mapping[str, npt.NDArray[np.float64]] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Return the number of surfels."""
@@ -59,7 +62,29 @@ class Surfels:
 
     def select(self, rows: npt.NDArray[Any]) -> Surfels:
         """Return some of the surfels: by a mask (K,) bool, or by their row numbers."""
-        return Surfels(*(getattr(self, f.name)[rows] for f in dataclasses.fields(self)))
+        return Surfels(
+            position=self.position[rows],
+            normal=self.normal[rows],
+            planarity=self.planarity[rows],
+            curvature=self.curvature[rows],
+            eigenvalues=self.eigenvalues[rows],
+            num_points=self.num_points[rows],
+            voxel_index=self.voxel_index[rows],
+            channels={name: values[rows] for name, values in self.channels.items()},
+        )
+
+    @property
+    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """All but the channels, in the order they are declared."""
+        return (
+            self.position,
+            self.normal,
+            self.planarity,
+            self.curvature,
+            self.eigenvalues,
+            self.num_points,
+            self.voxel_index,
+        )
 
 
 def derive(
@@ -93,6 +118,5 @@ def derive(
         num_points=np.empty(num, np.int64),
         voxel_index=np.empty((num, 3), np.int32),
     )
-    outputs = tuple(getattr(surfels, field.name) for field in dataclasses.fields(surfels))
-    derive_surfels(rows, chosen, voxel_size_m, bits, outputs)
+    derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays)
     return surfels

@@ -10,6 +10,7 @@ that no scan waits for the whole map.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -32,11 +33,20 @@ MAX_DEPTH = 24
 
 
 class VoxelTable:
-    """Rows of voxels, laid out as kernels/layout.py says, and the hash table that finds them."""
+    """
+    Rows of voxels, laid out as kernels/layout.py says, and the hash table that finds them.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    num_channels : int
+        Channels that are summed beside the moments, in rows of their own.
+
+    """
+
+    def __init__(self, num_channels: int = 0) -> None:
         """Make an empty table."""
         self._rows = Slab(1024, layout.ROW)
+        self._channels = Slab(1024, num_channels) if num_channels else None
         self._buckets = Slab(1, hashing.SEGMENT)
         self._directory = np.zeros(1, np.int32)
         self._held = np.zeros(1, np.int32)
@@ -63,7 +73,8 @@ class VoxelTable:
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
-        rows = int(self._state[hashing.ROWS_USED]) * layout.ROW * 8
+        width = layout.ROW + (self._channels.array.shape[1] if self._channels else 0)
+        rows = int(self._state[hashing.ROWS_USED]) * width * 8
         buckets = int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
         return rows + buckets + self._directory.nbytes + self._held.nbytes
 
@@ -93,6 +104,10 @@ class VoxelTable:
             )
             if done < len(moments):
                 self._make_room_or_undo(moments.first(done), version)
+        if self._channels:
+            if len(self._channels.array) < len(self.rows):
+                self._channels.grow(len(self.rows))
+            self._channels.array[self.find(moments.key)] += moments.channels
         return changed[: self._state[hashing.CHANGED]]
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
@@ -125,7 +140,15 @@ class VoxelTable:
             max(min_points, 1),
             fallen,
         )
+        if self._channels:
+            self._channels.array[found] -= moments.channels
         return fallen[:num_fallen]
+
+    def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """Return the sums of the channels of some rows, (K, C)."""
+        if not self._channels:
+            return np.empty((len(chosen), 0), np.int64)
+        return np.asarray(self._channels.array[chosen])
 
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
         """Return the rows changed after a version that hold at least so many points."""
@@ -143,6 +166,8 @@ class VoxelTable:
         try:
             self._make_room()
         except MapLimitError:
+            if self._channels:  # they would have been added last
+                added = replace(added, channels=np.zeros_like(added.channels))
             self.subtract(added, version, self.find(added.key))
             raise
 

@@ -7,7 +7,6 @@ A machine of hypothesis works on a map and on the exact integers of a slow twin 
 every step their digests are equal, and the voxels said to have changed are those touched.
 """
 
-import dataclasses
 import math
 
 from hypothesis import settings
@@ -40,7 +39,7 @@ ORIGIN = st.none() | st.tuples(*[st.floats(-50.0, 50.0)] * 3)
 def in_order(surfels):
     """Return the bits of surfels, sorted by voxel."""
     surfels = surfels.select(np.lexsort(surfels.voxel_index.T))
-    return [getattr(surfels, f.name).tobytes() for f in dataclasses.fields(surfels)]
+    return [values.tobytes() for values in surfels.arrays]
 
 
 class MapBesideTwin(RuleBasedStateMachine):

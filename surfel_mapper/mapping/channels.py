@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Channels: intensity and colour of points as integers, so that a map sums them exactly too.
+
+Intensity is quantised once to 1/256 (sensors give 8 or 16 bits, or reflectivities up to some
+thousands); colours are whole numbers from 0 to 255 already. What is no number counts as 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+CHANNELS = {'intensity': ('intensity',), 'rgb': ('red', 'green', 'blue')}
+"""Columns of a scan that a map can sum, and the channels that each is made of."""
+
+UNITS = {'intensity': 256.0, 'red': 1.0, 'green': 1.0, 'blue': 1.0}
+"""Integers a unit of each channel."""
+
+LARGEST = float(2**31 - 256)
+"""Quantised values are cut off here, so that 2^31 of them do not overflow an int64."""
+
+
+def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
+    """
+    Return the channels of columns, in order.
+
+    Raises
+    ------
+    ValueError
+        If a column is none that a map can sum.
+
+    """
+    unknown = [name for name in columns if name not in CHANNELS]
+    if unknown:
+        raise ValueError(f'columns: {unknown}, expected some of {list(CHANNELS)}')
+    return tuple(channel for name in columns for channel in CHANNELS[name])
+
+
+def quantised(
+    columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...], num_points: int
+) -> npt.NDArray[np.int32]:
+    """
+    Return the channels of the named columns as integers, (N, C) int32.
+
+    Parameters
+    ----------
+    columns : mapping of str to (N,) array
+        ``intensity``: numbers. ``rgb``: three bytes packed into float32 or uint32, as PCL and
+        RViz have them, or an (N, 3) array of 0 to 255; ``rgba`` will do for it.
+    names : tuple of str
+        Which columns.
+    num_points : int
+        N.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing or of another length.
+
+    """
+    parts = []
+    for name in names:
+        alternative = columns.get('rgba') if name == 'rgb' else None
+        column = columns.get(name, alternative)
+        if column is None or len(column) != num_points:
+            found = 'missing' if column is None else f'of length {len(column)}'
+            raise ValueError(f'column {name}: {found}, expected one row for {num_points} points')
+        parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
+    return np.ascontiguousarray(np.concatenate(parts, axis=1))
+
+
+def means(
+    sums: npt.NDArray[np.int64], count: npt.NDArray[np.int64], names: tuple[str, ...]
+) -> dict[str, npt.NDArray[np.float64]]:
+    """Return the mean of every channel, (K,) float64 each, from sums (K, C) and counts (K,)."""
+    return {
+        name: sums[:, channel] / (count * UNITS[name]) for channel, name in enumerate(names)
+    }
+
+
+def _fixed(column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    scaled = np.nan_to_num(column.astype(np.float64), nan=0.0) * UNITS['intensity']
+    return np.rint(np.clip(scaled, -LARGEST, LARGEST)).astype(np.int32).reshape(-1, 1)
+
+
+def _unpacked(column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:
+    if column.ndim == 2:
+        return np.asarray(np.clip(np.nan_to_num(column[:, :3]), 0, 255), np.int32)
+    packed = np.ascontiguousarray(column)
+    bits = packed.view(np.uint32) if packed.dtype == np.float32 else packed.astype(np.uint32)
+    return np.stack([(bits >> 16) & 255, (bits >> 8) & 255, bits & 255], axis=1).astype(np.int32)
