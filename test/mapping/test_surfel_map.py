@@ -8,6 +8,7 @@ the exact integers of a slow twin, and maps with each other by digest: nothing h
 """
 
 import math
+from pathlib import Path
 import subprocess
 import sys
 
@@ -432,7 +433,11 @@ print(surfel_map.digest() == alone.digest())
 @pytest.mark.skipif(sys.platform != 'linux', reason='reads /proc')
 def test_a_map_that_gets_no_memory_says_so_and_is_unchanged():
     done = subprocess.run(
-        [sys.executable, '-c', NO_MEMORY], capture_output=True, text=True, check=False
+        [sys.executable, '-c', NO_MEMORY],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()

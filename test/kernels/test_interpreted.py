@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A map made without the compiler, in a process of its own, equals one made with it."""
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+SHORT_MAPPING = """
+import hashlib
+import numpy as np
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+np.seterr(all='ignore')  # hashes overflow and 0 / 0 is nan on purpose, as compiled
+rng = np.random.default_rng(1)
+surfel_map, live = SurfelMap(0.2), []
+for number in range(6):
+    points = rng.normal(scale=[3.0, 3.0, 0.3], size=(250, 3))
+    points = points.astype([np.float32, np.float64][number % 2])
+    points[::50] = np.nan
+    points[1::60] = 1e20
+    q = rng.normal(size=4)
+    pose = pose_matrix([9000.0 + number, -4.0, 1.0], q / np.linalg.norm(q))
+    live.append(surfel_map.reduce(points, pose, origin=pose[:3, 3], max_range_m=9.0))
+    surfel_map.insert(live[-1])
+    print(live[-1].left_out, surfel_map.digest())
+    if number % 2:
+        print(len(surfel_map.remove(live.pop(0), 2)))
+    surfels = surfel_map.surfels_changed()
+    order = np.lexsort(surfels.voxel_index.T)
+    bits = b''.join(getattr(surfels, name)[order].tobytes() for name in (
+        'position', 'normal', 'planarity', 'curvature', 'eigenvalues', 'num_points'))
+    print(len(surfels), hashlib.sha256(bits).hexdigest())
+try:
+    surfel_map.remove(live[0])
+    surfel_map.remove(live[0])
+except ValueError as error:
+    print(error)
+"""
+
+
+@pytest.mark.timeout(200)
+def test_a_map_is_the_same_to_the_bit_without_the_compiler():
+    printed = []
+    for disable in ('0', '1'):
+        done = subprocess.run(
+            [sys.executable, '-c', SHORT_MAPPING],
+            cwd=Path(__file__).parents[2],
+            env={**os.environ, 'NUMBA_DISABLE_JIT': disable},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+        assert done.stderr == ''
+        printed.append(done.stdout)
+    assert printed[0] == printed[1]
+    assert 'does not hold' in printed[0]
+    assert len(printed[0].splitlines()) == 16

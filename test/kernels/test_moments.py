@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The kernels that reduce a scan, one by one, against Python integers.
+
+What a whole reduction gives is compared more broadly in test/mapping/test_moments.py.
+"""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.kernels.moments import (
+    add_run,
+    BEYOND,
+    CHUNK,
+    clear_table,
+    find_runs,
+    hash_shift,
+    home,
+    NOT_FINITE,
+    pack_moments,
+    quantise,
+    reason,
+    reduce_points,
+    TOO_FAR,
+    TOO_NEAR,
+)
+from surfel_mapper.mapping.moments import pack_keys, unpack_keys
+from test import reference
+from test.kernels.modes import both
+
+IDENTITY = np.eye(4)[:3]
+ANY_RANGE = np.array([0.0, np.inf])
+
+
+def some_points(num, dtype=np.float64, seed=0):
+    """Return points (N, 3) in runs of a voxel, some not finite, some on faces and lattice."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-2.0, 2.0, (num, 3))
+    points = np.repeat(points, rng.integers(1, 6, num), axis=0)[:num]
+    points += rng.normal(scale=0.05, size=points.shape)
+    points[::7] = np.round(points[::7] * 2.0) / 2.0
+    points[::11] = np.round(points[::11] * 131072.0) / 131072.0
+    points[::13] *= -0.0
+    points[::17, 1] = np.nan
+    points[::19, 2] = -np.inf
+    points[::23, 0] = 1e30
+    return points.astype(dtype)
+
+
+def scratch_for(num_voxels):
+    size = 1 << (2 * num_voxels - 1).bit_length()
+    keys, sums = np.full(num_voxels, -7, np.int64), np.full((num_voxels, 10), np.nan)
+    return np.full(size, -1, np.int32), keys, sums
+
+
+@both
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+@pytest.mark.parametrize('turned', [False, True])
+def test_points_are_quantised_as_by_python(call, dtype, turned):
+    pose = pose_matrix([3.0, 1e4, -2.0], [0.5, -0.5, 0.1, 0.7]) if turned else np.eye(4)
+    points = some_points(300, dtype)
+    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
+
+    call(quantise, *points.T.copy(), pose[:3], 65536 / 0.2, ANY_RANGE, keys, places)
+
+    for row, point in enumerate(points.tolist()):
+        expected = reference.quantise(point, 0.2, pose)
+        if expected is None:
+            assert keys[row] == -1
+        else:
+            voxel, place = expected
+            assert keys[row] == pack_keys(np.array([voxel]))[0]
+            assert tuple(places[:, row]) == place
+
+
+@both
+def test_points_outside_of_the_range_get_no_key(call):
+    points = np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, -3.0], [0.9, 0, 0], [0, -3.1, 0]])
+    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
+    limits = np.array([1.0, 9.0])
+    call(quantise, *points.T.copy(), IDENTITY, 131072.0, limits, keys, places)
+    assert (keys[:5] >= 0).tolist() == [True, True, True, False, False]
+
+
+@both
+@pytest.mark.parametrize('keys', [[5], [5, 5, 5], [1, 2, 3], [1, 1, -1, -1, 2, 2, 1], [-1], []])
+def test_runs_are_those_of_groupby(call, keys):
+    starts = np.full(CHUNK + 1, -9, np.int32)
+    num = call(find_runs, np.array(keys + [5] * 3, np.int64), len(keys), starts)
+    lengths = [len(list(group)) for _, group in itertools.groupby(keys)]
+    assert num == len(lengths)
+    assert np.diff(starts[: num + 1]).tolist() == lengths
+    assert starts[num] == len(keys)
+
+
+@both
+def test_a_run_adds_count_sums_and_products(call):
+    places = np.random.default_rng(1).integers(-32768, 32768, (3, 20)).astype(np.float64)
+    sums = np.zeros((3, 10))
+    sums[1] = 5.0
+    call(add_run, places, 4, 9, sums, 1)
+    x, y, z = places[:, 4:9].astype(int).tolist()
+    products = [sum(a * b for a, b in zip(*p, strict=True))
+                for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]]  # fmt: skip
+    assert sums[1].tolist() == [v + 5 for v in [5, sum(x), sum(y), sum(z), *products]]
+    assert not sums[[0, 2]].any()
+
+
+@both
+@pytest.mark.parametrize('num', [0, 1, 50, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 5])
+def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
+    points = some_points(num)
+    table, keys, sums = scratch = scratch_for(max(2 * num, 1))
+    left_out = np.full(4, -1, np.int64)
+
+    found = call(reduce_points, points.T.copy(), IDENTITY, 131072.0, ANY_RANGE, scratch, left_out)
+
+    twin = reference.scan_moments(points, 0.5)
+    assert list(map(tuple, unpack_keys(keys[:found]).tolist())) == list(twin)
+    assert sums[:found].astype(int).tolist() == [row[:10] for row in twin.values()]
+    assert (table == -1).all()
+    finite = np.isfinite(points).all(axis=1)
+    assert left_out[NOT_FINITE] == (~finite).sum()
+    assert left_out.sum() == num - sum(row[0] for row in twin.values())
+
+
+@both
+@pytest.mark.parametrize('room', [1, 8, 60])
+def test_a_scan_that_does_not_fit_leaves_the_table_clean(call, room):
+    table, keys, sums = scratch_for(room)
+    left_out = np.zeros(4, np.int64)
+    points = np.random.default_rng(2).uniform(-9.0, 9.0, (3 * CHUNK, 3))
+    points[: CHUNK + 9] = 0.1  # the first chunk fits
+    scratch = (table, keys, sums)
+    assert call(reduce_points, points.T, IDENTITY, 131072.0, ANY_RANGE, scratch, left_out) == -1
+    assert (table == -1).all()
+
+
+@both
+def test_a_table_is_cleared_however_its_entries_collide(call):
+    # every key of a crowded table: half of it is full, many far from home
+    keys = np.random.default_rng(3).integers(0, 2**63 - 1, 512)
+    table = np.full(1024, -1, np.int32)
+    shift = hash_shift(1024)
+    with np.errstate(over='ignore'):
+        for row, key in enumerate(keys):
+            place = int(home(key, shift))
+            while table[place] >= 0:
+                place = (place + 1) % 1024
+            table[place] = row
+    call(clear_table, table, keys, 512)
+    assert (table == -1).all()
+
+
+@both
+def test_hashes_stay_within_the_table(call):
+    keys = np.random.default_rng(4).integers(0, 2**63 - 1, 200)
+    for bits in (1, 4, 12, 20, 31):
+        shift = call(hash_shift, 1 << bits)
+        assert shift == 64 - bits
+        places = [call(home, key, shift) for key in keys]
+        assert min(places) >= 0
+        assert max(places) < 1 << bits
+
+
+@both
+@pytest.mark.parametrize(
+    ('point', 'cause'),
+    [
+        ([np.nan, 0.0, 0.0], NOT_FINITE),
+        ([0.0, np.inf, 0.0], NOT_FINITE),
+        ([0.0, 0.5, 0.0], TOO_NEAR),
+        ([0.0, 0.0, -6.0], TOO_FAR),
+        ([1e200, 0.0, 0.0], TOO_FAR),
+        ([2.0, 2.0, 2.0], BEYOND),
+    ],
+)
+def test_every_point_left_out_has_one_cause(call, point, cause):
+    assert call(reason, *np.array(point), np.array([1.0, 25.0])) == cause
+
+
+@both
+@pytest.mark.parametrize('wide', [np.int32, np.int64])
+@pytest.mark.parametrize('origin', [[3.0, -40.0, 2.0], [0.25, 0.25, 0.25], None])
+def test_sums_become_the_integers_they_are(call, wide, origin):
+    twin = reference.scan_moments(some_points(200), 0.5, origin)
+    rows = np.array(list(twin.values()))
+    num = len(rows)
+    count, total = np.empty(num, np.int32), np.empty((num, 3), wide)
+    product, view = np.empty((num, 6), np.int64), np.empty((num, 3), np.int16)
+    seen_from = np.full(3, np.nan) if origin is None else np.array(origin)
+
+    keys = pack_keys(np.array(list(twin)))
+    sums = rows[:, :10].astype(np.float64)
+    call(pack_moments, keys, sums, seen_from, 0.5, count, total, product, view)
+
+    assert (count == rows[:, 0]).all()
+    assert (total == rows[:, 1:4]).all()
+    assert (product == rows[:, 4:10]).all()
+    assert (view * count[:, None].astype(np.int64) == rows[:, 10:]).all()
