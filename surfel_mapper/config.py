@@ -88,6 +88,18 @@ class MapConfig(Stage):
         high=2**31 - 1,
         live=True,
     )
+    intensity: bool = setting(
+        False, 'Sum the intensity of the points too; clouds without one are dropped.'
+    )
+    color: bool = setting(
+        False, 'Sum the colour (rgb) of the points too; clouds without one are dropped.'
+    )
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of the points that the map sums."""
+        wanted = {'intensity': self.intensity, 'rgb': self.color}
+        return tuple(name for name, is_wanted in wanted.items() if is_wanted)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -25,6 +25,8 @@ from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import ConfigError, MapError, PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
+from surfel_mapper.mapping.channels import CHANNELS, missing_columns
+from surfel_mapper.mapping.moments import NARROW_COUNT
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
@@ -98,7 +100,9 @@ class Mapper:
                 'expected tf, odometry, pose or identity'
             )
         self.counters = Counters()
-        self.map = SurfelMap(self.config.map.voxel_size_m)
+        self.map = SurfelMap(
+            self.config.map.voxel_size_m, columns=self.config.map.columns
+        )
         self.window = SlidingWindow(
             self.map, self.config.window, max_voxels=self.config.map.max_voxels
         )
@@ -158,6 +162,8 @@ class Mapper:
             self._drop(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
             self._drop(scan, 'no_points', 'it has no points')
+        elif missing := missing_columns(scan.columns, self.map.columns):
+            self._drop(scan, 'missing_column', f'its points have no {" and no ".join(missing)}')
         elif self._in_order(scan):
             self._mount(scan.frame_id)
             self._waiting.append(scan)
@@ -228,11 +234,12 @@ class Mapper:
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
         for dtype in (np.float32, np.float64):
-            surfel_map = SurfelMap(self.config.map.voxel_size_m)
-            moments = surfel_map.add(np.zeros((1, 3), dtype))
+            surfel_map = SurfelMap(self.config.map.voxel_size_m, columns=self.config.map.columns)
+            one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
+            moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
             surfel_map.surfels_changed(since=0)
             surfel_map.remove(moments)
-            many = surfel_map.add(np.zeros((1 << 16, 3), dtype))  # sums in int64
+            many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
             surfel_map.remove(many)
         surfel_map.digest()
 
@@ -345,6 +352,7 @@ class Mapper:
             origin=None if self.config.pose.source == 'identity' else pose[:3, 3],
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m or np.inf,
+            columns=scan.columns,
         )
         self.counters.points_left_out.update(moments.left_out)
         return WindowedScan(

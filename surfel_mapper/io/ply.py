@@ -60,8 +60,18 @@ def write_surfels(path: str | Path, surfels: Surfels) -> None:
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
         'num_points': surfels.num_points.astype(np.uint32),
+        **channel_columns(surfels),
     }
     write_points(path, values)
+
+
+def channel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
+    """Return the mean intensity, float32, and colour, a byte a channel, where there are any."""
+    columns: dict[str, npt.NDArray[Any]] = {}
+    for name, values in surfels.channels.items():
+        is_colour = name != 'intensity'
+        columns[name] = np.rint(values).astype(np.uint8) if is_colour else np.float32(values)
+    return columns
 
 
 def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:

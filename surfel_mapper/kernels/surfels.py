@@ -47,7 +47,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
 
     One point, or all equal: eigenvalues 0; normal, planarity and curvature nan.
     """
-    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
+    _, normal, planarity, curvature, eigenvalues, num_points, _ = outputs
     unit = voxel_size / (1 << bits)
     scatter = np.empty((6, CHUNK))
     values = np.empty((3, CHUNK))

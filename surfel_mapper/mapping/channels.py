@@ -41,6 +41,13 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(channel for name in columns for channel in CHANNELS[name])
 
 
+def missing_columns(
+    columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]
+) -> list[str]:
+    """Return which of the named columns are not there; ``rgba`` will do for ``rgb``."""
+    return [n for n in names if n not in columns and not (n == 'rgb' and 'rgba' in columns)]
+
+
 def quantised(
     columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...], num_points: int
 ) -> npt.NDArray[np.int32]:
@@ -65,11 +72,14 @@ def quantised(
     """
     parts = []
     for name in names:
-        alternative = columns.get('rgba') if name == 'rgb' else None
-        column = columns.get(name, alternative)
-        if column is None or len(column) != num_points:
-            found = 'missing' if column is None else f'of length {len(column)}'
-            raise ValueError(f'column {name}: {found}, expected one row for {num_points} points')
+        if missing_columns(columns, (name,)):
+            raise ValueError(f'column {name}: missing, expected one row for {num_points} points')
+        column = columns['rgba' if name not in columns else name]
+        if len(column) != num_points:
+            raise ValueError(
+                f'column {name}: of length {len(column)}, expected one row for '
+                f'{num_points} points'
+            )
         parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
 

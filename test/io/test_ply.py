@@ -11,6 +11,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.io.ply import read_points, write_points, write_surfels
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.io.examples import make_surfels
 
 NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
@@ -138,3 +139,15 @@ def test_scans_of_real_lidars_are_read_like_plyfile_reads_them():
         assert list(columns) == [p.name for p in vertex.properties]
         for name, values in columns.items():
             np.testing.assert_array_equal(values, vertex[name])
+
+
+def test_intensity_and_colour_are_written_where_the_map_has_them(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
+    columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 1, 7]])}
+    surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
+    write_surfels(tmp_path / 'map.ply', surfel_map.surfels())
+    vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
+    assert vertex['intensity'].tolist() == [1.5]
+    assert [vertex[name].tolist() for name in ('red', 'green', 'blue')] == [[255], [0], [7]]
+    assert vertex['red'].dtype == np.uint8

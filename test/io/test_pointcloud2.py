@@ -20,6 +20,7 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import Field, from_columns, surfel_columns, to_scan
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.io.examples import make_surfels
 
 CODES = {1: 'b', 2: 'B', 3: 'h', 4: 'H', 5: 'i', 6: 'I', 7: 'f', 8: 'd'}
@@ -396,3 +397,13 @@ def test_messages_of_rosbags_decode():
 
     np.testing.assert_array_equal(scan.points, points)
     assert (scan.stamp_ns, scan.frame_id) == (5_000_000_006, 'lidar')
+
+
+def test_surfels_have_intensity_and_colour_where_the_map_has_them():
+    surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
+    columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 0, 7]])}
+    surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
+    found = surfel_columns(surfel_map.surfels())
+    assert list(found)[-2:] == ['intensity', 'rgb']
+    assert found['intensity'].tolist() == [1.5]
+    assert found['rgb'].view(np.uint32).tolist() == [0xFF0007]
