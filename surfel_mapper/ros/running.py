@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Running the node as a process, from its arguments to its exit.
+Running the node, from its arguments to its end.
 
 The executor runs in a thread of its own, since the main thread cannot hear a
 signal while it waits inside the middleware.
@@ -9,12 +9,9 @@ signal while it waits inside the middleware.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
-from contextlib import contextmanager
-import signal
 import threading
-from typing import Any
 
 from rclpy.executors import SingleThreadedExecutor
 
@@ -26,7 +23,7 @@ from surfel_mapper.ros.node import MapperNode
 
 def run_node(ros_args: Sequence[str]) -> None:
     """
-    Run the node until SIGINT or SIGTERM.
+    Run the node until KeyboardInterrupt, which is the usual way to end and raised again.
 
     Parameters
     ----------
@@ -40,16 +37,13 @@ def run_node(ros_args: Sequence[str]) -> None:
 
     """
     keep_freed_memory()
-    try:
-        with interruptible(), context(ros_args):
-            node = MapperNode()
-            try:
-                with logging_to(node.get_logger()):
-                    live(node)
-            finally:
-                node.destroy_node()
-    except KeyboardInterrupt:
-        pass  # the usual way to end
+    with context(ros_args):
+        node = MapperNode()
+        try:
+            with logging_to(node.get_logger()):
+                live(node)
+        finally:
+            node.destroy_node()
 
 
 def live(node: MapperNode) -> None:
@@ -84,26 +78,3 @@ def spin(node: MapperNode) -> None:
     for future in (working, node.failure):
         if future.done():
             future.result()
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """
-    Let the first SIGINT or SIGTERM of a with-block raise KeyboardInterrupt.
-
-    Those that follow are ignored: a terminal and a launch file both send one, and the second
-    would cut the end short that the first began.
-    """
-
-    def interrupt(*_: Any) -> None:
-        for number in signals:
-            signal.signal(number, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    signals = (signal.SIGINT, signal.SIGTERM)
-    before = [signal.signal(number, interrupt) for number in signals]
-    try:
-        yield
-    finally:
-        for number, handler in zip(signals, before, strict=True):
-            signal.signal(number, handler)

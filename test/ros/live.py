@@ -1,0 +1,198 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Processes of the command line, a peer that talks to them over DDS, and messages to send."""
+
+from __future__ import annotations
+
+from array import array
+import os
+from pathlib import Path
+import signal
+import subprocess
+import sys
+import time
+
+from diagnostic_msgs.msg import DiagnosticArray
+from nav_msgs.msg import Odometry
+import numpy as np
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.parameter_client import AsyncParameterClient
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
+from std_srvs.srv import Trigger
+
+ROOT = Path(__file__).parents[2]
+TIMEOUT_S = 30.0
+START_NS = 1_700_000_000_000_000_000
+NODE = '/surfel_mapper'
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RVIZ = QoSProfile(depth=10)
+SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+RELIABLE = [
+    *('-p', 'qos_overrides./points.subscription.reliability:=reliable'),
+    *('-p', 'qos_overrides./odom.subscription.reliability:=reliable'),
+]
+
+
+class Process:
+    """A verb of the command line, running in a folder that also takes its output."""
+
+    def __init__(self, arguments, folder):
+        self._output = Path(folder) / f'{arguments[0]}_{time.monotonic_ns()}.txt'
+        with open(self._output, 'wb') as file:
+            self._process = subprocess.Popen(
+                [sys.executable, '-m', 'surfel_mapper.cli.main', *map(str, arguments)],
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                cwd=folder,
+                env={**os.environ, 'PYTHONPATH': str(ROOT)},
+            )
+
+    @property
+    def output(self):
+        return self._output.read_text(encoding='utf-8')
+
+    def wait(self, timeout_s=TIMEOUT_S):
+        return self._process.wait(timeout_s)
+
+    def is_running(self):
+        return self._process.poll() is None
+
+    def wait_for_output(self, text, timeout_s=TIMEOUT_S):
+        end = time.monotonic() + timeout_s
+        while text not in self.output:
+            assert self.is_running(), self.output
+            assert time.monotonic() < end, f'no {text!r} in: {self.output}'
+            time.sleep(0.05)
+
+    def stop(self, number=signal.SIGINT):
+        self._process.send_signal(number)
+        return self.wait()
+
+    def kill(self):
+        if self.is_running():
+            self._process.kill()
+            self._process.wait(TIMEOUT_S)
+
+
+class Peer:
+    """A node of the test, which sends and collects."""
+
+    def __init__(self):
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context)
+        self.node = rclpy.create_node('peer', context=self._context)
+        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor.add_node(self.node)
+        self._publishers = {}
+
+    def close(self):
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self._context.shutdown()
+
+    def spin_until(self, condition, timeout_s=TIMEOUT_S, what=lambda: 'timed out'):
+        end = time.monotonic() + timeout_s
+        while not condition():
+            assert time.monotonic() < end, what()
+            self._executor.spin_once(0.05)
+
+    def advertise(self, *topics, depth=50):
+        """Publish clouds on topics of points and odometry on others, once they are read."""
+        for topic in topics:
+            kind = Odometry if topic.endswith('odom') else PointCloud2
+            self._publishers[topic] = self.node.create_publisher(kind, topic, depth)
+        self.spin_until(
+            lambda: all(self._publishers[t].get_subscription_count() for t in topics)
+        )
+        end = time.monotonic() + 0.5  # the other side needs to know of us too
+        self.spin_until(lambda: time.monotonic() > end)
+
+    def publish(self, topic, message):
+        self._publishers[topic].publish(message)
+
+    def collect(self, kind, topic, qos=SENSOR):
+        """Return a list that fills with the messages of a topic."""
+        messages = []
+        self.node.create_subscription(kind, topic, messages.append, qos)
+        self.spin_until(lambda: self.node.count_publishers(topic) > 0)
+        return messages
+
+    def call(self, service, kind=Trigger, request=None):
+        client = self.node.create_client(kind, f'{NODE}/{service}')
+        self.spin_until(client.service_is_ready)
+        future = client.call_async(request or kind.Request())
+        self.spin_until(future.done)
+        self.node.destroy_client(client)
+        return future.result()
+
+    def parameters(self):
+        client = AsyncParameterClient(self.node, NODE)
+        self.spin_until(client.services_are_ready)
+        return client
+
+    def result(self, future):
+        self.spin_until(future.done)
+        return future.result()
+
+    def diagnosis(self, expected=None):
+        """Return the first report that holds some values, as (status, values)."""
+        reports = self.collect(DiagnosticArray, '/diagnostics')
+        values = {}
+
+        def is_as_expected():
+            if reports:
+                values.update({item.key: item.value for item in reports[-1].status[0].values})
+            return reports and all(
+                values.get(key) == str(value) for key, value in (expected or {}).items()
+            )
+
+        self.spin_until(is_as_expected, what=lambda: f'no {expected}, but {values}')
+        return reports[-1].status[0], values
+
+
+def odometry(stamp_ns, xyz, parent='odom', child='base_link'):
+    """Return the pose of a vehicle that does not turn."""
+    message = Odometry(child_frame_id=child)
+    message.header.frame_id = parent
+    stamp(message, stamp_ns)
+    position = message.pose.pose.position
+    position.x, position.y, position.z = map(float, xyz)
+    return message
+
+
+def cloud(stamp_ns, points, frame_id='lidar'):
+    """Return points as a cloud of x y z."""
+    content = np.ascontiguousarray(points, '<f4')
+    message = PointCloud2(
+        height=1,
+        width=len(content),
+        fields=[
+            PointField(name=name, offset=4 * i, datatype=7, count=1)
+            for i, name in enumerate('xyz')
+        ],
+        point_step=12,
+        row_step=12 * len(content),
+        data=array('B', content.tobytes()),
+    )
+    message.header.frame_id = frame_id
+    stamp(message, stamp_ns)
+    return message
+
+
+def stamp(message, stamp_ns):
+    """Set the time of a message."""
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+
+
+def room(seed, num=4000):
+    """Return points on a floor and two walls, seen from the middle of a room."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-4.0, 4.0, (num, 3))
+    points[: num // 2, 2] = -1.1
+    points[num // 2 : 3 * num // 4, 1] = 3.3
+    points[3 * num // 4 :, 0] = -3.7
+    return points.astype(np.float32)

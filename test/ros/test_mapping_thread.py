@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The queue before the mapper: its order, its bounds, and its end."""
+
+from __future__ import annotations
+
+from concurrent.futures import CancelledError
+import threading
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from surfel_mapper.config import Config
+from surfel_mapper.io.pose_messages import poses_in, StampedPose
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.ros.mapping_thread import MappingThread, MAX_CLOUDS, MAX_POSES
+from test.ros.live import cloud, odometry, room, START_NS
+
+PERIOD_NS = 100_000_000
+UNTURNED = (0.0, 0.0, 0.0, 1.0)
+CONFIG = Config.from_mapping(
+    {'pose.source': 'odometry', 'frames.base_to_sensor': [0.0, 0.0, 0.5, *UNTURNED]}
+)
+TIMEOUT_S = 20
+
+
+class Bench:
+    """A thread at work, or held until released, and what came of it."""
+
+    def __init__(self, on_update=None):
+        self.mapper = Mapper(CONFIG)
+        self.stamps = []
+        self.failures = []
+        self.thread = MappingThread(self.mapper, self.failures.append)
+        self.thread.start(on_update or (lambda update: self.stamps.append(update.stamp_ns)))
+        self._released = threading.Event()
+
+    def hold(self):
+        """Keep the thread busy, so that what is put in waits."""
+        busy = threading.Event()
+
+        def wait():
+            busy.set()
+            self._released.wait(TIMEOUT_S)
+
+        self.thread.call(wait)
+        assert busy.wait(TIMEOUT_S)
+
+    def release(self):
+        self._released.set()
+
+    def put_pose(self, stamp_ns):
+        message = odometry(stamp_ns, (1e-9 * (stamp_ns - START_NS), 0.0, 0.0))
+        self.thread.put_poses(poses_in('odometry', message, 'base_link'))
+
+    def put_cloud(self, stamp_ns, message=None):
+        self.thread.put_cloud(message or cloud(stamp_ns, room(seed=1, num=400)), '/points')
+
+
+@pytest.fixture
+def bench():
+    bench = Bench()
+    yield bench
+    bench.release()
+    bench.thread.stop()
+    assert bench.failures == []
+
+
+def test_poses_overtake_clouds_so_that_a_backlog_is_mapped_completely(bench):
+    stamps = [START_NS + i * PERIOD_NS for i in range(MAX_CLOUDS)]
+    bench.hold()
+    for stamp_ns in stamps:  # 2 s, four times as long as a scan may wait for its pose
+        bench.put_cloud(stamp_ns)
+    for stamp_ns in stamps:
+        bench.put_pose(stamp_ns)
+    bench.release()
+    bench.thread.stop()
+
+    assert bench.stamps == stamps
+    assert not bench.mapper.counters.dropped
+
+
+def test_of_too_many_clouds_the_oldest_are_dropped_and_counted(bench):
+    stamps = [START_NS + i * PERIOD_NS for i in range(MAX_CLOUDS + 3)]
+    bench.hold()
+    for stamp_ns in stamps:
+        bench.put_pose(stamp_ns)
+        bench.put_cloud(stamp_ns)
+    bench.release()
+    bench.thread.stop()
+
+    assert bench.stamps == stamps[3:]
+    assert bench.mapper.counters.received == len(stamps)
+    assert bench.mapper.counters.dropped == {'overload': 3}
+
+
+def test_of_too_many_poses_the_oldest_are_dropped_and_counted(bench):
+    bench.hold()
+    pose = StampedPose('odom', 'base_link', START_NS, (0.0, 0.0, 0.0), UNTURNED)
+    later = [pose._replace(stamp_ns=START_NS + i) for i in range(1, MAX_POSES)]
+    bench.thread.put_poses([pose, pose, *later])
+    bench.release()
+    bench.thread.stop()
+
+    assert bench.mapper.counters.messages_ignored == {'overload': 1}
+
+
+def test_a_call_comes_after_the_clouds_before_it_and_hands_back_result_or_error(bench):
+    bench.hold()
+    bench.put_pose(START_NS)
+    bench.put_cloud(START_NS)
+    mapped = bench.thread.call(lambda: bench.mapper.counters.mapped)
+    failed = bench.thread.call(lambda: 1 // 0)
+    bench.release()
+
+    assert mapped.result(TIMEOUT_S) == 1
+    with pytest.raises(ZeroDivisionError):
+        failed.result(TIMEOUT_S)
+
+
+def test_what_is_posted_twice_is_done_once(bench):
+    done = []
+
+    def note():
+        done.append(1)
+
+    bench.hold()
+    bench.thread.post(note)
+    bench.thread.post(note)
+    bench.release()
+    bench.thread.stop()
+
+    assert done == [1]
+
+
+def test_bad_clouds_and_those_of_a_pause_are_counted_and_the_next_is_mapped(bench):
+    bad = cloud(START_NS, room(seed=1))
+    bad.point_step = 11
+    stamps = [START_NS + i * PERIOD_NS for i in range(3)]
+    for stamp_ns in stamps:
+        bench.put_pose(stamp_ns)
+    bench.put_cloud(stamps[0], bad)
+    bench.thread.call(lambda: setattr(bench.thread, 'paused', True))
+    bench.put_cloud(stamps[1])
+    bench.thread.call(lambda: setattr(bench.thread, 'paused', False))
+    bench.put_cloud(stamps[2])
+    bench.thread.stop()
+
+    assert bench.stamps == [stamps[2]]
+    assert bench.mapper.counters.received == 3
+    assert bench.mapper.counters.dropped == {'bad_cloud': 1, 'paused': 1}
+
+
+def test_an_error_that_nobody_foresaw_ends_the_thread_and_cancels_what_waits():
+    def fail(update):
+        raise RuntimeError('broken')
+
+    bench = Bench(on_update=fail)
+    bench.hold()
+    bench.put_pose(START_NS)
+    bench.put_cloud(START_NS)
+    waiting = bench.thread.call(lambda: 1)
+    bench.release()
+    bench.thread.stop()
+
+    assert [str(error) for error in bench.failures] == ['broken']
+    with pytest.raises(CancelledError):
+        waiting.result(TIMEOUT_S)
+    with pytest.raises(CancelledError):
+        bench.thread.call(lambda: 1).result(TIMEOUT_S)

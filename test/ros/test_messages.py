@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Clouds and diagnostics as messages."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.serialization import deserialize_message, serialize_message
+from sensor_msgs.msg import PointCloud2
+
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.ros.messages import diagnostics, surfel_cloud, time_message
+from test.ros.live import room
+
+
+def test_surfels_arrive_as_they_were_sent():
+    surfel_map = SurfelMap(voxel_size_m=0.5)
+    surfel_map.add(room(seed=1))
+    surfels = surfel_map.surfels(min_points=3)
+    sent = surfel_cloud(surfels, 12_000_000_034, 'odom')
+
+    scan = to_scan(deserialize_message(serialize_message(sent), PointCloud2))
+
+    assert (scan.stamp_ns, scan.frame_id) == (12_000_000_034, 'odom')
+    assert len(scan) == len(surfels) > 50
+    np.testing.assert_array_equal(scan.points, surfels.position.astype(np.float32))
+    expected = {
+        'normal_x': surfels.normal[:, 0],
+        'normal_y': surfels.normal[:, 1],
+        'normal_z': surfels.normal[:, 2],
+        'curvature': surfels.curvature,
+        'planarity': surfels.planarity,
+        'num_points': surfels.num_points,
+    }
+    assert list(scan.columns) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(scan.columns[name], values.astype(scan.columns[name].dtype))
+
+
+def test_an_empty_map_is_a_cloud_without_points():
+    scan = to_scan(surfel_cloud(SurfelMap(0.5).surfels(), 0, 'odom'))
+    assert len(scan) == 0
+
+
+def test_times_before_the_epoch_have_positive_nanoseconds():
+    assert (time_message(-1).sec, time_message(-1).nanosec) == (-1, 999_999_999)
+
+
+def test_a_report_is_ok_without_a_problem_and_a_warning_with_one():
+    fine = diagnostics('mapper', 5, '', {'scans': {'mapped': 3, 'dropped': {}}, 'voxels': 7})
+    assert [(item.key, item.value) for item in fine.status[0].values] == [
+        ('scans.mapped', '3'),
+        ('voxels', '7'),
+    ]
+    assert (fine.status[0].level, fine.status[0].message) == (b'\0', 'ok')
+    assert fine.status[0].name == 'mapper: mapping'
+    bad = diagnostics('mapper', 5, 'no clouds', {})
+    assert (bad.status[0].level, bad.status[0].message) == (b'\1', 'no clouds')

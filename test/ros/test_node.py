@@ -1,0 +1,339 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The node as a process of its own, talked to over DDS."""
+
+from __future__ import annotations
+
+from array import array
+import signal
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool
+from visualization_msgs.msg import MarkerArray
+
+from surfel_mapper.config import Config
+from surfel_mapper.io.ply import read_points
+from surfel_mapper.io.pointcloud2 import surfel_columns, to_scan
+from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.pipeline import Mapper
+from test.ros.live import (
+    cloud,
+    LATCHED,
+    odometry,
+    RELIABLE,
+    room,
+    RVIZ,
+    START_NS,
+)
+
+pytestmark = pytest.mark.timeout(120)
+
+PERIOD_NS = 100_000_000
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base_to_sensor': [0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
+    'window.max_scans': 3,
+    'publish.normals_rate_hz': 20.0,
+    'publish.markers_rate_hz': 20.0,
+    'publish.diagnostics_rate_hz': 20.0,
+}
+ARGUMENTS = [
+    '--ros-args',
+    *(item for name, value in SETTINGS.items() for item in ('-p', f'{name}:={value}')),
+    *RELIABLE,
+]
+
+
+def drive(num_scans):
+    """Return clouds with their poses: a sensor that moves through a room."""
+    stamps = [START_NS + i * PERIOD_NS for i in range(num_scans)]
+    poses = [odometry(stamp_ns, (0.2 * i, 0.0, 0.0)) for i, stamp_ns in enumerate(stamps)]
+    return list(zip([cloud(s, room(seed=i)) for i, s in enumerate(stamps)], poses, strict=True))
+
+
+def mapped(messages):
+    """Return the updates of a Mapper fed with the same messages, and the Mapper."""
+    mapper = Mapper(Config.from_mapping(SETTINGS))
+    updates = []
+    for points, pose in messages:
+        for found in poses_in('odometry', pose, 'base_link'):
+            mapper.add_pose(*found)
+        mapper.add_scan(to_scan(points))
+        updates += mapper.insert_ready()
+    return updates, mapper
+
+
+def send(peer, messages):
+    for points, pose in messages:
+        time.sleep(0.02)  # the queue of a topic holds 20
+        peer.publish('/odom', pose)
+        peer.publish('/points', points)
+
+
+def assert_equal_columns(message, surfels):
+    """Check that a cloud holds surfels, in any order."""
+    scan, expected = to_scan(message), surfel_columns(surfels)
+    found = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
+    assert list(found) == list(expected)
+    order = np.lexsort((found['z'], found['y'], found['x']))
+    expected_order = np.lexsort((expected['z'], expected['y'], expected['x']))
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name][order], values[expected_order], name)
+
+
+def test_what_comes_out_is_what_a_mapper_makes_of_what_went_in(start, peer, tmp_path):
+    node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
+    changed = peer.collect(PointCloud2, '/surfel_mapper/changed')
+    normals = peer.collect(PointCloud2, '/surfel_mapper/normals', LATCHED)
+    peer.advertise('/odom', '/points')
+    messages = drive(6)
+    updates, mapper = mapped(messages)
+
+    send(peer, messages)
+    peer.spin_until(lambda: len(changed) == len(updates))
+    saved = peer.call('save_map')
+
+    assert saved.success, saved.message
+    digest = mapper.map.digest()
+    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    path = tmp_path / 'maps' / 'map.ply'
+    assert saved.message == (
+        f'{path}: {len(surfels)} surfels of 3 scans (6 received), digest {digest}'
+    )
+    assert len(read_points(path)['x']) == len(surfels)
+
+    for message, update in zip(changed, updates, strict=True):
+        assert to_scan(message).stamp_ns == update.stamp_ns
+        assert message.header.frame_id == 'odom'
+        assert_equal_columns(message, update.changed)
+    last_ns = updates[-1].stamp_ns
+    peer.spin_until(lambda: normals and to_scan(normals[-1]).stamp_ns == last_ns)
+    assert_equal_columns(normals[-1], surfels)
+    late = peer.collect(PointCloud2, '/surfel_mapper/normals', LATCHED)
+    peer.spin_until(lambda: late)
+    assert late[0] == normals[-1]
+
+    assert node.stop(signal.SIGTERM) == 0
+    assert f'mapped 6, gated 0, dropped: none; surfels {len(surfels)}, digest {digest}' in (
+        node.output
+    )
+    assert 'Traceback' not in node.output
+
+
+def bad_clouds(stamp_ns):
+    """Return clouds that no sensor should send, one for each way to be wrong, with the cause."""
+    points = room(seed=1)
+
+    def made(points=points, **changes):
+        message = cloud(stamp_ns, points)
+        for name, value in changes.items():
+            setattr(message, name, value)
+        return message
+
+    no_z, unknown_type, no_frame = made(), made(), made()
+    del no_z.fields[2]
+    unknown_type.fields[1].datatype = 9
+    no_frame.header.frame_id = ''
+    return [
+        ('bad_cloud', no_z),
+        ('bad_cloud', unknown_type),
+        ('bad_cloud', made(point_step=10)),
+        ('bad_cloud', made(row_step=7)),
+        ('bad_cloud', made(data=array('B', bytes(100)))),
+        ('bad_cloud', made(data=array('B'))),
+        ('empty_frame_id', no_frame),
+        ('no_points', made(points[:0])),
+        ('no_valid_points', made(np.full_like(points, np.nan))),
+        ('no_valid_points', made(np.full_like(points, np.inf))),
+        ('no_valid_points', made(points + np.float32(1e9))),
+    ]
+
+
+def test_bad_clouds_are_counted_and_the_good_ones_between_them_mapped(start, peer):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    causes = [cause for cause, _ in bad_clouds(START_NS)]
+    good = drive(len(causes))
+    for number, pair in enumerate(good):
+        stamp_ns = START_NS + number * PERIOD_NS + PERIOD_NS // 2
+        _, bad = bad_clouds(stamp_ns)[number]
+        send(peer, [pair, (bad, odometry(stamp_ns, (0.2 * number, 0.0, 0.0)))])
+
+    _, values = peer.diagnosis({'scans.received': 2 * len(causes)})
+
+    dropped = {key: int(value) for key, value in values.items() if '.dropped.' in key}
+    assert dropped == {f'scans.dropped.{cause}': causes.count(cause) for cause in causes}
+    assert values['scans.mapped'] == str(len(good))
+    assert node.output.count('[WARN]') >= len(set(causes))
+    assert node.stop() == 0
+
+
+def test_stamps_that_go_back_are_dropped_or_start_anew(start, peer):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    (first, pose), (second, second_pose) = drive(2)
+    send(peer, [(second, second_pose), (first, pose)])
+    long_ago = START_NS - 10 * 10**9
+    send(peer, [(cloud(long_ago, room(seed=5)), odometry(long_ago, (0, 0, 0)))])
+
+    _, values = peer.diagnosis({'scans.received': 3})
+
+    assert values['scans.mapped'] == '2', node.output
+    assert values['scans.dropped.stamp_back'] == '1'
+    assert values['resets'] == '1'
+    assert values['window_scans'] == '1'
+
+
+def test_clear_and_pause_do_what_they_say(start, peer):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    messages = drive(4)
+    send(peer, messages[:2])
+    peer.diagnosis({'scans.mapped': 2})
+
+    answer = peer.call('clear')
+    assert answer.success
+    assert 'of 2 scans' in answer.message
+    assert peer.diagnosis()[1]['voxels'] == '0'
+
+    assert peer.call('pause', SetBool, SetBool.Request(data=True)).success
+    send(peer, messages[2:3])
+    peer.diagnosis({'scans.dropped.paused': 1})
+    assert peer.call('pause', SetBool, SetBool.Request(data=False)).success
+    send(peer, messages[3:])
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    assert values['window_scans'] == '1'
+    assert node.is_running()
+
+
+def test_a_map_that_cannot_be_saved_is_answered_with_the_reason(start, peer, tmp_path):
+    (tmp_path / 'file').write_text('in the way')
+    node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "file"}')
+
+    answer = peer.call('save_map')
+
+    assert not answer.success
+    assert str(tmp_path / 'file') in answer.message
+    assert peer.call('clear').success
+    assert node.is_running()
+
+
+def test_parameters_are_described_and_only_live_ones_change(start, peer):
+    node = start('node', *ARGUMENTS)
+    client = peer.parameters()
+
+    described = peer.result(client.describe_parameters(['window.max_scans', 'map.voxel_size_m']))
+    max_scans, voxel_size_m = described.descriptors
+    assert 'scans' in max_scans.description
+    assert (max_scans.read_only, voxel_size_m.read_only) == (False, True)
+    bounds = voxel_size_m.floating_point_range[0]
+    assert (bounds.from_value, bounds.to_value) == (0.001, 1000.0)
+
+    def change(name, value):
+        response = peer.result(client.set_parameters([Parameter(name, value=value)]))
+        return response.results[0]
+
+    assert 'read-only' in change('map.voxel_size_m', 0.3).reason
+    assert 'range' in change('window.max_scans', -1).reason
+    assert change('window.max_scans', 2).successful
+    peer.advertise('/odom', '/points')
+    send(peer, drive(4))
+    _, values = peer.diagnosis({'scans.mapped': 4})
+    assert values['window_scans'] == '2', node.output
+
+
+def test_markers_come_while_somebody_subscribes(start, peer):
+    start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    messages = drive(3)
+    send(peer, messages)
+    _, mapper = mapped(messages)
+
+    markers = peer.collect(MarkerArray, '/surfel_mapper/markers', RVIZ)
+    stamp_ns = START_NS + 2 * PERIOD_NS
+
+    def is_last(found):
+        header = found.markers[0].header
+        return header.stamp.sec * 10**9 + header.stamp.nanosec == stamp_ns
+
+    peer.spin_until(lambda: markers and is_last(markers[-1]))
+    discs, lines = markers[-1].markers
+    surfels = mapper.map.surfels(5)
+    assert len(lines.points) == 2 * len(surfels)
+    assert len(discs.points) == 18 * len(surfels)
+    assert discs.header.frame_id == 'odom'
+
+
+def test_without_clouds_the_diagnostics_say_so(start, peer):
+    start('node', *ARGUMENTS)
+    status, values = peer.diagnosis()
+    assert status.level == b'\1'
+    assert status.message == 'no cloud on /points yet'
+    assert values['scans.received'] == '0'
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'messages'),
+    [
+        (['-p', 'window.max_scan:=5'], ['window.max_scan', 'did you mean window.max_scans?']),
+        (['-p', 'map.voxel_size_m:=0.0'], ['map.voxel_size_m: 0.0, expected a value in']),
+        (['-p', 'pose.source:=registration'], ['registration is not available']),
+        (['-p', 'use_sim_time:=maybe'], ['use_sim_time']),
+        (['--params-file', 'nowhere.yaml'], ['nowhere.yaml']),
+        (['--nonsense'], ['--nonsense']),
+        (
+            ['-p', 'pose.source:=identity', '-p', 'qos_overrides./points.subscription.depth:=x'],
+            ['qos_overrides./points.subscription'],
+        ),
+    ],
+)
+def test_what_cannot_work_ends_the_node_with_a_message(start, arguments, messages):
+    node = start('node', '--ros-args', *arguments)
+    assert node.wait() == 1
+    for message in messages:
+        assert message in node.output
+    assert 'surfel-mapper node: ' in node.output
+    assert 'Traceback' not in node.output
+
+
+def test_transforms_without_their_package_end_the_node_with_what_to_install(start):
+    try:
+        import tf2_msgs  # noqa: F401
+    except ImportError:
+        pass
+    else:
+        pytest.skip('tf2_msgs is installed')
+    node = start('node')
+    assert node.wait() == 1
+    assert 'sudo apt install ros-jazzy-tf2-msgs' in node.output
+    assert 'Traceback' not in node.output
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize('when', ['compiling', 'ready:'])
+def test_a_signal_ends_the_node_at_any_time_without_complaint(start, number, when):
+    node = start('node', *ARGUMENTS)
+    node.wait_for_output(when)
+    assert node.stop(number) == 0
+    assert 'Traceback' not in node.output
+    if when == 'ready:':
+        assert 'scans received 0, mapped 0' in node.output
+        assert node.output.count('digest') == 1
+
+
+def test_a_burst_of_signals_is_one(start):
+    node = start('node', *ARGUMENTS)
+    node.wait_for_output('ready:')
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):
+        if node.is_running():
+            node._process.send_signal(number)
+        time.sleep(0.05)
+    assert node.wait() == 0
+    assert node.output.count('digest') == 1
