@@ -82,7 +82,7 @@ def merged(kind: Kind, column: Array, groups: Groups) -> Array:
         lengths = np.sqrt((means * means).sum(axis=1, keepdims=True))
         defined = lengths > 1e-6  # rounding of opposite float32 directions leaves less
         units = np.divide(means, lengths, out=means, where=defined)
-        return np.where(defined, units, column[groups.first]).astype(column.dtype)
+        return np.asarray(np.where(defined, units, column[groups.first]), column.dtype)
     if column.dtype.kind in 'iu':
         means = np.rint(means)
     if column.dtype.kind == 'b':

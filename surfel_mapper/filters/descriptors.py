@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Filters that add columns or go by them, one point at a time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import ConfigError, FilterError
+from surfel_mapper.filters.base import Filter, Mask, with_columns
+from surfel_mapper.filters.columns import (
+    EIGEN_VALUES,
+    INCIDENCE_ANGLES,
+    NORMALS,
+    OBSERVATION_DIRECTIONS,
+    with_normals,
+)
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.registry import register
+from surfel_mapper.scan import Scan
+
+Array = npt.NDArray[Any]
+
+MAX_COMPONENTS = 2**32 - 1
+
+
+@register(theirs='AddDescriptorDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AddDescriptor(Filter):
+    """Give every point the same value, in a new column or in place of one of the same name."""
+
+    column_name: str = parameter(
+        'testDescriptor', 'Name of the column.', theirs='descriptorName'
+    )
+    num_components: int = parameter(
+        1, 'Numbers a point.', low=1, high=MAX_COMPONENTS, theirs='descriptorDimension'
+    )
+    values: tuple[float, ...] = parameter(
+        (), 'The value, so many numbers.', items=float, theirs='descriptorValues'
+    )
+
+    def check(self) -> None:
+        """Refuse values that are too few or too many."""
+        if len(self.values) != self.num_components:
+            raise ConfigError(
+                f'{self.name}: values (descriptorValues): {len(self.values)} numbers, expected '
+                f'num_components (descriptorDimension) = {self.num_components}'
+            )
+        if not self.column_name:
+            raise ConfigError(f'{self.name}: column_name (descriptorName): empty')
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan with the column."""
+        column = np.empty((len(scan), self.num_components), scan.points.dtype)
+        column[:] = self.values
+        return with_columns(
+            scan, **{self.column_name: column[:, 0] if self.num_components == 1 else column}
+        )
+
+
+@register(theirs='CutAtDescriptorThresholdDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CutAtDescriptorThreshold(Filter):
+    """Drop the points whose column is above, or below, a limit; those at it stay."""
+
+    column_name: str = parameter(
+        'none', 'Name of the column; of several components the first counts.', theirs='descName'
+    )
+    use_larger_than: bool = parameter(
+        True, '1: drop what is above; 0: drop what is below.', theirs='useLargerThan'
+    )
+    threshold: float = parameter(0.0, 'The limit.', theirs='threshold')
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; nan does not."""
+        values = self.column(scan, self.column_name)
+        first = values if values.ndim == 1 else values.reshape(len(values), -1)[:, 0]
+        if self.use_larger_than:
+            return np.asarray(first <= self.threshold, np.bool_)
+        return np.asarray(first >= self.threshold, np.bool_)
+
+
+@register(theirs='ObservationDirectionDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationDirection(Filter):
+    """Add observationDirections, from each point to where the sensor is, m."""
+
+    x_m: float = parameter(0.0, 'x of the sensor in the frame of the points, m.', theirs='x')
+    y_m: float = parameter(0.0, 'y of it, m.', theirs='y')
+    z_m: float = parameter(0.0, 'z of it, m.', theirs='z')
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan with the column."""
+        sensor = np.array([self.x_m, self.y_m, self.z_m], scan.points.dtype)
+        return with_columns(scan, **{OBSERVATION_DIRECTIONS: sensor - scan.points})
+
+
+@register(theirs='OrientNormalsDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrientNormals(Filter):
+    """Turn the normals to the side of the sensor, or all away; needs observationDirections."""
+
+    toward_sensor: bool = parameter(
+        True, '1: towards the sensor; 0: away from it.', theirs='towardCenter'
+    )
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan with the normals turned; those at a right angle stay as they are."""
+        scan = with_normals(scan)
+        normals = self.column(scan, NORMALS)
+        along = dot(normals, self.column(scan, OBSERVATION_DIRECTIONS))
+        wrong = along < 0.0 if self.toward_sensor else along > 0.0
+        return with_columns(scan, normals=np.where(wrong[:, None], -normals, normals))
+
+
+@register(theirs='IncidenceAngleDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IncidenceAngle(Filter):
+    """Add incidenceAngles, between normal and observation direction, 0 to pi rad."""
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan with the column; nan where a direction has no length."""
+        scan = with_normals(scan)
+        normals = self.column(scan, NORMALS)
+        cosine = dot(normals, unit(self.column(scan, OBSERVATION_DIRECTIONS)))
+        angles = np.arccos(np.clip(cosine, -1.0, 1.0))  # rounding may leave 1.0000001
+        return with_columns(scan, **{INCIDENCE_ANGLES: angles.astype(scan.points.dtype)})
+
+
+def dot(a: Array, b: Array) -> Array:
+    """Return the scalar products of rows, in float64 and added in the order x, y, z."""
+    a, b = a.astype(np.float64), b.astype(np.float64)
+    return np.asarray(a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2])
+
+
+def unit(vectors: Array) -> Array:
+    """Return rows made unit length, in float64; nan where a row has no length."""
+    vectors = vectors.astype(np.float64)
+    length = np.sqrt(dot(vectors, vectors))[:, None]
+    return np.divide(vectors, length, out=np.full_like(vectors, np.nan), where=length > 0.0)
+
+
+@register(theirs='SphericalityDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Sphericality(Filter):
+    """Add sphericality, -1 on a plane to 1 in a ball; needs three eigValues."""
+
+    keep_unstructureness: bool = parameter(
+        False, 'Add unstructureness, the part of it that a ball has.', theirs='keepUnstructureness'
+    )
+    keep_structureness: bool = parameter(
+        False, 'Add structureness, the part of it that a plane has.', theirs='keepStructureness'
+    )
+
+    def apply(self, scan: Scan) -> Scan:
+        """
+        Return the scan with the columns.
+
+        With eigenvalues e0 <= e1 <= e2 unstructureness is e0 / e2, structureness is
+        e1 / e2 (e1 - e0) / sqrt(e0^2 + e1^2), and sphericality is their difference. On a line
+        all are 0; they are nan where e2 is 0 or an eigenvalue is negative.
+
+        Source: Kubelka et al. 2020, Radio propagation models for differential GNSS based on
+        dense point clouds, equation 1.
+        """
+        values = self.column(scan, EIGEN_VALUES)
+        if values.shape != (len(scan), 3):
+            raise FilterError(f'{EIGEN_VALUES}: shape {values.shape}, expected (N, 3)')
+        e0, e1, e2 = np.sort(values.astype(np.float64), axis=1).T
+        with np.errstate(divide='ignore', invalid='ignore'):
+            unstructured = e0 / e2
+            structured = e1 / e2 * ((e1 - e0) / np.hypot(e0, e1))
+        line, undefined = e1 <= 0.0, ~((e2 > 0.0) & (e0 >= 0.0))
+        for part in (unstructured, structured):
+            part[line] = 0.0
+            part[undefined] = np.nan
+        columns = {'sphericality': unstructured - structured}
+        if self.keep_unstructureness:
+            columns['unstructureness'] = unstructured
+        if self.keep_structureness:
+            columns['structureness'] = structured
+        dtype = scan.points.dtype
+        return with_columns(scan, **{name: part.astype(dtype) for name, part in columns.items()})
