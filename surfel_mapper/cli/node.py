@@ -28,15 +28,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the node until it is told to end."""
-    before = [signal.signal(number, interrupt) for number in SIGNALS]
+    before = {number: signal.signal(number, interrupt) for number in SIGNALS}
     try:
         with loading_ros():
             from surfel_mapper.ros.running import run_node
         run_node(args.ros_args)
     except KeyboardInterrupt:
-        return 0
-    for number, handler in zip(SIGNALS, before, strict=True):
-        signal.signal(number, handler)
+        pass
+    finally:
+        for number, handler in before.items():
+            if signal.getsignal(number) is interrupt:  # not interrupted: we go on
+                signal.signal(number, handler)
     return 0
 
 

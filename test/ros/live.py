@@ -100,6 +100,10 @@ class Peer:
             assert time.monotonic() < end, what()
             self._executor.spin_once(0.05)
 
+    def spin_for(self, seconds):
+        end = time.monotonic() + seconds
+        self.spin_until(lambda: time.monotonic() > end)
+
     def advertise(self, *topics, depth=50):
         """Publish clouds on topics of points and odometry on others, once they are read."""
         for topic in topics:
@@ -108,16 +112,20 @@ class Peer:
         self.spin_until(
             lambda: all(self._publishers[t].get_subscription_count() for t in topics)
         )
-        end = time.monotonic() + 0.5  # the other side needs to know of us too
-        self.spin_until(lambda: time.monotonic() > end)
+        self.spin_for(0.5)  # the other side needs to know of us too
 
     def publish(self, topic, message):
         self._publishers[topic].publish(message)
 
-    def collect(self, kind, topic, qos=SENSOR):
+    def subscribe(self, kind, topic, qos=SENSOR):
         """Return a list that fills with the messages of a topic."""
         messages = []
         self.node.create_subscription(kind, topic, messages.append, qos)
+        return messages
+
+    def collect(self, kind, topic, qos=SENSOR):
+        """Return the same once somebody publishes them."""
+        messages = self.subscribe(kind, topic, qos)
         self.spin_until(lambda: self.node.count_publishers(topic) > 0)
         return messages
 

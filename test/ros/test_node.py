@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+from importlib.util import find_spec
 import signal
 import time
 
@@ -18,6 +19,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
+from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
 from surfel_mapper.io.ply import read_points
 from surfel_mapper.io.pointcloud2 import surfel_columns, to_scan
@@ -294,26 +296,27 @@ def test_without_clouds_the_diagnostics_say_so(start, peer):
         ),
     ],
 )
-def test_what_cannot_work_ends_the_node_with_a_message(start, arguments, messages):
-    node = start('node', '--ros-args', *arguments)
-    assert node.wait() == 1
+def test_what_cannot_work_ends_the_node_with_a_message(domain, capfd, arguments, messages):
+    assert main(['node', '--ros-args', *arguments]) == 1
+    said = capfd.readouterr().err
     for message in messages:
-        assert message in node.output
-    assert 'surfel-mapper node: ' in node.output
-    assert 'Traceback' not in node.output
+        assert message in said
+    assert 'surfel-mapper node: ' in said
 
 
-def test_transforms_without_their_package_end_the_node_with_what_to_install(start):
-    try:
-        import tf2_msgs  # noqa: F401
-    except ImportError:
-        pass
-    else:
-        pytest.skip('tf2_msgs is installed')
-    node = start('node')
+def test_an_unknown_parameter_gives_no_traceback(start):
+    node = start('node', '--ros-args', '-p', 'map.voxelsize:=1.0')
     assert node.wait() == 1
-    assert 'sudo apt install ros-jazzy-tf2-msgs' in node.output
+    assert node.output.splitlines()[-1] == (
+        'surfel-mapper node: map.voxelsize: no such setting; did you mean map.voxel_size_m?'
+    )
     assert 'Traceback' not in node.output
+
+
+@pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
+def test_transforms_without_their_package_end_the_node_with_what_to_install(domain, capfd):
+    assert main(['node']) == 1
+    assert 'sudo apt install ros-jazzy-tf2-msgs' in capfd.readouterr().err
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

@@ -1,0 +1,173 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Playing a bag over DDS, as a process of its own."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from rclpy.serialization import deserialize_message
+from rosbags import rosbag2
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.errors import DependencyError
+from surfel_mapper.io.bag import BagReader
+from surfel_mapper.ros import shared_memory
+from surfel_mapper.ros.player import message_type
+from test.io.recorded import (
+    drive,
+    NUM_SCANS,
+    PERIOD_NS,
+    ROS1,
+    ROS2,
+    START_NS,
+    write_ros1,
+    write_rosbag2,
+)
+from test.ros.live import LATCHED, RVIZ
+
+pytestmark = pytest.mark.timeout(120)
+
+
+@pytest.fixture
+def bag(tmp_path):
+    entries = drive()
+    for entry in list(entries):  # twice as long, so that there is something to pace
+        topic, type_, record_ns, message = entry
+        entries.append((topic, type_, record_ns + NUM_SCANS * PERIOD_NS, message))
+    return write_rosbag2(tmp_path / 'bag', entries)
+
+
+def recorded(bag, topic, kind):
+    with BagReader(bag) as reader:
+        return [deserialize_message(bytes(m.raw), kind) for m in reader.messages([topic])]
+
+
+def report(process):
+    assert process.wait() == 0, process.output
+    return json.loads(process.output.splitlines()[-1])
+
+
+def test_every_message_arrives_in_order_as_it_was_recorded(start, peer, bag):
+    clouds = peer.subscribe(PointCloud2, '/points', RVIZ)
+    poses = peer.subscribe(Odometry, '/odom', RVIZ)
+
+    playing = start('play', bag, '--rate', 2, '--wait-for', '/points', '/odom', '--json')
+    peer.spin_until(lambda: not playing.is_running())
+
+    assert clouds == recorded(bag, '/points', PointCloud2)
+    assert poses == recorded(bag, '/odom', Odometry)
+    found = report(playing)
+    assert found['published'] == {'/odom': 12, '/points': 12, '/pose': 12}
+    assert set(found['skipped']) == {'/tf', '/tf_static'}
+    assert 'tf2_msgs' in found['skipped']['/tf']
+    assert found['seconds'] >= (2 * NUM_SCANS - 1) * PERIOD_NS / 1e9 / 2
+
+
+def test_topics_are_chosen_and_remapped_and_the_clock_runs(start, peer, bag):
+    poses = peer.subscribe(PoseStamped, '/other', RVIZ)
+    clock = peer.subscribe(Clock, '/clock', RVIZ)
+
+    playing = start(
+        *('play', bag, '--topics', '/pose', '--wait-for', '/pose', '--clock', '--json'),
+        *('--ros-args', '-r', '/pose:=/other'),
+    )
+    peer.spin_until(lambda: not playing.is_running())
+
+    assert poses == recorded(bag, '/pose', PoseStamped)
+    assert report(playing)['published'] == {'/pose': 12}
+    times = [message.clock.sec * 10**9 + message.clock.nanosec for message in clock]
+    assert times == sorted(times)
+    assert times[-1] == START_NS + (2 * NUM_SCANS - 1) * PERIOD_NS
+    assert len(times) > 2 * 12  # between the messages too
+
+
+def test_a_latched_topic_is_latched_again(start, peer, tmp_path):
+    qos = Qos(
+        history=QosHistory.KEEP_LAST,
+        depth=1,
+        reliability=QosReliability.RELIABLE,
+        durability=QosDurability.TRANSIENT_LOCAL,
+        deadline=QosTime(0, 0),
+        lifespan=QosTime(0, 0),
+        liveliness=QosLiveliness.AUTOMATIC,
+        liveliness_lease_duration=QosTime(0, 0),
+        avoid_ros_namespace_conventions=False,
+    )
+    topic, type_, record_ns, message = next(entry for entry in drive() if entry[0] == '/pose')
+    with rosbag2.Writer(tmp_path / 'bag', version=9) as writer:
+        connection = writer.add_connection(
+            topic, type_, typestore=ROS2, offered_qos_profiles=[qos]
+        )
+        writer.write(connection, record_ns, ROS2.serialize_cdr(message, type_))
+        later_ns = record_ns + 60 * 10**9  # keeps the player alive
+        writer.write(connection, later_ns, ROS2.serialize_cdr(message, type_))
+
+    playing = start('play', tmp_path / 'bag')
+    peer.spin_until(lambda: peer.node.count_publishers(topic) > 0)
+    peer.spin_for(0.5)  # the only message of this minute is out by now
+    late = peer.subscribe(PoseStamped, topic, LATCHED)
+
+    peer.spin_until(lambda: late)
+    assert playing.is_running()
+
+
+def test_nobody_to_wait_for_is_said_with_what_to_check(domain, capsys, bag):
+    assert main(['play', str(bag), '--wait-for', '/points', '--timeout', '0.2']) == 1
+    said = capsys.readouterr().err
+    assert 'nobody subscribed to /points within 0.2 s' in said
+    assert 'ROS_DOMAIN_ID' in said
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'message'),
+    [
+        (['--topics', '/nothing'], 'no topic /nothing; its topics: /odom, /points'),
+        (['--topics', '/points', '--wait-for', '/odom'], 'nobody can subscribe to /odom'),
+        (['--rate', '0'], 'rate: 0.0, expected more than 0'),
+        (['--ros-args', '--nonsense'], '--nonsense'),
+    ],
+)
+def test_what_cannot_be_played_is_refused(domain, capsys, bag, arguments, message):
+    assert main(['play', str(bag), *arguments]) == 1
+    assert message in capsys.readouterr().err
+
+
+def test_a_bag_of_ros_1_is_refused_with_how_to_convert_it(domain, capsys, tmp_path):
+    bag = write_ros1(tmp_path / 'old.bag', drive(store=ROS1))
+    assert main(['play', str(bag)]) == 1
+    assert 'rosbags-convert' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize('name', ['no_such_package/msg/Thing', 'std_msgs/msg/NoSuchType', 'odd'])
+def test_a_type_that_is_not_installed_is_named(domain, name):
+    with pytest.raises(DependencyError, match=name):
+        message_type(name)
+
+
+def test_shared_memory_is_left_as_the_user_configured_it(monkeypatch):
+    for name in shared_memory.OWN_SETTINGS:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
+    shared_memory.enlarge_shared_memory()
+    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in shared_memory.os.environ
+
+
+def test_the_profile_of_shared_memory_is_installed_beside_the_code():
+    assert shared_memory.PROFILE.read_text(encoding='utf-8').startswith('<?xml')
