@@ -1,0 +1,95 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Run benchmarks: a table of each on the terminal, then a line of JSON for every row."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib import import_module
+import json
+from pathlib import Path
+import sys
+
+from test.bench.machine import facts, load
+from test.bench.options import cache_directory, Options
+from test.bench.report import Row, table
+
+BENCHES = ('mapping', 'scaling', 'compare')
+"""Modules of this folder that have run(options) -> list of rows, in the order to run them."""
+
+
+def summary(name: str) -> str:
+    """Return the first line of the docstring of a bench, without loading it."""
+    source = Path(__file__).with_name(f'{name}.py').read_text(encoding='utf-8')
+    return (ast.get_docstring(ast.parse(source)) or '').splitlines()[0]
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the command line."""
+    benches = '\n'.join(f'  {name:<10}  {summary(name)}' for name in BENCHES)
+    result = argparse.ArgumentParser(
+        prog='python -m test.bench',
+        description='Milliseconds a scan of the simulated street.',
+        epilog=f'benches:\n{benches}\n\n'
+        'The street is simulated once, 1.6 MB a scan, and kept in --cache. Peers come from PyPI\n'
+        'at the first call with --peers, into environments of their own in --cache (1.2 GB), and\n'
+        'take about ten minutes. Both may be deleted at any time.',
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument(
+        '--only', action='append', choices=BENCHES, metavar='NAME', help='this one; repeatable'
+    )
+    result.add_argument('--scans', type=int, metavar='N', help='scans timed (default 100)')
+    result.add_argument('--quick', action='store_true', help='shorter windows, fewer scans')
+    result.add_argument(
+        '--peers', action='store_true', help='compare with Open3D, small_gicp, KISS-ICP as well'
+    )
+    result.add_argument(
+        '--cache', type=Path, default=cache_directory(), metavar='DIR', help='default: %(default)s'
+    )
+    return result
+
+
+def options(args: argparse.Namespace) -> Options:
+    """Return the options that the arguments ask for."""
+    result = Options(peers=args.peers, cache=args.cache)
+    result = result.quick() if args.quick else result
+    return result if args.scans is None else replace(result, scans=args.scans)
+
+
+def run(names: Sequence[str], chosen: Options) -> list[Row]:
+    """Run benches, printing the table of each; return all rows with what they depend on."""
+    found: list[Row] = []
+    for name in names:
+        load_before = load()
+        rows = import_module(f'test.bench.{name}').run(chosen)
+        print(f'{name}: {summary(name)}')
+        print(f'load {load_before} before, {load()} after\n{table(rows)}\n', flush=True)
+        found += [{'bench': name, 'load': load_before, **rounded(row)} for row in rows]
+    return found
+
+
+def rounded(row: Row) -> Row:
+    """Return a row with no more digits than clocks are good for."""
+    return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run what the command line asks for."""
+    args = parser().parse_args(arguments)
+    if args.scans is not None and args.scans < 1:
+        parser().error(f'--scans: {args.scans}, expected one or more')
+    machine, chosen = facts(), options(args)
+    print(', '.join(f'{name} {value}' for name, value in machine.items()))
+    print(f'window {chosen.window}, {chosen.scans} scans timed, {chosen.num_points} points\n')
+    for row in run(args.only or BENCHES, chosen):
+        settings = {'window': chosen.window, 'points': chosen.num_points}
+        print(json.dumps({**settings, **row, **machine}))
+    return 0
+
+
+if __name__ == '__main__':
+    sys.exit(main())

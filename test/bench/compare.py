@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Ours beside numpy alone and, with --peers, beside others, on one core.
+
+All are fed the same scans at the same poses, and ``x_ours`` is how many times as long as ours
+they take. Ours and numpy read PointCloud2 of 32-byte steps; the peers get packed points, which
+is less work. What else a peer does less stands in the last column; none of those marked is exact.
+That numpy and ours hold the same integers at the end is checked. A peer that needs more than a
+second for a scan is given fewer scans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from surfel_mapper.io.raw_cloud import RawCloud
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.simulation.recording import POINT
+from test.bench.machine import one_core
+from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW
+from test.bench.options import Options
+from test.bench.ours import Ours
+from test.bench.peers import PEERS
+from test.bench.peers.run import environment, PeerError, run_peer
+from test.bench.report import Row, spread
+from test.bench.street import Street
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for everyone, by voxel size; the first is ours."""
+    street = Street(options)
+    street.prepare(options.untimed + options.scans)
+    rows: list[Row] = []
+    with one_core():
+        for size_m in options.voxel_sizes_m:
+            ours, numpy_map = Ours(size_m, options.window), NumpyMap(size_m, options.window)
+            times = timed(options, street, ours.step)
+            reference_ms = float(np.median(times))
+            voxels = ours.map.num_voxels
+            rows.append(row(options, size_m, 'surfel_mapper', times, reference_ms, voxels))
+            times = timed(options, street, partial(numpy_step, numpy_map))
+            check_equal(numpy_map, ours.map)
+            rows.append(row(options, size_m, 'numpy, sorted keys', times, reference_ms, voxels))
+            if options.peers:
+                rows += peer_rows(options, street, size_m, reference_ms)
+    return rows
+
+
+def timed(options: Options, street: Street, step: Callable[..., Any]) -> list[float]:
+    """Return the times of a step, given message and pose."""
+    times = []
+    for number, message, counts in street.drive(options.untimed, options.scans):
+        pose = street.pose(number)
+        start = perf_counter()
+        step(message, pose)
+        if counts:
+            times.append((perf_counter() - start) * 1e3)
+    return times
+
+
+def numpy_step(numpy_map: NumpyMap, message: RawCloud, pose: np.ndarray) -> None:
+    """Map a scan with numpy, from the bytes on."""
+    points = np.frombuffer(message.data, POINT)
+    numpy_map.step([points[name] for name in 'xyz'], pose)
+
+
+def check_equal(numpy_map: NumpyMap, surfel_map: SurfelMap) -> None:
+    """Refuse to compare maps that do not hold the same."""
+    key, moments = numpy_map.state()
+    found = (key, *(moments[:, part] for part in (COUNT, SUM, PRODUCT, VIEW)))
+    for ours, theirs in zip(surfel_map.moments().arrays, found, strict=True):
+        if not np.array_equal(ours.ravel(), theirs.ravel()):
+            raise RuntimeError('the maps of numpy and of surfel_mapper differ: one has a bug')
+
+
+def peer_rows(
+    options: Options, street: Street, size_m: float, reference_ms: float
+) -> list[Row]:
+    """Return a row for each peer; of one that cannot be had or fails, only why."""
+    rows: list[Row] = []
+    for peer in PEERS:
+        try:
+            python = environment(peer, options.cache)
+            times, voxels = run_peer(python, peer, options, street, size_m)
+        except PeerError as error:
+            rows.append({'voxel_m': size_m, 'who': peer.name, 'less': f'not measured: {error}'})
+        else:
+            found = row(options, size_m, peer.name, times, reference_ms, voxels)
+            rows.append({**found, 'less': peer.less})
+    return rows
+
+
+def row(
+    options: Options,
+    size_m: float,
+    who: str,
+    times: list[float],
+    reference_ms: float,
+    voxels: int,
+) -> Row:
+    """Return the row of one of those compared."""
+    figures = spread(times)
+    return {
+        'voxel_m': size_m,
+        'who': who,
+        **figures,
+        'x_ours': figures['median_ms'] / reference_ms,
+        'Mpt_s': options.num_points / figures['median_ms'] * 1e-3,
+        'scans': len(times),
+        'voxels': voxels,
+        'less': None,
+    }

@@ -1,0 +1,63 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What figures depend on beside the code: the machine, its load, and how many cores are used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import PackageNotFoundError, version
+import os
+from pathlib import Path
+import platform
+from typing import Any
+
+
+def facts() -> dict[str, Any]:
+    """Return what stays the same during a run."""
+    return {
+        'cpu': cpu_model(),
+        'cores': os.cpu_count(),
+        'python': platform.python_version(),
+        'numpy': installed('numpy'),
+        'numba': installed('numba'),
+    }
+
+
+def load() -> float:
+    """Return how many processes wanted to run, on average over the last minute."""
+    return round(os.getloadavg()[0], 2)
+
+
+def cpu_model() -> str:
+    """Return the name of the processor."""
+    cpuinfo = Path('/proc/cpuinfo')
+    lines = cpuinfo.read_text(encoding='utf-8').splitlines() if cpuinfo.exists() else []
+    names = [line.split(':', 1)[1].strip() for line in lines if line.startswith('model name')]
+    return names[0] if names else platform.processor()
+
+
+def installed(package: str) -> str | None:
+    """Return the version of a package, None where it is missing."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """
+    Keep this thread, and what it starts, on one core; where the system can do it.
+
+    The last core is taken, as systems put what they do themselves onto the first.
+    """
+    if not hasattr(os, 'sched_setaffinity'):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {max(before)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)

@@ -1,0 +1,112 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From a PointCloud2 to the normals of all voxels that changed, by stage, on one core.
+
+``calls`` are the bare calls of map and decoder, ``Mapper`` is the pipeline that node and replay
+use, with poses from odometry (its insert includes evict). ``total`` is measured around all of
+it, so it is a little more than the stages. Points a second count those without return, as the
+sensor does. Bytes are a live voxel's in the map, its share of the hash table included, and those
+that a scan in the window keeps for each of its voxels.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+from surfel_mapper.config import Config
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.ours import Ours
+from test.bench.report import rates, Row, spread
+from test.bench.street import Street
+
+BUDGET_MS = {0.5: 8.0, 0.2: 25.0}
+"""What a scan of 131,072 points may cost in a window of 100, by voxel size."""
+
+Times = dict[str, list[float]]
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for every stage, by voxel size and way."""
+    street = Street(options)
+    street.prepare(options.untimed + options.scans)
+    rows: list[Row] = []
+    with one_core():
+        for size_m in options.voxel_sizes_m:
+            ours = Ours(size_m, options.window)
+            rows += stages(options, size_m, 'calls', by_calls(ours, options, street))
+            rows[-1] = {**rows[-1], **memory(ours)}
+            rows += stages(options, size_m, 'Mapper', by_mapper(size_m, options, street))
+    return rows
+
+
+def by_calls(ours: Ours, options: Options, street: Street) -> Times:
+    """Return the times of the bare calls."""
+    times: Times = {}
+    for number, message, counts in street.drive(options.untimed, options.scans):
+        pose = street.pose(number)
+        start = perf_counter()
+        stages = ours.step(message, pose)
+        stages['total'] = (perf_counter() - start) * 1e3
+        if counts:
+            append(times, stages)
+    return times
+
+
+def by_mapper(size_m: float, options: Options, street: Street) -> Times:
+    """Return the times of the pipeline."""
+    drive = street.simulation.drive
+    settings = {'voxel_size_m': size_m, 'min_points': 1}
+    window = {'max_scans': options.window}
+    mapper = Mapper(
+        Config.from_mapping({'map': settings, 'window': window, 'pose': {'source': 'odometry'}})
+    )
+    mount = drive.base_to_sensor
+    mapper.add_pose(BASE, SENSOR, 0, mount[:3], mount[3:], static=True)
+    times: Times = {}
+    for number, message, counts in street.drive(options.untimed, options.scans):
+        stamp_ns = street.simulation.stamp_ns(number)
+        xyz, q_xyzw = drive.pose(stamp_ns)
+        start = perf_counter()
+        scan = to_scan(message)
+        decoded = perf_counter()
+        mapper.add_pose(ODOM, BASE, stamp_ns, xyz, q_xyzw)
+        mapper.add_scan(scan)
+        (update,) = mapper.insert_ready()
+        total = (perf_counter() - start) * 1e3
+        if counts:
+            decode = (decoded - start) * 1e3
+            append(times, {'decode': decode, **update.milliseconds, 'total': total})
+    return times
+
+
+def append(times: Times, stages: dict[str, float]) -> None:
+    """Add the stages of one scan to those of all."""
+    for stage, milliseconds in stages.items():
+        times.setdefault(stage, []).append(milliseconds)
+
+
+def stages(options: Options, size_m: float, way: str, times: Times) -> list[Row]:
+    """Return the rows of one run, the total last."""
+    rows: list[Row] = [
+        {'voxel_m': size_m, 'way': way, 'stage': stage, **spread(values)}
+        for stage, values in times.items()
+    ]
+    budget = {'budget_ms': BUDGET_MS.get(size_m)}
+    rows[-1] = {**rows[-1], **budget, **rates(rows[-1]['median_ms'], options.num_points)}
+    return rows
+
+
+def memory(ours: Ours) -> Row:
+    """Return how many voxels there are and what they take."""
+    in_scans = sum(len(moments) for moments in ours.scans)
+    return {
+        'voxels': ours.map.num_voxels,
+        'changed': ours.num_changed,
+        'B_voxel': ours.map.nbytes / ours.map.num_voxels,
+        'B_scan_voxel': sum(moments.nbytes for moments in ours.scans) / in_scans,
+    }

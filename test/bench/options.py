@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Options: how large a benchmark is; the defaults are those that figures are quoted for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+import os
+from pathlib import Path
+
+WARM_SCANS = 5
+"""So many scans go through a full window before the clock starts: kernels are loaded by then."""
+
+
+def cache_directory() -> Path:
+    """Return where simulated scans and environments of others are kept between runs."""
+    caches = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
+    return Path(caches) / 'surfel_mapper_bench'
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """
+    What every bench is run with.
+
+    Attributes
+    ----------
+    scans : int
+        Scans timed, after the window is full.
+    window : int
+        Scans in the window.
+    windows : tuple of int
+        Lengths of window that are compared; the first is what the others are divided by.
+    map_voxels : tuple of int
+        Sizes of map that are compared, likewise.
+    voxel_sizes_m : tuple of float
+        Edges of voxels.
+    beams, columns : int
+        Of the simulated lidar.
+    peers : bool
+        Whether others are measured that have to be installed first.
+    cache : Path
+        Directory of what is kept between runs.
+
+    """
+
+    scans: int = 100
+    window: int = 100
+    windows: tuple[int, ...] = (25, 400)
+    map_voxels: tuple[int, ...] = (100_000, 5_000_000)
+    voxel_sizes_m: tuple[float, ...] = (0.5, 0.2)
+    beams: int = 64
+    columns: int = 2048
+    peers: bool = False
+    cache: Path = field(default_factory=cache_directory)
+
+    @property
+    def num_points(self) -> int:
+        """Points of a scan, those without return included."""
+        return self.beams * self.columns
+
+    @property
+    def untimed(self) -> int:
+        """Scans before the first that is timed."""
+        return self.window + WARM_SCANS
+
+    def quick(self) -> Options:
+        """Return options by which everything takes seconds, for comparing while working."""
+        return replace(
+            self, scans=25, window=25, windows=(10, 50), map_voxels=(100_000, 1_000_000)
+        )

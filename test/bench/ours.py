@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The job itself by the calls it consists of, each stage timed: what Mapper does, without Mapper.
+
+Decode a PointCloud2, reduce it to moments, insert them, evict the oldest scan, derive the normals
+of all voxels that changed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from time import perf_counter
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.raw_cloud import RawCloud
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+STAGES = ('decode', 'reduce', 'insert', 'evict', 'normals')
+
+
+class Ours:
+    """
+    A map and its window of scans.
+
+    Parameters
+    ----------
+    voxel_size_m : float
+        Edge of a voxel.
+    window : int
+        How many scans stay.
+
+    """
+
+    def __init__(self, voxel_size_m: float, window: int) -> None:
+        self.map = SurfelMap(voxel_size_m)
+        self.scans: deque[ScanMoments] = deque()
+        self.num_changed = 0
+        self._window = window
+
+    def step(self, message: RawCloud, pose: npt.NDArray[np.float64]) -> dict[str, float]:
+        """Map a scan; return the milliseconds of every stage."""
+        times = [perf_counter()]
+        scan = to_scan(message)
+        times.append(perf_counter())
+        moments = self.map.reduce(scan.points, pose, origin=pose[:3, 3])
+        times.append(perf_counter())
+        version = self.map.version
+        self.map.insert(moments)
+        self.scans.append(moments)
+        times.append(perf_counter())
+        if len(self.scans) > self._window:
+            self.map.remove(self.scans.popleft())
+        times.append(perf_counter())
+        changed = self.map.surfels_changed(version)
+        times.append(perf_counter())
+        self.num_changed = len(changed)
+        return {
+            stage: (end - start) * 1e3
+            for stage, start, end in zip(STAGES, times[:-1], times[1:], strict=True)
+        }

@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Others that map point clouds, measured where their packages can be had.
+
+Each has a module here with a class ``Peer(voxel_size_m, window)``: ``step(points, T_map_sensor)``
+takes a scan, (N, 3) float32 with nan, and ``num_voxels`` says how much it holds. The module is
+loaded by ``driver`` in an environment of its own and imports nothing of surfel_mapper.
+Versions are fixed, so that figures can be repeated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class PeerSpec:
+    """
+    One of those that are compared.
+
+    Attributes
+    ----------
+    name : str
+        As it stands in the table.
+    module : str
+        Where its class is.
+    requires : tuple of str
+        What pip installs for it.
+    less : str
+        What it does less than we.
+
+    """
+
+    name: str
+    module: str
+    requires: tuple[str, ...]
+    less: str | None = None
+
+
+OPEN3D = ('open3d-cpu==0.19.0',)  # later ones need libusb of the system
+SMALL_GICP = ('small_gicp==1.0.1', 'numpy')
+
+PEERS = (
+    PeerSpec(
+        name='Open3D HashMap + numpy',
+        module='test.bench.peers.open3d_hashmap',
+        requires=OPEN3D,
+    ),
+    PeerSpec(
+        name='Open3D rebuild',
+        module='test.bench.peers.open3d_rebuild',
+        requires=OPEN3D,
+        less='not exact: normals of downsampled points',
+    ),
+    PeerSpec(
+        name='small_gicp GaussianVoxelMap, means',
+        module='test.bench.peers.small_gicp_means',
+        requires=SMALL_GICP,
+        less='removes voxels not seen for long, never points; no covariances, no normals',
+    ),
+    PeerSpec(
+        name='small_gicp GaussianVoxelMap, covariances',
+        module='test.bench.peers.small_gicp_covariances',
+        requires=SMALL_GICP,
+        less='removes voxels not seen for long, never points; no normals',
+    ),
+    PeerSpec(
+        name='KISS-ICP VoxelHashMap',
+        module='test.bench.peers.kiss_icp_map',
+        requires=('kiss-icp==1.3.0',),
+        less='keeps 20 points a voxel, removes by distance; no moments, no normals',
+    ),
+)

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A peer is installed into an environment of its own and runs there, in a process."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+import re
+import subprocess
+import sys
+import tempfile
+from typing import Any
+import venv
+
+import numpy as np
+
+from test.bench.options import Options
+from test.bench.peers import PeerSpec
+from test.bench.street import Street
+
+ROOT = Path(__file__).parents[3]
+
+COLOUR = re.compile(r'\x1b\[[\d;]*m')
+
+READY = 'ready'
+"""A file of this name says that everything is installed in an environment."""
+
+
+class PeerError(RuntimeError):
+    """A peer cannot be installed or run."""
+
+
+def run_peer(
+    python: str | Path, peer: PeerSpec, options: Options, street: Street, size_m: float
+) -> tuple[list[float], int]:
+    """
+    Return milliseconds of every timed scan, and voxels at the end.
+
+    Raises
+    ------
+    PeerError
+        With the last line that the peer said.
+
+    """
+    numbers = range(options.untimed + options.scans)
+    with tempfile.TemporaryDirectory() as scratch:
+        poses = Path(scratch) / 'poses.npy'
+        np.save(poses, np.array([street.pose(number) for number in numbers]))
+        job = {
+            'module': peer.module,
+            'scans': [str(street.path(number)) for number in numbers],
+            'poses': str(poses),
+            'voxel_size_m': size_m,
+            'window': options.window,
+            'untimed': options.untimed,
+        }
+        command = [str(python), '-m', 'test.bench.peers.driver']
+        result = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
+    return result['milliseconds'], result['num_voxels']
+
+
+def environment(peer: PeerSpec, cache: Path) -> Path:
+    """
+    Return the python of the environment of a peer, made if it is not there yet.
+
+    Raises
+    ------
+    PeerError
+        With the last line that pip said.
+
+    """
+    version = f'{sys.version_info.major}.{sys.version_info.minor}'
+    name = hashlib.sha256(' '.join([version, *peer.requires]).encode()).hexdigest()[:12]
+    directory = cache / f'venv-{name}'
+    python = directory / 'bin' / 'python'
+    if not (directory / READY).exists():
+        print(f'installing {" ".join(peer.requires)} into {directory}', file=sys.stderr)
+        venv.create(directory, clear=True, with_pip=True)
+        pip = [str(python), '-m', 'pip', 'install', '--quiet', '--disable-pip-version-check']
+        output([*pip, *peer.requires])
+        (directory / READY).touch()
+    return python
+
+
+def output(command: list[str], **settings: Any) -> str:
+    """Return what a process wrote to stdout, or raise PeerError."""
+    done = subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+    if done.returncode:
+        said = COLOUR.sub('', done.stderr).split('\n')
+        raise PeerError([f'exit code {done.returncode}', *filter(str.strip, said)][-1])
+    return done.stdout

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The scans of all benchmarks: a lidar of 131,072 points driving through the simulated street.
+
+Simulated once and kept as .npy, a file a scan, in a directory named by a hash of all that the
+points depend on. Messages are laid out as drivers do it, 32 bytes a point, and are 4 MiB each:
+of a list of them, none is in a cache any more when its turn comes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import asdict
+import hashlib
+import json
+from pathlib import Path
+import sys
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.io.files import replace_file
+from surfel_mapper.io.raw_cloud import Header, RawCloud, Stamp
+from surfel_mapper.scan import Scan
+from surfel_mapper.simulation import Lidar, Simulation, World
+from surfel_mapper.simulation.recording import cloud_bytes, SENSOR
+from test.bench.options import Options
+
+LENGTH_M = 600.0
+"""Of the street: room for 1200 scans, one every 0.5 m."""
+
+NOISE_M = 0.02
+
+
+class Street:
+    """
+    Scans of a drive at 10 Hz and 5 m/s.
+
+    Parameters
+    ----------
+    options : Options
+        Size of the lidar, and the cache.
+
+    """
+
+    def __init__(self, options: Options) -> None:
+        lidar = Lidar(beams=options.beams, columns=options.columns, range_noise_m=NOISE_M)
+        world = World.street(seed=1, length_m=LENGTH_M)
+        self.simulation = Simulation(world, lidar)
+        self.directory = options.cache / f'street-{self._hash()}'
+
+    def pose(self, number: int) -> npt.NDArray[np.float64]:
+        """Return T_odom_sensor (4, 4) of a scan."""
+        return self.simulation.drive.T_odom_sensor(self.simulation.stamp_ns(number))
+
+    def points(self, number: int) -> npt.NDArray[np.float32]:
+        """Return the points of a scan, (N, 3) in the sensor frame, m; nan where none returned."""
+        path = self.path(number)
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with replace_file(path) as file:
+                np.save(file, self.simulation.scan(number).points)
+        return np.load(path)
+
+    def path(self, number: int) -> Path:
+        """Return the file of a scan."""
+        return self.directory / f'{number:05d}.npy'
+
+    def prepare(self, num_scans: int) -> None:
+        """Simulate what is not there yet of the first so many scans."""
+        missing = [n for n in range(num_scans) if not self.path(n).exists()]
+        if missing:
+            print(f'simulating {len(missing)} scans into {self.directory}', file=sys.stderr)
+        for number in missing:
+            self.points(number)
+
+    def message(self, number: int) -> RawCloud:
+        """Return a scan as a PointCloud2; columns other than x y z are zero, nobody reads them."""
+        points = self.points(number)
+        zeros = np.zeros(len(points), np.float32)
+        columns = {'intensity': zeros, 'ring': zeros, 'time': zeros}
+        stamp_ns = self.simulation.stamp_ns(number)
+        scan = Scan(points=points, stamp_ns=stamp_ns, frame_id=SENSOR, columns=columns)
+        cloud = cloud_bytes(scan, self.simulation.lidar.beams)
+        return RawCloud(
+            header=Header(Stamp(*divmod(stamp_ns, 10**9)), SENSOR),
+            height=cloud.height,
+            width=cloud.width,
+            fields=list(cloud.fields),
+            is_bigendian=cloud.is_bigendian,
+            point_step=cloud.point_step,
+            row_step=cloud.row_step,
+            data=cloud.data,
+            is_dense=cloud.is_dense,
+        )
+
+    def drive(self, untimed: int, timed: int) -> Iterator[tuple[int, RawCloud, bool]]:
+        """
+        Yield number, message and whether it counts, of so many scans each.
+
+        All that count are in memory before the first of them is yielded, and so are cold in the
+        caches when their turn comes.
+        """
+        for number in range(untimed):
+            yield number, self.message(number), False
+        messages = [self.message(untimed + later) for later in range(timed)]
+        for later, message in enumerate(messages):
+            yield untimed + later, message, True
+
+    def _hash(self) -> str:
+        """Return a short hash of everything that points depend on."""
+        world = self.simulation.world.to_mapping()
+        state = [world, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
+        return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:12]

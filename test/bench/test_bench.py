@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmarks run, on a lidar of 512 points; how long anything takes is not tested."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+
+import numpy as np
+import pytest
+
+from test.bench import __main__ as bench
+from test.bench.machine import one_core
+from test.bench.numpy_map import NumpyMap
+from test.bench.options import Options
+from test.bench.peers import PeerSpec
+from test.bench.peers.run import PeerError, run_peer
+from test.bench.report import spread, table
+from test.bench.street import Street
+
+SCANS, WINDOW = 3, 4
+
+
+class Peer:
+    """A peer for the driver that needs no environment of its own."""
+
+    def __init__(self, voxel_size_m, window):
+        self._map = NumpyMap(voxel_size_m, window)
+
+    def step(self, points, T_map_sensor):
+        self._map.step(list(points.T), T_map_sensor)
+
+    @property
+    def num_voxels(self):
+        return len(self._map.state()[0])
+
+
+@pytest.fixture(scope='module')
+def options(tmp_path_factory):
+    return Options(
+        scans=SCANS,
+        window=WINDOW,
+        windows=(2, 5),
+        map_voxels=(100, 20_000),
+        beams=8,
+        columns=64,
+        cache=tmp_path_factory.mktemp('cache'),
+    )
+
+
+@pytest.mark.parametrize('name', bench.BENCHES)
+def test_every_bench_gives_rows_of_figures(options, name, capsys):
+    rows = bench.run([name], options)
+
+    assert {row['voxel_m'] for row in rows} == {0.5, 0.2}
+    for row in rows:
+        assert row['bench'] == name
+        assert 0.0 < row['p10_ms'] <= row['median_ms'] <= row['p99_ms'] <= row['slowest_ms']
+        assert json.loads(json.dumps(row)) == row
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[0] == f'{name}: {bench.summary(name)}'
+    assert len(printed) == len(rows) + 4
+
+
+def test_the_stages_of_mapping_are_all_there(options):
+    rows = bench.run(['mapping'], options)
+    found = [(row['way'], row['stage']) for row in rows if row['voxel_m'] == 0.5]
+    assert found == [
+        *(('calls', s) for s in ('decode', 'reduce', 'insert', 'evict', 'normals', 'total')),
+        *(('Mapper', s) for s in ('decode', 'reduce', 'insert', 'normals', 'total')),
+    ]
+
+
+def test_the_windows_and_maps_compared_are_as_long_and_large_as_asked(options):
+    rows = [row for row in bench.run(['scaling'], options) if row['voxel_m'] == 0.5]
+    assert [row['window'] for row in rows] == [2, 5, WINDOW, WINDOW]
+    small, large = (row['voxels'] for row in rows if row['varied'] == 'map')
+    assert large - small == 20_000 - 100
+
+
+def test_scans_are_simulated_once_and_kept(options):
+    street = Street(options)
+    first = street.points(0)
+    written_ns = street.path(0).stat().st_mtime_ns
+
+    again = Street(options)
+    np.testing.assert_array_equal(again.points(0), first)
+    assert again.path(0).stat().st_mtime_ns == written_ns
+    assert first.shape == (512, 3)
+    assert np.isfinite(first).all(axis=1).mean() > 0.5
+
+
+def test_a_peer_is_given_the_same_scans_in_a_process_of_its_own(options):
+    street = Street(options)
+    street.prepare(options.untimed + SCANS)
+    expected = Peer(0.5, WINDOW)
+    for number in range(options.untimed + SCANS):
+        expected.step(street.points(number), street.pose(number))
+
+    peer = PeerSpec(name='numpy', module='test.bench.test_bench', requires=())
+    milliseconds, num_voxels = run_peer(sys.executable, peer, options, street, 0.5)
+
+    assert len(milliseconds) == SCANS
+    assert num_voxels == expected.num_voxels > 0
+
+
+def test_a_peer_that_fails_says_why(options):
+    street = Street(options)
+    street.prepare(options.untimed + SCANS)
+    peer = PeerSpec(name='absent', module='test.bench.peers.absent', requires=())
+    with pytest.raises(PeerError, match=r'^ModuleNotFoundError: .*absent'):
+        run_peer(sys.executable, peer, options, street, 0.5)
+
+
+@pytest.mark.skipif(not hasattr(os, 'sched_getaffinity'), reason='the system cannot pin')
+def test_one_core_is_one_core_and_no_longer_than_asked():
+    before = os.sched_getaffinity(0)
+    with one_core():
+        assert len(os.sched_getaffinity(0)) == 1
+    assert os.sched_getaffinity(0) == before
+
+
+def test_the_command_line_chooses_size_and_benches(tmp_path):
+    args = bench.parser().parse_args(
+        ['--only', 'scaling', '--quick', '--scans', '7', '--cache', str(tmp_path)]
+    )
+    chosen = bench.options(args)
+    assert args.only == ['scaling']
+    assert (chosen.scans, chosen.cache, chosen.peers) == (7, tmp_path, False)
+    assert chosen.window < Options().window
+    assert bench.options(bench.parser().parse_args([])) == Options()
+
+
+def test_a_number_of_scans_that_is_not_positive_is_refused(capsys):
+    with pytest.raises(SystemExit) as exit_info:
+        bench.main(['--scans', '0'])
+    assert exit_info.value.code == 2
+    assert '--scans: 0, expected one or more' in capsys.readouterr().err
+
+
+def test_spread_is_of_the_times_given():
+    figures = spread([float(value) for value in range(101)])
+    assert figures == {'median_ms': 50.0, 'p10_ms': 10.0, 'p99_ms': 99.0, 'slowest_ms': 100.0}
+
+
+def test_a_table_is_aligned_and_leaves_missing_values_empty():
+    rows = [{'who': 'a', 'ms': 0.12345}, {'who': 'bcd', 'less': 'no normals'}]
+    assert table(rows) == 'who     ms  less\na    0.123\nbcd         no normals'
