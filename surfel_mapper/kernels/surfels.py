@@ -63,11 +63,9 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
             out = start + i
             row = np.int64(chosen[out])
             nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
-            if math.isnan(planarity[out]):
-                nx = ny = nz = math.nan
-            elif looks_away(nx, ny, nz, rows[row]):
-                nx, ny, nz = -nx, -ny, -nz
-            normal[out, 0], normal[out, 1], normal[out, 2] = nx, ny, nz
+            side = side_seen(nx, ny, nz, rows, row)  # a factor: half of the branches would miss
+            side = math.nan if math.isnan(planarity[out]) else side
+            normal[out, 0], normal[out, 1], normal[out, 2] = nx * side, ny * side, nz * side
             for j in range(3):
                 eigenvalues[out, j] = values[j, i]
 
@@ -144,14 +142,14 @@ def derive_shape(values, num, num_points, unit, planarity, curvature):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def looks_away(nx, ny, nz, row):
+def side_seen(nx, ny, nz, rows, row):
     """
-    Return whether a normal has to be turned.
+    Return 1 if a normal points to the side from which its voxel was seen, else -1.
 
-    It points to the side from which the voxel was seen. Where that is unknown or exactly
-    sideways, the component of largest magnitude is positive; of equal ones the first counts.
+    Where that is unknown or exactly sideways: 1 if the component of largest magnitude is
+    positive; of equal ones the first counts.
     """
-    towards = (nx * row[VIEW] + ny * row[VIEW + 1]) + nz * row[VIEW + 2]
+    towards = (nx * rows[row, VIEW] + ny * rows[row, VIEW + 1]) + nz * rows[row, VIEW + 2]
     if towards == 0.0:
         if abs(nx) >= abs(ny) and abs(nx) >= abs(nz):
             towards = nx
@@ -159,7 +157,7 @@ def looks_away(nx, ny, nz, row):
             towards = ny
         else:
             towards = nz
-    return towards < 0.0
+    return -1.0 if towards < 0.0 else 1.0
 
 
 @njit(cache=True, nogil=True)

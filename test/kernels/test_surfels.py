@@ -16,10 +16,10 @@ from surfel_mapper.kernels.surfels import (
     CHUNK,
     derive_surfels,
     gather,
-    looks_away,
     place_means,
     rows_changed_after,
     rows_changed_at,
+    side_seen,
 )
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
@@ -151,8 +151,8 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     ],
 )
 def test_normals_that_look_away_are_known(call, normal, view, away):
-    row = np.array(row_of([(0, 0, 0)], view=view))
-    assert bool(call(looks_away, *map(float, normal), row)) == away
+    rows = np.array([row_of([(0, 0, 0)], view=view)])
+    assert call(side_seen, *map(float, normal), rows, 0) == (-1.0 if away else 1.0)
 
 
 @both
