@@ -5,9 +5,9 @@ The one configuration of node and replay: a frozen dataclass for every stage.
 
 A setting states its default, unit, bounds and meaning once, here; the ROS parameters, the YAML
 files and the table of the README are made from it or compared with it. A setting is called
-``stage.name`` everywhere. Values keep to the types of ROS parameters, so that one YAML serves
-both. Nothing is repaired in silence: an unknown name, a wrong type or a value out of bounds is
-a ConfigError.
+``stage.name`` everywhere, or by its name alone where it is of no stage. Values keep to the types
+of ROS parameters, so that one YAML serves both. Nothing is repaired in silence: an unknown name,
+a wrong type or a value out of bounds is a ConfigError.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ class OutputConfig(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Config:
-    """All settings of the pipeline, one field a stage."""
+    """All settings of the pipeline: one field a stage, and those of no stage."""
 
     map: MapConfig = field(default_factory=MapConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
@@ -280,6 +280,15 @@ class Config:
     input: InputConfig = field(default_factory=InputConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
+    filters: str = setting(
+        '', 'YAML file of the filters that every scan passes before it is mapped; empty: none.'
+    )
+
+    def __post_init__(self) -> None:
+        """Check the settings of no stage; each stage has checked its own."""
+        for declared in dataclasses.fields(self):
+            if 'meaning' in declared.metadata:
+                checked(declared.name, getattr(self, declared.name), declared)
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:
@@ -298,19 +307,24 @@ class Config:
 
         """
         stages: dict[str, dict[str, Any]] = {}
+        of_no_stage: dict[str, Any] = {}
         known = {declared.name: declared for declared in declarations()}
         for name, value in flatten(mapping):
             if name not in known:
                 raise ConfigError(f'{name}: no such setting{near(name, known)}')
-            stage, _, key = name.rpartition('.')
-            stages.setdefault(stage, {})[key] = value
+            declared = known[name]
+            place = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
+            place[declared.key] = value
         classes = {f.name: f.default_factory for f in dataclasses.fields(cls)}
-        return cls(**{stage: classes[stage](**values) for stage, values in stages.items()})  # type: ignore[operator]
+        made = {stage: classes[stage](**values) for stage, values in stages.items()}  # type: ignore[operator]
+        return cls(**made, **of_no_stage)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
         return {
-            declared.name: getattr(getattr(self, declared.stage), declared.key)
+            declared.name: getattr(
+                getattr(self, declared.stage) if declared.stage else self, declared.key
+            )
             for declared in declarations()
         }
 
@@ -321,7 +335,7 @@ class Config:
 
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """One setting as declared: its full name and what ``setting`` was told."""
+    """One setting as declared: its full name, and what ``setting`` was told; stage may be ''."""
 
     name: str
     stage: str
@@ -338,6 +352,9 @@ def declarations() -> list[Declaration]:
     """Return the declaration of every setting, in order."""
     rows = []
     for stage in dataclasses.fields(Config):
+        if 'meaning' in stage.metadata:
+            rows.append(Declaration(stage.name, '', stage.name, stage.default, **stage.metadata))
+            continue
         for key in dataclasses.fields(stage.default_factory):  # type: ignore[arg-type]
             name = f'{stage.name}.{key.name}'
             rows.append(Declaration(name, stage.name, key.name, key.default, **key.metadata))

@@ -23,6 +23,15 @@ LATEST = 1000
 
 
 @dataclass(slots=True)
+class FilterCounts:
+    """What one filter of the chain did so far: points in and out, its latest times."""
+
+    points_in: int = 0
+    points_out: int = 0
+    milliseconds: deque[float] = field(default_factory=lambda: deque(maxlen=LATEST))
+
+
+@dataclass(slots=True)
 class Counters:
     """
     Counts and times of one pipeline.
@@ -45,6 +54,8 @@ class Counters:
         Other messages (transforms, odometry) not used, by cause.
     milliseconds : dict of str to deque of float
         Time of every stage for the latest scans.
+    filters : dict of str to FilterCounts
+        The same by filter, in the order of the chain.
 
     """
 
@@ -58,6 +69,7 @@ class Counters:
     points_left_out: Counter[str] = field(default_factory=Counter)
     messages_ignored: Counter[str] = field(default_factory=Counter)
     milliseconds: dict[str, deque[float]] = field(default_factory=dict)
+    filters: dict[str, FilterCounts] = field(default_factory=dict)
 
     @contextmanager
     def timed(self, stage: str) -> Iterator[None]:
@@ -72,14 +84,24 @@ class Counters:
         """Add the time that one scan spent in a stage."""
         self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(milliseconds)
 
+    def add_filter(
+        self, name: str, points_in: int, points_out: int, milliseconds: float
+    ) -> None:
+        """Add what one filter did to one scan."""
+        counts = self.filters.setdefault(name, FilterCounts())
+        counts.points_in += points_in
+        counts.points_out += points_out
+        counts.milliseconds.append(milliseconds)
+
     def summary(self) -> dict[str, Any]:
         """Return everything as plain numbers, with median and 99th percentile of the times."""
-        times = {
-            stage: {
-                'median': round(float(np.median(values)), 3),
-                'p99': round(float(np.percentile(values, 99)), 3),
+        filters = {
+            name: {
+                'points_in': counts.points_in,
+                'points_out': counts.points_out,
+                'milliseconds': percentiles(counts.milliseconds),
             }
-            for stage, values in self.milliseconds.items()
+            for name, counts in self.filters.items()
         }
         return {
             'scans': {
@@ -93,5 +115,14 @@ class Counters:
             'points': self.points,
             'points_left_out': dict(self.points_left_out),
             'messages_ignored': dict(self.messages_ignored),
-            'milliseconds': times,
+            'milliseconds': {k: percentiles(v) for k, v in self.milliseconds.items()},
+            'filters': filters,
         }
+
+
+def percentiles(milliseconds: deque[float]) -> dict[str, float]:
+    """Return median and 99th percentile of times."""
+    return {
+        'median': round(float(np.median(milliseconds)), 3),
+        'p99': round(float(np.percentile(milliseconds, 99)), 3),
+    }

@@ -53,7 +53,7 @@ class NotInMapError(MapError, ValueError):
 
 
 class FilterError(SurfelMapperError, ValueError):
-    """A filter cannot work on a scan: a column is missing, or coordinates are not what it takes."""
+    """A filter cannot work on a scan: a column is missing, or a value is not what it takes."""
 
 
 class BagError(SurfelMapperError):

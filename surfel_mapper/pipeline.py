@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, replace
 import logging
 import time
 from typing import Any
@@ -23,7 +23,14 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
-from surfel_mapper.errors import ConfigError, MapError, PoseError, PoseNotYetError
+from surfel_mapper.errors import (
+    ConfigError,
+    FilterError,
+    MapError,
+    PoseError,
+    PoseNotYetError,
+)
+from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
 from surfel_mapper.mapping.moments import NARROW_COUNT
@@ -61,7 +68,8 @@ class Update:
     evictions : tuple of Eviction
         The scans that left, oldest first.
     milliseconds : dict of str to float
-        Time by stage: reduce, insert (evictions included), normals, total.
+        Time by stage: filter (where there are any), reduce, insert (evictions included),
+        normals, total.
 
     """
 
@@ -87,7 +95,8 @@ class Mapper:
     Raises
     ------
     ConfigError
-        If ``pose.source`` is registration, which this version cannot do.
+        If ``pose.source`` is registration, which this version cannot do, or ``filters`` names a
+        file that holds no chain.
 
     """
 
@@ -100,6 +109,7 @@ class Mapper:
                 'expected tf, odometry, pose or identity'
             )
         self.counters = Counters()
+        self.chain = Chain.load(self.config.filters) if self.config.filters else Chain()
         self.map = SurfelMap(
             self.config.map.voxel_size_m, columns=self.config.map.columns
         )
@@ -233,6 +243,7 @@ class Mapper:
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
+        self.chain.warm_up()
         for dtype in (np.float32, np.float64):
             surfel_map = SurfelMap(self.config.map.voxel_size_m, columns=self.config.map.columns)
             one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
@@ -247,6 +258,7 @@ class Mapper:
         """Return counts and times, and what the map is: for files, reports and diagnostics."""
         return {
             **self.counters.summary(),
+            'filter_chain': self.chain.to_list(),
             'voxel_size_m': self.map.voxel_size_m,
             'window_scans': len(self.window),
             'voxels': self.map.num_voxels,
@@ -311,8 +323,12 @@ class Mapper:
             self.counters.gated += 1
             return None
         start, version = time.perf_counter(), self.map.version
+        filtered = self._filter(scan, pose) if len(self.chain) else scan
+        if filtered is None:
+            return None
+        cleaned = time.perf_counter() if len(self.chain) else start
         try:
-            windowed = self._reduce(scan, pose)
+            windowed = self._reduce(filtered, pose)
             reduced = time.perf_counter()
             if not len(windowed.moments):
                 self._drop(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
@@ -325,7 +341,8 @@ class Mapper:
         changed = self.map.surfels_changed(version, self.config.map.min_points)
         end = time.perf_counter()
         times = {
-            'reduce': (reduced - start) * 1e3,
+            **({'filter': (cleaned - start) * 1e3} if len(self.chain) else {}),
+            'reduce': (reduced - cleaned) * 1e3,
             'insert': (inserted - reduced) * 1e3,
             'normals': (end - inserted) * 1e3,
             'total': (end - start) * 1e3,
@@ -342,6 +359,29 @@ class Mapper:
             evictions=tuple(evictions),
             milliseconds=times,
         )
+
+    def _filter(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Scan | None:
+        """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
+        try:
+            T_base_sensor = self.transforms.lookup(
+                self.config.frames.base, scan.frame_id, scan.stamp_ns
+            )
+        except PoseError:
+            T_base_sensor = None  # the filters that need it will say so
+        try:
+            filtered, steps = self.chain.run(
+                replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
+            )
+        except FilterError as error:
+            self._drop(scan, 'filter', str(error))
+            return None
+        for step in steps:
+            self.counters.add_filter(*astuple(step))
+        self.counters.points_left_out['filtered'] += len(scan) - len(filtered)
+        if not len(filtered):
+            self._drop(scan, 'filtered_out', 'the filters left none of its points')
+            return None
+        return filtered
 
     def _reduce(self, scan: Scan, pose: npt.NDArray[np.float64]) -> WindowedScan:
         """Reduce a scan to its moments; where the sensor is unknown, normals stay unturned."""

@@ -43,12 +43,14 @@ def default_yaml() -> str:
     text, stage = HEADER, None
     for declared in declarations():
         if declared.stage != stage:
-            text += ('\n' if stage else '') + f'    {declared.stage}:\n'
+            text += '\n' if stage else ''
+            text += f'    {declared.stage}:\n' if declared.stage else ''
             stage = declared.stage
-        comment = textwrap.wrap(f'{declared.meaning} {allowed(declared)}'.strip(), 91)
-        lines = [f'# {line}' for line in comment]
+        indent = '      ' if stage else '    '
+        comment = f'{declared.meaning} {allowed(declared)}'.strip()
+        lines = [f'# {line}' for line in textwrap.wrap(comment, 97 - len(indent))]
         lines.append(f'{declared.key}: {yaml_value(declared.default)}')
-        text += textwrap.indent('\n'.join(lines), '      ') + '\n'
+        text += textwrap.indent('\n'.join(lines), indent) + '\n'
     return text
 
 
@@ -73,7 +75,7 @@ def allowed(declared: Declaration) -> str:
 
 def yaml_value(value: Any) -> str:
     """Return a default as ROS and YAML both read it: JSON is that."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return value if isinstance(value, str) and value else json.dumps(value)
 
 
 def with_table(readme: str) -> str:

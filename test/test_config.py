@@ -60,6 +60,15 @@ def test_replacing_changes_what_is_named_and_keeps_the_rest():
     assert config.window.max_scans == 7
 
 
+def test_a_setting_of_no_stage_goes_by_its_name_alone():
+    config = Config.from_mapping({'filters': 'clean.yaml', 'map': {'min_points': 3}})
+    assert (config.filters, config.map.min_points) == ('clean.yaml', 3)
+    assert config.to_mapping()['filters'] == 'clean.yaml'
+    assert config.replace({'map.min_points': 4}).filters == 'clean.yaml'
+    with pytest.raises(ConfigError, match='filters: 7, expected a str'):
+        Config(filters=7)
+
+
 def test_replacing_is_checked_too():
     with pytest.raises(ConfigError, match=r'window\.max_scans: -1'):
         Config().replace({'window.max_scans': -1})
@@ -89,7 +98,7 @@ def test_a_stage_checks_itself_without_the_rest():
 
 @pytest.mark.parametrize('declared', declarations(), ids=lambda declared: declared.name)
 def test_every_declaration_is_complete(declared):
-    assert declared.name == f'{declared.stage}.{declared.key}'
+    assert declared.name == f'{declared.stage}.{declared.key}'.removeprefix('.')
     assert declared.meaning.endswith('.')
     numeric = isinstance(declared.default, (int, float)) and not isinstance(declared.default, bool)
     assert (declared.low is not None, declared.high is not None) == (numeric, numeric)

@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from surfel_mapper.config import Config, declarations, load_config
+from surfel_mapper.config import Config, declarations, flatten, load_config
 from test import settings
 
 LAUNCH_CONFIGS = settings.DEFAULT_YAML.parent
@@ -23,11 +23,7 @@ LAUNCH_CONFIGS = settings.DEFAULT_YAML.parent
 
 def test_default_yaml_has_every_setting_at_its_default_and_nothing_else():
     content = yaml.safe_load(settings.DEFAULT_YAML.read_text(encoding='utf-8'))
-    stages = content['/**']['ros__parameters']
-    found = {
-        f'{stage}.{key}': value for stage, keys in stages.items() for key, value in keys.items()
-    }
-    assert found == {
+    assert dict(flatten(content['/**']['ros__parameters'])) == {
         name: list(value) if isinstance(value, tuple) else value
         for name, value in Config().to_mapping().items()
     }
@@ -37,7 +33,7 @@ def test_default_yaml_has_every_setting_at_its_default_and_nothing_else():
 @pytest.mark.parametrize('declared', declarations(), ids=lambda declared: declared.name)
 def test_a_number_keeps_its_type_in_default_yaml(declared):
     content = yaml.safe_load(settings.DEFAULT_YAML.read_text(encoding='utf-8'))
-    value = content['/**']['ros__parameters'][declared.stage][declared.key]
+    value = dict(flatten(content['/**']['ros__parameters']))[declared.name]
     expected = list if isinstance(declared.default, tuple) else type(declared.default)
     assert type(value) is expected  # 1 for 1.0 would be refused by ROS
 

@@ -40,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument('--pose-topic', help='topic of the poses (/tf, /odom or /pose)')
     parser.add_argument('--config', type=Path, metavar='FILE', help='YAML file of settings')
     parser.add_argument(
+        '--filters',
+        metavar='FILE',
+        help='YAML file of a filter chain, as libpointmatcher has them (see `surfel-mapper '
+        'filters`); FILE#key: the list under a key of it',
+    )
+    parser.add_argument(
         '--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)'
     )
     parser.add_argument(
@@ -60,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.pipeline import Mapper
 
     config = load_config(args.config)
+    if args.filters is not None:
+        config = config.replace({'filters': args.filters})
     mapper = Mapper(config if args.window else config.replace(ALL_SCANS))
     output = output_directory(args.bag, args.output)
     with BagReader(args.bag) as reader:
@@ -164,7 +172,13 @@ def report(summary: dict[str, Any], output: Path) -> str:
     gated = f' ({scans["gated"]} left out by the motion gate)'
     stages = '   '.join(
         f'{stage} {times[stage]["median"]:.1f} ms'
-        for stage in ('decode', 'reduce', 'insert', 'normals', 'total')
+        for stage in ('decode', 'filter', 'reduce', 'insert', 'normals', 'total')
+        if stage in times
+    )
+    filters = ''.join(
+        f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
+        f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
+        for name, done in summary['filters'].items()
     )
     speed = summary['recorded_s'] / summary['replay_s']
     return (
@@ -172,6 +186,7 @@ def report(summary: dict[str, Any], output: Path) -> str:
         f'{gated if scans["gated"] else ""}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
+        f'{filters}'
         f'digest {summary["digest"]}\n'
         f'{output / "map.ply"}   {output / "map.png"}   {output / "summary.json"}'
     )

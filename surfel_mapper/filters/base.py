@@ -16,7 +16,7 @@ and replay keep the same points and any part of a bag is filtered as the whole i
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -32,14 +32,13 @@ Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[Any]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Filter:
     """
     Base of all filters: checks every parameter against its declaration.
 
     A filter implements ``keep`` or ``apply``. ``name`` and ``theirs`` are given by ``register``.
     """
-
-    __slots__ = ()
 
     name: ClassVar[str] = ''
     """Name in a chain."""
@@ -116,12 +115,12 @@ def select(scan: Scan, rows: Array) -> Scan:
         for axis in range(3):
             np.take(scan.points[:, axis], rows, out=points[:, axis], mode='raise')
     columns = {name: np.take(column, rows, axis=0) for name, column in scan.columns.items()}
-    return dataclasses.replace(scan, points=points, columns=columns)
+    return replace(scan, points=points, columns=columns)
 
 
 def with_columns(scan: Scan, **columns: Array) -> Scan:
     """Return the scan with columns added, or put in place of those of the same name."""
-    return dataclasses.replace(scan, columns={**scan.columns, **columns})
+    return replace(scan, columns={**scan.columns, **columns})
 
 
 def generator(scan: Scan, seed: int) -> np.random.Generator:

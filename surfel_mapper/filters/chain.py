@@ -20,14 +20,27 @@ list under a key of the top level, ``FILE#key.key`` one further down.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+import contextlib
+from dataclasses import dataclass, replace
+import math
 from pathlib import Path
 import time
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import Filter
-from surfel_mapper.filters.parameters import values_of
+from surfel_mapper.filters.columns import (
+    DENSITIES,
+    EIGEN_VALUES,
+    EIGEN_VECTORS,
+    INCIDENCE_ANGLES,
+    NORMALS,
+    OBSERVATION_DIRECTIONS,
+)
+from surfel_mapper.filters.parameters import parameters_of, values_of
 from surfel_mapper.filters.registry import find
 from surfel_mapper.scan import Scan
 
@@ -121,6 +134,18 @@ class Chain:
             )
         return cls.from_list(content, str(path))
 
+    def to_list(self) -> list[dict[str, dict[str, Any]]]:
+        """Return the chain as ``from_list`` takes it and JSON holds it, all by our names."""
+        return [
+            {
+                each.name: {
+                    declared.name: jsonable(getattr(each, declared.name))
+                    for declared in parameters_of(type(each))
+                }
+            }
+            for each in self.filters
+        ]
+
     def __len__(self) -> int:
         """Return the number of filters."""
         return len(self.filters)
@@ -149,6 +174,45 @@ class Chain:
             milliseconds = (time.perf_counter() - start) * 1e3
             steps.append(Step(name, points_in, len(scan), milliseconds))
         return scan, tuple(steps)
+
+
+    def warm_up(self) -> None:
+        """Compile the kernels of our filters, for all types that scans may have."""
+        for dtype in (np.float32, np.float64):
+            scan = example(dtype)
+            for each in self.filters:
+                if type(each).__module__.startswith('surfel_mapper.'):
+                    with contextlib.suppress(FilterError):  # it needs what the example lacks
+                        replace(each).apply(scan)  # a copy: it may count its scans
+
+
+def example(dtype: npt.DTypeLike) -> Scan:
+    """Return a small scan with the columns that filters may need."""
+    rng = np.random.default_rng(0)
+    points = np.asfortranarray(rng.uniform(-1.0, 1.0, (64, 3)).astype(dtype))
+    ones = np.ones(len(points), dtype)
+    return Scan(
+        points=points,
+        stamp_ns=0,
+        frame_id='example',
+        columns={
+            NORMALS: points / np.sqrt((points**2).sum(axis=1, keepdims=True)),
+            OBSERVATION_DIRECTIONS: -points,
+            DENSITIES: ones,
+            EIGEN_VALUES: np.abs(points),
+            EIGEN_VECTORS: np.tile(np.eye(3, dtype=dtype).ravel(), (len(points), 1)),
+            INCIDENCE_ANGLES: ones,
+        },
+        T_base_sensor=np.eye(4),
+        T_fixed_sensor=np.eye(4),
+    )
+
+
+def jsonable(value: Any) -> Any:
+    """Return the value of a parameter as JSON has it: infinite ones as text, lists for tuples."""
+    if isinstance(value, tuple):
+        return [jsonable(item) for item in value]
+    return str(value) if isinstance(value, float) and math.isinf(value) else value
 
 
 def read(path: str) -> Any:

@@ -100,8 +100,8 @@ def find(name: str) -> type[Filter]:
     if name not in _FILTERS and not _load_entry_point(name):
         points = [point.name for point in entry_points(group=GROUP)]
         raise ConfigError(
-            f'{name}: no such filter{near(name, [*_FILTERS, *points])}; '
-            '`surfel-mapper filters` lists all'
+            f'{name}: no such filter, `surfel-mapper filters` lists all'
+            f'{near(name, [*_FILTERS, *points])}'
         )
     return _FILTERS[name]
 
