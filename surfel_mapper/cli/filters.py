@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper filters``: every filter that a chain may have, with its parameters."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import textwrap
+from typing import Any, TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from surfel_mapper.filters.base import Filter
+
+SUMMARY = 'List the filters for --filters, with parameters, defaults and bounds.'
+
+EXAMPLE = 'surfel-mapper filters voxel_grid'
+
+WIDTH = 99
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.add_argument(
+        'names', nargs='*', metavar='NAME', help="only these; our names or libpointmatcher's"
+    )
+    parser.add_argument('--json', action='store_true', help='print as JSON')
+
+
+def run(args: argparse.Namespace) -> int:
+    """List the filters."""
+    from surfel_mapper.filters.registry import all_filters, find
+
+    found = [find(name) for name in args.names] or all_filters()
+    listed = [as_mapping(cls) for cls in found]
+    print(json.dumps(listed) if args.json else '\n\n'.join(map(described, listed)))
+    return 0
+
+
+def as_mapping(cls: type[Filter]) -> dict[str, Any]:
+    """Return everything about a filter as plain values; infinite ones as text."""
+    from surfel_mapper.filters.parameters import parameters_of, plain
+
+    return {
+        'name': cls.name,
+        'libpointmatcher': cls.theirs,
+        'meaning': (inspect.getdoc(cls) or '').partition('\n')[0],
+        'parameters': [
+            {
+                'name': each.name,
+                'libpointmatcher': each.theirs,
+                'type': each.kind,
+                'default': plain(each.default),
+                'libpointmatcher_default': plain(each.their_default),
+                'allowed': each.allowed,
+                'meaning': each.meaning,
+            }
+            for each in parameters_of(cls)
+        ],
+    }
+
+
+def described(content: dict[str, Any]) -> str:
+    """Return a filter for people: a line about it, and below one for each parameter."""
+    theirs = f' ({content["libpointmatcher"]})' if content['libpointmatcher'] else ''
+    lines = [f'{content["name"]}{theirs}', *textwrap.wrap(content['meaning'], WIDTH - 2)]
+    for each in content['parameters']:
+        name = f'{each["name"]} ({each["libpointmatcher"]})' if theirs else each['name']
+        name = name.removesuffix(' ()')
+        default = each['default'] or "''"
+        if theirs and each['libpointmatcher_default'] != each['default']:
+            default += f' ({each["libpointmatcher_default"]} under the other name)'
+        allowed = f' in {each["allowed"]}' if each['allowed'].startswith('[') else ''
+        choices = f' of {each["allowed"]}' if each['allowed'] and not allowed else ''
+        line = f'{name}: {default}, {each["type"]}{allowed}{choices}. {each["meaning"]}'
+        lines += textwrap.wrap(line, WIDTH - 4, initial_indent='  ', subsequent_indent='      ')
+    return '\n  '.join(lines)
