@@ -58,21 +58,21 @@ def home(key, shift):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
+def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
     """
-    Sum the points of a scan by voxel; return how many voxels, or -1 if they may not fit.
+    Sum points first to last of a scan by voxel; return how many voxels, -1 if they may not fit.
 
     xyz       (3, N) float32 or float64, sensor frame, m
     pose      (3, 4) float64, takes points of the sensor frame to the map frame
     scale     float64, 65536 / voxel size
     range_sq  (2,) float64, m^2: smallest and largest squared distance from the sensor
-    scratch   table (B,) int32, B a power of two, all -1 before and after;
+    scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
               keys (E,) int64, out: voxel keys in the order of first appearance, E <= B / 2;
               sums (E, 10) float64, out: count, sum (3), products (6: xx xy xz yy yz zz) of
               the places in the voxel, in lattice units about its centre
     left_out  (4,) int64, out: points not finite, too near, too far, beyond the voxel indices
 
-    If it returns -1, call again with larger arrays.
+    If it returns -1, the table is clear again: call with larger arrays.
     """
     table, keys, sums = scratch
     chunk_keys = np.empty(CHUNK, np.int64)
@@ -82,8 +82,8 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     left_out[:] = 0
     num_rows = 0
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
-    for start in range(0, len(all_x), CHUNK):
-        chunk = slice(start, start + CHUNK)
+    for start in range(first, last, CHUNK):
+        chunk = slice(start, min(start + CHUNK, last))
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
         quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
         num_runs = find_runs(chunk_keys, len(x), starts)
@@ -97,7 +97,43 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
             else:
                 for i in range(starts[run], starts[run + 1]):
                     left_out[reason(x[i], y[i], z[i], range_sq)] += 1
-    clear_table(table, keys, num_rows)
+    return num_rows
+
+
+@njit(cache=True, nogil=True)
+def merge_sums(scratch, num_rows, other_keys, other_sums):
+    """
+    Add the sums of other points; return how many voxels there are then, -1 if too many.
+
+    scratch     as reduce_points leaves it, with num_rows voxels
+    other_keys  (K,) int64, voxel keys
+    other_sums  (K, 10) float64
+
+    If it returns -1, the table is clear again.
+    """
+    table, keys, sums = scratch
+    shift = hash_shift(len(table))
+    mask = len(table) - 1
+    if num_rows + len(other_keys) > len(keys):
+        clear_table(table, keys, num_rows)
+        return -1
+    for other in range(len(other_keys)):
+        if other + AHEAD < len(other_keys):
+            prefetch(table, home(other_keys[other + AHEAD], shift))
+        key = other_keys[other]
+        place = home(key, shift)
+        row = np.int64(table[place])
+        while row >= 0 and keys[row] != key:
+            place = (place + 1) & mask
+            row = np.int64(table[place])
+        if row < 0:
+            row = num_rows
+            num_rows += 1
+            table[place] = row
+            keys[row] = key
+            sums[row, :] = 0.0
+        for column in range(10):
+            sums[row, column] += other_sums[other, column]
     return num_rows
 
 
@@ -241,7 +277,7 @@ def reason(x, y, z, range_sq):
 @njit(cache=True, nogil=True)
 def clear_table(table, keys, num_rows):
     """
-    Set back to -1 what reduce_points wrote into its table, by walking the table's own entries.
+    Set back to -1 what reduce_points wrote into its table, by walking its entries.
 
     table     (B,) int32
     keys      (E,) int64

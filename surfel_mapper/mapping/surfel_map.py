@@ -32,9 +32,11 @@ from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.surfels import rows_changed_at
 from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.levels import coarse_moments
-from surfel_mapper.mapping.moments import Reducer, ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
+from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
+from surfel_mapper.mapping.threads import pool
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
 LOGGED = 1 << 18
@@ -54,6 +56,8 @@ class SurfelMap:
         Edge of a voxel, m.
     columns : tuple of str
         What else of the points is summed, exactly too: ``intensity``, ``rgb``.
+    threads : int
+        How many threads share the work; the result has the same bits for any number.
     level : int
         The lattice unit is ``voxel_size_m / 2^(16 + level)``; other than 0 only in maps made
         from finer ones, which take the moments of no scan.
@@ -61,22 +65,33 @@ class SurfelMap:
     Raises
     ------
     ValueError
-        If the voxel size is not positive and finite, or a column is none that can be summed.
+        If the voxel size is not positive and finite, a column is none that can be summed, or
+        there is no thread.
 
     """
 
     def __init__(
-        self, voxel_size_m: float = 0.5, *, columns: tuple[str, ...] = (), level: int = 0
+        self,
+        voxel_size_m: float = 0.5,
+        *,
+        columns: tuple[str, ...] = (),
+        threads: int = 1,
+        level: int = 0,
     ) -> None:
         """Make an empty map."""
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
+        if threads < 1:
+            raise ValueError(f'threads: {threads}, expected 1 or more')
         self.voxel_size_m = float(voxel_size_m)
         self.level = level
         self.version = 0
         self.columns = columns
         self._channel_names = channel_names(columns)
-        self._reducer = Reducer(self.voxel_size_m, columns)
+        self._threads = threads
+        self._reducer = Reducer(
+            self.voxel_size_m, columns, pool=pool(threads), threads=threads
+        )
         self._reset()
 
     def _reset(self) -> None:
@@ -390,7 +405,7 @@ class SurfelMap:
 
     def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
         bits = layout.BITS + self.level
-        surfels = derive(self._table.rows, chosen, self.voxel_size_m, bits)
+        surfels = derive(self._table.rows, chosen, self.voxel_size_m, bits, self._threads)
         if not self._channel_names:
             return surfels
         sums = self._table.channels(chosen)

@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.surfels import derive_surfels
+from surfel_mapper.mapping.threads import pool, split
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,7 @@ def derive(
     chosen: npt.NDArray[np.int32],
     voxel_size_m: float,
     bits: int,
+    threads: int = 1,
 ) -> Surfels:
     """
     Derive the surfels of some rows of a map's slab.
@@ -106,6 +108,8 @@ def derive(
         Edge of a voxel, m.
     bits : int
         A voxel is 2^bits lattice units wide.
+    threads : int
+        How many threads share the work.
 
     """
     num = len(chosen)
@@ -118,5 +122,15 @@ def derive(
         num_points=np.empty(num, np.int64),
         voxel_index=np.empty((num, 3), np.int32),
     )
-    derive_surfels(rows, chosen, voxel_size_m, bits, surfels.arrays)
+
+    def derive_part(part: slice) -> None:
+        outputs = tuple(values[part] for values in surfels.arrays)
+        derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
+
+    own, *others = split(num, threads)
+    executor = pool(threads)
+    futures = [executor.submit(derive_part, part) for part in others] if executor else []
+    derive_part(own)
+    for future in futures:
+        future.result()
     return surfels

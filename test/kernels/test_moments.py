@@ -20,6 +20,7 @@ from surfel_mapper.kernels.moments import (
     find_runs,
     hash_shift,
     home,
+    merge_sums,
     NOT_FINITE,
     pack_moments,
     quantise,
@@ -34,6 +35,7 @@ from test.kernels.modes import both
 
 IDENTITY = np.eye(4)[:3]
 ANY_RANGE = np.array([0.0, np.inf])
+AS_THEY_ARE = (IDENTITY, 131072.0, ANY_RANGE)  # half a metre, no pose, no limit
 
 
 def some_points(num, dtype=np.float64, seed=0):
@@ -117,11 +119,12 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
     table, keys, sums = scratch = scratch_for(max(2 * num, 1))
     left_out = np.full(4, -1, np.int64)
 
-    found = call(reduce_points, points.T.copy(), IDENTITY, 131072.0, ANY_RANGE, scratch, left_out)
+    found = call(reduce_points, points.T.copy(), 0, num, *AS_THEY_ARE, scratch, left_out)
 
     twin = reference.scan_moments(points, 0.5)
     assert list(map(tuple, unpack_keys(keys[:found]).tolist())) == list(twin)
     assert sums[:found].astype(int).tolist() == [row[:10] for row in twin.values()]
+    call(clear_table, table, keys, found)
     assert (table == -1).all()
     finite = np.isfinite(points).all(axis=1)
     assert left_out[NOT_FINITE] == (~finite).sum()
@@ -136,8 +139,36 @@ def test_a_scan_that_does_not_fit_leaves_the_table_clean(call, room):
     points = np.random.default_rng(2).uniform(-9.0, 9.0, (3 * CHUNK, 3))
     points[: CHUNK + 9] = 0.1  # the first chunk fits
     scratch = (table, keys, sums)
-    assert call(reduce_points, points.T, IDENTITY, 131072.0, ANY_RANGE, scratch, left_out) == -1
+    asked = (points.T, 0, len(points), *AS_THEY_ARE, scratch, left_out)
+    assert call(reduce_points, *asked) == -1
     assert (table == -1).all()
+
+
+@both
+@pytest.mark.parametrize('cut', [0, 1, 700, CHUNK, 2999, 3000])
+def test_parts_of_a_scan_add_up_to_the_whole_in_the_same_order(call, cut):
+    points = some_points(3000)
+    whole, first, second = scratch_for(3000), scratch_for(3000), scratch_for(3000)
+    left_out = np.zeros(4, np.int64)
+    num = call(reduce_points, points.T.copy(), 0, 3000, *AS_THEY_ARE, whole, left_out)
+
+    merged = call(reduce_points, points.T.copy(), 0, cut, *AS_THEY_ARE, first, left_out)
+    other = call(reduce_points, points.T.copy(), cut, 3000, *AS_THEY_ARE, second, left_out)
+    merged = call(merge_sums, first, merged, second[1][:other], second[2][:other])
+
+    assert merged == num
+    np.testing.assert_array_equal(first[1][:num], whole[1][:num])
+    np.testing.assert_array_equal(first[2][:num], whole[2][:num])
+
+
+@both
+def test_parts_that_do_not_fit_together_leave_the_table_clean(call):
+    scratch = scratch_for(4)
+    points = np.full((3, 3), 0.1)
+    left_out = np.zeros(4, np.int64)
+    num = call(reduce_points, points.T.copy(), 0, 3, *AS_THEY_ARE, scratch, left_out)
+    assert call(merge_sums, scratch, num, np.arange(4), np.zeros((4, 10))) == -1
+    assert (scratch[0] == -1).all()
 
 
 @both

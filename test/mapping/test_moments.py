@@ -16,7 +16,8 @@ import pytest
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.mapping.moments import as_points, pack_keys, Reducer, ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
+from surfel_mapper.mapping.reducer import as_points, Reducer
 from test.reference import as_twin, scan_moments
 
 pytestmark = pytest.mark.filterwarnings('error')

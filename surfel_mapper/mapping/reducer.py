@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reducer: from the points of a scan to its moments.
+
+Works in scratch memory that it keeps from scan to scan. With several threads each reduces a part
+of the points and the parts are added up in order; sums of integers do not depend on that, and
+not even the order of the voxels does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from dataclasses import replace
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels.channels import sum_channels
+from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
+from surfel_mapper.kernels.moments import (
+    BEYOND,
+    clear_table,
+    merge_sums,
+    NOT_FINITE,
+    pack_moments,
+    reduce_points,
+    TOO_FAR,
+    TOO_NEAR,
+)
+from surfel_mapper.kernels.queries import build_table
+from surfel_mapper.mapping.channels import channel_names, quantised
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.threads import split
+
+NARROW_COUNT = 1 << 16
+"""Below so many points in every voxel the sums fit into int32."""
+
+CAUSES = {
+    'not_finite': NOT_FINITE,
+    'too_near': TOO_NEAR,
+    'too_far': TOO_FAR,
+    'beyond_map': BEYOND,
+}
+"""Why points are left out, and where a kernel counts them."""
+
+
+Quantisation = tuple[npt.NDArray[np.float64], float, npt.NDArray[np.float64]]
+"""Pose (3, 4), lattice units a metre, smallest and largest squared range (2,)."""
+
+
+class Scratch:
+    """Memory in which a kernel sums points by voxel."""
+
+    def __init__(self) -> None:
+        """Start with room for few voxels."""
+        self.left_out = np.zeros(4, np.int64)
+        self.reserve(2048)
+
+    def reserve(self, num_voxels: int) -> None:
+        """Make room for so many voxels; what was there is lost."""
+        self.table = np.full(2 * num_voxels, -1, np.int32)
+        self.keys = np.empty(num_voxels, np.int64)
+        self.sums = np.empty((num_voxels, 10))
+
+    @property
+    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """As the kernels take them."""
+        return self.table, self.keys, self.sums
+
+    def fill(self, xyz: npt.NDArray[Any], part: slice, quantisation: Quantisation) -> int:
+        """Sum a part of the points, with more room if need be; return how many voxels."""
+        pose, scale, range_sq = quantisation
+        first, last = part.start, part.stop
+        while True:
+            scratch, left_out = self.arrays, self.left_out
+            num = reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out)
+            if num >= 0:
+                return int(num)
+            self.reserve(2 * len(self.keys))
+
+    def clear(self, num_voxels: int) -> None:
+        """Empty the table of so many voxels."""
+        clear_table(self.table, self.keys, num_voxels)
+
+
+class Reducer:
+    """
+    Reduces scans to moments, over and over in the same scratch memory.
+
+    Parameters
+    ----------
+    voxel_size_m : float
+        Edge of a voxel.
+    columns : tuple of str
+        Columns of the points to sum as well.
+    pool : Executor, optional
+        Where all parts of the points but the first are reduced.
+    threads : int
+        How many parts.
+
+    """
+
+    def __init__(
+        self,
+        voxel_size_m: float,
+        columns: tuple[str, ...] = (),
+        *,
+        pool: Executor | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.voxel_size_m = voxel_size_m
+        self._columns = columns
+        self._pool = pool
+        self._scratch = [Scratch() for _ in range(threads if pool else 1)]
+
+    def reduce(
+        self,
+        points: npt.ArrayLike,
+        T_map_sensor: npt.NDArray[np.float64] | None = None,
+        *,
+        origin: npt.ArrayLike | None = None,
+        min_range_m: float = 0.0,
+        max_range_m: float = math.inf,
+        columns: Mapping[str, npt.NDArray[Any]] | None = None,
+    ) -> ScanMoments:
+        """
+        Return the moments of points; see SurfelMap.reduce.
+
+        Raises
+        ------
+        ValueError
+            If shapes or types are wrong, pose or origin are not finite, or a column is missing.
+        MapLimitError
+            If a voxel gets more than 2^23 points of one scan.
+
+        """
+        points = as_points(points)
+        pose = np.eye(4) if T_map_sensor is None else np.asarray(T_map_sensor, np.float64)
+        if pose.shape != (4, 4) or not np.isfinite(pose).all():
+            raise ValueError('T_map_sensor: expected a finite (4, 4) transform')
+        seen_from = np.full(3, np.nan) if origin is None else np.asarray(origin, np.float64)
+        if seen_from.shape != (3,) or (origin is not None and not np.isfinite(seen_from).all()):
+            raise ValueError('origin: expected the finite position of the sensor, x y z')
+        values = quantised(columns or {}, self._columns, len(points)) if self._columns else None
+        range_sq = np.array([min_range_m**2, max_range_m**2])
+        scale = (1 << BITS) / self.voxel_size_m
+        quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
+        num = self._sum(points.T, quantisation)
+        scratch = self._scratch[0]
+        scratch.clear(num)
+        moments = self._pack(num, np.ascontiguousarray(seen_from))
+        if values is None:
+            return moments
+        build_table(moments.key, scratch.table)
+        sums = np.empty((num, values.shape[1]), np.int64)
+        sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
+        scratch.clear(num)
+        return replace(moments, channel_names=channel_names(self._columns), channels=sums)
+
+    def _sum(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
+        """Sum all points in the first scratch memory; return how many voxels."""
+        first, *others = self._scratch
+        own, *parts = split(xyz.shape[1], len(self._scratch))
+        futures = [
+            self._pool.submit(scratch.fill, xyz, part, quantisation)
+            for scratch, part in zip(others, parts, strict=True)
+            if self._pool
+        ]
+        num = first.fill(xyz, own, quantisation)
+        nums = [future.result() for future in futures]
+        for scratch, found in zip(others, nums, strict=True):
+            scratch.clear(found)
+        for scratch, found in zip(others, nums, strict=True):
+            num = int(merge_sums(first.arrays, num, scratch.keys[:found], scratch.sums[:found]))
+            if num < 0:  # once more, with room for all
+                first.reserve(2 * max(len(first.keys), len(scratch.keys)))
+                return self._sum(xyz, quantisation)
+        return num
+
+    def _pack(self, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
+        """Turn the sums into integers."""
+        key, sums = self._scratch[0].keys[:num].copy(), self._scratch[0].sums[:num]
+        largest = sums[:, 0].max(initial=0.0)
+        if largest > MAX_SCAN_COUNT:
+            raise MapLimitError(
+                f'{largest:.0f} points in one voxel of one scan; '
+                f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
+            )
+        moments = ScanMoments(
+            voxel_size_m=self.voxel_size_m,
+            key=key,
+            count=np.empty(num, np.int32),
+            total=np.empty((num, 3), np.int32 if largest < NARROW_COUNT else np.int64),
+            product=np.empty((num, 6), np.int64),
+            view=np.empty((num, 3), np.int16),
+            left_out=self._causes(),
+        )
+        pack_moments(
+            key,
+            sums,
+            origin,
+            self.voxel_size_m,
+            moments.count,
+            moments.total,
+            moments.product,
+            moments.view,
+        )
+        return moments
+
+    def _causes(self) -> dict[str, int]:
+        """Return how many points were left out, by cause; causes that did not occur are not in."""
+        left_out = np.sum([scratch.left_out for scratch in self._scratch], axis=0)
+        counts = {name: int(left_out[row]) for name, row in CAUSES.items()}
+        return {name: number for name, number in counts.items() if number}
+
+
+def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
+    """
+    Return points as the kernels take them: (N, 3) float32 or float64, column by column.
+
+    Arrays that are so already (Fortran order, writeable) are not copied.
+    """
+    array = np.asarray(points)
+    if array.size == 0 and array.ndim < 2:
+        array = array.reshape(0, 3)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise ValueError(f'points: shape {array.shape}, expected (N, 3)')
+    if array.dtype.kind not in 'fiu':
+        raise ValueError(f'points: dtype {array.dtype}, expected numbers')
+    dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
+    return np.require(array, dtype, ['F', 'A', 'W'])
