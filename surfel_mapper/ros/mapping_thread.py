@@ -87,11 +87,13 @@ class MappingThread:
         self._poses_lost = 0
         self._warned_s: dict[str, float] = {}
         self._stopping = False
-        self._thread = threading.Thread(target=self._run, name='mapping', daemon=True)
+        self._thread = threading.Thread()
 
     def start(self, on_update: Callable[[Update], None]) -> None:
         """Start the thread; it calls a function with what every scan did to the map."""
-        self._on_update = on_update
+        self._thread = threading.Thread(
+            target=self._run, args=(on_update,), name='mapping', daemon=True
+        )
         self._thread.start()
 
     def stop(self) -> None:
@@ -146,10 +148,10 @@ class MappingThread:
                 self._work.append(call)
                 self._changed.notify()
 
-    def _run(self) -> None:
+    def _run(self, on_update: Callable[[Update], None]) -> None:
         """Work until stopped; an error that is not ours to handle ends it."""
         try:
-            while self._step():
+            while self._step(on_update):
                 pass
         except BaseException as error:
             self._on_failure(error)
@@ -160,7 +162,7 @@ class MappingThread:
             if isinstance(item, Call) and item.future:
                 item.future.cancel()
 
-    def _step(self) -> bool:
+    def _step(self, on_update: Callable[[Update], None]) -> bool:
         """Wait for something to do and do it; false at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopping or self._poses or self._work)
@@ -179,7 +181,7 @@ class MappingThread:
         elif item is not None:
             fulfil(item)
         for update in self._mapper.insert_ready():
-            self._on_update(update)
+            on_update(update)
         return True
 
     def _count_lost(self, clouds: int, poses: int) -> None:

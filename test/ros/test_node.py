@@ -14,6 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
@@ -191,6 +192,21 @@ def test_stamps_that_go_back_are_dropped_or_start_anew(start, peer):
     assert values['scans.dropped.stamp_back'] == '1'
     assert values['resets'] == '1'
     assert values['window_scans'] == '1'
+
+
+def test_stamped_poses_of_the_base_and_remapped_clouds_are_taken(start, peer):
+    start(
+        *('node', *ARGUMENTS, '-p', 'pose.source:=pose', '-p', 'frames.base_to_sensor:=[]'),
+        *('-p', 'frames.base:=lidar', '-r', 'points:=/lidar/points', '-r', 'pose:=/where'),
+    )
+    poses = peer.node.create_publisher(PoseStamped, '/where', 10)
+    peer.spin_until(poses.get_subscription_count)
+    peer.advertise('/lidar/points')
+    for points, moved in drive(2):
+        poses.publish(PoseStamped(header=moved.header, pose=moved.pose.pose))
+        peer.publish('/lidar/points', points)
+
+    peer.diagnosis({'scans.mapped': 2})
 
 
 def test_clear_and_pause_do_what_they_say(start, peer):

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The node, fed by play over DDS, ends with the digest that replay of the same bag states."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+import yaml
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.config import load_config
+from test.ros.live import RELIABLE, ROOT, TIMEOUT_S
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def offered_settings(bag, capsys):
+    """Return the settings that info offers for the bag's odometry."""
+    assert main(['info', str(bag), '--json']) == 0
+    poses = json.loads(capsys.readouterr().out)['poses']
+    return next(o['settings'] for o in poses if o['settings']['pose.source'] == 'odometry')
+
+
+def live_digest(start, bag, config, num_scans, rate):
+    """Return what the node says at its end, having mapped the bag."""
+    node = start('node', '--ros-args', '--params-file', config, *RELIABLE)
+    playing = start('play', bag, '--rate', rate, '--wait-for', '/points', '/odom', '--json')
+    assert playing.wait() == 0, playing.output
+    assert json.loads(playing.output.splitlines()[-1])['published']['/points'] == num_scans
+    assert node.stop() == 0, node.output
+    assert f'scans received {num_scans}, mapped {num_scans},' in node.output
+    return node.output.rpartition('digest ')[2].split()[0]
+
+
+def offline_summary(bag, config, output, capsys):
+    arguments = ['--config', str(config), '--window', '--output', str(output), '--json']
+    assert main(['replay', str(bag), *arguments]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def compare(start, bag, tmp_path, capsys, num_scans, rate, **settings):
+    offered = offered_settings(bag, capsys)
+    config = tmp_path / 'settings.yaml'
+    content = {'/**': {'ros__parameters': {**offered, **settings}}}
+    config.write_text(yaml.safe_dump(content), encoding='utf-8')
+
+    live = live_digest(start, bag, config, num_scans, rate)
+
+    summary = offline_summary(bag, config, tmp_path / 'offline', capsys)
+    assert live == summary['digest']
+    assert sum(summary['scans']['evicted'].values()) > 5
+
+
+def test_on_a_simulated_street(start, tmp_path, capsys):
+    bag = tmp_path / 'street'
+    lidar = ['--beams', '16', '--columns', '512', '--noise', '0.02']
+    assert main(['simulate', 'street', '--output', str(bag), '--scans', '30', *lidar]) == 0
+    capsys.readouterr()
+
+    compare(start, bag, tmp_path, capsys, 30, 2, **{'window.max_distance_m': 8.0})
+
+
+def test_on_a_real_bag(start, tmp_path, capsys, data_folder):
+    bag = data_folder / 'data' / 'bags' / 'hall_os0_full'
+
+    compare(start, bag, tmp_path, capsys, 22, 5, **{'window.max_scans': 9})
+
+
+def test_in_the_demo(domain, tmp_path):
+    lidar = ['--scans', '8', '--beams', '16', '--columns', '256']
+    done = subprocess.run(
+        [sys.executable, str(ROOT / 'examples' / 'demo.py'), '--output', 'out', *lidar],
+        cwd=tmp_path,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=4 * TIMEOUT_S,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert 'They are equal to the last bit.' in done.stdout
+    for line in ('picture  out/offline/map.png', 'figures  out/offline/summary.json'):
+        assert line in done.stdout
+        assert (tmp_path / line.split()[1]).is_file()
+    assert (tmp_path / 'out' / 'live' / 'map.ply').is_file()
+
+
+def test_the_settings_of_the_demo_are_those_that_info_offers(tmp_path, capsys):
+    bag = tmp_path / 'street'
+    lidar = ['--scans', '2', '--beams', '8', '--columns', '64']
+    assert main(['simulate', 'street', '--output', str(bag), *lidar]) == 0
+    capsys.readouterr()
+    settings = load_config(ROOT / 'examples' / 'street.yaml').to_mapping()
+    offered = offered_settings(bag, capsys)
+    assert {name: settings[name] for name in offered} == {
+        name: tuple(value) if isinstance(value, list) else value for name, value in offered.items()
+    }
