@@ -88,6 +88,9 @@ class MapConfig(Stage):
         high=2**31 - 1,
         live=True,
     )
+    threads: int = setting(
+        1, 'How many threads share the work of a scan; the map is the same.', low=1, high=64
+    )
     intensity: bool = setting(
         False, 'Sum the intensity of the points too; clouds without one are dropped.'
     )

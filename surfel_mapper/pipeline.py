@@ -33,7 +33,7 @@ from surfel_mapper.errors import (
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
-from surfel_mapper.mapping.moments import NARROW_COUNT
+from surfel_mapper.mapping.reducer import NARROW_COUNT
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
@@ -111,7 +111,9 @@ class Mapper:
         self.counters = Counters()
         self.chain = Chain.load(self.config.filters) if self.config.filters else Chain()
         self.map = SurfelMap(
-            self.config.map.voxel_size_m, columns=self.config.map.columns
+            self.config.map.voxel_size_m,
+            columns=self.config.map.columns,
+            threads=self.config.map.threads,
         )
         self.window = SlidingWindow(
             self.map, self.config.window, max_voxels=self.config.map.max_voxels
