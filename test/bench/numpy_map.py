@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +47,7 @@ class NumpySurfels:
 
 
 def reduce_points(
-    xyz: list[npt.NDArray], T_map_sensor: Floats, size_m: float
+    xyz: list[npt.NDArray[Any]], T_map_sensor: Floats, size_m: float
 ) -> tuple[Ints, Ints]:
     """
     Sum the points of a scan by voxel.
@@ -95,7 +96,8 @@ def pack(index: list[Ints]) -> Ints:
 def unpack(key: Ints) -> Ints:
     """Return the voxel indices (K, 3) of keys."""
     shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
-    return ((key[:, None] >> shifts) & MASK) - OFFSET
+    index: Ints = ((key[:, None] >> shifts) & MASK) - OFFSET
+    return index
 
 
 def views(key: Ints, origin: Floats, size_m: float) -> Ints:
@@ -154,7 +156,7 @@ class NumpyMap:
         self._row_key = np.zeros(1024, np.int64)
         self._free = np.arange(1024)
 
-    def step(self, xyz: list[npt.NDArray], T_map_sensor: Floats) -> NumpySurfels:
+    def step(self, xyz: list[npt.NDArray[Any]], T_map_sensor: Floats) -> NumpySurfels:
         """Map a scan, evict the oldest, return the surfels of all voxels that changed."""
         key, moments = reduce_points(xyz, T_map_sensor, self._size_m)
         rows = self._insert(key, moments)
@@ -182,7 +184,7 @@ class NumpyMap:
         rows[known] = self._row[at[known]]
         self._moments[rows[known]] += moments[known]
         new = ~known
-        rows[new] = fresh = self._take(np.count_nonzero(new))
+        rows[new] = fresh = self._take(int(np.count_nonzero(new)))
         self._moments[fresh], self._row_key[fresh] = moments[new], key[new]
         self._key = np.insert(self._key, at[new], key[new])
         self._row = np.insert(self._row, at[new], fresh)
@@ -192,7 +194,7 @@ class NumpyMap:
         """Subtract moments from their rows; return the rows that are empty now."""
         left = self._moments[rows] - moments
         self._moments[rows] = left
-        empty = rows[left[:, 0] == 0]
+        empty: Ints = rows[left[:, 0] == 0]
         at = np.searchsorted(self._key, self._row_key[empty])
         self._key, self._row = np.delete(self._key, at), np.delete(self._row, at)
         self._free = np.concatenate([self._free, empty])

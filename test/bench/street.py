@@ -61,7 +61,8 @@ class Street:
             path.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(path) as file:
                 np.save(file, self.simulation.scan(number).points)
-        return np.load(path)
+        points: npt.NDArray[np.float32] = np.load(path)
+        return points
 
     def path(self, number: int) -> Path:
         """Return the file of a scan."""

@@ -86,7 +86,9 @@ def environment(peer: PeerSpec, cache: Path) -> Path:
 
 def output(command: list[str], **settings: Any) -> str:
     """Return what a process wrote to stdout, or raise PeerError."""
-    done = subprocess.run(command, capture_output=True, text=True, check=False, **settings)
+    done: subprocess.CompletedProcess[str] = subprocess.run(
+        command, capture_output=True, text=True, check=False, **settings
+    )
     if done.returncode:
         said = COLOUR.sub('', done.stderr).split('\n')
         raise PeerError([f'exit code {done.returncode}', *filter(str.strip, said)][-1])
