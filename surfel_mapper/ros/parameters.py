@@ -61,7 +61,8 @@ def declare(node: Node, declared: Declaration, value: Any) -> None:
         return
     # rclpy takes an empty list for one of bytes, so the type is declared first, then the value,
     # and in the end that it cannot be changed.
-    kind = Parameter.Type.DOUBLE_ARRAY
+    number_list = declared.items is float
+    kind = Parameter.Type.DOUBLE_ARRAY if number_list else Parameter.Type.STRING_ARRAY
     node.declare_parameter(declared.name, kind, ParameterDescriptor(), ignore_override=True)
     node.set_parameters([Parameter(declared.name, kind, list(value))])
     final = descriptor(declared)

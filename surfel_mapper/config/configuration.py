@@ -1,0 +1,168 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""All settings together, and how they are read from a file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from surfel_mapper.config.settings import (
+    checked,
+    Declaration,
+    flatten,
+    near,
+    setting,
+    stage_name,
+)
+from surfel_mapper.config.stages import (
+    FramesConfig,
+    InputConfig,
+    MapConfig,
+    OutputConfig,
+    PoseConfig,
+    PublishConfig,
+    WindowConfig,
+)
+from surfel_mapper.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Config:
+    """All settings of the pipeline: one field a stage, and those of no stage."""
+
+    map: MapConfig = field(default_factory=MapConfig)
+    window: WindowConfig = field(default_factory=WindowConfig)
+    pose: PoseConfig = field(default_factory=PoseConfig)
+    frames: FramesConfig = field(default_factory=FramesConfig)
+    input: InputConfig = field(default_factory=InputConfig)
+    publish: PublishConfig = field(default_factory=PublishConfig)
+    output: OutputConfig = field(default_factory=OutputConfig)
+    filters: str = setting(
+        '', 'YAML file of the filters that every scan passes before it is mapped; empty: none.'
+    )
+
+    def __post_init__(self) -> None:
+        """Check the settings of no stage; each stage has checked its own."""
+        for declared in dataclasses.fields(self):
+            if 'meaning' in declared.metadata:
+                checked(declared.name, getattr(self, declared.name), declared)
+
+    @classmethod
+    def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:
+        """
+        Return the configuration with some settings changed from their defaults.
+
+        Parameters
+        ----------
+        mapping : mapping of str
+            Stages to mappings of settings, or ``stage.name`` to values, or both.
+
+        Raises
+        ------
+        ConfigError
+            If a name is unknown (with the nearest known one), or a value is refused.
+
+        """
+        stages: dict[str, dict[str, Any]] = {}
+        of_no_stage: dict[str, Any] = {}
+        known = {declared.name: declared for declared in declarations()}
+        for name, value in flatten(mapping):
+            if name not in known:
+                raise ConfigError(f'{name}: no such setting{near(name, known)}')
+            declared = known[name]
+            place = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
+            place[declared.key] = value
+        made = {
+            declared.name: declared.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
+            for stage, declared in stage_fields().items()
+        }
+        return cls(**made, **of_no_stage)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all settings as ``stage.name`` to value, in the order they are declared."""
+        places: dict[str, Any] = {'': self}
+        places.update((stage, getattr(self, f.name)) for stage, f in stage_fields().items())
+        return {
+            declared.name: getattr(places[declared.stage], declared.key)
+            for declared in declarations()
+        }
+
+    def replace(self, mapping: Mapping[str, Any]) -> Config:
+        """Return a copy with some settings changed; see from_mapping."""
+        return Config.from_mapping({**self.to_mapping(), **dict(flatten(mapping))})
+
+
+def stage_fields() -> dict[str, dataclasses.Field[Any]]:
+    """Return the field of Config that holds each stage, by the name of the stage."""
+    return {
+        stage_name(stage.default_factory): stage  # type: ignore[arg-type]
+        for stage in dataclasses.fields(Config)
+        if 'meaning' not in stage.metadata
+    }
+
+
+def declarations() -> list[Declaration]:
+    """Return the declaration of every setting, in order."""
+    rows = []
+    for stage, holder in stage_fields().items():
+        for key in dataclasses.fields(holder.default_factory):  # type: ignore[arg-type]
+            name = f'{stage}.{key.name}'
+            rows.append(Declaration(name, stage, key.name, key.default, **key.metadata))
+    for key in dataclasses.fields(Config):
+        if 'meaning' in key.metadata:
+            rows.append(Declaration(key.name, '', key.name, key.default, **key.metadata))
+    return rows
+
+
+def load_config(path: str | Path | None = None) -> Config:
+    """
+    Return the configuration in a YAML file, or the defaults without one.
+
+    Parameters
+    ----------
+    path : str or Path, optional
+        A YAML file of ROS parameters (``/**: ros__parameters: ...``), or of the stages alone.
+        ``use_sim_time`` and ``qos_overrides`` are for the node and passed over here.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or holds something that is no setting.
+
+    """
+    import yaml
+
+    if path is None:
+        return Config()
+    try:
+        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+    except OSError as error:
+        raise ConfigError(f'{path}: cannot be read: {error.strerror}') from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ConfigError(f'{path}: not YAML: {error}') from error
+    if content is None:
+        return Config()
+    try:
+        return Config.from_mapping(ros_parameters(content))
+    except ConfigError as error:
+        raise ConfigError(f'{path}: {error}') from error
+
+
+def ros_parameters(content: Any) -> dict[str, Any]:
+    """Return the settings in the content of a parameters file, whichever way it is laid out."""
+    if not isinstance(content, Mapping):
+        raise ConfigError(f'a {type(content).__name__}, expected a mapping of settings')
+    settings: dict[str, Any] = {}
+    for name, value in content.items():
+        if isinstance(value, Mapping) and 'ros__parameters' in value:
+            settings.update(flatten(value['ros__parameters'] or {}))
+        else:
+            settings.update(flatten({name: value}))
+    for_node = ('use_sim_time', 'qos_overrides.')
+    return {name: value for name, value in settings.items() if not name.startswith(for_node)}
+
+

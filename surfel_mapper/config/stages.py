@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The stages of the pipeline that every map has, and their settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+from surfel_mapper.config.settings import setting, Stage
+from surfel_mapper.errors import ConfigError
+
+POSE_SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapConfig(Stage):
+    """The voxel map."""
+
+    voxel_size_m: float = setting(0.5, 'Edge of a voxel, m.', low=0.001, high=1000.0)
+    min_points: int = setting(
+        5, 'Surfels of fewer points are not published.', low=1, high=2**31 - 1, live=True
+    )
+    max_voxels: int = setting(
+        0,
+        'The oldest scans leave while the map holds more voxels; 0: no such limit.',
+        low=0,
+        high=2**31 - 1,
+        live=True,
+    )
+    threads: int = setting(
+        1, 'How many threads share the work of a scan; the map is the same.', low=1, high=64
+    )
+    intensity: bool = setting(
+        False, 'Sum the intensity of the points too; clouds without one are dropped.'
+    )
+    color: bool = setting(
+        False, 'Sum the colour (rgb) of the points too; clouds without one are dropped.'
+    )
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of the points that the map sums."""
+        wanted = {'intensity': self.intensity, 'rgb': self.color}
+        return tuple(name for name, is_wanted in wanted.items() if is_wanted)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WindowConfig(Stage):
+    """Which scans stay in the map; the first limit reached evicts the oldest."""
+
+    max_scans: int = setting(
+        100, 'At most this many scans; 0: no such limit.', low=0, high=2**31 - 1, live=True
+    )
+    max_age_s: float = setting(
+        0.0,
+        'A scan older than the newest by more than this leaves, s; 0: no such limit.',
+        low=0.0,
+        high=1e9,
+        live=True,
+    )
+    max_distance_m: float = setting(
+        0.0,
+        'A scan leaves once the sensor has travelled farther than this since, m; '
+        '0: no such limit.',
+        low=0.0,
+        high=1e9,
+        live=True,
+    )
+    max_bytes: int = setting(
+        0,
+        'The oldest scans leave while those held need more bytes; 0: no such limit.',
+        low=0,
+        high=2**62,
+        live=True,
+    )
+    keep_points: bool = setting(False, 'Keep the points of the scans of the window.')
+    gate_distance_m: float = setting(
+        0.0,
+        'A scan is left out unless the sensor has moved this far since the last one mapped, m, '
+        'or turned by gate_angle_deg; both 0: every scan is mapped.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    gate_angle_deg: float = setting(
+        0.0,
+        'A scan is left out unless the sensor has turned by this since the last one mapped, '
+        'deg, or moved by gate_distance_m.',
+        low=0.0,
+        high=180.0,
+        live=True,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseConfig(Stage):
+    """Where the pose of a scan comes from."""
+
+    source: str = setting(
+        'tf',
+        'tf: the tree in /tf; odometry: nav_msgs/Odometry; pose: geometry_msgs/PoseStamped; '
+        'identity: clouds are in the fixed frame.',
+        choices=POSE_SOURCES,
+    )
+    max_wait_s: float = setting(
+        0.5,
+        'A scan whose pose is not there when newer data is this much newer is dropped, s.',
+        low=0.0,
+        high=3600.0,
+        live=True,
+    )
+    max_waiting_scans: int = setting(
+        20,
+        'At most this many scans wait for their pose; the oldest is dropped.',
+        low=1,
+        high=10**6,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FramesConfig(Stage):
+    """Coordinate frames, after REP 105."""
+
+    fixed: str = setting('odom', 'The frame of the map and of all output.')
+    base: str = setting('base_link', 'The frame whose pose odometry or pose messages give.')
+    base_to_sensor: tuple[float, ...] = setting(
+        (),
+        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw; empty: from /tf_static.',
+    )
+
+    def check(self, stage: str) -> None:
+        """Refuse empty frames and extrinsics that are no rigid transform."""
+        for name in ('fixed', 'base'):
+            if not getattr(self, name):
+                raise ConfigError(f'{stage}.{name}: empty, expected the name of a frame')
+        values = self.base_to_sensor
+        if len(values) not in (0, 7):
+            raise ConfigError(
+                f'{stage}.base_to_sensor: {len(values)} values, '
+                'expected 7 (x y z qx qy qz qw) or none'
+            )
+        if values and abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
+            raise ConfigError(
+                f'{stage}.base_to_sensor: quaternion {list(values[3:])} has norm '
+                f'{math.hypot(*values[3:]):.6g}, expected 1 (order x y z w)'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputConfig(Stage):
+    """What is taken of the clouds that come in."""
+
+    min_range_m: float = setting(
+        0.1, 'Points nearer to the origin of their frame are left out, m.', low=0.0, high=1e6
+    )
+    max_range_m: float = setting(
+        0.0, 'Points farther from it are left out, m; 0: no such limit.', low=0.0, high=1e6
+    )
+    reset_after_s: float = setting(
+        1.0,
+        'A stamp that goes back by more than this clears the map, s; '
+        'by less, the scan is dropped.',
+        low=0.0,
+        high=1e9,
+    )
+
+    def check(self, stage: str) -> None:
+        """Refuse an empty range."""
+        if 0.0 < self.max_range_m <= self.min_range_m:
+            raise ConfigError(
+                f'{stage}.max_range_m: {self.max_range_m}, expected more than '
+                f'{stage}.min_range_m ({self.min_range_m}), or 0 for no limit'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PublishConfig(Stage):
+    """What the node publishes, and how often."""
+
+    changed: bool = setting(True, 'Publish ~/changed after every scan.', live=True)
+    normals_rate_hz: float = setting(
+        1.0, 'Rate of the full map on ~/normals, Hz; 0: never.', low=0.0, high=1000.0, live=True
+    )
+    markers_rate_hz: float = setting(
+        1.0, 'Rate of ~/markers, Hz; 0: never.', low=0.0, high=1000.0, live=True
+    )
+    max_markers: int = setting(
+        20_000, 'At most this many surfels are drawn in ~/markers.', low=1, high=10**7, live=True
+    )
+    diagnostics_rate_hz: float = setting(
+        1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OutputConfig(Stage):
+    """Where files are written; the node writes nowhere else."""
+
+    directory: str = setting('surfel_maps', 'Directory of ~/save_map; made when first needed.')
+    map_name: str = setting('map', 'Name of the files of ~/save_map inside it, no extension.')
+
+    def check(self, stage: str) -> None:
+        """Refuse names that would leave the directory."""
+        if not self.directory:
+            raise ConfigError(f'{stage}.directory: empty, expected the path of a directory')
+        name = self.map_name
+        if not name or name.startswith('.') or any(c in name for c in '/\\\0'):
+            raise ConfigError(
+                f'{stage}.map_name: {name!r}, expected a plain file name: '
+                'not empty, no leading dot, no slash'
+            )
+
+
