@@ -46,6 +46,8 @@ class Counters:
         How often the map was cleared because time went back.
     dropped : Counter of str
         Scans dropped, by cause.
+    dropped_by_frame : dict of str to Counter of str
+        The same by frame; by topic, where the frame could not be read.
     points : int
         Points that entered the map.
     points_left_out : Counter of str
@@ -66,6 +68,7 @@ class Counters:
     points: int = 0
     evicted: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
+    dropped_by_frame: dict[str, Counter[str]] = field(default_factory=dict)
     points_left_out: Counter[str] = field(default_factory=Counter)
     messages_ignored: Counter[str] = field(default_factory=Counter)
     milliseconds: dict[str, deque[float]] = field(default_factory=dict)
@@ -79,6 +82,11 @@ class Counters:
             yield
         finally:
             self.add_time(stage, (time.perf_counter() - start) * 1e3)
+
+    def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
+        """Count scans as dropped for a cause."""
+        self.dropped[cause] += number
+        self.dropped_by_frame.setdefault(frame_id, Counter())[cause] += number
 
     def add_time(self, stage: str, milliseconds: float) -> None:
         """Add the time that one scan spent in a stage."""
@@ -110,6 +118,7 @@ class Counters:
                 'gated': self.gated,
                 'evicted': dict(self.evicted),
                 'dropped': dict(self.dropped),
+                'dropped_by_frame': {k: dict(v) for k, v in self.dropped_by_frame.items()},
             },
             'resets': self.resets,
             'points': self.points,

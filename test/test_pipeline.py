@@ -606,6 +606,7 @@ def test_the_summary_states_what_was_done_and_what_the_map_is():
         'gated': 0,
         'evicted': {'max_scans': 1},
         'dropped': {'stamp_repeated': 1, 'empty_frame_id': 1},
+        'dropped_by_frame': {'lidar': {'stamp_repeated': 1}, '': {'empty_frame_id': 1}},
     }
     assert summary['points'] == 120
     assert summary['window_scans'] == 2

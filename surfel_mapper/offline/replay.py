@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-import logging
 from typing import TYPE_CHECKING
 
 from surfel_mapper.config import Config
@@ -37,8 +36,6 @@ ALL_SCANS = {
     'map.max_voxels': 0,
 }
 """Settings with which no scan leaves the map."""
-
-log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,10 +134,7 @@ def add_cloud(reader: BagReader, mapper: Mapper, message: BagMessage) -> None:
         with mapper.counters.timed('decode'):
             scan = to_scan(reader.decode(message), message.topic)
     except CloudFormatError as error:
-        mapper.counters.received += 1
-        mapper.counters.dropped['bad_cloud'] += 1
-        if mapper.counters.dropped['bad_cloud'] == 1:
-            log.warning('cloud dropped, others like it are only counted: %s', error)
+        mapper.refuse_clouds('bad_cloud', message.topic, str(error))
         return
     mapper.add_scan(scan)
 
@@ -150,9 +144,7 @@ def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: Po
     try:
         decoded = reader.decode(message)
     except BagError as error:
-        mapper.counters.messages_ignored['bad_message'] += 1
-        if mapper.counters.messages_ignored['bad_message'] == 1:
-            log.warning('pose ignored, others like it are only counted: %s', error)
+        mapper.ignore_message('bad_message', f'pose ignored: {error}')
         return
     kind = topics.kinds.get(message.topic, 'tf')
     for pose in poses_in(kind, decoded, mapper.config.frames.base):

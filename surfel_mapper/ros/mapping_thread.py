@@ -14,9 +14,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-import logging
 import threading
-import time
 from typing import Any, NamedTuple, TypeVar
 
 from surfel_mapper.errors import CloudFormatError
@@ -24,16 +22,11 @@ from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 
-log = logging.getLogger(__name__)
-
 MAX_CLOUDS = 20
 """Clouds that may wait, 2 s of a lidar at 10 Hz and some 80 MB; the oldest is dropped."""
 
 MAX_POSES = 10_000
 """Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
-
-WARN_EVERY_S = 1.0
-"""A warning is logged at most this often; everything is counted."""
 
 Result = TypeVar('Result')
 
@@ -85,7 +78,6 @@ class MappingThread:
         self._num_clouds = 0
         self._clouds_lost = 0
         self._poses_lost = 0
-        self._warned_s: dict[str, float] = {}
         self._stopping = False
         self._thread = threading.Thread()
 
@@ -186,41 +178,27 @@ class MappingThread:
 
     def _count_lost(self, clouds: int, poses: int) -> None:
         """Enter in the counts what the queue had to drop."""
-        counters = self._mapper.counters
         if poses:
-            counters.messages_ignored['overload'] += poses
+            self._mapper.ignore_message('overload', f'{poses} poses dropped: too many wait', poses)
         if clouds:
-            counters.received += clouds
-            counters.dropped['overload'] += clouds
-            self._warn(
-                'overload',
-                f'{clouds} clouds dropped: they come faster than they can be mapped; larger '
-                'voxels (map.voxel_size_m) or a shorter range (input.max_range_m) would help',
+            reason = (
+                'they come faster than they can be mapped; larger voxels (map.voxel_size_m) or a '
+                'shorter range (input.max_range_m) would help'
             )
+            self._mapper.refuse_clouds('overload', 'the input topics', reason, clouds)
 
     def _add(self, cloud: Cloud) -> None:
         """Decode a cloud and give it to the mapper; a bad one is counted."""
-        counters = self._mapper.counters
         if self.paused:
-            counters.received += 1
-            counters.dropped['paused'] += 1
+            self._mapper.refuse_clouds('paused', cloud.topic, 'mapping is paused')
             return
         try:
-            with counters.timed('decode'):
+            with self._mapper.counters.timed('decode'):
                 scan = to_scan(cloud.msg, cloud.topic)
         except CloudFormatError as error:
-            counters.received += 1
-            counters.dropped['bad_cloud'] += 1
-            self._warn('bad_cloud', f'cloud in frame {cloud.msg.header.frame_id!r}: {error}')
+            self._mapper.refuse_clouds('bad_cloud', cloud.topic, str(error))
             return
         self._mapper.add_scan(scan)
-
-    def _warn(self, cause: str, text: str) -> None:
-        """Log a warning unless one of its cause was just logged."""
-        now = time.monotonic()
-        if now - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
-            self._warned_s[cause] = now
-            log.warning(text)
 
 
 def fulfil(call: Call) -> None:

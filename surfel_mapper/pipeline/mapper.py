@@ -11,9 +11,8 @@ at any speed does alike.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterator
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 import logging
 import time
 from typing import Any
@@ -31,56 +30,19 @@ from surfel_mapper.errors import (
     PoseNotYetError,
 )
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.geometry import compose, inverse, pose_matrix, rotation_angle
+from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
 from surfel_mapper.mapping.reducer import NARROW_COUNT
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
+from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.scan_queue import ScanQueue
+from surfel_mapper.pipeline.update import Update
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
-
-WARN_EVERY_S = 1.0
-"""A warning of one cause is logged at most this often; all are counted."""
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Update:
-    """
-    What one scan did to the map.
-
-    Attributes
-    ----------
-    stamp_ns : int
-        Stamp of the scan.
-    frame_id : str
-        The fixed frame, in which the surfels are.
-    T_fixed_sensor : (4, 4) float64
-        Pose of the sensor.
-    num_points : int
-        Points of the scan that entered the map.
-    changed : Surfels
-        Every voxel that the scan or an eviction changed and that has ``map.min_points``.
-    removed_voxel_index : (K, 3) int32
-        Voxels that were surfels and, after an eviction, have too few points.
-    evictions : tuple of Eviction
-        The scans that left, oldest first.
-    milliseconds : dict of str to float
-        Time by stage: filter (where there are any), reduce, insert (evictions included),
-        normals, total.
-
-    """
-
-    stamp_ns: int
-    frame_id: str
-    T_fixed_sensor: npt.NDArray[np.float64]
-    num_points: int
-    changed: Surfels
-    removed_voxel_index: npt.NDArray[np.int32]
-    evictions: tuple[Eviction, ...]
-    milliseconds: dict[str, float]
 
 
 class Mapper:
@@ -119,10 +81,9 @@ class Mapper:
             self.map, self.config.window, max_voxels=self.config.map.max_voxels
         )
         self.transforms = TransformBuffer(reset_after_s=self.config.input.reset_after_s)
-        self._waiting: deque[Scan] = deque()
-        self._newest_ns: dict[str, int] = {}
+        self._drops = Drops(self.counters)
+        self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._mounted: set[str] = set()
-        self._warned: dict[str, float] = {}
 
     def add_pose(
         self,
@@ -158,8 +119,7 @@ class Mapper:
             else:
                 self.transforms.add(parent, child, stamp_ns, transform)
         except (PoseError, ValueError) as error:
-            self.counters.messages_ignored['bad_pose'] += 1
-            self._warn('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+            self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
 
     def add_scan(self, scan: Scan) -> None:
         """
@@ -171,20 +131,44 @@ class Mapper:
         """
         self.counters.received += 1
         if not scan.frame_id:
-            self._drop(scan, 'empty_frame_id', 'its header has no frame_id')
+            self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
-            self._drop(scan, 'no_points', 'it has no points')
+            self._drops.scan(scan, 'no_points', 'it has no points')
         elif missing := missing_columns(scan.columns, self.map.columns):
-            self._drop(scan, 'missing_column', f'its points have no {" and no ".join(missing)}')
-        elif self._in_order(scan):
+            reason = f'its points have no {" and no ".join(missing)}'
+            self._drops.scan(scan, 'missing_column', reason)
+        else:
+            if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
+                self._start_anew(scan, back_s)
             self._mount(scan.frame_id)
-            self._waiting.append(scan)
-            while len(self._waiting) > self.config.pose.max_waiting_scans:
-                self._drop(
-                    self._waiting.popleft(),
-                    'queue_full',
-                    f'{self.config.pose.max_waiting_scans} newer scans wait for their poses',
-                )
+            self._queue.push(scan)
+
+    def refuse_clouds(self, cause: str, topic: str, reason: str, number: int = 1) -> None:
+        """
+        Count clouds that came in but never became scans: damaged, too many, unwanted.
+
+        Parameters
+        ----------
+        cause : str
+            What they are counted as.
+        topic : str
+            Where they came in.
+        reason : str
+            What was found, what was expected, and the remedy, for the log.
+        number : int
+            How many.
+
+        """
+        self.counters.received += number
+        self.counters.drop(cause, topic, number)
+        dropped = self.counters.dropped[cause]
+        self._drops.warn(
+            cause, f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
+        )
+
+    def ignore_message(self, cause: str, reason: str, number: int = 1) -> None:
+        """Count messages other than clouds that are not used, and warn about it."""
+        self._drops.message(cause, reason, number)
 
     def insert_ready(self) -> Iterator[Update]:
         """
@@ -192,35 +176,32 @@ class Mapper:
 
         A scan whose pose cannot come any more, or did not in time, is dropped and counted.
         """
-        while self._waiting:
-            scan = self._waiting[0]
+        while (scan := self._queue.first) is not None:
             try:
                 pose = self._lookup(scan)
             except PoseNotYetError as error:
                 waited_s = (self._now_ns() - scan.stamp_ns) / 1e9
                 if waited_s <= self.config.pose.max_wait_s:
                     return
-                self._waiting.popleft()
-                self._drop(scan, 'no_pose', f'no pose within {waited_s:.3f} s: {error}')
+                self._queue.pop()
+                self._drops.scan(scan, 'no_pose', f'no pose within {waited_s:.3f} s: {error}')
                 continue
             except PoseError as error:
-                self._waiting.popleft()
-                self._drop(scan, 'no_pose', str(error))
+                self._queue.pop()
+                self._drops.scan(scan, 'no_pose', str(error))
                 continue
-            self._waiting.popleft()
+            self._queue.pop()
             update = self._insert(scan, pose)
             if update is not None:
                 yield update
 
     def finish(self) -> None:
         """End the input: what still waits for a pose is dropped and counted."""
-        while self._waiting:
-            self._drop(self._waiting.popleft(), 'no_pose', 'no pose until the end of the input')
+        self._queue.drop_all('no_pose', 'no pose until the end of the input')
 
     def clear(self) -> None:
         """Forget all scans, waiting ones too (counted); poses and counts stay."""
-        while self._waiting:
-            self._drop(self._waiting.popleft(), 'cleared', 'the map was cleared')
+        self._queue.drop_all('cleared', 'the map was cleared')
         self.window.clear()
 
     def reconfigure(self, config: Config) -> None:
@@ -268,21 +249,6 @@ class Mapper:
             'digest': self.map.digest(),
         }
 
-    def _in_order(self, scan: Scan) -> bool:
-        """Return whether a scan may enter; start anew where time was set back."""
-        newest = max(self._newest_ns.values(), default=scan.stamp_ns)
-        back_s = (newest - scan.stamp_ns) / 1e9
-        if back_s > self.config.input.reset_after_s:
-            self._start_anew(scan, back_s)
-        last = self._newest_ns.get(scan.frame_id)
-        if last is not None and scan.stamp_ns <= last:
-            behind_s = (last - scan.stamp_ns) / 1e9
-            cause = 'stamp_back' if behind_s else 'stamp_repeated'
-            self._drop(scan, cause, f'its stamp is {behind_s:.3f} s before the one before it')
-            return False
-        self._newest_ns[scan.frame_id] = scan.stamp_ns
-        return True
-
     def _start_anew(self, scan: Scan, back_s: float) -> None:
         """Forget what was mapped before time was set back, and the poses of that time."""
         reset_after_s = self.config.input.reset_after_s
@@ -295,16 +261,15 @@ class Mapper:
         )
         self.counters.resets += 1
         self.clear()
-        self._newest_ns.clear()
+        self._queue.forget_stamps()
         newest_pose = self.transforms.newest_ns
         if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
             self.transforms.clear()  # else the scan would be mapped where the robot was then
 
     def _now_ns(self) -> int:
         """Return the newest stamp of all data seen."""
-        stamps = list(self._newest_ns.values())
-        newest_pose = self.transforms.newest_ns
-        return max(stamps if newest_pose is None else [*stamps, newest_pose])
+        stamps = (self._queue.newest_ns, self.transforms.newest_ns)
+        return max(stamp for stamp in stamps if stamp is not None)
 
     def _mount(self, frame_id: str) -> None:
         """Enter the configured extrinsics of a sensor when its frame is first seen."""
@@ -321,7 +286,8 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan; None where the motion gate or the map leaves it out."""
-        if self._stands_still(pose):
+        last = self.window.newest
+        if last is not None and stands_still(last.T_map_sensor, pose, self.config.window):
             self.counters.gated += 1
             return None
         start, version = time.perf_counter(), self.map.version
@@ -333,11 +299,11 @@ class Mapper:
             windowed = self._reduce(filtered, pose)
             reduced = time.perf_counter()
             if not len(windowed.moments):
-                self._drop(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
+                self._drops.scan(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
                 return None
             evictions = self.window.insert(windowed, self.config.map.min_points)
         except MapError as error:
-            self._drop(scan, 'map_limit', str(error))
+            self._drops.scan(scan, 'map_limit', str(error))
             return None
         inserted = time.perf_counter()
         changed = self.map.surfels_changed(version, self.config.map.min_points)
@@ -375,13 +341,13 @@ class Mapper:
                 replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
             )
         except FilterError as error:
-            self._drop(scan, 'filter', str(error))
+            self._drops.scan(scan, 'filter', str(error))
             return None
         for step in steps:
             self.counters.add_filter(*astuple(step))
         self.counters.points_left_out['filtered'] += len(scan) - len(filtered)
         if not len(filtered):
-            self._drop(scan, 'filtered_out', 'the filters left none of its points')
+            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
             return None
         return filtered
 
@@ -412,30 +378,3 @@ class Mapper:
         self.counters.evicted.update(eviction.limit for eviction in evictions)
         for stage, milliseconds in times.items():
             self.counters.add_time(stage, milliseconds)
-
-    def _stands_still(self, pose: npt.NDArray[np.float64]) -> bool:
-        """Return whether the sensor moved too little since the last scan that was mapped."""
-        gate, last = self.config.window, self.window.newest
-        if last is None or not (gate.gate_distance_m or gate.gate_angle_deg):
-            return False
-        motion = compose(inverse(last.T_map_sensor), pose)
-        distance_m = float(np.sqrt((motion[:3, 3] ** 2).sum()))
-        angle_deg = float(np.degrees(rotation_angle(motion)))
-        moved = 0.0 < gate.gate_distance_m <= distance_m
-        turned = 0.0 < gate.gate_angle_deg <= angle_deg
-        return not (moved or turned)
-
-    def _drop(self, scan: Scan, cause: str, reason: str) -> None:
-        self.counters.dropped[cause] += 1
-        self._warn(
-            cause,
-            f'scan at {scan.stamp_ns / 1e9:.6f} s in frame {scan.frame_id!r} dropped: {reason} '
-            f'({self.counters.dropped[cause]} dropped for this cause)',
-        )
-
-    def _warn(self, cause: str, message: str) -> None:
-        """Log a warning, unless one of the same cause was logged just before."""
-        now = time.monotonic()
-        if now - self._warned.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
-            self._warned[cause] = now
-            _log.warning('%s', message)

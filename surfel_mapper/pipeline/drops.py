@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is left out: every drop is counted by cause and frame; the log hears of it now and then.
+
+A bad cable drops ten scans a second for hours; a line a second for each cause is enough to see
+it, and the counts tell the rest.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+
+from surfel_mapper.counters import Counters
+from surfel_mapper.scan import Scan
+
+_log = logging.getLogger(__name__)
+
+WARN_EVERY_S = 1.0
+"""A warning of one cause is logged at most this often; all are counted."""
+
+
+class Drops:
+    """Counts what is left out into the counters of a pipeline, and warns about it."""
+
+    def __init__(self, counters: Counters) -> None:
+        """Count into these counters."""
+        self._counters = counters
+        self._warned_s: dict[str, float] = {}
+
+    def scan(self, scan: Scan, cause: str, reason: str) -> None:
+        """Count a scan as dropped for a cause."""
+        counters = self._counters
+        counters.drop(cause, scan.frame_id)
+        self.warn(
+            cause,
+            f'scan at {scan.stamp_ns / 1e9:.6f} s in frame {scan.frame_id!r} dropped: {reason} '
+            f'({counters.dropped[cause]} dropped for this cause)',
+        )
+
+    def message(self, cause: str, reason: str, number: int = 1) -> None:
+        """Count messages that are no scans as not used for a cause."""
+        self._counters.messages_ignored[cause] += number
+        self.warn(cause, reason)
+
+    def warn(self, cause: str, message: str) -> None:
+        """Log a warning, unless one of the same cause was logged just before."""
+        now_s = time.monotonic()
+        if now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+            self._warned_s[cause] = now_s
+            _log.warning('%s', message)

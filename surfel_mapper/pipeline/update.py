@@ -1,0 +1,50 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What one scan did to the map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.window import Eviction
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Update:
+    """
+    What one scan did to the map.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the scan.
+    frame_id : str
+        The fixed frame, in which the surfels are.
+    T_fixed_sensor : (4, 4) float64
+        Pose of the sensor.
+    num_points : int
+        Points of the scan that entered the map.
+    changed : Surfels
+        Every voxel that the scan or an eviction changed and that has ``map.min_points``.
+    removed_voxel_index : (K, 3) int32
+        Voxels that were surfels and, after an eviction, have too few points.
+    evictions : tuple of Eviction
+        The scans that left, oldest first.
+    milliseconds : dict of str to float
+        Time by stage: filter (where there are any), reduce, insert (evictions included),
+        normals, total.
+
+    """
+
+    stamp_ns: int
+    frame_id: str
+    T_fixed_sensor: npt.NDArray[np.float64]
+    num_points: int
+    changed: Surfels
+    removed_voxel_index: npt.NDArray[np.int32]
+    evictions: tuple[Eviction, ...]
+    milliseconds: dict[str, float]
