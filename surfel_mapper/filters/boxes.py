@@ -1,0 +1,201 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Boxes: cut the space of a scan until every box holds few points, and see what these are like.
+
+A box is cut at the middle one of its points across its longest edge, so that all boxes of a level
+hold the same number of points but for one, and boxes stay as even as they can. All boxes of a
+level are cut at once: 14 sorts for 131,072 points and boxes of 10.
+
+From each box either points are drawn by chance, which keep their columns and take the shape of
+their box, or one point is made, the mean. libpointmatcher drops boxes whose points are all on one
+line or too few for a normal; here they stay, with a normal as shapes.py says.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.filters.base import generator, Mask, select, with_columns
+from surfel_mapper.filters.columns import DENSITIES
+from surfel_mapper.filters.merging import Groups, merged_columns
+from surfel_mapper.filters.neighbours import coordinates, Ids, Points
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.registry import register
+from surfel_mapper.filters.shapes import eigen, Moments, ShapeFilter
+from surfel_mapper.scan import Scan
+
+INT32_MAX = 2**31 - 1
+
+Columns = dict[str, npt.NDArray[Any]]
+
+
+def cut_into_boxes(points: Points, max_points: int) -> tuple[Ids, int]:
+    """
+    Return the box of every point, (N,) int64, and the number of boxes.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+        Finite.
+    max_points : int
+        A box with more is cut.
+
+    """
+    total = len(points)
+    if not total:
+        return np.empty(0, np.int64), 0
+    ranks = np.argsort(np.argsort(points, axis=0, kind='stable'), axis=0)
+    order, starts = np.arange(total), np.array([0, total])
+    low, high = points.min(axis=0)[None], points.max(axis=0)[None]
+    while (too_many := np.diff(starts) > max_points).any():
+        count = np.diff(starts)
+        box = np.repeat(np.arange(len(count)), count)
+        axis = (high - low).argmax(axis=1)
+        rank = np.where(too_many[box], ranks[order, axis[box]], 0)  # the others stay as they are
+        order = order[np.argsort(box * total + rank, kind='stable')]
+        middle = (starts[:-1] + count - count // 2)[too_many]
+        low, high = np.repeat(low, 1 + too_many, axis=0), np.repeat(high, 1 + too_many, axis=0)
+        lower = np.flatnonzero(too_many) + np.arange(len(middle))
+        axis = axis[too_many]
+        high[lower, axis] = low[lower + 1, axis] = points[order[middle], axis]
+        starts = np.sort(np.append(starts, middle))
+    rows = np.empty(total, np.int64)
+    rows[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+    return rows, len(starts) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Boxes:
+    """
+    The boxes of a scan.
+
+    Attributes
+    ----------
+    points : (N, 3) float64, m
+    rows : (N,) int64
+        Box of every point.
+    moments : Moments
+        Of the points in each of M boxes.
+    values, vectors : (M, 3) and (M, 3, 3) float64
+        Eigenvalues and eigenvectors, as shapes.eigen gives them.
+
+    """
+
+    points: Points
+    rows: Ids
+    moments: Moments
+    values: Points
+    vectors: Points
+
+    @classmethod
+    def of(cls, scan: Scan, max_points: int) -> Boxes:
+        """Return the boxes of a scan; nan and infinite points are refused."""
+        points = coordinates(scan)
+        rows, number = cut_into_boxes(points, max_points)
+        moments = Moments.of_groups(points, rows, number)
+        return cls(points, rows, moments, *eigen(moments.covariance))
+
+    def __len__(self) -> int:
+        """Return the number of boxes."""
+        return len(self.moments.count)
+
+    def spread(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """Return largest minus smallest of the values (N,) of the points in each box, (M,)."""
+        if not len(values):
+            return values
+        order = np.argsort(self.rows, kind='stable')
+        starts = np.searchsorted(self.rows[order], np.arange(len(self)))
+        ordered = values[order]
+        return np.asarray(
+            np.maximum.reduceat(ordered, starts) - np.minimum.reduceat(ordered, starts)
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BoxFilter(ShapeFilter):
+    """Base of the filters that sample from boxes."""
+
+    ratio: float = parameter(
+        0.5, 'Share of the points that stay, drawn by chance.', low=1e-7, high=1.0, theirs='ratio'
+    )
+    max_points: int = parameter(
+        7, 'A box with more points is cut in two.', low=3, high=INT32_MAX, theirs='knn'
+    )
+    sampling_method: int = parameter(
+        0, '0: draw points by chance; 1: one point for a box, the mean.', low=0, high=1,
+        theirs='samplingMethod',
+    )
+    max_box_m: float = parameter(
+        math.inf, 'Boxes whose points extend farther along an axis are dropped, m.',
+        theirs='maxBoxDim',
+    )
+    average_columns: bool = parameter(
+        True,
+        'Where one point is made, 1: average the columns; 0: keep those of the first point.',
+        theirs='averageExistingDescriptors',
+    )
+    keep_densities: bool = parameter(
+        False,
+        'Add densities, points per m^3 of the ball about the mean of the box.',
+        theirs='keepDensities',
+    )
+    seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the points drawn in their order, or means in the order of their first points."""
+        boxes = Boxes.of(scan, self.max_points)
+        fit = self.fit(scan, boxes)
+        if self.sampling_method == 0:
+            drawn = generator(scan, self.seed).random(len(scan)) < self.ratio
+            rows = np.flatnonzero(drawn & fit[boxes.rows])
+            sampled, chosen = select(scan, rows), boxes.rows[rows]
+        else:
+            sampled, chosen = self.means(scan, boxes, fit)
+        dtype = scan.points.dtype
+        columns = {
+            name: column[chosen].astype(dtype if column.dtype.kind == 'f' else column.dtype)
+            for name, column in self.columns_of(boxes).items()
+        }
+        return with_columns(sampled, **columns)
+
+    def means(self, scan: Scan, boxes: Boxes, fit: Mask) -> tuple[Scan, Ids]:
+        """Return the scan of the means of the boxes that fit, and which boxes these are."""
+        first = Groups.of(boxes.rows, len(boxes)).first
+        chosen = np.flatnonzero(fit)
+        chosen = chosen[np.argsort(first[chosen])]
+        place = np.full(len(boxes), -1)
+        place[chosen] = np.arange(len(chosen))
+        inside = select(scan, fit[boxes.rows])
+        groups = Groups.of(place[boxes.rows[fit[boxes.rows]]], len(chosen))
+        means = replace(
+            inside,
+            points=boxes.moments.mean[chosen].astype(scan.points.dtype, order='F'),
+            columns=merged_columns(inside, groups, average=self.average_columns),
+        )
+        return means, chosen
+
+    def fit(self, scan: Scan, boxes: Boxes) -> Mask:
+        """Return which boxes are sampled, (M,) bool."""
+        if self.max_box_m == math.inf:
+            return np.ones(len(boxes), np.bool_)
+        extents = [boxes.spread(axis) for axis in boxes.points.T]
+        return np.asarray(np.max(extents, axis=0) <= self.max_box_m, np.bool_)
+
+    def columns_of(self, boxes: Boxes) -> Columns:
+        """Return the columns asked for, a row for each box."""
+        columns = self.shape_columns(boxes.values, boxes.vectors)
+        if self.keep_densities:
+            columns[DENSITIES] = boxes.moments.density
+        return columns
+
+
+@register(theirs='SamplingSurfaceNormalDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SamplingSurfaceNormal(BoxFilter):
+    """Cut the space into boxes of few points, sample from each, add the normal of the box."""

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The shape of several points together: mean, covariance, eigenvalues, eigenvectors, density.
+
+Definitions are those of the map: covariance = scatter / (n - 1), eigenvalues ascending, the
+normal is the unit eigenvector of the smallest, and of every eigenvector the component of largest
+magnitude is positive. Where all points are equal, or there is but one, eigenvalues are 0 and
+eigenvectors nan; on a line the normal is some direction across it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.columns import EIGEN_VALUES, EIGEN_VECTORS, NORMALS
+from surfel_mapper.filters.neighbours import Ids, Points
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.kernels.eigen3 import decompose
+
+PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+"""Rows of a symmetric matrix as it is stored: xx xy xz yy yz zz."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moments:
+    """
+    What M sets of points are like.
+
+    Attributes
+    ----------
+    count : (M,) int64
+        Points in each.
+    mean : (M, 3) float64, m
+    covariance : (6, M) float64, m^2
+        Rows as PAIRS says.
+    radius : (M,) float64, m
+        Distance from the mean to the farthest point.
+
+    """
+
+    count: npt.NDArray[np.int64]
+    mean: Points
+    covariance: Points
+    radius: Points
+
+    @classmethod
+    def of_groups(cls, points: Points, rows: Ids, number: int) -> Moments:
+        """Return those of groups of points, from the group of each; every group has one."""
+
+        def total(values: Points) -> Points:
+            return np.asarray(np.bincount(rows, values, number), np.float64)
+
+        count = np.bincount(rows, minlength=number)
+        mean = np.stack([total(axis) / count for axis in points.T], axis=1)
+        apart = points - mean[rows]
+        free = np.maximum(count - 1, 1)
+        covariance = np.stack([total(apart[:, i] * apart[:, j]) / free for i, j in PAIRS])
+        far_sq = np.zeros(number)
+        np.maximum.at(far_sq, rows, (apart * apart).sum(axis=1))
+        return cls(count, mean, covariance, np.sqrt(far_sq))
+
+    @classmethod
+    def of_neighbours(cls, points: Points, ids: Ids) -> Moments:
+        """Return those of neighbours, from their rows (M, K); N where there is none."""
+        present = ids < len(points)
+        count = present.sum(axis=1)
+        around = points[np.where(present, ids, 0)]
+        if not present.all():
+            around[~present] = 0.0
+        mean = around.sum(axis=1) / count[:, None]
+        around -= mean[:, None]
+        if not present.all():
+            around[~present] = 0.0
+        free = np.maximum(count - 1, 1)
+        axes = np.moveaxis(around, 2, 0)
+        covariance = np.stack(
+            [np.einsum('mk,mk->m', axes[i], axes[j]) / free for i, j in PAIRS]
+        )
+        far_sq = np.einsum('mki,mki->mk', around, around).max(axis=1, initial=0.0)
+        return cls(count, mean, covariance, np.sqrt(far_sq))
+
+    @classmethod
+    def joined(cls, parts: list[Moments]) -> Moments:
+        """Return those of all parts, one after another."""
+        if not parts:
+            return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((6, 0)), np.empty(0))
+        return cls(
+            np.concatenate([part.count for part in parts]),
+            np.concatenate([part.mean for part in parts]),
+            np.concatenate([part.covariance for part in parts], axis=1),
+            np.concatenate([part.radius for part in parts]),
+        )
+
+    @property
+    def density(self) -> Points:
+        """Points per m^3 of the ball about the mean; 0 where they are all at one place."""
+        volume = 4.0 / 3.0 * np.pi * self.radius**3
+        density = np.divide(self.count, volume, out=np.zeros(len(volume)), where=volume > 0.0)
+        return np.asarray(density, np.float64)
+
+
+def eigen(matrices: Points) -> tuple[Points, Points]:
+    """
+    Return eigenvalues and eigenvectors of symmetric matrices.
+
+    Parameters
+    ----------
+    matrices : (6, M) float64
+        Positive semidefinite, rows as PAIRS says.
+
+    Returns
+    -------
+    values : (M, 3) float64
+        Ascending, none negative.
+    vectors : (M, 3, 3) float64
+        vectors[:, i] are of unit length and belong to values[:, i]; nan where all values are 0.
+
+    Notes
+    -----
+    The kernel gives the values and the vector of the smallest, n. Across n a matrix is 2 by 2,
+    and its larger vector follows from a square root; the third is across both.
+
+    """
+    number = matrices.shape[1]
+    values, smallest = np.empty((2, 3, number))
+    decompose(np.ascontiguousarray(matrices), number, values, smallest)
+    n = smallest.T
+    # a basis across n: the axis most across it, made orthogonal, and their cross product
+    u = np.zeros((number, 3))
+    u[np.arange(number), np.abs(n).argmin(axis=1)] = 1.0
+    u = unit(u - (u * n).sum(axis=1, keepdims=True) * n)
+    w = np.cross(n, u)
+    full = as_matrices(matrices)
+    uu, uw, ww = (np.einsum('mi,mij,mj->m', a, full, b) for a, b in ((u, u), (u, w), (w, w)))
+    half = 0.5 * (uu - ww)
+    radius = np.hypot(half, uw)
+    equal = radius == 0.0  # every direction across n is as good
+    half, uw = np.divide((half, uw), radius, out=np.zeros((2, number)), where=~equal)
+    first = np.where(half >= 0.0, half + 1.0, uw)
+    second = np.where(half >= 0.0, uw, 1.0 - half)
+    largest = unit(first[:, None] * u + second[:, None] * w)
+    vectors = np.stack([n, np.cross(largest, n), largest], axis=1)
+    leading = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=2)[..., None], axis=2)
+    vectors *= np.where(leading < 0.0, -1.0, 1.0)
+    vectors[values[2] == 0.0] = np.nan
+    return values.T.copy(), vectors
+
+
+def as_matrices(rows: Points) -> Points:
+    """Return symmetric matrices (M, 3, 3) from their rows as PAIRS says, (6, M)."""
+    return np.asarray(rows[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
+
+
+def unit(vectors: Points) -> Points:
+    """Return vectors (..., 3) at unit length; those of length 0 become nan."""
+    lengths = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
+    units = np.divide(vectors, lengths, out=np.full_like(vectors, np.nan), where=lengths > 0.0)
+    return np.asarray(units, np.float64)
+
+
+def shares(values: Points) -> Points:
+    """
+    Return planarity, cylindricality and sphericality from ascending eigenvalues, (M, 3).
+
+    They are in [0, 1] and at most one of them is near 1: 2 (e1 - e0), e2 - e1 and 3 e0, over the
+    sum; 0 where that is 0.
+    """
+    e0, e1, e2 = values.T
+    total = e0 + e1 + e2
+    parts = np.stack([2.0 * (e1 - e0), e2 - e1, 3.0 * e0], axis=1)
+    found = total[:, None] > 0.0
+    return np.asarray(np.divide(parts, total[:, None], out=np.zeros_like(parts), where=found))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShapeFilter(Filter):
+    """Base of the filters that add what the points about a point are like."""
+
+    keep_normals: bool = parameter(True, 'Add the column normals.', theirs='keepNormals')
+    keep_eigen_values: bool = parameter(
+        False, 'Add eigValues, of the covariance, ascending, m^2.', theirs='keepEigenValues'
+    )
+    keep_eigen_vectors: bool = parameter(
+        False, 'Add eigVectors, one after another.', theirs='keepEigenVectors'
+    )
+
+    def shape_columns(self, values: Points, vectors: Points) -> dict[str, npt.NDArray[Any]]:
+        """Return the columns asked for, from eigenvalues and eigenvectors."""
+        columns = {}
+        if self.keep_normals:
+            columns[NORMALS] = vectors[:, 0]
+        if self.keep_eigen_values:
+            columns[EIGEN_VALUES] = values
+        if self.keep_eigen_vectors:
+            columns[EIGEN_VECTORS] = vectors.reshape(-1, 9)
+        return columns
