@@ -10,14 +10,23 @@ import math
 import pytest
 
 from surfel_mapper.config import Config, declarations, load_config, MapConfig, WindowConfig
+from surfel_mapper.config.configuration import stage_fields
 from surfel_mapper.errors import ConfigError
 
 DECLARATIONS = {declared.name: declared for declared in declarations()}
 BOUNDED = [declared for declared in declarations() if declared.low is not None]
 QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
+UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio'}
+
 # A stage may refuse together what each bound accepts alone; these companions keep them apart.
-COMPANIONS = {'input.min_range_m': {'input.max_range_m': 0.0}}
+LEVEL = {'layers.tsdf.weight_dropoff': False}
+COMPANIONS = {
+    'input.min_range_m': {'input.max_range_m': 0.0},
+    'layers.tsdf.voxel_size_m': LEVEL,
+    'layers.tsdf.truncation_m': LEVEL,
+    'layers.tsdf.dropoff_m': LEVEL,
+}
 
 
 def configured(name, value):
@@ -103,7 +112,7 @@ def test_every_declaration_is_complete(declared):
     numeric = isinstance(declared.default, (int, float)) and not isinstance(declared.default, bool)
     assert (declared.low is not None, declared.high is not None) == (numeric, numeric)
     if isinstance(declared.default, float):
-        assert declared.key.rpartition('_')[2] in {'m', 's', 'deg', 'hz'}
+        assert declared.key.rpartition('_')[2] in UNITS
 
 
 @pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
@@ -112,7 +121,7 @@ def test_a_bound_is_allowed_and_what_lies_beyond_is_not(declared):
     whole = isinstance(declared.default, int)
     for bound, outwards in ((declared.low, -math.inf), (declared.high, math.inf)):
         value = bound
-        assert getattr(getattr(configured(declared.name, value), stage), key) == bound
+        assert configured(declared.name, value).to_mapping()[declared.name] == bound
         beyond = bound + (1 if outwards > 0 else -1) if whole else math.nextafter(bound, outwards)
         with pytest.raises(ConfigError, match=rf'^{stage}\.{key}: .* expected a value in \['):
             configured(declared.name, beyond)
@@ -121,7 +130,7 @@ def test_a_bound_is_allowed_and_what_lies_beyond_is_not(declared):
 @pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
 @pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, '1', None, True, [1.0], {}])
 def test_what_is_no_finite_number_is_refused_by_name(declared, value):
-    stage = type(getattr(Config(), declared.stage))
+    stage = stage_fields()[declared.stage].default_factory
     with pytest.raises(ConfigError, match=rf'^{declared.stage}\.{declared.key}: .*expected a'):
         stage(**{declared.key: value})
 

@@ -21,6 +21,7 @@ from surfel_mapper.config.stages import (
     PublishConfig,
     WindowConfig,
 )
+from surfel_mapper.config.tsdf import TsdfConfig
 
 __all__ = [
     'Config',
@@ -32,6 +33,7 @@ __all__ = [
     'PoseConfig',
     'PublishConfig',
     'Stage',
+    'TsdfConfig',
     'WindowConfig',
     'declarations',
     'flatten',

@@ -27,6 +27,7 @@ from surfel_mapper.config.stages import (
     PublishConfig,
     WindowConfig,
 )
+from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import ConfigError
 
 
@@ -41,6 +42,7 @@ class Config:
     input: InputConfig = field(default_factory=InputConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
+    tsdf: TsdfConfig = field(default_factory=TsdfConfig)
     filters: str = setting(
         '', 'YAML file of the filters that every scan passes before it is mapped; empty: none.'
     )

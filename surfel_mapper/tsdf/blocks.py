@@ -1,0 +1,394 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+BlockMap: the voxels of a TSDF in cubes of M x M x M, found by hash.
+
+Block (a, b, c) spans from (a, b, c) * M * voxel_size_m to the next. Voxel (i, j, k) of it has the
+number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
+((a, b, c) * M + (i, j, k) + 0.5) * voxel_size_m. Row r of every array belongs to one block:
+
+    head    (R, 4) int64       key, version, stamp of the last change; see kernels/blocks.py
+    field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
+                               it; weight, 0 where a voxel was never observed
+    color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
+    votes   (R, V, N) float32  for labels, see kernels/tsdf_labels.py; V depends on the semantics
+    stamps  (R, 2, N) int64    first and last stamp, ns; 0 where a voxel was never observed
+
+color, votes and stamps have no rows where the configuration does not ask for them. All are slabs
+that grow in place, so an array is good until blocks are added and must not be kept. Rows are
+reused: one that is not in use is zero but for its head.
+
+``version`` counts the changes of the map; whoever follows them keeps the version that he has seen
+and asks ``changed_since`` for the rows. A block changed after the last ``clear_updated`` is
+flagged updated, and stays when the window moves on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels import hashing
+from surfel_mapper.kernels.blocks import (
+    find_blocks,
+    FREE,
+    HEAD,
+    NEW,
+    place_blocks,
+    remove_blocks,
+    STAMP,
+    VERSION,
+)
+from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
+from surfel_mapper.mapping.slab import Slab
+
+Int64 = npt.NDArray[np.int64]
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+FIRST_ROWS = 128
+"""Rows to begin with; any slab of so many is whole pages."""
+MAX_DEPTH = 24
+"""The directory of the hash table has at most 2^24 entries."""
+
+UPPER = np.array([(n & 1, n >> 1 & 1, n >> 2) for n in range(8)])
+"""The block itself and the seven beside and above it that hold the far corners of its cubes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """
+    Content of some blocks, taken out of a map or about to be put into one.
+
+    Attributes
+    ----------
+    index : (K, 3) int64
+        Which blocks.
+    stamp_ns : (K,) int64
+        Stamp of the last change of each.
+    field, color, votes, stamps
+        As in BlockMap, one row a block.
+
+    """
+
+    index: Int64
+    stamp_ns: Int64
+    field: Float32
+    color: Float32
+    votes: Float32
+    stamps: Int64
+
+    def __len__(self) -> int:
+        """Return how many blocks."""
+        return len(self.index)
+
+
+class BlockMap:
+    """
+    Blocks of voxels with distance, weight and what else the configuration asks for.
+
+    Parameters
+    ----------
+    config : TsdfConfig
+        Voxel size, voxels per side, channels, budget.
+
+    Attributes
+    ----------
+    config : TsdfConfig
+        As given.
+    version : int
+        Number of changes so far.
+
+    """
+
+    def __init__(self, config: TsdfConfig) -> None:
+        """Make an empty map."""
+        self.config = config
+        self.version = 0
+        self._settled = 0
+        voxels = self.voxels_per_block
+        widths = {  # in int64
+            'head': HEAD,
+            'field': voxels,
+            'color': 2 * voxels * config.color,
+            'votes': config.votes_per_voxel * voxels // 2,
+            'stamps': 2 * voxels * config.tracking,
+        }
+        self._slabs = {name: Slab(FIRST_ROWS, width) for name, width in widths.items() if width}
+        self._row_bytes = 8 * sum(widths.values())
+        self._buckets = Slab(1, hashing.SEGMENT)
+        self._directory = np.zeros(1, np.int32)
+        self._held = np.zeros(1, np.int32)
+        self._local_depth = np.zeros(1, np.int8)
+        self._state = np.zeros(hashing.STATE, np.int64)
+        self._state[hashing.FREE_ROW] = -1
+        self._state[hashing.SEGMENTS] = 1
+
+    @property
+    def voxels_per_block(self) -> int:
+        """N, the number of voxels in a block."""
+        return self.config.voxels_per_side**3
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks in the map."""
+        return int(self._state[hashing.VOXELS])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use for blocks and their hash table."""
+        rows = int(self._state[hashing.ROWS_USED]) * self._row_bytes
+        return rows + int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
+
+    @property
+    def head(self) -> Int64:
+        """Key, version and stamp of each row, (R, 4); only until the map grows."""
+        return self._slabs['head'].array[:, :HEAD]
+
+    @property
+    def field(self) -> Float32:
+        """Distance and weight, (R, 2, N); only until the map grows."""
+        return self._floats('field', 2)
+
+    @property
+    def distance(self) -> Float32:
+        """Signed distances, (R, N) m, a view of field."""
+        return self.field[:, 0]
+
+    @property
+    def weight(self) -> Float32:
+        """Weights, (R, N), 0 where never observed, a view of field."""
+        return self.field[:, 1]
+
+    @property
+    def color(self) -> Float32:
+        """Colours and their weights, (R, 4, N), or no rows."""
+        return self._floats('color', 4)
+
+    @property
+    def votes(self) -> Float32:
+        """Votes for labels, (R, V, N), or no rows."""
+        return self._floats('votes', self.config.votes_per_voxel)
+
+    @property
+    def stamps(self) -> Int64:
+        """First and last stamps, (R, 2, N) ns, or no rows."""
+        if 'stamps' not in self._slabs:
+            return np.empty((0, 2, self.voxels_per_block), np.int64)
+        return self._slabs['stamps'].array.reshape(-1, 2, self.voxels_per_block)
+
+    def rows(self) -> Int64:
+        """Return the rows in use, ascending."""
+        return np.flatnonzero(self._used_head()[:, VERSION] != FREE)
+
+    def changed_since(self, version: int) -> Int64:
+        """Return the rows of blocks changed after a version of the map, ascending."""
+        return np.flatnonzero(self._used_head()[:, VERSION] > version)
+
+    def index(self, rows: Int64) -> Int64:
+        """Return which blocks stand in rows, (K, 3) int64."""
+        return block_index(self.head[rows, KEY])
+
+    def find(self, index: npt.ArrayLike) -> Int64:
+        """Return the rows of blocks given by (..., 3) index, -1 where the map has none."""
+        keys = block_keys(np.asarray(index))
+        rows = np.empty(keys.size, np.int64)
+        find_blocks(keys.ravel(), self.head, self._table, self._state, rows)
+        return rows.reshape(keys.shape)
+
+    def neighbours(self, rows: Int64, offsets: npt.ArrayLike = UPPER) -> Int64:
+        """Return the rows of the blocks at (O, 3) offsets from those in rows, (K, O), or -1."""
+        return self.find(self.index(rows)[:, None] + np.asarray(offsets))
+
+    def place(self, index: npt.ArrayLike) -> Int64:
+        """
+        Return the rows of blocks, adding empty ones where the map has none.
+
+        Parameters
+        ----------
+        index : (K, 3) int
+            Which blocks.
+
+        Returns
+        -------
+        (K,) int64
+            Rows; -1 for blocks beyond the budget.
+
+        Raises
+        ------
+        MapLimitError
+            If an index is beyond 20 bits, or there is no memory; the map holds what it held.
+
+        """
+        keys = block_keys(np.asarray(index))
+        if (keys < 0).any():
+            raise MapLimitError(
+                f'block {np.asarray(index)[keys < 0][0]}: blocks of '
+                f'{self.config.block_size_m} m reach {INDEX_OFFSET * self.config.block_size_m} m '
+                'from the origin; use a local frame'
+            )
+        return self.place_keys(keys)
+
+    def place_keys(self, keys: Int64) -> Int64:
+        """Return the rows of blocks given by their keys, as place does."""
+        limit = self.config.max_blocks or np.iinfo(np.int64).max
+        rows = np.full(len(keys), -1, np.int64)
+        done = 0
+        while done < len(keys):
+            done = place_blocks(keys, self.head, self._table, self._state, limit, done, rows)
+            if done < len(keys):
+                try:
+                    self._make_room()
+                except MapLimitError:
+                    self.drop_new(rows[:done])
+                    raise
+        return rows
+
+    def touch(self, rows: Int64, stamp_ns: int) -> None:
+        """Mark blocks as changed by a measurement at a stamp; a change of the map."""
+        self.version += 1
+        self.head[rows, VERSION] = self.version
+        self.head[rows, STAMP] = stamp_ns
+
+    def drop_new(self, rows: Int64) -> int:
+        """Remove those of some blocks that were placed and never changed; return how many."""
+        rows = rows[rows >= 0]
+        rows = rows[self.head[rows, VERSION] == NEW]
+        remove_blocks(rows, self.head, self._table, self._state)
+        return len(rows)
+
+    def clear_updated(self) -> None:
+        """Take the flag of all blocks: what changed so far has been seen by whoever needs it."""
+        self._settled = self.version
+
+    def updated(self) -> Int64:
+        """Return the rows of blocks changed since the flags were cleared."""
+        return self.changed_since(self._settled)
+
+    def evict(self, position: npt.ArrayLike, stamp_ns: int) -> Blocks:
+        """
+        Remove the blocks that the window leaves behind, and hand them back.
+
+        Parameters
+        ----------
+        position : (3,) float
+            The middle of the window in the map frame, m.
+        stamp_ns : int
+            The time now.
+
+        Returns
+        -------
+        Blocks
+            Those of which the centre is farther than max_radius_m or whose last change is older
+            than max_age_s, and that are not flagged updated.
+
+        """
+        config, rows = self.config, self.rows()
+        leaves = np.zeros(len(rows), bool)
+        if config.max_radius_m > 0.0:
+            centres = (self.index(rows) + 0.5) * config.block_size_m
+            leaves |= np.linalg.norm(centres - np.asarray(position), axis=1) > config.max_radius_m
+        if config.max_age_s > 0.0:
+            leaves |= stamp_ns - self.head[rows, STAMP] > config.max_age_s * 1e9
+        leaves &= self.head[rows, VERSION] <= self._settled
+        return self.remove(rows[leaves])
+
+    def remove(self, rows: Int64) -> Blocks:
+        """Remove blocks and return what they held."""
+        removed = self.copied(rows)
+        for name, slab in self._slabs.items():
+            if name != 'head':
+                slab.array[rows] = 0
+        remove_blocks(rows, self.head, self._table, self._state)
+        return removed
+
+    def copied(self, rows: Int64) -> Blocks:
+        """Return a copy of what blocks hold."""
+        return Blocks(
+            index=self.index(rows),
+            stamp_ns=self.head[rows, STAMP],
+            field=some(self.field, rows),
+            color=some(self.color, rows),
+            votes=some(self.votes, rows),
+            stamps=some(self.stamps, rows),
+        )
+
+    def insert(self, blocks: Blocks) -> None:
+        """
+        Put blocks into the map, in place of what it held there; a change of the map.
+
+        Raises
+        ------
+        MapLimitError
+            If they do not fit; the map holds what it held.
+
+        """
+        rows = self.place(blocks.index)
+        if (rows < 0).any():
+            self.drop_new(rows)
+            raise MapLimitError(
+                f'{len(blocks)} blocks do not fit into max_blocks = {self.config.max_blocks}'
+            )
+        self.touch(rows, 0)
+        self.head[rows, STAMP] = blocks.stamp_ns
+        for name in self._slabs.keys() - {'head'}:
+            getattr(self, name)[rows] = getattr(blocks, name)
+
+    def _floats(self, name: str, width: int) -> Float32:
+        if name not in self._slabs:
+            return np.empty((0, width, self.voxels_per_block), np.float32)
+        flat = self._slabs[name].array.view(np.float32)
+        return flat.reshape(-1, width, self.voxels_per_block)
+
+    def _used_head(self) -> Int64:
+        return self.head[: self._state[hashing.ROWS_USED]]
+
+    @property
+    def _table(self) -> tuple[npt.NDArray[Any], ...]:
+        """The hash table as the kernels take it."""
+        buckets = self._buckets.array.reshape(-1)
+        return self._directory, buckets, self._held, self._local_depth
+
+    def _make_room(self) -> None:
+        """Enlarge what kept place_blocks from placing a block."""
+        num_segments, num_rows = len(self._held), len(self.head)
+        used = int(self._state[hashing.ROWS_USED])
+        if self._state[hashing.FREE_ROW] < 0 and used == num_rows:
+            for slab in reversed(self._slabs.values()):  # the head, which says how many, last
+                if len(slab.array) < 2 * num_rows:
+                    slab.grow(2 * num_rows)
+        elif self._state[hashing.SEGMENTS] == num_segments:
+            self._buckets.grow(2 * num_segments)
+            self._held = np.append(self._held, np.zeros_like(self._held))
+            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+        elif self._state[hashing.DEPTH] < MAX_DEPTH:
+            self._directory = np.repeat(self._directory, 2)
+            self._state[hashing.DEPTH] += 1
+        else:
+            raise MapLimitError(f'{self.num_blocks} blocks: the hash table is full')
+
+
+def some(array: npt.NDArray[Any], rows: Int64) -> Any:
+    """Return a copy of some rows, or of none where the channel is not kept."""
+    return array[rows] if len(array) else array.copy()
+
+
+def block_keys(index: npt.NDArray[Any]) -> Int64:
+    """Return the keys of blocks, (...,) int64; -1 for an index beyond 20 bits."""
+    place = index.astype(np.int64) + INDEX_OFFSET
+    within = ((place >= 0) & (place <= INDEX_MASK)).all(axis=-1)
+    x, y, z = (place[..., axis] for axis in range(3))
+    keys: Int64 = np.where(within, x << 2 * INDEX_BITS | y << INDEX_BITS | z, -1)
+    return keys
+
+
+def block_index(keys: Int64) -> Int64:
+    """Return the blocks that keys stand for, (..., 3) int64."""
+    shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
+    index: Int64 = (keys[..., None] >> shifts & INDEX_MASK) - INDEX_OFFSET
+    return index

@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The hashed blocks: found where they were placed, zero when reused, handed back when removed."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels.blocks import VERSION
+from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap
+
+
+def every_channel(**settings):
+    channels = dict(color=True, tracking=True, semantics='first_k', first_k=3)
+    return BlockMap(TsdfConfig(voxels_per_side=2, **channels, **settings))
+
+
+def indices(count, seed=1, size=40):
+    """Return so many different blocks, in no order."""
+    rng = np.random.default_rng(seed)
+    numbers = rng.permutation(size**3)[:count]
+    return np.stack(np.unravel_index(numbers, (size, size, size)), axis=1) - size // 2
+
+
+def test_keys_and_indices_are_inverse_up_to_the_limit():
+    index = np.array([[0, 0, 0], [-1, 1, -1], [-(1 << 20), (1 << 20) - 1, 7]])
+    assert np.array_equal(block_index(block_keys(index)), index)
+    assert (block_keys(np.array([[1 << 20, 0, 0], [0, 0, -(1 << 20) - 1]])) == -1).all()
+
+
+def test_blocks_are_found_after_any_growth_and_removal():
+    blocks, index = every_channel(), indices(20_000)
+    expected = dict(zip(map(tuple, index), blocks.place(index), strict=True))
+    assert len(set(expected.values())) == len(index) == blocks.num_blocks
+
+    blocks.remove(blocks.find(index[::3]))
+    again = indices(5000, seed=2)
+    blocks.place(again)
+
+    for part in index[::3]:
+        expected.pop(tuple(part))
+    survivors = np.array(list(expected))
+    assert np.array_equal(blocks.find(survivors), list(expected.values()))
+    assert (blocks.find(again) >= 0).all()
+    union = {*expected, *map(tuple, again)}
+    assert blocks.num_blocks == len(union) == len(blocks.rows())
+    assert {*map(tuple, blocks.index(blocks.rows()))} == union
+    assert blocks.find([[100, 0, 0], [1 << 30, 0, 0]]).tolist() == [-1, -1]
+
+
+def test_a_row_that_is_used_again_holds_nothing():
+    blocks = every_channel()
+    rows = blocks.place(indices(300))
+    for array in (blocks.field, blocks.color, blocks.votes, blocks.stamps):
+        array[rows] = 7
+    blocks.remove(rows[:200])
+    fresh = blocks.place(indices(200, seed=3) + 1000)
+    assert {*fresh} == {*rows[:200]}
+    for array in (blocks.field, blocks.color, blocks.votes, blocks.stamps):
+        assert not array[fresh].any()
+        assert (array[rows[200:]] == 7).all()
+
+
+def test_what_is_removed_can_be_put_back():
+    blocks, rng = every_channel(), np.random.default_rng(4)
+    index = indices(50)
+    rows = blocks.place(index)
+    blocks.touch(rows, 123)
+    blocks.field[rows] = rng.random((50, 2, 8))
+    blocks.color[rows] = rng.random((50, 4, 8))
+    blocks.votes[rows] = rng.random((50, 6, 8))
+    blocks.stamps[rows] = rng.integers(0, 1000, (50, 2, 8))
+    before = blocks.copied(rows)
+    removed = blocks.remove(rows)
+    assert blocks.num_blocks == 0
+
+    other = every_channel()
+    other.insert(removed)
+    after = other.copied(other.find(index))
+    for name in ('index', 'stamp_ns', 'field', 'color', 'votes', 'stamps'):
+        assert np.array_equal(getattr(after, name), getattr(before, name)), name
+    assert len(other.changed_since(0)) == 50
+
+
+def test_changes_are_told_since_any_version():
+    blocks = every_channel()
+    rows = blocks.place(indices(10))
+    assert len(blocks.changed_since(0)) == 0  # placed, not changed
+    blocks.touch(rows[:6], 1)
+    seen = blocks.version
+    blocks.touch(rows[4:8], 2)
+    assert np.array_equal(blocks.changed_since(0), np.sort(rows[:8]))
+    assert np.array_equal(blocks.changed_since(seen), np.sort(rows[4:8]))
+    assert blocks.drop_new(rows) == 2
+    assert np.array_equal(blocks.rows(), np.sort(rows[:8]))
+
+
+def test_beyond_the_budget_there_is_no_row():
+    blocks = every_channel(max_blocks=10)
+    rows = blocks.place(indices(30))
+    assert (rows[:10] >= 0).all()
+    assert (rows[10:] == -1).all()
+    assert np.array_equal(blocks.place(indices(30)), rows)
+    full = every_channel()
+    full.touch(full.place(indices(30)), 1)
+    with pytest.raises(MapLimitError, match='max_blocks = 10'):
+        every_channel(max_blocks=10).insert(full.copied(full.rows()))
+
+
+def test_an_index_that_no_key_holds_is_refused():
+    blocks = every_channel()
+    with pytest.raises(MapLimitError, match='local frame'):
+        blocks.place([[0, 0, 0], [0, 1 << 20, 0]])
+    assert blocks.num_blocks == 0
+
+
+def test_neighbours_are_found_by_their_offsets():
+    blocks = every_channel()
+    corner = np.array([[-1, -1, -1]])
+    cube = np.array([(x, y, z) for z in (0, 1) for y in (0, 1) for x in (0, 1)]) - 1
+    rows = blocks.place(cube[:-1])
+    found = blocks.neighbours(blocks.find(corner))
+    assert np.array_equal(found[0, :-1], rows)
+    assert found[0, -1] == -1
+    assert np.array_equal(blocks.neighbours(rows[:1], [[0, 0, 0], [0, 0, 5]]), [[rows[0], -1]])
+
+
+def test_rows_not_in_use_are_never_changed():
+    blocks = every_channel()
+    rows = blocks.place(indices(20))
+    blocks.touch(rows, 1)
+    blocks.remove(rows[:5])
+    assert np.array_equal(blocks.changed_since(0), np.sort(rows[5:]))
+    assert (blocks.head[rows[5:], VERSION] == 1).all()
