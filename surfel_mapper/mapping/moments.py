@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET
+from surfel_mapper.kernels.layout import BITS, INDEX_BITS, INDEX_MASK, INDEX_OFFSET
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -101,10 +101,27 @@ class ScanMoments:
         """1 where the view is a sum over points already, 0 where it is one point's."""
         return int(self.view.dtype == np.int64)
 
-    def first(self, num_voxels: int) -> ScanMoments:
-        """Return the moments of the first so many voxels."""
+    def select(self, voxels: slice | npt.NDArray[Any]) -> ScanMoments:
+        """Return the moments of some voxels: a slice, a mask or row numbers."""
         names = ('key', 'count', 'total', 'product', 'view', 'channels')
-        return replace(self, **{name: getattr(self, name)[:num_voxels] for name in names})
+        return replace(self, **{name: getattr(self, name)[voxels] for name in names})
+
+
+def point_keys(
+    points: npt.NDArray[Any], T_map_sensor: npt.NDArray[np.float64], voxel_size_m: float
+) -> npt.NDArray[np.int64]:
+    """Return the key of the voxel of each point, (N,); -1 where it is in none."""
+    x, y, z = points.astype(np.float64).T
+    scale = (1 << BITS) / voxel_size_m
+    with np.errstate(invalid='ignore'):  # nan and inf are in no voxel
+        lattice = [
+            np.floor((((r[0] * x + r[1] * y) + r[2] * z) + r[3]) * scale) for r in T_map_sensor[:3]
+        ]
+        inside = np.all([np.abs(a) < INDEX_OFFSET << BITS for a in lattice], axis=0)
+    keys = np.full(len(points), -1)
+    index = [a[inside].astype(np.int64) >> BITS for a in lattice]
+    keys[inside] = pack_keys(np.stack(index, axis=1))
+    return keys
 
 
 def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:

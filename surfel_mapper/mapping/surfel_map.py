@@ -32,7 +32,7 @@ from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.surfels import rows_changed_at
 from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.levels import coarse_moments
-from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
@@ -354,9 +354,21 @@ class SurfelMap:
         ]
         return self._derive(np.concatenate(parts) if parts else np.empty(0, np.int32))
 
-    def moments(self) -> ScanMoments:
-        """Return the exact moments of all voxels, sorted by voxel; a copy."""
-        chosen = self._table.changed_after(-1, 1)
+    def moments(self, voxel_index: npt.NDArray[Any] | None = None) -> ScanMoments:
+        """
+        Return the exact moments of voxels, sorted by voxel; a copy.
+
+        Parameters
+        ----------
+        voxel_index : (K, 3) int, optional
+            Of these voxels, as far as the map holds them; without it, of all.
+
+        """
+        if voxel_index is None:
+            chosen = self._table.changed_after(-1, 1)
+        else:
+            chosen = self._table.find(np.unique(pack_keys(voxel_index)))
+            chosen = chosen[chosen >= 0]
         chosen = chosen[np.argsort(self._table.rows[chosen, layout.KEY])]
         rows = self._table.rows[chosen]
         return ScanMoments(

@@ -103,7 +103,7 @@ class VoxelTable:
                 changed,
             )
             if done < len(moments):
-                self._make_room_or_undo(moments.first(done), version)
+                self._make_room_or_undo(moments.select(slice(done)), version)
         if self._channels:
             if len(self._channels.array) < len(self.rows):
                 self._channels.grow(len(self.rows))

@@ -12,14 +12,14 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import WindowConfig
-from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.moments import point_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 
@@ -172,6 +172,35 @@ class SlidingWindow:
         for scan in scans:
             self._append(scan)
 
+    def drop_voxels(
+        self, voxel_index: npt.NDArray[Any], min_points: int = 1
+    ) -> npt.NDArray[np.int32]:
+        """
+        Empty voxels of the map, and take them out of the scans, so that these leave exactly.
+
+        Points that are kept go with their voxels.
+
+        Parameters
+        ----------
+        voxel_index : (K, 3) int
+            The voxels; those that the map does not hold are passed over.
+        min_points : int
+            From how many points on a voxel counts for the result.
+
+        Returns
+        -------
+        (E, 3) int32
+            Indices of the voxels that held ``min_points`` and are empty now.
+
+        """
+        held = self._map.moments(voxel_index)
+        if not len(held):
+            return np.empty((0, 3), np.int32)
+        fallen = self._map.remove(held, min_points)
+        self._scans = deque((without(scan, held.key), m) for scan, m in self._scans)
+        self._nbytes = sum(scan.nbytes for scan in self)
+        return fallen
+
     def clear(self) -> None:
         """Forget all scans and clear the map."""
         self._forget()
@@ -212,3 +241,21 @@ class SlidingWindow:
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')
+
+
+def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
+    """Return a scan without the voxels of some sorted keys."""
+    hit = contains(keys, scan.moments.key)
+    if not hit.any():
+        return scan
+    points = scan.points
+    if points is not None:
+        size_m = scan.moments.voxel_size_m
+        points = points[~contains(keys, point_keys(points, scan.T_map_sensor, size_m))]
+    return replace(scan, moments=scan.moments.select(~hit), points=points)
+
+
+def contains(keys: npt.NDArray[np.int64], wanted: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return which of the wanted keys are among the keys, which are sorted."""
+    at = np.searchsorted(keys, wanted)
+    return np.asarray(keys[np.minimum(at, len(keys) - 1)] == wanted)

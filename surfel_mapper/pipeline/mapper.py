@@ -37,6 +37,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_queue import ScanQueue
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.poses import TransformBuffer
@@ -203,6 +204,23 @@ class Mapper:
         """Forget all scans, waiting ones too (counted); poses and counts stay."""
         self._queue.drop_all('cleared', 'the map was cleared')
         self.window.clear()
+
+    def clear_region(self, region: Region) -> npt.NDArray[np.int32]:
+        """
+        Empty the voxels whose centres are in a part of space, for good.
+
+        The scans of the window lose them too, so that what leaves later leaves exactly.
+
+        Returns
+        -------
+        (E, 3) int32
+            Indices of the surfels (``map.min_points``) that are gone.
+
+        """
+        voxel_index = self.map.moments().voxel_index
+        centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
+        inside = voxel_index[region.contains(centers)]
+        return self.window.drop_voxels(inside, self.config.map.min_points)
 
     def reconfigure(self, config: Config) -> None:
         """

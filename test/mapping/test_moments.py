@@ -276,7 +276,7 @@ def test_bytes_and_first_rows_are_of_the_arrays():
     key, count, total, product, view = moments.arrays
     assert moments.nbytes == sum(a.nbytes for a in (key, count, total, product, view))
     assert moments.nbytes == 78 * len(moments)
-    some = moments.first(100)
+    some = moments.select(slice(100))
     expected = dict(list(as_twin(moments).items())[:100])
     assert as_twin(some) == expected
     assert isinstance(some, ScanMoments)

@@ -13,9 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from test import reference
@@ -217,3 +220,74 @@ def test_a_cleared_window_is_as_a_new_one():
     for number in range(10):
         window.insert(scan_at(surfel_map, number, number, [number, 0, 0]))
     assert len(window) == 4
+
+
+# Clearing
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 10**6), st.booleans())
+def test_voxels_that_are_dropped_leave_the_map_and_the_scans(seed, keep_points):
+    rng = np.random.default_rng(seed)
+    window, surfel_map = window_with({'max_scans': 4}, keep_points=keep_points)
+    for number in range(6):
+        window.insert(scan_at(surfel_map, number, number, rng.normal(size=3), keep_points))
+    held = surfel_map.moments()
+    chosen = held.voxel_index[rng.random(len(held)) < 0.4]
+    counts = dict(zip(map(tuple, held.voxel_index.tolist()), held.count.tolist(), strict=True))
+
+    fallen = window.drop_voxels(np.concatenate([chosen, [[900, 0, 0]], chosen[:1]]), 3)
+
+    gone = {tuple(index) for index in chosen.tolist()}
+    assert {tuple(index) for index in fallen.tolist()} == {v for v in gone if counts[v] >= 3}
+    left = {tuple(index) for index in surfel_map.moments().voxel_index.tolist()}
+    assert left == set(counts) - gone
+    assert window.nbytes == sum(scan.nbytes for scan in window)
+    alone = SurfelMap(0.5)
+    for scan in window:
+        alone.insert(scan.moments)
+        if keep_points:
+            pose = scan.T_map_sensor
+            again = surfel_map.reduce(scan.points, pose, origin=pose[:3, 3])
+            assert sorted(again.key) == sorted(scan.moments.key)
+            assert again.num_points == scan.moments.num_points
+    assert surfel_map.digest() == alone.digest()
+    for number in range(6, 10):
+        window.insert(scan_at(surfel_map, number, number, (50.0, 0.0, 0.0), keep_points))
+    assert len(surfel_map.moments(chosen)) == 0
+    assert surfel_map.moments().voxel_index[:, 0].min() > 80
+
+
+def test_what_settled_scans_left_is_dropped_too():
+    window, surfel_map = window_with({})
+    for number in range(3):
+        window.insert(scan_at(surfel_map, number, number, (0.0, 0.0, 0.0)))
+    window.drop_voxels(surfel_map.moments().voxel_index)
+    assert surfel_map.num_voxels == 0
+    assert len(window) == 3
+    assert window.newest.moments.num_points == 0
+
+
+def test_dropping_nothing_changes_nothing():
+    window, surfel_map = window_with({'max_scans': 3})
+    window.insert(scan_at(surfel_map, 0, 0.0, (0.0, 0.0, 0.0)))
+    digest, version = surfel_map.digest(), surfel_map.version
+    assert window.drop_voxels(np.empty((0, 3), int)).shape == (0, 3)
+    assert window.drop_voxels(np.array([[500, 500, 500]])).shape == (0, 3)
+    assert (surfel_map.digest(), surfel_map.version) == (digest, version)
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_points_are_found_in_the_voxels_that_the_map_puts_them_in(dtype):
+    rng = np.random.default_rng(5)
+    points = rng.normal(scale=40.0, size=(5000, 3)).astype(dtype)
+    points[:4] = [[np.nan, 0, 0], [0, np.inf, 0], [0, 0, 1e9], [-1e30, 0, 0]]
+    pose = pose_matrix(rng.normal(scale=200.0, size=3), Rotation.random(rng=rng).as_quat())
+    surfel_map = SurfelMap(0.3)
+    moments = surfel_map.reduce(points, pose)
+    keys = point_keys(points, pose, 0.3)
+    assert (keys[:4] == -1).all()
+    found, counts = np.unique(keys[4:], return_counts=True)
+    assert dict(zip(found, counts, strict=True)) == dict(
+        zip(moments.key, moments.count, strict=True)
+    )

@@ -22,6 +22,7 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, interpolate, pose_matrix
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
 from test import reference
 
@@ -616,6 +617,24 @@ def test_the_summary_states_what_was_done_and_what_the_map_is():
     assert summary['voxel_size_m'] == 0.5
 
 
+def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
+    mapper = mapper_with(window__max_scans=2, map__min_points=2)
+    for stamp_s in (1.0, 2.0):
+        add_pose(mapper, stamp_s)
+        insert(mapper, scan_at(stamp_s))
+    before = mapper.map.surfels(2)
+    gone = mapper.clear_region(Ball((0.0, 0.0, 1.0), 2.0))
+    centers = (before.voxel_index + 0.5) * 0.5
+    inside = np.linalg.norm(centers - [0.0, 0.0, 1.0], axis=1) <= 2.0
+    assert 0 < inside.sum() < len(before)
+    assert sorted(gone.tolist()) == sorted(before.voxel_index[inside].tolist())
+    add_pose(mapper, 3.0, x=100.0)
+    (update,) = insert(mapper, scan_at(3.0))  # evicts the first, without what was cleared
+    removed = update.removed_voxel_index.tolist()
+    assert not set(map(tuple, gone.tolist())) & set(map(tuple, removed))
+    assert_counts_add_up(mapper)
+
+
 COMPILED_BEFORE_THE_FIRST_SCAN = """
 import importlib, pkgutil
 import numpy as np
@@ -657,7 +676,7 @@ print({name: kinds for name, kinds in after.items() if kinds != before[name]})
 def test_after_the_warm_up_nothing_is_compiled_any_more():
     done = subprocess.run(
         [sys.executable, '-c', COMPILED_BEFORE_THE_FIRST_SCAN],
-        cwd=Path(__file__).parents[1],
+        cwd=Path(__file__).parents[2],
         capture_output=True,
         text=True,
         check=False,

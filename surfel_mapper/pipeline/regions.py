@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of space, in the fixed frame, of which a map can be cleared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+
+class Region(Protocol):
+    """A part of space."""
+
+    def contains(self, points: Floats) -> Mask:
+        """Return which points (N, 3), m, are inside, (N,) bool."""
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """
+    A box along the axes.
+
+    Raises
+    ------
+    ValueError
+        If a bound is nan, or a lower one is not below its upper one.
+
+    """
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        """Check the bounds."""
+        if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
+            raise ValueError(f'box from {self.low} to {self.high}, expected low below high')
+
+    def contains(self, points: Floats) -> Mask:
+        """Return which points are inside, the faces included."""
+        inside = (points >= self.low) & (points <= self.high)
+        return np.asarray(inside.all(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Ball:
+    """
+    All within a radius.
+
+    Raises
+    ------
+    ValueError
+        If the radius is not positive, or something is not finite.
+
+    """
+
+    center: tuple[float, float, float]
+    radius_m: float
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        if not (self.radius_m > 0.0 and np.isfinite([*self.center, self.radius_m]).all()):
+            raise ValueError(
+                f'radius {self.radius_m} m about {self.center}, expected finite and positive'
+            )
+
+    def contains(self, points: Floats) -> Mask:
+        """Return which points are inside, the surface included."""
+        offset = points - self.center
+        return np.asarray((offset * offset).sum(axis=1) <= self.radius_m**2)
+
+
+@dataclass(frozen=True, slots=True)
+class Prism:
+    """
+    All above and below a polygon in x and y, its last corner joined to the first.
+
+    Where edges cross, a point is inside if a ray from it crosses an odd number of them.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than three corners, or one is not finite.
+
+    """
+
+    corners: tuple[tuple[float, float], ...]
+
+    def __post_init__(self) -> None:
+        """Check the corners."""
+        if len(self.corners) < 3:
+            raise ValueError(f'polygon of {len(self.corners)} corners, expected 3 or more')
+        if not np.isfinite(self.corners).all():
+            raise ValueError(f'polygon {self.corners}, expected finite corners')
+
+    def contains(self, points: Floats) -> Mask:
+        """Return which points are inside."""
+        x, y = points[:, 0], points[:, 1]
+        inside = np.zeros(len(points), bool)
+        ends = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
+        for (x0, y0), (x1, y1) in ends:
+            if y0 == y1:
+                continue  # a ray along x crosses no edge along x
+            passes = (y0 <= y) != (y1 <= y)
+            inside ^= passes & (x < x0 + (y - y0) / (y1 - y0) * (x1 - x0))
+        return inside

@@ -1,0 +1,59 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Regions: which points are inside, by hand and by other tests of the same; what is refused."""
+
+from matplotlib.path import Path as Polygon
+import numpy as np
+import pytest
+
+from surfel_mapper.pipeline.regions import Ball, Box, Prism
+
+POINTS = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))
+
+
+def test_a_box_contains_what_is_between_its_faces_and_on_them():
+    points = np.array([[0.0, 0, 0], [1, 2, 3], [0.5, 1, 1], [1.1, 1, 1], [0.5, -0.1, 1]])
+    inside = Box((0.0, 0.0, 0.0), (1.0, 2.0, 3.0)).contains(points)
+    assert inside.tolist() == [True, True, True, False, False]
+
+
+def test_a_box_may_be_without_an_end():
+    box = Box((-np.inf, -np.inf, 0.0), (np.inf, np.inf, np.inf))
+    assert np.array_equal(box.contains(POINTS), POINTS[:, 2] >= 0.0)
+
+
+def test_a_ball_contains_what_is_within_its_radius():
+    distances = np.linalg.norm(POINTS - [0.5, 0.0, -0.5], axis=1)
+    assert np.array_equal(Ball((0.5, 0.0, -0.5), 1.2).contains(POINTS), distances <= 1.2)
+
+
+@pytest.mark.parametrize(
+    'corners',
+    [
+        ((-1.0, -1.0), (1.5, -0.5), (0.3, 1.7)),
+        ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (0.0, 0.1), (-1.0, 1.0)),
+        ((0.0, -1.0), (1.0, -1.0), (1.0, 0.0), (0.0, 0.0)),
+    ],
+)
+@pytest.mark.parametrize('turned', [1, -1])
+def test_a_prism_contains_what_is_in_its_polygon_at_any_height(corners, turned):
+    expected = Polygon([*corners, corners[0]], closed=True).contains_points(POINTS[:, :2])
+    assert np.array_equal(Prism(corners[::turned]).contains(POINTS), expected)
+    assert expected.any()
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (lambda: Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)), 'expected low below high'),
+        (lambda: Box((0.0, np.nan, 0.0), (1.0, 1.0, 1.0)), 'expected low below high'),
+        (lambda: Ball((0.0, 0.0, 0.0), 0.0), 'radius 0.0 m .* positive'),
+        (lambda: Ball((0.0, np.inf, 0.0), 1.0), 'expected finite'),
+        (lambda: Ball((0.0, 0.0, 0.0), np.nan), 'radius nan'),
+        (lambda: Prism(((0.0, 0.0), (1.0, 1.0))), 'of 2 corners, expected 3'),
+        (lambda: Prism(((0.0, 0.0), (1.0, np.nan), (1.0, 0.0))), 'expected finite corners'),
+    ],
+)
+def test_a_region_that_is_none_is_refused(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
