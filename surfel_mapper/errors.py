@@ -12,6 +12,7 @@ Every exception that this package raises on purpose.
         MapLimitError      a voxel index or a count beyond what the integers hold     (ValueError)
         NotInMapError      removing moments that the map does not hold                (ValueError)
       FilterError          a filter cannot work on a scan                             (ValueError)
+      AlignmentError       scans, pairs or poses from which no poses follow           (ValueError)
       BagError             a bag that cannot be read, or lacks what is asked of it
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
       DependencyError      an optional package is missing; says how to install it     (ImportError)
@@ -54,6 +55,10 @@ class NotInMapError(MapError, ValueError):
 
 class FilterError(SurfelMapperError, ValueError):
     """A filter cannot work on a scan: a column is missing, or a value is not what it takes."""
+
+
+class AlignmentError(SurfelMapperError, ValueError):
+    """A graph of scans, its pairs or its poses are not fit for alignment; nothing has changed."""
 
 
 class BagError(SurfelMapperError):

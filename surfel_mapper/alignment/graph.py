@@ -1,0 +1,218 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Graph: scans with their poses, and which of their points belong together.
+
+Vertex 0 is the reference, at the origin for good. There is at most one edge from a vertex to
+another, and one back. Everything is checked on its way in and copied, so that what is in a graph
+is consistent at any time and the sums over the pairs of an edge need be taken only once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import AlignmentError
+from surfel_mapper.kernels.edges import (
+    fit_residual,
+    NUM_MOMENTS,
+    NUM_WEIGHTED,
+    pair_moments,
+    weighted_moments,
+)
+
+Floats = npt.NDArray[np.float64]
+Pairs = npt.NDArray[np.int32]
+Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
+
+
+@dataclass(slots=True)
+class Edge:
+    """Pairs of points of two vertices, their weights if any, and the sums over them."""
+
+    pairs: Pairs
+    weights: Floats | None = None
+    moments: Floats | None = None
+
+
+class Graph:
+    """Vertices are clouds and poses, edges are pairs of their points; see LUM."""
+
+    def __init__(self) -> None:
+        """Make a graph without vertices."""
+        self._points: list[Points] = []
+        self._poses: list[Floats] = []
+        self._edges: dict[tuple[int, int], Edge] = {}
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of vertices."""
+        return len(self._points)
+
+    @property
+    def ends(self) -> npt.NDArray[np.int64]:
+        """Source and target of every edge, (E, 2), in the order in which they came."""
+        return np.array(list(self._edges), np.int64).reshape(-1, 2)
+
+    @property
+    def is_weighted(self) -> npt.NDArray[np.bool_]:
+        """Whether the pairs of each edge have weights, (E,)."""
+        return np.array([edge.weights is not None for edge in self._edges.values()], bool)
+
+    @property
+    def poses(self) -> Floats:
+        """Poses of all vertices, (V, 6); a copy."""
+        return np.array(self._poses).reshape(-1, 6)
+
+    def add_vertex(self, points: npt.ArrayLike, pose: npt.ArrayLike | None) -> int:
+        """Add a cloud at a pose, at the origin without one; return its number."""
+        number = self.num_vertices
+        checked_points, checked = _points(number, points), _pose(number, pose)
+        self._points.append(checked_points)
+        self._poses.append(checked)
+        return number
+
+    def points(self, vertex: int) -> Points:
+        """Return the points of a vertex; they cannot be written to."""
+        return self._points[self._known(vertex)]
+
+    def set_points(self, vertex: int, points: npt.ArrayLike) -> None:
+        """Give a vertex other points; its pairs stay, so all that they name must be there."""
+        checked = _points(self._known(vertex), points)
+        for ends, edge in self._edges.items():
+            for column, end in enumerate(ends):
+                if end == vertex:
+                    _check_rows(ends, vertex, edge.pairs[:, column], len(checked))
+        self._points[vertex] = checked
+        for ends, edge in self._edges.items():
+            if vertex in ends:
+                edge.moments = None
+
+    def pose(self, vertex: int) -> Floats:
+        """Return the pose (6,) of a vertex; a copy."""
+        return np.array(self._poses[self._known(vertex)])
+
+    def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:
+        """Move a vertex other than the reference."""
+        if self._known(vertex) == 0:
+            raise AlignmentError('vertex 0 is the reference: its pose is the origin for good')
+        self._poses[vertex] = _pose(vertex, pose)
+
+    def set_poses(self, poses: Floats) -> None:
+        """Move all vertices, to poses that are known to be right."""
+        self._poses = list(np.array(poses))
+
+    def edge(self, source: int, target: int) -> Edge:
+        """Return an edge."""
+        ends = (self._known(source), self._known(target))
+        if ends not in self._edges:
+            raise AlignmentError(f'there is no edge {source} -> {target}')
+        return self._edges[ends]
+
+    def set_edge(
+        self, source: int, target: int, pairs: npt.ArrayLike, weights: npt.ArrayLike | None
+    ) -> None:
+        """Add or replace an edge."""
+        ends = (self._known(source), self._known(target))
+        if source == target:
+            raise AlignmentError(f'edge {source} -> {target}: from a vertex to itself')
+        rows = np.asarray(pairs)
+        if rows.size == 0:
+            rows = np.empty((0, 2), np.int32)
+        if rows.ndim != 2 or rows.shape[1] != 2 or rows.dtype.kind not in 'iu':
+            raise AlignmentError(
+                f'edge {source} -> {target}: pairs of shape {rows.shape} and type {rows.dtype}, '
+                'expected (K, 2) whole numbers'
+            )
+        for column, end in enumerate(ends):
+            _check_rows(ends, end, rows[:, column], len(self._points[end]))
+        self._edges[ends] = Edge(
+            np.array(rows, np.int32, order='C'), _weights(ends, weights, len(rows))
+        )
+
+    def moments(self, weighted: bool) -> Floats:
+        """Return the sums over the pairs of the edges with weights, or of those without."""
+        rows = [
+            self._sum(ends, edge)
+            for ends, edge in self._edges.items()
+            if (edge.weights is not None) == weighted
+        ]
+        return np.array(rows).reshape(-1, NUM_WEIGHTED if weighted else NUM_MOMENTS)
+
+    def residual(
+        self, T_source: Floats, T_target: Floats, center: Floats, motion: Floats
+    ) -> Floats:
+        """Return what is left of the gaps after motions (E, 6) about centers, squared, m^2."""
+        result = np.zeros(len(self._edges))
+        for row, ((s, t), edge) in enumerate(self._edges.items()):
+            about = (T_source[row], T_target[row], center[row], motion[row])
+            result[row] = fit_residual(self._points[s], self._points[t], edge.pairs, *about)
+        return result
+
+    def _sum(self, ends: tuple[int, int], edge: Edge) -> Floats:
+        if edge.moments is None:
+            source, target = (self._points[end] for end in ends)
+            if edge.weights is None:
+                edge.moments = np.empty(NUM_MOMENTS)
+                pair_moments(source, target, edge.pairs, edge.moments)
+            else:
+                edge.moments = np.empty(NUM_WEIGHTED)
+                weighted_moments(source, target, edge.pairs, edge.weights, edge.moments)
+        return edge.moments
+
+    def _known(self, vertex: int) -> int:
+        """Return a vertex that is there."""
+        if not 0 <= vertex < self.num_vertices:
+            raise AlignmentError(f'there is no vertex {vertex} among {self.num_vertices}')
+        return vertex
+
+
+def _points(vertex: int, points: npt.ArrayLike) -> Points:
+    array = np.asarray(points)
+    if array.ndim != 2 or array.shape[1] != 3 or array.dtype.kind not in 'fiu':
+        raise AlignmentError(
+            f'vertex {vertex}: points of shape {array.shape} and type {array.dtype}, '
+            'expected (N, 3) numbers'
+        )
+    if not len(array):
+        raise AlignmentError(f'vertex {vertex}: no points')
+    copy = np.array(array, np.float32 if array.dtype == np.float32 else np.float64, order='C')
+    copy.setflags(write=False)
+    return copy
+
+
+def _pose(vertex: int, pose: npt.ArrayLike | None) -> Floats:
+    array = np.zeros(6) if pose is None else np.array(pose, np.float64)
+    if array.shape != (6,) or not np.isfinite(array).all():
+        raise AlignmentError(
+            f'vertex {vertex}: pose {array.tolist()}, expected 6 finite numbers '
+            '(x y z in m, roll pitch yaw in rad)'
+        )
+    return array
+
+
+def _weights(ends: tuple[int, int], weights: npt.ArrayLike | None, num: int) -> Floats | None:
+    if weights is None:
+        return None
+    array = np.array(weights, np.float64, order='C')
+    if array.shape != (num, 3, 3) or not np.isfinite(array).all():
+        raise AlignmentError(
+            f'edge {ends[0]} -> {ends[1]}: weights of shape {array.shape}, '
+            f'expected ({num}, 3, 3), all finite'
+        )
+    return array
+
+
+def _check_rows(
+    ends: tuple[int, int], vertex: int, rows: npt.NDArray[np.integer], num_points: int
+) -> None:
+    """Refuse pairs that name points which a vertex does not have."""
+    beyond = np.flatnonzero((rows < 0) | (rows >= num_points))
+    if len(beyond):
+        raise AlignmentError(
+            f'edge {ends[0]} -> {ends[1]}: pair {beyond[0]} names point {rows[beyond[0]]} of '
+            f'vertex {vertex}, which has {num_points}'
+        )

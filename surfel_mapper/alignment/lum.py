@@ -1,0 +1,275 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+LUM: the poses of many scans that agree best with each other, all at once.
+
+The graph and its names are those of pcl::registration::LUM, whose results ``jacobian='pcl'``
+gives. The default differs where PCL fails: it takes the Jacobian of the poses that are used and
+so converges at any yaw and after full turns, weighs exact pairs instead of dropping them, lets
+the edges of both directions act on both scans, and works in float64 with a sparse solver, so
+that a graph 1 km from the origin, or of a thousand scans, is none that differs.
+
+Source: Lu and Milios 1997.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+import logging
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.alignment.angles import transforms
+from surfel_mapper.alignment.edge_terms import edge_sums, EdgeTerms, exact_terms, pcl_terms
+from surfel_mapper.alignment.graph import Graph, Points
+from surfel_mapper.alignment.solver import components, exact_step, pcl_step
+from surfel_mapper.alignment.weighted_terms import weighted_terms
+from surfel_mapper.errors import AlignmentError
+
+_log = logging.getLogger(__name__)
+
+Floats = npt.NDArray[np.float64]
+Ends = tuple[int, int]
+
+JACOBIANS = ('exact', 'pcl')
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LumResult:
+    """
+    How an alignment ended.
+
+    Attributes
+    ----------
+    converged : bool
+        Whether the last step was below the threshold.
+    iterations : int
+        Steps taken.
+    residuals : mapping of (source, target) to float, m
+        Root of the mean squared distance of the pairs of every edge at the poses found; nan
+        without pairs.
+    dropped : mapping of (source, target) to str
+        Edges that did not count in the last step, and why.
+    unconnected : tuple of int
+        Vertices that no edge that counts connects to vertex 0: they stay where they were.
+    open_axes : mapping of (source, target) to (K, 3) float64
+        Edges whose pairs lie on a line but for their noise, and that line: the rotation about it
+        was left to other edges.
+
+    """
+
+    converged: bool
+    iterations: int
+    residuals: Mapping[Ends, float]
+    dropped: Mapping[Ends, str]
+    unconnected: tuple[int, ...]
+    open_axes: Mapping[Ends, Floats] = field(default_factory=dict)
+
+
+class LUM:
+    """
+    Aligns the clouds of a graph, given which of their points belong together.
+
+    Poses are x y z in m, roll pitch yaw in rad, T = translation Rz(yaw) Ry(pitch) Rx(roll), of
+    the cloud in the frame of vertex 0. Whatever is refused changes nothing.
+
+    Parameters
+    ----------
+    max_iterations : int
+        At most so many steps; one or more.
+    convergence_threshold : float
+        Steps end when poses change by at most so much, the mean over the vertices other than 0
+        of the length of the change (m and rad together).
+    jacobian : str
+        ``exact``, or ``pcl`` for the steps that PCL takes.
+
+    Raises
+    ------
+    AlignmentError
+        If an argument is out of bounds.
+
+    """
+
+    def __init__(
+        self,
+        *,
+        max_iterations: int = 5,
+        convergence_threshold: float = 0.0,
+        jacobian: str = 'exact',
+    ) -> None:
+        """Make an empty graph."""
+        if jacobian not in JACOBIANS:
+            raise AlignmentError(f'jacobian {jacobian!r}, expected one of {", ".join(JACOBIANS)}')
+        self.graph = Graph()
+        self.jacobian = jacobian
+        self.max_iterations = max_iterations
+        self.convergence_threshold = convergence_threshold
+
+    @property
+    def num_vertices(self) -> int:
+        """Number of clouds in the graph."""
+        return self.graph.num_vertices
+
+    @property
+    def max_iterations(self) -> int:
+        """At most so many steps."""
+        return self._max_iterations
+
+    @max_iterations.setter
+    def max_iterations(self, value: int) -> None:
+        if value < 1:
+            raise AlignmentError(f'max_iterations {value}, expected one or more')
+        self._max_iterations = int(value)
+
+    @property
+    def convergence_threshold(self) -> float:
+        """Steps end when poses change by at most so much on average."""
+        return self._convergence_threshold
+
+    @convergence_threshold.setter
+    def convergence_threshold(self, value: float) -> None:
+        if not 0.0 <= value < math.inf:
+            raise AlignmentError(f'convergence_threshold {value}, expected zero or more, finite')
+        self._convergence_threshold = float(value)
+
+    def add_point_cloud(self, points: npt.ArrayLike, pose: npt.ArrayLike | None = None) -> int:
+        """
+        Add a cloud (N, 3), m, at a pose (6,) or at the origin; return its vertex.
+
+        The first one becomes the reference, at the origin; a pose given to it is ignored with a
+        warning. Points may hold nan; pairs of such points are passed over.
+        """
+        if pose is not None and not self.num_vertices:
+            _log.warning('the pose of vertex 0 is ignored: it is the reference, at the origin')
+            pose = None
+        return self.graph.add_vertex(points, pose)
+
+    def point_cloud(self, vertex: int) -> Points:
+        """Return the points of a vertex in their own frame; they cannot be written to."""
+        return self.graph.points(vertex)
+
+    def set_point_cloud(self, vertex: int, points: npt.ArrayLike) -> None:
+        """Give a vertex other points; correspondences stay as they are."""
+        self.graph.set_points(vertex, points)
+
+    def pose(self, vertex: int) -> Floats:
+        """Return the pose (6,) of a vertex."""
+        return self.graph.pose(vertex)
+
+    def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:
+        """Set the pose (6,) of a vertex other than 0."""
+        self.graph.set_pose(vertex, pose)
+
+    def transformation(self, vertex: int) -> Floats:
+        """Return the pose of a vertex as T_0_vertex, (4, 4)."""
+        return np.asarray(transforms(self.pose(vertex)[None])[0])
+
+    def transformed_cloud(self, vertex: int) -> Floats:
+        """Return the points of a vertex in the frame of vertex 0, (N, 3)."""
+        T = self.transformation(vertex)
+        return np.asarray(self.point_cloud(vertex) @ T[:3, :3].T + T[:3, 3])
+
+    def concatenated_cloud(self) -> Floats:
+        """Return the points of all vertices in the frame of vertex 0, (N, 3)."""
+        clouds = [self.transformed_cloud(vertex) for vertex in range(self.num_vertices)]
+        return np.concatenate([np.empty((0, 3)), *clouds])
+
+    def set_correspondences(
+        self,
+        source: int,
+        target: int,
+        pairs: npt.ArrayLike,
+        weights: npt.ArrayLike | None = None,
+    ) -> None:
+        """
+        Say which points of two clouds belong together, in place of what was said before.
+
+        Parameters
+        ----------
+        source, target : int
+            Vertices.
+        pairs : (K, 2) int
+            Row of a point of the source, row of a point of the target.
+        weights : (K, 3, 3) float, optional
+            By what the gap of each pair counts in which direction, symmetric, in the frame of
+            the target. Only their ratios matter.
+
+        """
+        self.graph.set_edge(source, target, pairs, weights)
+
+    def correspondences(self, source: int, target: int) -> npt.NDArray[np.int32]:
+        """Return the pairs (K, 2) of an edge; a copy."""
+        return np.array(self.graph.edge(source, target).pairs)
+
+    def compute(self) -> LumResult:
+        """
+        Find the poses; they are in the graph afterwards.
+
+        Raises
+        ------
+        AlignmentError
+            If there are fewer than two vertices, or no finite poses follow; in that case the
+            poses are those from before. With ``jacobian='pcl'`` also for pairs with weights.
+
+        """
+        num_others = self.num_vertices - 1
+        if num_others < 1:
+            raise AlignmentError(f'{self.num_vertices} vertices, expected two or more')
+        ends, poses = self.graph.ends, self.graph.poses
+        step = exact_step if self.jacobian == 'exact' else pcl_step
+        converged, iterations = False, 0
+        while iterations < self.max_iterations and not converged:
+            terms, _ = self._terms(ends, poses)
+            moved = step(poses, ends, terms)
+            change = float(np.sqrt(((moved - poses) ** 2).sum(axis=1)).sum())
+            if not math.isfinite(change):
+                raise AlignmentError('the edges do not determine the poses: no finite solution')
+            poses, iterations = moved, iterations + 1
+            converged = change <= self.convergence_threshold * num_others
+        self.graph.set_poses(poses)
+        return self._result(converged, iterations, ends, terms)
+
+    def _terms(self, ends: npt.NDArray[np.int64], poses: Floats) -> tuple[EdgeTerms, Floats]:
+        """Return the terms of all edges at some poses, and the root mean square of the gaps."""
+        weighted = self.graph.is_weighted
+        if weighted.any() and self.jacobian == 'pcl':
+            raise AlignmentError("pairs with weights, which PCL has not; use jacobian='exact'")
+        T = transforms(poses)
+        T_source, T_target = T[ends[:, 0]], T[ends[:, 1]]
+        plain = ~weighted
+        sums = edge_sums(self.graph.moments(False), T_source[plain], T_target[plain])
+        if self.jacobian == 'pcl':
+            return pcl_terms(sums, partial(self.graph.residual, T_source, T_target)), sums.rms
+        terms = exact_terms(sums)
+        if not weighted.any():
+            return terms, sums.rms
+        others, rms = weighted_terms(
+            self.graph.moments(True), T_source[weighted], T_target[weighted]
+        )
+        order = np.argsort(np.concatenate([np.flatnonzero(plain), np.flatnonzero(weighted)]))
+        return terms.joined(others, order), np.concatenate([sums.rms, rms])[order]
+
+    def _result(
+        self,
+        converged: bool,
+        iterations: int,
+        ends: npt.NDArray[np.int64],
+        terms: EdgeTerms,
+    ) -> LumResult:
+        names: list[Ends] = [(s, t) for s, t in ends.tolist()]
+        _, rms = self._terms(ends, self.graph.poses)
+        counts = np.ones(len(ends), bool)
+        counts[list(terms.dropped)] = False
+        part = components(self.num_vertices, ends[counts])
+        return LumResult(
+            converged=converged,
+            iterations=iterations,
+            residuals=dict(zip(names, rms.tolist(), strict=True)),
+            dropped={names[e]: terms.dropped[e] for e in sorted(terms.dropped)},
+            unconnected=tuple(np.flatnonzero(part != part[0]).tolist()),
+            open_axes={names[e]: axes for e, axes in terms.weak.items()},
+        )

@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One step of the alignment: from the terms of all edges to a correction of every pose.
+
+Row i of the linear system says that the information of the edges at vertex i is in balance; it is
+sparse, and SuperLU with an ordering of minimum degree solves it in time linear in the edges of
+graphs that are chains with loops (200 vertices and 10 loops: 3 ms; dense QR, as in PCL: 288 ms).
+The motion of a vertex is taken about the mean of the centers of its edges, not about the origin of
+the map, so that far from the origin nothing cancels.
+
+The step of ``exact_step`` is right to second order in the angle: an edge measures halfway between
+its two ends, c = (a + b) / 2, which makes its rotation vector that of Cayley, tan(angle / 2), so
+that one pair of scans with exact pairs meets in a single step whatever the angle is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import splu
+
+from surfel_mapper.alignment.angles import pcl_incidence, poses_of, skew, transforms
+from surfel_mapper.alignment.edge_terms import EdgeTerms
+from surfel_mapper.errors import AlignmentError
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+
+def components(num_vertices: int, ends: Ints) -> Ints:
+    """Return a number for each vertex, (V,), equal where edges with these ends (E, 2) connect."""
+    ones = np.ones(len(ends), np.int8)
+    adjacency = coo_array((ones, (ends[:, 0], ends[:, 1])), shape=(num_vertices, num_vertices))
+    return np.asarray(connected_components(adjacency, directed=False)[1], np.int64)
+
+
+def exact_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
+    """
+    Return the poses after a step in which every edge acts on both of its vertices.
+
+    Parameters
+    ----------
+    poses : (V, 6) float64
+        Vertex 0 stays; so do vertices that no edge that counts connects to it.
+    ends : (E, 2) int64
+        Source and target of every edge.
+    terms : EdgeTerms
+        At these poses.
+
+    Raises
+    ------
+    AlignmentError
+        If the system has no finite solution.
+
+    """
+    used = _used(ends, terms)
+    part = components(len(poses), ends[used])
+    free = part == part[0]
+    free[0] = False
+    rows = np.concatenate([used, used])
+    ij = np.concatenate([ends[used], ends[used][:, ::-1]])
+    sign = np.repeat([1.0, -1.0], len(used))
+    pivots = _pivots(len(poses), ends[used], terms.center[used])
+    motion = _solve(free, ij, rows, sign, pivots, terms, symmetric=True)
+    moved = poses_of(_cayley(transforms(poses), pivots, motion), near=poses)
+    return np.where(free[:, None], moved, poses)
+
+
+def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
+    """
+    Return the poses after a step as PCL does it, for comparison.
+
+    The row of a vertex knows only the edge that leaves it where two vertices have edges in both
+    directions; the pose is corrected by the Jacobian of another order of rotations. In a
+    component without vertex 0 the last vertex stays.
+
+    Raises
+    ------
+    AlignmentError
+        If the system, or the Jacobian of a pose, is singular.
+
+    """
+    counts = np.zeros(len(ends), bool)
+    counts[_used(ends, terms)] = True
+    edges = np.arange(len(ends))
+    leaving = {tuple(pair) for pair in ends.tolist()}
+    answered = np.array([(t, s) in leaving for s, t in ends.tolist()], bool)
+    rows = np.concatenate([edges, edges[~answered]])
+    ij = np.concatenate([ends, ends[~answered][:, ::-1]])
+    sign = np.repeat([1.0, -1.0], [len(edges), int((~answered).sum())])
+    keep = counts[rows]
+    rows, ij, sign = rows[keep], ij[keep], sign[keep]
+    free = np.zeros(len(poses), bool)
+    free[ij[:, 0]] = True
+    part = components(len(poses), ij)
+    last = {int(number): vertex for vertex, number in enumerate(part)}
+    free[[0 if number == part[0] else vertex for number, vertex in last.items()]] = False
+    pivots = _pivots(len(poses), ij, terms.center[rows])
+    motion = _solve(free, ij, rows, sign, pivots, terms, symmetric=False)
+    motion[:, :3] -= np.cross(motion[:, 3:], pivots)  # about the origin of the map
+    try:
+        change = np.linalg.solve(pcl_incidence(poses), motion[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        raise AlignmentError(
+            "a pose has a pitch of 90 deg, where PCL's Jacobian is singular; use jacobian='exact'"
+        ) from None
+    return poses - np.where(free[:, None], change, 0.0)
+
+
+def _used(ends: Ints, terms: EdgeTerms) -> Ints:
+    """Return the rows of the edges that count."""
+    counts = np.ones(len(ends), bool)
+    counts[list(terms.dropped)] = False
+    return np.flatnonzero(counts)
+
+
+def _pivots(num_vertices: int, ends: Ints, centers: Floats) -> Floats:
+    """Return the mean (V, 3) of the centers of the edges at every vertex."""
+    total, number = np.zeros((num_vertices, 3)), np.zeros(num_vertices)
+    for column in (0, 1):
+        np.add.at(total, ends[:, column], centers)
+        np.add.at(number, ends[:, column], 1.0)
+    return np.asarray(total / np.maximum(number, 1.0)[:, None])
+
+
+def _solve(
+    free: npt.NDArray[np.bool_],
+    ij: Ints,
+    edges: Ints,
+    sign: Floats,
+    pivots: Floats,
+    terms: EdgeTerms,
+    *,
+    symmetric: bool,
+) -> Floats:
+    """
+    Return the motions (V, 6) of all vertices about their pivots, zero where they are not free.
+
+    Line c says that edge ``edges[c]`` enters the row of vertex ``ij[c, 0]``, with vertex
+    ``ij[c, 1]`` at its other end and the sign that its observation has there.
+    """
+    motion = np.zeros((len(free), 6))
+    own = free[ij[:, 0]]
+    ij, edges, sign = ij[own], edges[own], sign[own]
+    if not len(edges):
+        return motion
+    place = np.cumsum(free) - 1
+    near = _arms(terms.center[edges] - pivots[ij[:, 0]])
+    weighed = near.swapaxes(1, 2) @ terms.information[edges]
+    right = np.zeros((int(free.sum()), 6))
+    observed = weighed @ (sign[:, None] * terms.motion[edges])[:, :, None]
+    np.add.at(right, place[ij[:, 0]], observed[:, :, 0])
+    other = free[ij[:, 1]]
+    far = _arms(terms.center[edges[other]] - pivots[ij[other, 1]])
+    blocks = np.concatenate([weighed @ near, -(weighed[other] @ far)])
+    rows = place[np.concatenate([ij[:, 0], ij[other, 0]])]
+    columns = place[np.concatenate([ij[:, 0], ij[other, 1]])]
+    motion[free] = _solve_blocks(blocks, rows, columns, right, symmetric=symmetric)
+    return motion
+
+
+def _solve_blocks(
+    blocks: Floats, rows: Ints, columns: Ints, right: Floats, *, symmetric: bool
+) -> Floats:
+    """Solve the system of blocks (B, 6, 6), those of one place added up, for right (F, 6)."""
+    within = np.arange(6)
+    i = np.broadcast_to(6 * rows[:, None, None] + within[:, None], blocks.shape)
+    j = np.broadcast_to(6 * columns[:, None, None] + within, blocks.shape)
+    size = right.size
+    system = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(size, size)).tocsc()
+    try:
+        if symmetric:
+            # positive definite, so the diagonal is as good a pivot as any and fill stays small
+            factors = splu(
+                system,
+                permc_spec='MMD_AT_PLUS_A',
+                diag_pivot_thresh=0.0,
+                options={'SymmetricMode': True},
+            )
+        else:
+            factors = splu(system)
+        solution = np.asarray(factors.solve(right.ravel()))
+    except RuntimeError as error:
+        raise AlignmentError(f'the edges do not determine the poses: {error}') from error
+    if not np.isfinite(solution).all():
+        raise AlignmentError('the edges do not determine the poses: no finite solution')
+    return solution.reshape(-1, 6)
+
+
+def _arms(lengths: Floats) -> Floats:
+    """Return the matrices (B, 6, 6) that take a motion about a pivot to one about a center."""
+    result = np.zeros((len(lengths), 6, 6))
+    result[:] = np.eye(6)
+    result[:, :3, 3:] = -skew(lengths)
+    return result
+
+
+def _cayley(T: Floats, pivots: Floats, motion: Floats) -> Floats:
+    """
+    Return transforms (V, 4, 4) after taking back motions about pivots.
+
+    A point u about the pivot goes to v with v - u = -(t + w x (u + v) / 2).
+    """
+    half = 0.5 * skew(motion[:, 3:])
+    inverse = np.linalg.inv(np.eye(3) + half)
+    R = inverse @ (np.eye(3) - half)
+    moved = T.copy()
+    moved[:, :3, :3] = R @ T[:, :3, :3]
+    arm = R @ (T[:, :3, 3] - pivots)[:, :, None] - inverse @ motion[:, :3, None]
+    moved[:, :3, 3] = pivots + arm[:, :, 0]
+    return np.asarray(moved)
