@@ -138,10 +138,11 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def unit(vectors: Array) -> Array:
-    """Return rows made unit length, in float64; nan where a row has no length."""
+    """Return rows made unit length, in float64; nan where a row has no finite length."""
     vectors = vectors.astype(np.float64)
     length = np.sqrt(dot(vectors, vectors))[:, None]
-    return np.divide(vectors, length, out=np.full_like(vectors, np.nan), where=length > 0.0)
+    has_length = (length > 0.0) & np.isfinite(length)
+    return np.divide(vectors, length, out=np.full_like(vectors, np.nan), where=has_length)
 
 
 @register(theirs='SphericalityDataPointsFilter')

@@ -174,5 +174,8 @@ FILTERS = {
     },
 }
 
-NARROWER = {('SimpleSensorNoise', 'sensorType'): (0, 4)}
+NARROWER = {
+    ('SimpleSensorNoise', 'sensorType'): (0, 4),
+    **dict.fromkeys([('Gestalt', f'vSize{axis}') for axis in 'XYZ'], (0.001, inf)),
+}
 """Where values within its bounds are refused there nevertheless, and here by the bounds."""

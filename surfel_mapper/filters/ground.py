@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Ground: which points lie on surfaces that are nearly level.
+
+Points are grouped into voxels, and the surfel of a voxel, the plane through its points, says how
+steep the surface is there. Where the floor meets a wall the plane leans, and neither is ground;
+smaller voxels keep that strip narrow. A table or a roof is as level as the floor: ``max_height_m``
+leaves out what is above the robot's wheels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+
+from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.base import Filter, Mask, select, with_columns
+from surfel_mapper.filters.neighbours import coordinates, Points
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.registry import register
+from surfel_mapper.filters.shapes import eigen, Moments, shares
+from surfel_mapper.filters.voxel_grid import Grid
+from surfel_mapper.scan import Scan
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ground(Filter):
+    """Split the points by whether the surface about them is level: keep one part, or mark both."""
+
+    keep_part: str = parameter(
+        'mark',
+        'Keep the ground, all but the ground, or all points with the column ground (1 or 0).',
+        choices=('ground', 'rest', 'mark'),
+    )
+    max_slope_deg: float = parameter(
+        15.0, 'Steepest surfel that is ground, deg.', low=0.0, high=90.0
+    )
+    voxel_size_m: float = parameter(0.5, 'Edge of the voxels, m.', low=0.001)
+    min_points: int = parameter(
+        5, 'With fewer points a voxel has no slope and is not ground.', low=3, high=2**31 - 1
+    )
+    min_planarity: float = parameter(
+        0.3, 'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
+        low=0.0, high=1.0,
+    )
+    max_height_m: float = parameter(
+        math.inf, 'Surfels higher than this above the origin of the robot (frames.base) are not '
+        'ground, m.',
+    )
+    up: str = parameter(
+        'fixed',
+        'Whose z is up: the fixed frame (level as far as its source knows), the robot, or the '
+        'sensor.',
+        choices=('fixed', 'base', 'sensor'),
+    )
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the part of the scan to keep, or all with the column; nan is refused."""
+        points = coordinates(scan)
+        is_ground = self.is_ground(scan, points)
+        if self.keep_part == 'mark':
+            return with_columns(scan, ground=is_ground.astype(np.uint8))
+        return select(scan, is_ground if self.keep_part == 'ground' else ~is_ground)
+
+    def is_ground(self, scan: Scan, points: Points) -> Mask:
+        """Return which points are ground."""
+        up = self.upwards(scan)
+        if not len(points):
+            return np.zeros(0, np.bool_)
+        grid = Grid.over(points, np.full(3, self.voxel_size_m), 'origin')
+        _, _, groups = grid.group(points, True)
+        moments = Moments.of_groups(points, groups.rows, len(groups.first))
+        values, vectors = eigen(moments.covariance)
+        cosine = np.abs(vectors[:, 0] @ up)
+        level = cosine >= math.cos(math.radians(self.max_slope_deg))
+        level &= moments.count >= self.min_points
+        level &= shares(values)[:, 0] >= self.min_planarity
+        if self.max_height_m < math.inf:
+            level &= self.height_m(scan, moments.mean) <= self.max_height_m
+        return np.asarray(level[groups.rows])
+
+    def upwards(self, scan: Scan) -> Points:
+        """Return the direction upwards in the frame of the points, (3,)."""
+        if self.up == 'sensor':
+            return np.array([0.0, 0.0, 1.0])
+        pose = scan.T_fixed_sensor if self.up == 'fixed' else scan.T_base_sensor
+        if pose is None:
+            raise FilterError(
+                f'the pose of {scan.frame_id!r} in the {self.up} frame is not known, so up is '
+                'not; let poses come in, or set up: sensor'
+            )
+        return np.asarray(pose[2, :3], np.float64)
+
+    def height_m(self, scan: Scan, places: Points) -> Points:
+        """Return how high places in the frame of the points are above the robot, m."""
+        if scan.T_base_sensor is None:
+            raise FilterError(
+                f'the place of {scan.frame_id!r} on the robot is not known, so max_height_m has '
+                'no origin; set frames.base_to_sensor, or let /tf_static have it'
+            )
+        rotation, place = scan.T_base_sensor[:3, :3], scan.T_base_sensor[:3, 3]
+        base_in_sensor = -rotation.T @ place
+        return np.asarray((places - base_in_sensor) @ self.upwards(scan), np.float64)

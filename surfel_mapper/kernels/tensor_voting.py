@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tensor votes: what the neighbours of a point say of the surface, curve or corner it is on.
+
+A vote is a symmetric matrix, and six million of them are cast among the points of a scan with 50
+neighbours each: one loop needs no memory for them, numpy 48 bytes each and a dozen passes.
+
+Source: Wu et al. 2012, A closed-form solution to tensor voting, equation 11, made symmetric:
+c R K (1 - r r^T / 2) R for a neighbour with tensor K in the direction r, R = 1 - 2 r r^T, and
+decay c = exp(-distance^2 / sigma). For the first round, where nothing is known of the neighbours,
+Guy and Medioni 1997: what lies across r, 1 - r r^T.
+"""
+
+import math
+
+from numba import njit
+
+REACH = 3.0
+"""Votes come no farther than this times sigma."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def first_votes(points, ids, sigma, votes):
+    """
+    Cast the votes of neighbours of which nothing is known, added to the point's own ball.
+
+    points  (N, 3) float64, m
+    ids     (P, K) int32, neighbours of P points, the point itself first; N where there is none
+    sigma   scale of the votes
+    votes   (6, P) float64, out: their sum, xx xy xz yy yz zz
+
+    The weight is z^2 (z - 3)^4 / 16, z the distance over sigma: most from about one sigma away.
+    """
+    for i in range(len(ids)):
+        own = ids[i, 0]
+        xx, xy, xz, yy, yz, zz = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
+        for k in range(1, ids.shape[1]):
+            other = ids[i, k]
+            if other == len(points):
+                break
+            x = points[own, 0] - points[other, 0]
+            y = points[own, 1] - points[other, 1]
+            z = points[own, 2] - points[other, 2]
+            length = math.sqrt((x * x + y * y) + z * z)
+            far = length / sigma
+            if not (length > 0.0 and far < REACH):
+                continue
+            x, y, z = x / length, y / length, z / length
+            weight = far * far * (far - REACH) ** 4 / 16.0
+            xx += weight * (1.0 - x * x)
+            xy -= weight * x * y
+            xz -= weight * x * z
+            yy += weight * (1.0 - y * y)
+            yz -= weight * y * z
+            zz += weight * (1.0 - z * z)
+        votes[0, i], votes[1, i], votes[2, i] = xx, xy, xz
+        votes[3, i], votes[4, i], votes[5, i] = yy, yz, zz
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def closed_form_votes(points, ids, tensors, sigma, votes):
+    """
+    Cast the votes of neighbours with tensors.
+
+    points   (N, 3) float64, m
+    ids      (P, K) int32, neighbours of P points, the point itself first; N where there is none
+    tensors  (N, 6) float64, of the neighbours, xx xy xz yy yz zz
+    sigma    scale of the votes
+    votes    (6, P) float64, out: their sum
+    """
+    for i in range(len(ids)):
+        own = ids[i, 0]
+        xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(1, ids.shape[1]):
+            other = ids[i, k]
+            if other == len(points):
+                break
+            x = points[own, 0] - points[other, 0]
+            y = points[own, 1] - points[other, 1]
+            z = points[own, 2] - points[other, 2]
+            length_sq = (x * x + y * y) + z * z
+            length = math.sqrt(length_sq)
+            if not (length > 0.0 and length / sigma < REACH):
+                continue
+            x, y, z = x / length, y / length, z / length
+            txx, txy, txz = tensors[other, 0], tensors[other, 1], tensors[other, 2]
+            tyy, tyz, tzz = tensors[other, 3], tensors[other, 4], tensors[other, 5]
+            # with u = K r, s = r u: R K R = K - 2 (u r' + r u') + 4 s r r', R K R r = 2 s r - u
+            ux = (txx * x + txy * y) + txz * z
+            uy = (txy * x + tyy * y) + tyz * z
+            uz = (txz * x + tyz * y) + tzz * z
+            s = (ux * x + uy * y) + uz * z
+            # less the quarter of (2 s r - u) r' + r (2 s r - u)': 3 s r r' and 7/4 remain
+            weight = math.exp(-length_sq / sigma)
+            xx += weight * (txx - 3.5 * ux * x + 3.0 * s * x * x)
+            xy += weight * (txy - 1.75 * (ux * y + uy * x) + 3.0 * s * x * y)
+            xz += weight * (txz - 1.75 * (ux * z + uz * x) + 3.0 * s * x * z)
+            yy += weight * (tyy - 3.5 * uy * y + 3.0 * s * y * y)
+            yz += weight * (tyz - 1.75 * (uy * z + uz * y) + 3.0 * s * y * z)
+            zz += weight * (tzz - 3.5 * uz * z + 3.0 * s * z * z)
+        votes[0, i], votes[1, i], votes[2, i] = xx, xy, xz
+        votes[3, i], votes[4, i], votes[5, i] = yy, yz, zz
