@@ -6,6 +6,10 @@ Nearest neighbours within a scan, for the filters that look around a point.
 The search is scipy's k-d tree. Its answer comes in pieces of at most a million neighbours, so
 that memory follows the points and not their number times the number of neighbours: the default
 of the tensor votes on 131,072 points would take 160 MB for the coordinates of all neighbours.
+
+Many lidars put every beam without return at (0, 0, 0). No tree can part points at one place, and
+a search from each through all of them takes minutes; so of those at one place only as many as
+anyone asks for go into the tree.
 """
 
 from __future__ import annotations
@@ -63,7 +67,7 @@ def neighbourhoods(
     points : (N, 3) float64
         Finite.
     number : int
-        Neighbours of each, the point itself among them; at most N.
+        Neighbours of each, the point itself or one at the same place among them; at most N.
     max_distance_m : float
         Those farther away do not count.
     epsilon : float
@@ -81,7 +85,8 @@ def neighbourhoods(
     """
     if not len(points):
         return
-    tree = search_tree(points)
+    in_tree = np.append(worth_searching(points, number), len(points))
+    tree = search_tree(points[in_tree[:-1]])
     # scipy's bound is exclusive
     bound = float(np.nextafter(max_distance_m, math.inf))
     step = max(AT_ONCE // number, 1)
@@ -90,4 +95,15 @@ def neighbourhoods(
         distances, ids = tree.query(
             points[rows], k=number, eps=epsilon, distance_upper_bound=bound
         )
-        yield rows, ids.reshape(-1, number), distances.reshape(-1, number)
+        yield rows, in_tree[ids.reshape(-1, number)], distances.reshape(-1, number)
+
+
+def worth_searching(points: Points, number: int) -> Ids:
+    """Return the rows of points without those that so many others precede at the same place."""
+    order = np.lexsort(points.T)
+    ordered = points[order]
+    begins = np.ones(len(points), np.bool_)
+    begins[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    starts = np.flatnonzero(begins)
+    before = np.arange(len(points)) - np.repeat(starts, np.diff(starts, append=len(points)))
+    return np.sort(order[before < number])

@@ -15,7 +15,7 @@ import math
 import numpy as np
 
 from surfel_mapper.filters.base import Filter, Mask
-from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, search_tree
+from surfel_mapper.filters.neighbours import coordinates, neighbourhoods
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
@@ -68,7 +68,8 @@ class RadiusOutliers(Filter):
             return np.zeros(len(points), np.bool_)
         if number == 1:
             return np.ones(len(points), np.bool_)
+        stays = np.empty(len(points), np.bool_)
         # whether there are so many is settled by the last of the nearest so many
-        bound = float(np.nextafter(self.radius_m, math.inf))
-        last, _ = search_tree(points).query(points, k=[number], distance_upper_bound=bound)
-        return np.asarray(np.isfinite(last[:, 0]))
+        for rows, _, distances in neighbourhoods(points, number, self.radius_m):
+            stays[rows] = np.isfinite(distances[:, -1])
+        return stays
