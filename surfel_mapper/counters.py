@@ -129,6 +129,26 @@ class Counters:
         }
 
 
+class Laps:
+    """The times of stages that follow each other."""
+
+    def __init__(self) -> None:
+        """Start the first stage."""
+        self._start = self._lap = time.perf_counter()
+        self._stages: dict[str, float] = {}
+
+    def end(self, stage: str) -> None:
+        """End a stage and start the next."""
+        now = time.perf_counter()
+        self._stages[stage] = (now - self._lap) * 1e3
+        self._lap = now
+
+    @property
+    def milliseconds(self) -> dict[str, float]:
+        """Return the time of every stage that has ended, and ``total``, that of all."""
+        return {**self._stages, 'total': (self._lap - self._start) * 1e3}
+
+
 def percentiles(milliseconds: deque[float]) -> dict[str, float]:
     """Return median and 99th percentile of times."""
     return {

@@ -16,7 +16,7 @@ can, so it should be dropped.
 
 from __future__ import annotations
 
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 import math
@@ -36,7 +36,7 @@ MAX_NAMES = 12
 """So many frames are named in a message."""
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, eq=False)
 class _Edge:
     """The transforms of one child frame in its parent, by ascending stamp; one where static."""
 
@@ -187,6 +187,12 @@ class TransformBuffer:
             return T_target_common
         return compose(T_target_common, T_common_source)
 
+    def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
+        """Return when transforms between two frames are held, in a span, ends included."""
+        above = {*self._edges_above(source)} ^ {*self._edges_above(target)}
+        held = (edge.stamps for edge in above if not edge.is_static)
+        return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
+
     def clear(self) -> None:
         """Forget the dynamic edges; static ones stay."""
         self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}
@@ -239,6 +245,11 @@ def _check_held(asked: str, edges: list[_Edge], stamp_ns: int) -> None:
     for edge in dynamic:
         if stamp_ns > edge.stamps[-1]:
             raise PoseNotYetError(f'{asked}: newer than all of {edge}')
+
+
+def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:
+    """Return those of ascending stamps that are in a span, ends included."""
+    return stamps[bisect_left(stamps, start_ns) : bisect_right(stamps, end_ns)]
 
 
 def _chained(edges: list[_Edge], stamp_ns: int) -> Transform | None:

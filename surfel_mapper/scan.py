@@ -17,6 +17,25 @@ import numpy as np
 import numpy.typing as npt
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PointTimes:
+    """
+    When the points of a scan were measured.
+
+    Attributes
+    ----------
+    offsets : (N,) int64
+        Nanoseconds after the stamp of the scan; those of points that are none mean nothing.
+    first_ns, last_ns : int
+        Times of the first and the last point.
+
+    """
+
+    offsets: npt.NDArray[np.int64]
+    first_ns: int
+    last_ns: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """
@@ -36,6 +55,8 @@ class Scan:
     T_base_sensor, T_fixed_sensor : (4, 4) float64, optional
         Where the sensor is on the robot, and in the fixed frame at the stamp; None where that is
         not known. Filters that look at the robot or at the vertical need them.
+    times : PointTimes, optional
+        When the points were measured, for deskewing; None: all at the stamp.
 
     Raises
     ------
@@ -50,6 +71,7 @@ class Scan:
     columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     T_base_sensor: npt.NDArray[np.float64] | None = None
     T_fixed_sensor: npt.NDArray[np.float64] | None = None
+    times: PointTimes | None = None
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -69,6 +91,11 @@ class Scan:
         """Return the number of points."""
         return len(self.points)
 
+    @property
+    def end_ns(self) -> int:
+        """Time of the last point, or the stamp where that is later."""
+        return self.stamp_ns if self.times is None else max(self.stamp_ns, self.times.last_ns)
+
     def select(self, rows: npt.NDArray[Any]) -> Scan:
         """
         Return the scan with some of its points, their columns with them.
@@ -80,4 +107,5 @@ class Scan:
 
         """
         columns = {name: column[rows] for name, column in self.columns.items()}
-        return replace(self, points=self.points[rows], columns=columns)
+        times = self.times and replace(self.times, offsets=self.times.offsets[rows])
+        return replace(self, points=self.points[rows], columns=columns, times=times)

@@ -11,6 +11,7 @@ a wrong type or a value out of bounds is a ConfigError.
 """
 
 from surfel_mapper.config.configuration import Config, declarations, load_config
+from surfel_mapper.config.deskew import DeskewConfig
 from surfel_mapper.config.settings import Declaration, flatten, near, setting, Stage
 from surfel_mapper.config.stages import (
     FramesConfig,
@@ -26,6 +27,7 @@ from surfel_mapper.config.tsdf import TsdfConfig
 __all__ = [
     'Config',
     'Declaration',
+    'DeskewConfig',
     'FramesConfig',
     'InputConfig',
     'MapConfig',

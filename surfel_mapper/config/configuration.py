@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surfel_mapper.config.deskew import DeskewConfig
 from surfel_mapper.config.settings import (
     checked,
     Declaration,
@@ -40,6 +41,7 @@ class Config:
     pose: PoseConfig = field(default_factory=PoseConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     input: InputConfig = field(default_factory=InputConfig)
+    deskew: DeskewConfig = field(default_factory=DeskewConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
@@ -52,6 +54,11 @@ class Config:
         for declared in dataclasses.fields(self):
             if 'meaning' in declared.metadata:
                 checked(declared.name, getattr(self, declared.name), declared)
+        if self.deskew.enabled and self.pose.source == 'identity':
+            raise ConfigError(
+                'deskew.enabled: true, but clouds that are in the fixed frame already '
+                '(pose.source identity) cannot be deskewed'
+            )
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:

@@ -11,18 +11,20 @@ at any speed does alike.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import astuple, replace
+from functools import partial
 import logging
-import time
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config, declarations
-from surfel_mapper.counters import Counters
+from surfel_mapper.counters import Counters, Laps
+from surfel_mapper.deskew import deskewed, point_times
 from surfel_mapper.errors import (
+    CloudFormatError,
     ConfigError,
     FilterError,
     MapError,
@@ -41,7 +43,7 @@ from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_queue import ScanQueue
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.poses import TransformBuffer
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import PointTimes, Scan
 
 _log = logging.getLogger(__name__)
 
@@ -138,13 +140,27 @@ class Mapper:
         elif missing := missing_columns(scan.columns, self.map.columns):
             reason = f'its points have no {" and no ".join(missing)}'
             self._drops.scan(scan, 'missing_column', reason)
-        else:
+        elif (timed := self._timed(scan)) is not None:
             if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
                 self._start_anew(scan, back_s)
             self._mount(scan.frame_id)
-            self._queue.push(scan)
+            self._queue.push(timed)
 
-    def refuse_clouds(self, cause: str, topic: str, reason: str, number: int = 1) -> None:
+    def _timed(self, scan: Scan) -> Scan | None:
+        """Return a scan with the times that deskewing needs; None where it has none."""
+        settings = self.config.deskew
+        if not settings.enabled:
+            return scan
+        try:
+            times = point_times(scan, settings.field, settings.unit, settings.reference)
+        except CloudFormatError as error:
+            self._drops.scan(scan, 'no_times', str(error))
+            return None
+        return replace(scan, times=times)
+
+    def refuse_clouds(
+        self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''
+    ) -> None:
         """
         Count clouds that came in but never became scans: damaged, too many, unwanted.
 
@@ -158,10 +174,12 @@ class Mapper:
             What was found, what was expected, and the remedy, for the log.
         number : int
             How many.
+        frame_id : str
+            Their frame, under which they are counted; without it, under their topic.
 
         """
         self.counters.received += number
-        self.counters.drop(cause, topic, number)
+        self.counters.drop(cause, frame_id or topic, number)
         dropped = self.counters.dropped[cause]
         self._drops.warn(
             cause, f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
@@ -181,7 +199,7 @@ class Mapper:
             try:
                 pose = self._lookup(scan)
             except PoseNotYetError as error:
-                waited_s = (self._now_ns() - scan.stamp_ns) / 1e9
+                waited_s = (self._now_ns() - scan.end_ns) / 1e9
                 if waited_s <= self.config.pose.max_wait_s:
                     return
                 self._queue.pop()
@@ -222,6 +240,24 @@ class Mapper:
         inside = voxel_index[region.contains(centers)]
         return self.window.drop_voxels(inside, self.config.map.min_points)
 
+    def restore(self, surfel_map: SurfelMap, scans: Iterable[WindowedScan]) -> None:
+        """
+        Put a saved map, and the scans of its window, in the place of what there is.
+
+        Raises
+        ------
+        MapError
+            If it has another voxel size, level or other columns. Nothing has changed then.
+
+        """
+        for name in ('voxel_size_m', 'level', 'columns'):
+            found, expected = getattr(surfel_map, name), getattr(self.map, name)
+            if found != expected:
+                raise MapError(f'map with {name} {found}, expected {expected} as configured')
+        self.clear()
+        self.map.insert(surfel_map.moments())
+        self.window.restore(scans)
+
     def reconfigure(self, config: Config) -> None:
         """
         Take new settings while running; they hold from the next scan on.
@@ -229,7 +265,8 @@ class Mapper:
         Raises
         ------
         ConfigError
-            If a setting differs that only a new start can change. Nothing has changed then.
+            If a setting differs that only a new start can change, or ``filters`` names a file
+            that holds no chain. Nothing has changed then.
 
         """
         old, new = self.config.to_mapping(), config.to_mapping()
@@ -238,6 +275,10 @@ class Mapper:
                 raise ConfigError(
                     f'{declared.name}: cannot change while running; set it at the start'
                 )
+        if config.filters != self.config.filters:
+            chain = Chain.load(config.filters) if config.filters else Chain()
+            chain.warm_up()
+            self.chain = chain
         self.config = config
         self.window.config = config.window
         self.window.max_voxels = config.map.max_voxels
@@ -300,7 +341,22 @@ class Mapper:
         """Return T_fixed_sensor at the stamp of a scan."""
         if self.config.pose.source == 'identity':
             return np.eye(4)
-        return self.transforms.lookup(self.config.frames.fixed, scan.frame_id, scan.stamp_ns)
+        pose = self._pose_at(scan.frame_id, scan.stamp_ns)
+        if scan.times is not None:  # the poses of all points have to be there
+            self._pose_at(scan.frame_id, scan.times.first_ns)
+            self._pose_at(scan.frame_id, scan.times.last_ns)
+        return pose
+
+    def _pose_at(self, frame_id: str, stamp_ns: int) -> npt.NDArray[np.float64]:
+        """Return T_fixed_sensor at a time."""
+        return self.transforms.lookup(self.config.frames.fixed, frame_id, stamp_ns)
+
+    def _deskewed(self, scan: Scan, times: PointTimes) -> Scan:
+        """Return a scan as seen from one place, where the sensor was at its stamp."""
+        fixed, sensor = self.config.frames.fixed, scan.frame_id
+        stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
+        min_range_m = self.config.input.min_range_m
+        return deskewed(scan, partial(self._pose_at, sensor), stamps, min_range_m)
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan; None where the motion gate or the map leaves it out."""
@@ -308,14 +364,19 @@ class Mapper:
         if last is not None and stands_still(last.T_map_sensor, pose, self.config.window):
             self.counters.gated += 1
             return None
-        start, version = time.perf_counter(), self.map.version
-        filtered = self._filter(scan, pose) if len(self.chain) else scan
+        laps, version = Laps(), self.map.version
+        if scan.times is not None:
+            scan = self._deskewed(scan, scan.times)
+            laps.end('deskew')
+        filtered: Scan | None = scan
+        if len(self.chain):
+            filtered = self._filter(scan, pose)
+            laps.end('filter')
         if filtered is None:
             return None
-        cleaned = time.perf_counter() if len(self.chain) else start
         try:
             windowed = self._reduce(filtered, pose)
-            reduced = time.perf_counter()
+            laps.end('reduce')
             if not len(windowed.moments):
                 self._drops.scan(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
                 return None
@@ -323,17 +384,10 @@ class Mapper:
         except MapError as error:
             self._drops.scan(scan, 'map_limit', str(error))
             return None
-        inserted = time.perf_counter()
+        laps.end('insert')
         changed = self.map.surfels_changed(version, self.config.map.min_points)
-        end = time.perf_counter()
-        times = {
-            **({'filter': (cleaned - start) * 1e3} if len(self.chain) else {}),
-            'reduce': (reduced - cleaned) * 1e3,
-            'insert': (inserted - reduced) * 1e3,
-            'normals': (end - inserted) * 1e3,
-            'total': (end - start) * 1e3,
-        }
-        self._count(windowed, evictions, times)
+        laps.end('normals')
+        self._count(windowed, evictions, laps.milliseconds)
         fallen = [eviction.fallen for eviction in evictions]
         return Update(
             stamp_ns=scan.stamp_ns,
@@ -343,7 +397,7 @@ class Mapper:
             changed=changed,
             removed_voxel_index=np.concatenate(fallen) if fallen else np.empty((0, 3), np.int32),
             evictions=tuple(evictions),
-            milliseconds=times,
+            milliseconds=laps.milliseconds,
         )
 
     def _filter(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Scan | None:
