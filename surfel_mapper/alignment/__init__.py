@@ -2,7 +2,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scans are moved until they agree: with each other, or with a map."""
 
+from surfel_mapper.alignment.correspondences import (
+    Limits,
+    loop_candidates,
+    match,
+    Samples,
+    surface_weights,
+)
 from surfel_mapper.alignment.graph import Graph
 from surfel_mapper.alignment.lum import LUM, LumResult
+from surfel_mapper.alignment.window import align_scans, WindowAlignment
 
-__all__ = ['LUM', 'Graph', 'LumResult']
+__all__ = [
+    'LUM',
+    'Graph',
+    'Limits',
+    'LumResult',
+    'Samples',
+    'WindowAlignment',
+    'align_scans',
+    'loop_candidates',
+    'match',
+    'surface_weights',
+]

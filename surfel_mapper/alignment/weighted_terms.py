@@ -91,9 +91,9 @@ def weighted_terms(
 
 def _center(A: Floats, quadratic: Floats, total: Floats) -> Floats:
     """Return the weighted means (E, 3) of the moved sources."""
-    of_source = np.trace(quadratic[..., 3], axis1=1, axis2=2) / np.where(total > 0, total, 1.0)[
-        :, None
-    ]
+    of_source = (
+        np.trace(quadratic[..., 3], axis1=1, axis2=2) / np.where(total > 0, total, 1.0)[:, None]
+    )
     of_source[:, 3] = 1.0
     return np.asarray((A @ of_source[:, :, None])[:, :, 0])
 

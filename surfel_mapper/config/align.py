@@ -57,18 +57,14 @@ class AlignConfig(Stage):
         20, 'Surfels are matched anew at most so often.', low=1, high=1000, live=True
     )
     settled_m: float = setting(
-        0.002, 'The poses have settled when none changes by more, m.', low=1e-6, high=1.0,
-        live=True,
-    )  # fmt: skip
-    settled_deg: float = setting(
-        0.01, 'Nor turns by more, deg.', low=1e-6, high=10.0, live=True
+        0.002, 'Poses have settled when none changes by more, m.', low=1e-6, high=1.0, live=True
     )
+    settled_deg: float = setting(0.01, 'Nor turns by more, deg.', low=1e-6, high=10.0, live=True)
     move_m: float = setting(
-        0.002, 'Scans are moved in the map whose pose changed by more, m.', low=0.0, high=1e3,
-        live=True,
-    )  # fmt: skip
+        0.002, 'Scans that go farther are moved in the map, m.', low=0.0, high=1e3, live=True
+    )
     move_deg: float = setting(
-        0.01, 'Or that turned by more, deg.', low=0.0, high=180.0, live=True
+        0.01, 'So are those that turn by more, deg.', low=0.0, high=180.0, live=True
     )
     map_frame: str = setting(
         '',

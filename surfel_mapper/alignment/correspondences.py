@@ -1,0 +1,240 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which points of two scans belong together, and which scans are worth asking.
+
+A scan is stood for by samples: its own points, or the centroids of its surfels, which have a
+normal and a variance across it. Nearest neighbours come from scipy's k-d tree, built once a scan
+in the scan's own frame, whatever its pose becomes. Points are paired to points; surfels pull
+across the surface only, for the centroids of one wall seen from two places differ along it: the
+rings of a lidar on the road go with the lidar, and points paired to points would hold it back.
+
+Source: Chen and Medioni 1992 for points and planes; Segal, Haehnel and Thrun 2009.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from surfel_mapper.errors import AlignmentError
+from surfel_mapper.mapping.surfels import Surfels
+
+Floats = npt.NDArray[np.float64]
+Pairs = npt.NDArray[np.int32]
+
+ALONG = 1e-4
+"""What a gap along a surface counts, as part of what it counts across."""
+
+LONG_WAY = 3.0
+"""The way to where a loop closes is at least so many times the distance that counts as near."""
+
+LOOPS_A_SCAN = 3
+"""A scan is compared with so many of an earlier pass."""
+
+MIN_PLANARITY = 0.2
+"""Surfels that are less planar have no normal to rely on, as where a voxel holds one ring."""
+
+
+class Samples:
+    """
+    What stands for a scan, in its own frame.
+
+    Parameters
+    ----------
+    position : (N, 3) float, m
+        All finite.
+    normal : (N, 3) float, optional
+        Unit normals, needed where angles are compared.
+    variance : (N,) float, optional
+        Of the points across the surface, m^2: with it samples are surfels.
+
+    Raises
+    ------
+    AlignmentError
+        If there are none, a number is not finite, or shapes do not fit.
+
+    """
+
+    def __init__(
+        self,
+        position: npt.ArrayLike,
+        normal: npt.ArrayLike | None = None,
+        variance: npt.ArrayLike | None = None,
+    ) -> None:
+        """Check the arrays and build the tree."""
+        self.position = np.ascontiguousarray(position, np.float64)
+        if self.position.ndim != 2 or self.position.shape[1] != 3 or not len(self.position):
+            raise AlignmentError(f'samples: shape {self.position.shape}, expected (N, 3), N > 0')
+        num = len(self.position)
+        self.normal = None if normal is None else np.asarray(normal, np.float64)
+        self.variance = None if variance is None else np.asarray(variance, np.float64)
+        for name, values, shape in (
+            ('position', self.position, (num, 3)),
+            ('normal', self.normal, (num, 3)),
+            ('variance', self.variance, (num,)),
+        ):
+            if values is not None and (values.shape != shape or not np.isfinite(values).all()):
+                raise AlignmentError(f'samples: {name} is not {shape} and finite')
+        if self.variance is not None and self.normal is None:
+            raise AlignmentError('samples: surfels need normals')
+        self.tree = cKDTree(self.position)
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.position)
+
+    @classmethod
+    def of_surfels(cls, surfels: Surfels, min_points: int = 1) -> Samples:
+        """Return the samples of those surfels that are planar enough."""
+        flat = (surfels.planarity >= MIN_PLANARITY) & (surfels.num_points >= min_points)
+        chosen = surfels.select(flat)
+        return cls(chosen.position, chosen.normal, chosen.eigenvalues[:, 0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Limits:
+    """
+    Which samples may belong together.
+
+    Attributes
+    ----------
+    max_distance_m : float
+        Apart at most.
+    max_angle_deg : float
+        Between their normals at most; 180: normals are not asked for.
+    reciprocal : bool
+        Whether each has to be the nearest to the other.
+
+    """
+
+    max_distance_m: float
+    max_angle_deg: float = 180.0
+    reciprocal: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        if not 0.0 < self.max_distance_m < math.inf:
+            raise AlignmentError(f'max_distance_m {self.max_distance_m}, expected over 0, finite')
+        if not 0.0 < self.max_angle_deg <= 180.0:
+            raise AlignmentError(f'max_angle_deg {self.max_angle_deg}, expected in (0, 180]')
+
+
+def match(source: Samples, target: Samples, T_target_source: Floats, limits: Limits) -> Pairs:
+    """
+    Return every sample of a scan with the nearest one of another, where that may be.
+
+    Parameters
+    ----------
+    source, target : Samples
+        Each in its own frame.
+    T_target_source : (4, 4) float64
+        Pose of the source in the frame of the target.
+    limits : Limits
+        Which pairs there may be.
+
+    Returns
+    -------
+    (K, 2) int32
+        Rows of source and target, as LUM takes them.
+
+    Raises
+    ------
+    AlignmentError
+        If angles are to be compared and a scan has no normals.
+
+    """
+    moved = _moved(source.position, T_target_source)
+    distance, rows = target.tree.query(moved, distance_upper_bound=limits.max_distance_m)
+    chosen = np.flatnonzero(np.isfinite(distance))
+    rows = rows[chosen]
+    if limits.max_angle_deg < 180.0:
+        R = T_target_source[:3, :3]
+        kept = _alike(source, target, R, (chosen, rows), limits.max_angle_deg)
+        chosen, rows = chosen[kept], rows[kept]
+    if limits.reciprocal and len(chosen):
+        asked, of = np.unique(rows, return_inverse=True)
+        back = (target.position[asked] - T_target_source[:3, 3]) @ T_target_source[:3, :3]
+        kept = source.tree.query(back)[1][of] == chosen
+        chosen, rows = chosen[kept], rows[kept]
+    return np.stack([chosen, rows], axis=1).astype(np.int32)
+
+
+def surface_weights(
+    source: Samples, target: Samples, pairs: Pairs, T_target_source: Floats, scale_m: float
+) -> Floats:
+    """
+    Return by what the gaps of pairs of surfels count, (K, 3, 3), in the frame of the target.
+
+    Across the surface it is one over the variance of both ends, less for gaps beyond the scale
+    (Geman and McClure), so that what is no pair does not pull.
+    """
+    if source.variance is None or target.variance is None or target.normal is None:
+        raise AlignmentError('samples are not surfels: they have no variance')
+    i, j = pairs.T
+    normal = target.normal[j]
+    moved = _moved(source.position[i], T_target_source)
+    across = ((moved - target.position[j]) * normal).sum(axis=1)
+    robust = 1.0 / (1.0 + (across / scale_m) ** 2) ** 2
+    floor = (0.1 * scale_m) ** 2
+    weight = robust / (source.variance[i] + target.variance[j] + floor)
+    outer = normal[:, :, None] * normal[:, None, :] + ALONG * np.eye(3)
+    return np.asarray(weight[:, None, None] * outer)
+
+
+def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[int, int]]:
+    """
+    Return the scans that are near each other although the way between them is long.
+
+    Parameters
+    ----------
+    T_map_sensor : (S, 4, 4) float64
+        Poses, in the order of the way.
+    max_distance_m : float
+        Scans farther apart are no candidates; 0: none are.
+
+    Returns
+    -------
+    list of (int, int)
+        The later scan first; for each the few that are nearest. The way between them is at least
+        three times ``max_distance_m``.
+
+    """
+    if max_distance_m <= 0.0:
+        return []
+    position = T_map_sensor[:, :3, 3]
+    steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+    way_m = np.concatenate([[0.0], np.cumsum(steps)])
+    pairs = cKDTree(position).query_pairs(max_distance_m, output_type='ndarray')
+    near = pairs[way_m[pairs[:, 1]] - way_m[pairs[:, 0]] >= LONG_WAY * max_distance_m]
+    distance = np.linalg.norm(position[near[:, 1]] - position[near[:, 0]], axis=1)
+    num_of: dict[int, int] = {}
+    found = []
+    for target, source in near[np.argsort(distance, kind='stable')].tolist():
+        if num_of.get(source, 0) < LOOPS_A_SCAN:
+            num_of[source] = num_of.get(source, 0) + 1
+            found.append((source, target))
+    return sorted(found)
+
+
+def _moved(points: Floats, T: Floats) -> Floats:
+    return np.asarray(points @ T[:3, :3].T + T[:3, 3])
+
+
+def _alike(
+    source: Samples,
+    target: Samples,
+    R_target_source: Floats,
+    pairs: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
+    max_angle_deg: float,
+) -> npt.NDArray[np.bool_]:
+    """Return which pairs have normals that differ by no more than an angle."""
+    if source.normal is None or target.normal is None:
+        raise AlignmentError('samples have no normals, so max_angle_deg cannot be held')
+    normal = source.normal[pairs[0]] @ R_target_source.T
+    cosine = (normal * target.normal[pairs[1]]).sum(axis=1)
+    return np.asarray(cosine >= math.cos(math.radians(max_angle_deg)))
