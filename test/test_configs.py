@@ -71,7 +71,10 @@ def test_ros_reads_default_yaml_as_we_do():
     )
     found = json.loads(done.stdout)
     # ROS has no type for an empty list: it takes the parameter as not set.
-    expected = {name: None if v == () else v for name, v in Config().to_mapping().items()}
+    expected = {
+        name: (list(value) or None) if isinstance(value, tuple) else value
+        for name, value in Config().to_mapping().items()
+    }
     assert {name: (type(value), value) for name, value in found.items()} == {
         name: (type(value), value) for name, value in expected.items()
     }

@@ -53,6 +53,7 @@ HOMES = {
     'diagnostic_msgs': 'ros/',
     'distributed': 'cluster/',
     'geometry_msgs': 'ros/',
+    'lifecycle_msgs': 'ros/',
     'llvmlite': 'kernels/',
     'matplotlib': 'viz/',
     'nav_msgs': 'ros/',

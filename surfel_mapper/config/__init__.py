@@ -10,8 +10,11 @@ of ROS parameters, so that one YAML serves both. Nothing is repaired in silence:
 a wrong type or a value out of bounds is a ConfigError.
 """
 
+from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.configuration import Config, declarations, load_config
 from surfel_mapper.config.deskew import DeskewConfig
+from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
+from surfel_mapper.config.registration import RegistrationConfig
 from surfel_mapper.config.settings import Declaration, flatten, near, setting, Stage
 from surfel_mapper.config.stages import (
     FramesConfig,
@@ -25,15 +28,19 @@ from surfel_mapper.config.stages import (
 from surfel_mapper.config.tsdf import TsdfConfig
 
 __all__ = [
+    'AlignConfig',
+    'ClearConfig',
     'Config',
     'Declaration',
     'DeskewConfig',
+    'DiagnosticsConfig',
     'FramesConfig',
     'InputConfig',
     'MapConfig',
     'OutputConfig',
     'PoseConfig',
     'PublishConfig',
+    'RegistrationConfig',
     'Stage',
     'TsdfConfig',
     'WindowConfig',

@@ -10,7 +10,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.deskew import DeskewConfig
+from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
+from surfel_mapper.config.registration import RegistrationConfig
 from surfel_mapper.config.settings import (
     checked,
     Declaration,
@@ -39,14 +42,23 @@ class Config:
     map: MapConfig = field(default_factory=MapConfig)
     window: WindowConfig = field(default_factory=WindowConfig)
     pose: PoseConfig = field(default_factory=PoseConfig)
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    align: AlignConfig = field(default_factory=AlignConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     input: InputConfig = field(default_factory=InputConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
+    clear: ClearConfig = field(default_factory=ClearConfig)
+    diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
     filters: str = setting(
-        '', 'YAML file of the filters that every scan passes before it is mapped; empty: none.'
+        '',
+        'YAML file of the filters that every scan passes before it is mapped; empty: none.',
+        live=True,
+    )
+    autostart: bool = setting(
+        True, 'The node configures and activates itself; else it waits to be told to.'
     )
 
     def __post_init__(self) -> None:

@@ -164,6 +164,12 @@ class InputConfig(Stage):
         low=0.0,
         high=1e9,
     )
+    max_waiting_clouds: int = setting(
+        20,
+        'At most this many clouds wait to be mapped; the oldest is dropped.',
+        low=1,
+        high=10**4,
+    )
 
     def check(self, stage: str) -> None:
         """Refuse an empty range."""
@@ -199,6 +205,9 @@ class OutputConfig(Stage):
 
     directory: str = setting('surfel_maps', 'Directory of ~/save_map; made when first needed.')
     map_name: str = setting('map', 'Name of the files of ~/save_map inside it, no extension.')
+    save_on_shutdown: bool = setting(
+        False, 'Save the map when the node ends, as ~/save_map does.', live=True
+    )
 
     def check(self, stage: str) -> None:
         """Refuse names that would leave the directory."""

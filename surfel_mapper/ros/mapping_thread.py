@@ -11,7 +11,7 @@ it needs, although these have arrived.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
 import threading
@@ -21,9 +21,6 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
-
-MAX_CLOUDS = 20
-"""Clouds that may wait, 2 s of a lidar at 10 Hz and some 80 MB; the oldest is dropped."""
 
 MAX_POSES = 10_000
 """Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
@@ -73,10 +70,11 @@ class MappingThread:
         self._mapper = mapper
         self._on_failure = on_failure
         self._changed = threading.Condition()
+        self._max_clouds = mapper.config.input.max_waiting_clouds
         self._poses: deque[tuple[StampedPose, bool]] = deque()
         self._work: deque[Cloud | Call] = deque()
         self._num_clouds = 0
-        self._clouds_lost = 0
+        self._clouds_lost: Counter[tuple[str, str]] = Counter()
         self._poses_lost = 0
         self._stopping = False
         self._thread = threading.Thread()
@@ -110,12 +108,17 @@ class MappingThread:
         with self._changed:
             self._work.append(Cloud(msg, topic))
             self._num_clouds += 1
-            if self._num_clouds > MAX_CLOUDS:
-                oldest = next(i for i, item in enumerate(self._work) if isinstance(item, Cloud))
-                del self._work[oldest]
+            if self._num_clouds > self._max_clouds:
+                oldest = next(item for item in self._work if isinstance(item, Cloud))
+                self._work.remove(oldest)
                 self._num_clouds -= 1
-                self._clouds_lost += 1
+                self._clouds_lost[oldest.topic, oldest.msg.header.frame_id] += 1
             self._changed.notify()
+
+    @property
+    def num_clouds(self) -> int:
+        """How many clouds wait."""
+        return self._num_clouds
 
     def call(self, function: Callable[[], Result]) -> Future[Result]:
         """
@@ -163,7 +166,7 @@ class MappingThread:
             poses, self._poses = self._poses, deque()
             item = self._work.popleft() if self._work else None
             self._num_clouds -= isinstance(item, Cloud)
-            clouds_lost, self._clouds_lost = self._clouds_lost, 0
+            clouds_lost, self._clouds_lost = self._clouds_lost, Counter()
             poses_lost, self._poses_lost = self._poses_lost, 0
         self._count_lost(clouds_lost, poses_lost)
         for pose, static in poses:
@@ -176,27 +179,30 @@ class MappingThread:
             on_update(update)
         return True
 
-    def _count_lost(self, clouds: int, poses: int) -> None:
+    def _count_lost(self, clouds: Counter[tuple[str, str]], poses: int) -> None:
         """Enter in the counts what the queue had to drop."""
         if poses:
             self._mapper.ignore_message('overload', f'{poses} poses dropped: too many wait', poses)
-        if clouds:
+        for (topic, frame_id), number in clouds.items():
             reason = (
-                'they come faster than they can be mapped; larger voxels (map.voxel_size_m) or a '
-                'shorter range (input.max_range_m) would help'
+                f'in frame {frame_id!r}, clouds come faster than they can be mapped; larger '
+                'voxels (map.voxel_size_m) or a shorter range (input.max_range_m) would help'
             )
-            self._mapper.refuse_clouds('overload', 'the input topics', reason, clouds)
+            self._mapper.refuse_clouds('overload', topic, reason, number, frame_id)
 
     def _add(self, cloud: Cloud) -> None:
         """Decode a cloud and give it to the mapper; a bad one is counted."""
+        frame_id = cloud.msg.header.frame_id
         if self.paused:
-            self._mapper.refuse_clouds('paused', cloud.topic, 'mapping is paused')
+            reason = 'mapping is paused; call ~/pause with false to go on'
+            self._mapper.refuse_clouds('paused', cloud.topic, reason, frame_id=frame_id)
             return
         try:
             with self._mapper.counters.timed('decode'):
                 scan = to_scan(cloud.msg, cloud.topic)
         except CloudFormatError as error:
-            self._mapper.refuse_clouds('bad_cloud', cloud.topic, str(error))
+            reason = f'in frame {frame_id!r}, {error}'
+            self._mapper.refuse_clouds('bad_cloud', cloud.topic, reason, frame_id=frame_id)
             return
         self._mapper.add_scan(scan)
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Clouds and diagnostics as messages.
+Clouds as messages.
 
 The bytes of a cloud go through an array.array, which takes 0.6 ms for 4 MiB; assigning a numpy
 array, which rclpy checks byte by byte, takes 270 ms.
@@ -10,11 +10,9 @@ array, which rclpy checks byte by byte, takes 270 ms.
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
@@ -22,8 +20,6 @@ from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
-
-OK, WARN = DiagnosticStatus.OK, DiagnosticStatus.WARN
 
 
 def surfel_cloud(surfels: Surfels, stamp_ns: int, frame_id: str) -> PointCloud2:
@@ -51,40 +47,3 @@ def time_message(stamp_ns: int) -> Time:
     """Return a time in nanoseconds as a message."""
     sec, nanosec = divmod(stamp_ns, 10**9)
     return Time(sec=sec, nanosec=nanosec)
-
-
-def diagnostics(
-    name: str, stamp_ns: int, problem: str, values: Mapping[str, Any]
-) -> DiagnosticArray:
-    """
-    Return a report about one node.
-
-    Parameters
-    ----------
-    name : str
-        Of the node.
-    stamp_ns : int
-        The time now.
-    problem : str
-        What is wrong and what to do about it; empty where all is well.
-    values : mapping of str
-        Figures; nested mappings become names with dots.
-
-    """
-    status = DiagnosticStatus(
-        level=WARN if problem else OK,
-        name=f'{name}: mapping',
-        message=problem or 'ok',
-        hardware_id=name,
-        values=[KeyValue(key=key, value=str(value)) for key, value in leaves(values)],
-    )
-    return DiagnosticArray(header=Header(stamp=time_message(stamp_ns)), status=[status])
-
-
-def leaves(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested mappings under dotted names."""
-    for key, value in values.items():
-        if isinstance(value, Mapping):
-            yield from leaves(value, f'{prefix}{key}.')
-        else:
-            yield f'{prefix}{key}', value

@@ -1,45 +1,57 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The node: parameters and services around a Mapper, its inputs and outputs.
+The node: its life cycle and its parameters, around a session that does the work.
 
-Three threads. The main one waits for signals (running.py). The executor's takes messages and
-requests and passes them on. The mapping thread alone touches the map, and publishes what comes
-of it. A service waits for the mapping thread, behind the clouds that came before the request, so
-its answer is about all of them.
+Three threads. The main one makes the transitions and hears signals (running.py). The executor's
+takes messages and requests and passes them on. The mapping thread alone touches the map, and
+publishes what comes of it.
+
+    unconfigured  parameters and diagnostics
+    inactive      kernels are compiled, topics and services are there, no scan is taken
+    active        scans are mapped
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from collections.abc import Callable, Iterator
 from functools import partial
-import time
+from typing import Any
 
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import (
+    LifecycleNodeMixin,
+    LifecycleState,
+    TransitionCallbackReturn,
+)
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from std_srvs.srv import SetBool, Trigger
+from rclpy.publisher import Publisher
 
-from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, SurfelMapperError
-from surfel_mapper.pipeline import Mapper
-from surfel_mapper.ros.inputs import Inputs
-from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.outputs import Outputs
+from surfel_mapper.ros.diagnostics import CountedPublisher, Diagnostics
+from surfel_mapper.ros.inbox import Inbox
 from surfel_mapper.ros.parameters import changed_config, declare_settings
-from surfel_mapper.ros.saving import save_map
+from surfel_mapper.ros.session import Session
+from surfel_mapper.ros.waiting import result_of
+
+SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
-class MapperNode(Node):
+class MapperNode(LifecycleNodeMixin, Node):
     """
-    A node that maps clouds: configure, activate, and close in the end.
+    A managed node that maps clouds.
 
     Attributes
     ----------
-    failure : Future
-        Done when the mapping thread has failed, with the error.
+    inbox : Inbox
+        What the main thread has to do: transitions that were requested, errors to raise.
+    refusal : Exception or None
+        Why the last transition was refused.
 
     Raises
     ------
@@ -49,59 +61,157 @@ class MapperNode(Node):
     """
 
     def __init__(self) -> None:
-        """Declare the parameters."""
+        """Declare the parameters, and offer the services of the life cycle."""
         try:
-            super().__init__('surfel_mapper')
+            Node.__init__(self, 'surfel_mapper')
         except ParameterException as error:  # one of rclpy's own, such as use_sim_time
             raise ConfigError(str(error)) from error
-        self.failure: Future[None] = Future()
+        self.inbox = Inbox()
+        self.refusal: Exception | None = None
+        self._session: Session | None = None
         self._config = declare_settings(self)
-
-    def configure(self) -> None:
-        """
-        Compile the kernels, then offer topics to read, and services.
-
-        Raises
-        ------
-        ConfigError
-            If this version cannot do what the settings ask for.
-
-        """
-        self._mapper = Mapper(self._config)
-        self.get_logger().info('compiling kernels: a moment, or a minute the first time')
-        start = time.monotonic()
-        self._mapper.warm_up()
-        self.get_logger().info(f'kernels ready after {time.monotonic() - start:.1f} s')
-        self._thread = MappingThread(self._mapper, self.failure.set_exception)
-        self._inputs = Inputs(self, self._config, self._thread)
-        self._outputs = Outputs(self, self._mapper, self._thread, self._inputs)
-        self._thread.start(self._outputs.publish_update)
+        # reentrant, so that a node that compiles still says in which state it is
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
+        self._change_state = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
-        self.create_service(Trigger, '~/clear', self._on_clear)
-        self.create_service(Trigger, '~/save_map', self._on_save_map)
-        self.create_service(SetBool, '~/pause', self._on_pause)
+        self._diagnostics = Diagnostics(self, self._config.publish.diagnostics_rate_hz)
+        self._lasting = set(self._entities())
 
-    def activate(self) -> None:
-        """Subscribe and publish; raises what ``Inputs.subscribe`` does."""
-        self._inputs.subscribe()
-        self._outputs.start_timers(self._config.publish)
+    @property
+    def autostart(self) -> bool:
+        """Whether the node configures and activates itself."""
+        return self._config.autostart
+
+    @property
+    def state(self) -> str:
+        """The name of the state of the life cycle."""
+        return str(self._state_machine.current_state[1])
+
+    def start(self) -> None:
+        """Configure and activate; raises why if that is refused."""
+        for transition in (self.trigger_configure, self.trigger_activate):
+            if transition() != SUCCESS:
+                raise self.refusal or RuntimeError(f'{self.state}: the transition failed')
+
+    def end(self) -> None:
+        """Shut down from whatever state, even from within a transition that was interrupted."""
+        if self.state in ('unconfigured', 'inactive', 'active'):
+            self.trigger_shutdown()
+        self._release(save=self._config.output.save_on_shutdown)
+
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
+        """Create a publisher whose messages are counted for the diagnostics."""
+        return super().create_publisher(*args, publisher_class=CountedPublisher, **kwargs)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Compile the kernels, then offer topics to read, and services."""
+        return self._attempt(self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Subscribe and publish."""
+        return self._attempt(self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take no more scans, and keep the map."""
+        return self._attempt(self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Forget the map, and withdraw topics and services."""
+        return self._attempt(partial(self._release, save=False))
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End for good; the map is saved first if that is asked for."""
+        save = self._config.output.save_on_shutdown
+        return self._attempt(partial(self._release, save=save))
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Go back to unconfigured; the main thread ends the node with the error."""
+        self._release(save=False)
+        return SUCCESS
+
+    def _configure(self) -> None:
+        try:
+            self._session = Session(self, self._config, self.inbox)
+        except BaseException:
+            self._withdraw()
+            raise
+        self._diagnostics.watch(self._session)
+
+    def _activate(self) -> None:
+        session = self._session
+        assert session is not None, 'only a configured node is activated'
+        session.activate()
         self.get_logger().info(
-            f'ready: reads {", ".join(self._inputs.topics())} (pose.source '
+            f'ready: reads {", ".join(session.inputs.topics())} (pose.source '
             f'{self._config.pose.source}), maps in frame {self._config.frames.fixed} with voxels '
             f'of {self._config.map.voxel_size_m:g} m'
         )
 
-    def deactivate(self) -> None:
-        """Take no more messages; those that came are still mapped."""
-        self._inputs.unsubscribe()
-        self._outputs.stop_timers()
+    def _deactivate(self) -> None:
+        if self._session is not None:
+            self._session.deactivate()
 
-    def close(self) -> None:
-        """End the mapping thread when all that came is mapped; log what became of it."""
-        self._thread.stop()
-        self._mapper.finish()
-        self.get_logger().info(report(self._mapper))
+    def _release(self, *, save: bool) -> None:
+        """End the session, if there is one."""
+        session, self._session = self._session, None
+        self._diagnostics.watch(None)
+        if session is not None:
+            session.deactivate()
+            session.close(save=save)
+            self._withdraw()
+
+    def _withdraw(self) -> None:
+        """Destroy all topics, services and timers that came with a session."""
+        for entity, destroy in dict(self._entities()).items():
+            if (entity, destroy) not in self._lasting:
+                destroy(entity)
+
+    def _entities(self) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
+        """Yield everything that others see of the node, and what destroys it."""
+        for entities, destroy in (
+            (self.timers, self.destroy_timer),
+            (self.subscriptions, self.destroy_subscription),
+            (self.publishers, self.destroy_publisher),
+            (self.services, self.destroy_service),
+        ):
+            yield from ((entity, destroy) for entity in entities)
+
+    def _attempt(self, action: Callable[[], object]) -> TransitionCallbackReturn:
+        """Carry out a transition; an error that nobody foresaw goes to the main thread."""
+        self.refusal = None
+        try:
+            action()
+        except SurfelMapperError as error:
+            self.refusal = error
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            self.refusal = error
+            self.inbox.fail(error)
+            return TransitionCallbackReturn.ERROR
+        return SUCCESS
+
+    async def _on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        """Have the main thread make a transition; one that is not possible is refused."""
+        action = partial(self._transit, request, response)
+        response.success = await result_of(self.inbox.ask(action), self.executor)
+        return response
+
+    def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
+        """Make a transition that was requested, in the main thread; return whether it was made."""
+        name = request.transition.label or str(request.transition.id)
+        before = self.state
+        try:
+            done = bool(self._change_state(request, response).success)
+        except rclpy_implementation.RCLError:  # unanswered, it would end rclpy's executor
+            done, self.refusal = False, ConfigError(f'not possible while {before}')
+        if not done:
+            reason = self.refusal or f'there is no such transition while {before}'
+            self.get_logger().error(f'transition {name} refused: {reason}')
+        return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse values that the configuration refuses."""
@@ -116,54 +226,5 @@ class MapperNode(Node):
         config = changed_config(self._config, parameters)
         if config != self._config:
             self._config = config
-            self._outputs.start_timers(config.publish)
-            self._thread.post(partial(self._reconfigure, config))
-
-    def _reconfigure(self, config: Config) -> None:
-        """Give the mapper new settings; called in the mapping thread."""
-        self._mapper.reconfigure(config)
-        self._outputs.expire()
-
-    def _on_clear(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(response, partial(clear, self._mapper))
-
-    def _on_save_map(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        return self._answer(response, partial(save_map, self._mapper))
-
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._thread.paused = request.data
-        response.success = True
-        response.message = 'paused: clouds are dropped' if request.data else 'mapping'
-        return response
-
-    def _answer(self, response: Trigger.Response, action: Callable[[], str]) -> Trigger.Response:
-        """Do something in the mapping thread and answer with what it says, or why it failed."""
-        try:
-            response.message = self._thread.call(action).result()
-            response.success = True
-            self.get_logger().info(response.message)
-        except CancelledError:
-            response.message = 'the node is about to end'
-        except (SurfelMapperError, OSError) as error:
-            response.message = str(error)
-            self.get_logger().error(response.message)
-        return response
-
-
-def clear(mapper: Mapper) -> str:
-    """Empty the map; return what was in it."""
-    message = f'cleared {mapper.map.num_voxels} voxels of {len(mapper.window)} scans'
-    mapper.clear()
-    return message
-
-
-def report(mapper: Mapper) -> str:
-    """Return in one line what was mapped."""
-    summary = mapper.summary()
-    scans = summary['scans']
-    dropped = ', '.join(f'{cause} {number}' for cause, number in scans['dropped'].items())
-    return (
-        f'scans received {scans["received"]}, mapped {scans["mapped"]}, '
-        f'gated {scans["gated"]}, dropped: {dropped or "none"}; surfels {summary["surfels"]}, '
-        f'digest {summary["digest"]}'
-    )
+            if self._session is not None:
+                self._session.reconfigure(config, is_active=self.state == 'active')

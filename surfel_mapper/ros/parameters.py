@@ -25,6 +25,9 @@ QOS_OVERRIDES = 'qos_overrides.'
 
 INT64_MAX = 2**63 - 1
 
+LISTS = {float: Parameter.Type.DOUBLE_ARRAY, str: Parameter.Type.STRING_ARRAY}
+"""Types of parameters by what a list holds."""
+
 
 def declare_settings(node: Node) -> Config:
     """
@@ -60,9 +63,8 @@ def declare(node: Node, declared: Declaration, value: Any) -> None:
         node.declare_parameter(declared.name, value, descriptor(declared), ignore_override=True)
         return
     # rclpy takes an empty list for one of bytes, so the type is declared first, then the value,
-    # and in the end that it cannot be changed.
-    number_list = declared.items is float
-    kind = Parameter.Type.DOUBLE_ARRAY if number_list else Parameter.Type.STRING_ARRAY
+    # and in the end whether it can be changed.
+    kind = LISTS[declared.items]
     node.declare_parameter(declared.name, kind, ParameterDescriptor(), ignore_override=True)
     node.set_parameters([Parameter(declared.name, kind, list(value))])
     final = descriptor(declared)

@@ -9,8 +9,8 @@ signal while it waits inside the middleware.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 import threading
 
 from rclpy.executors import SingleThreadedExecutor
@@ -40,41 +40,45 @@ def run_node(ros_args: Sequence[str]) -> None:
     with context(ros_args):
         node = MapperNode()
         try:
-            with logging_to(node.get_logger()):
+            with logging_to(node.get_logger()), executing(node):
                 live(node)
         finally:
             node.destroy_node()
 
 
 def live(node: MapperNode) -> None:
-    """Run a node from its start until it is interrupted or fails."""
-    node.configure()
+    """Start a node, unless it is to be told when, and make transitions until it has to end."""
     try:
-        node.activate()
-        spin(node)
+        if node.autostart:
+            node.start()
+        else:
+            node.get_logger().info('autostart is false: waits for the transition configure')
+        node.inbox.serve()
     finally:
-        node.deactivate()
-        node.close()
+        node.inbox.close()
+        node.end()
 
 
-def spin(node: MapperNode) -> None:
-    """Execute the callbacks of a node until it is interrupted or fails."""
+@contextmanager
+def executing(node: MapperNode) -> Iterator[None]:
+    """Execute the callbacks of a node in a thread, in a with-block."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     stopping = threading.Event()
 
     def work() -> None:
-        while not stopping.is_set():
-            executor.spin_once()
-
-    with ThreadPoolExecutor(1, 'executor') as pool:
-        working = pool.submit(work)
         try:
-            wait([working, node.failure], return_when=FIRST_COMPLETED)
-        finally:
-            stopping.set()
-            executor.create_task(stopping.is_set)  # any task ends the wait inside
-    executor.shutdown()
-    for future in (working, node.failure):
-        if future.done():
-            future.result()
+            while not stopping.is_set():
+                executor.spin_once()
+        except BaseException as error:
+            node.inbox.fail(error)
+
+    thread = threading.Thread(target=work, name='executor', daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        stopping.set()
+        executor.wake()
+        thread.join()
+        executor.shutdown()

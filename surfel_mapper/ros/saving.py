@@ -1,11 +1,19 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Saving the map where the configuration says, and nowhere else."""
+"""
+Saving and loading the map inside ``output.directory``, and nowhere else.
+
+Whoever can call a service of the node could otherwise write, or probe for, any file of its user.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
+from urllib.parse import unquote, urlsplit
 
+from surfel_mapper.config import OutputConfig
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.io.map_state import load_map as load_state
 from surfel_mapper.io.map_state import save_map as save_state
 from surfel_mapper.io.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
@@ -25,7 +33,7 @@ def save_map(mapper: Mapper) -> str:
 
     """
     output = mapper.config.output
-    directory = Path(output.directory).expanduser().absolute()
+    directory = directory_of(output)
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f'{output.map_name}.ply'
     surfels = mapper.map.surfels(mapper.config.map.min_points)
@@ -35,3 +43,60 @@ def save_map(mapper: Mapper) -> str:
         f'{path} and .npz: {len(surfels)} surfels of {len(mapper.window)} scans '
         f'({mapper.counters.received} received), digest {digest}'
     )
+
+
+def load_map(mapper: Mapper, url: str) -> str:
+    """
+    Put a map that ``save_map`` wrote in the place of the mapper's; return what was loaded.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        Its map and window are replaced; scans that come next are added.
+    url : str
+        A file in ``output.directory``, relative to it or in full, as a path or a file: URL, with
+        or without the extension; empty: ``output.map_name``.
+
+    Raises
+    ------
+    ConfigError
+        If it is not in the directory.
+    FileNotFoundError
+        If there is no such file.
+    FileFormatError
+        If it cannot be read, is damaged or holds something else.
+    MapError
+        If it has another voxel size or other columns than this mapper. Nothing has changed then,
+        nor after any other of these errors.
+
+    """
+    output = mapper.config.output
+    path = path_inside(directory_of(output), url or output.map_name)
+    if not path.exists():
+        raise FileNotFoundError(f'{path}: no such file; ~/save_map writes one')
+    surfel_map, scans = load_state(path)
+    mapper.restore(surfel_map, scans)
+    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    return (
+        f'loaded {path}: {len(surfels)} surfels of {len(scans)} scans, '
+        f'digest {mapper.map.digest()}'
+    )
+
+
+def directory_of(output: OutputConfig) -> Path:
+    """Return the full path of the directory of maps."""
+    return Path(output.directory).expanduser().absolute()
+
+
+def path_inside(directory: Path, url: str) -> Path:
+    """Return the full path of a map in a directory, or raise ConfigError if it is elsewhere."""
+    parts = urlsplit(url)
+    if parts.scheme not in ('', 'file') or parts.netloc or '\0' in url:
+        raise ConfigError(f'map_url: {url!r}, expected a file in output.directory, {directory}')
+    wanted = unquote(parts.path) if parts.scheme else url
+    path = directory / wanted
+    if path.suffix != '.npz':
+        path = path.with_name(f'{path.name}.npz')
+    if not path.resolve().is_relative_to(directory.resolve()):  # links are followed, and `..`
+        raise ConfigError(f'map_url: {url!r} is not inside output.directory, {directory}')
+    return path

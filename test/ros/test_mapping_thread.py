@@ -14,7 +14,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from surfel_mapper.config import Config
 from surfel_mapper.io.pose_messages import poses_in, StampedPose
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.ros.mapping_thread import MappingThread, MAX_CLOUDS, MAX_POSES
+from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
 from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000
@@ -22,6 +22,7 @@ UNTURNED = (0.0, 0.0, 0.0, 1.0)
 CONFIG = Config.from_mapping(
     {'pose.source': 'odometry', 'frames.base_to_sensor': [0.0, 0.0, 0.5, *UNTURNED]}
 )
+MAX_CLOUDS = CONFIG.input.max_waiting_clouds
 TIMEOUT_S = 20
 
 
@@ -93,6 +94,7 @@ def test_of_too_many_clouds_the_oldest_are_dropped_and_counted(bench):
     assert bench.stamps == stamps[3:]
     assert bench.mapper.counters.received == len(stamps)
     assert bench.mapper.counters.dropped == {'overload': 3}
+    assert bench.mapper.counters.dropped_by_frame == {'lidar': {'overload': 3}}
 
 
 def test_of_too_many_poses_the_oldest_are_dropped_and_counted(bench):

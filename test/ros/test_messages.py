@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds and diagnostics as messages."""
+"""Clouds as messages."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.ros.messages import diagnostics, surfel_cloud, time_message
+from surfel_mapper.ros.messages import surfel_cloud, time_message
 from test.ros.live import room
 
 
@@ -49,15 +49,3 @@ def test_an_empty_map_is_a_cloud_without_points():
 
 def test_times_before_the_epoch_have_positive_nanoseconds():
     assert (time_message(-1).sec, time_message(-1).nanosec) == (-1, 999_999_999)
-
-
-def test_a_report_is_ok_without_a_problem_and_a_warning_with_one():
-    fine = diagnostics('mapper', 5, '', {'scans': {'mapped': 3, 'dropped': {}}, 'voxels': 7})
-    assert [(item.key, item.value) for item in fine.status[0].values] == [
-        ('scans.mapped', '3'),
-        ('voxels', '7'),
-    ]
-    assert (fine.status[0].level, fine.status[0].message) == (b'\0', 'ok')
-    assert fine.status[0].name == 'mapper: mapping'
-    bad = diagnostics('mapper', 5, 'no clouds', {})
-    assert (bad.status[0].level, bad.status[0].message) == (b'\1', 'no clouds')

@@ -108,7 +108,7 @@ def test_what_comes_out_is_what_a_mapper_makes_of_what_went_in(start, peer, tmp_
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     path = tmp_path / 'maps' / 'map.ply'
     assert saved.message == (
-        f'{path}: {len(surfels)} surfels of 3 scans (6 received), digest {digest}'
+        f'{path} and .npz: {len(surfels)} surfels of 3 scans (6 received), digest {digest}'
     )
     assert len(read_points(path)['x']) == len(surfels)
 
@@ -293,7 +293,7 @@ def test_without_clouds_the_diagnostics_say_so(start, peer):
     start('node', *ARGUMENTS)
     status, values = peer.diagnosis()
     assert status.level == b'\1'
-    assert status.message == 'no cloud on /points yet'
+    assert status.message.startswith('no cloud on /points yet: nobody publishes there')
     assert values['scans.received'] == '0'
 
 

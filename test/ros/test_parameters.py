@@ -15,8 +15,20 @@ from rclpy.parameter import Parameter  # noqa: E402
 
 from surfel_mapper.ros.parameters import changed_config, declare_settings  # noqa: E402
 
-TYPES = {bool: 'BOOL', int: 'INTEGER', float: 'DOUBLE', str: 'STRING', tuple: 'DOUBLE_ARRAY'}
+TYPES = {
+    bool: 'BOOL',
+    int: 'INTEGER',
+    float: 'DOUBLE',
+    str: 'STRING',
+    (float,): 'DOUBLE_ARRAY',
+    (str,): 'STRING_ARRAY',
+}
 NUMBERS = ('INTEGER', 'DOUBLE')
+
+
+def type_name(declared):
+    is_list = isinstance(declared.default, tuple)
+    return TYPES[(declared.items,) if is_list else type(declared.default)]
 
 
 @pytest.fixture
@@ -45,9 +57,10 @@ def test_every_setting_is_a_parameter_of_its_type_default_bounds_and_meaning(mak
     for declared in declarations():
         found = node.get_parameter(declared.name)
         described = node.describe_parameter(declared.name)
-        expected = list(declared.default) if declared.default == () else declared.default
+        is_list = isinstance(declared.default, tuple)
+        expected = list(declared.default) if is_list else declared.default
         assert found.value == expected
-        assert found.type_.name == TYPES[type(declared.default)]
+        assert found.type_.name == type_name(declared)
         assert described.type == found.type_.value
         assert described.description == declared.meaning
         assert described.read_only is not declared.live
@@ -55,7 +68,7 @@ def test_every_setting_is_a_parameter_of_its_type_default_bounds_and_meaning(mak
             assert choice in described.additional_constraints
         ranges = [*described.floating_point_range, *described.integer_range]
         assert [(r.from_value, r.to_value) for r in ranges] == (
-            [(declared.low, declared.high)] if TYPES[type(declared.default)] in NUMBERS else []
+            [(declared.low, declared.high)] if type_name(declared) in NUMBERS else []
         )
 
 

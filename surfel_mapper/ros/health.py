@@ -1,0 +1,127 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is wrong with a node: findings of two severities, from what happened since the last report.
+
+No ROS here: numbers in, sentences out. A sentence names what it is about and the remedy.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from surfel_mapper.config import DiagnosticsConfig
+
+OK, WARN, ERROR = 0, 1, 2
+"""As in diagnostic_msgs/DiagnosticStatus."""
+
+REMEDIES = {
+    'bad_cloud': 'the log says what is wrong with them',
+    'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, and '
+    'its stamps with those of the clouds; pose.max_wait_s waits longer',
+    'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
+    'faster',
+    'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
+    'stamp_back': 'do two sensors share one frame?',
+    'stamp_repeated': 'does somebody publish the same clouds twice?',
+}
+"""What to do about scans that are dropped, by cause."""
+
+OFF_S = 1e5
+"""A latency beyond a day means that stamps and clock have nothing to do with each other."""
+
+
+@dataclass(kw_only=True)
+class Interval:
+    """
+    What happened from one report to the next.
+
+    Attributes
+    ----------
+    topic : str
+        Where clouds come in.
+    num_publishers : int
+        How many publish there.
+    ever_received : bool
+        Whether there was any cloud before.
+    received : int
+        Clouds that came in.
+    silent_s : float
+        Time since the last.
+    dropped : Counter of str
+        Scans dropped, by cause.
+    latency_s : float or None
+        99th percentile from stamp to publication; None where no scan was mapped.
+    paused : bool
+        Whether clouds are dropped on request.
+    loss : str
+        What the middleware says was lost, and the remedy.
+
+    """
+
+    topic: str
+    num_publishers: int = 1
+    ever_received: bool = True
+    received: int = 0
+    silent_s: float = 0.0
+    dropped: Counter[str] = field(default_factory=Counter)
+    latency_s: float | None = None
+    paused: bool = False
+    loss: str = ''
+
+
+def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
+    """Yield what is wrong, each with its level."""
+    yield from _input(interval, limits)
+    if interval.loss:
+        yield WARN, interval.loss
+    if interval.paused:
+        yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
+    yield from _drops(interval, limits)
+    yield from _latency(interval, limits)
+
+
+def _input(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
+    topic = interval.topic
+    if not interval.ever_received:
+        remedy = (
+            f'{interval.num_publishers} publish there; see fastdds_shm.xml if clouds are large'
+            if interval.num_publishers
+            else 'nobody publishes there; remap points to the topic of the lidar'
+        )
+        yield WARN, f'no cloud on {topic} yet: {remedy}'
+    elif 0.0 < limits.silence_s < interval.silent_s:
+        yield (
+            ERROR,
+            f'no cloud on {topic} for {interval.silent_s:.1f} s '
+            f'({interval.num_publishers} publish there); is the lidar alive?',
+        )
+
+
+def _drops(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
+    dropped = Counter({c: n for c, n in interval.dropped.items() if n and c != 'paused'})
+    share = dropped.total() / max(interval.received, dropped.total(), 1)
+    if share <= limits.warn_dropped_ratio:
+        return
+    level = ERROR if share > limits.error_dropped_ratio else WARN
+    causes = ', '.join(f'{cause} {number}' for cause, number in dropped.most_common())
+    remedy = REMEDIES.get(dropped.most_common(1)[0][0], '')
+    yield level, f'{dropped.total()} scans dropped just now ({causes})' + (
+        f': {remedy}' if remedy else ''
+    )
+
+
+def _latency(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
+    latency_s = interval.latency_s
+    if latency_s is None or abs(latency_s) > OFF_S:
+        return  # a bag played without use_sim_time is no fault
+    for level, limit_s in ((ERROR, limits.error_latency_s), (WARN, limits.warn_latency_s)):
+        if 0.0 < limit_s < latency_s:
+            yield (
+                level,
+                f'{latency_s:.3f} s from stamp to publication (99th percentile), above '
+                f'{limit_s:g} s: the milliseconds by stage say where, queue whether clouds wait',
+            )
+            return

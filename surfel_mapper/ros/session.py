@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a node has from configure to cleanup: a mapper, its thread, what goes in and out."""
+
+from __future__ import annotations
+
+from collections import deque
+from concurrent.futures import CancelledError
+from contextlib import suppress
+import time
+
+from rclpy.node import Node
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.ros.control import Control
+from surfel_mapper.ros.inbox import Inbox
+from surfel_mapper.ros.inputs import Inputs
+from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.outputs import Outputs
+from surfel_mapper.ros.saving import save_map
+
+LATEST = 200
+"""Latencies of so many scans are kept for the percentiles, 10 s at 20 Hz."""
+
+
+class Session:
+    """
+    The working parts of a node, from empty map to report.
+
+    Parameters
+    ----------
+    node : Node
+        Whose topics and services they are.
+    config : Config
+        All settings.
+    inbox : Inbox
+        Gets the error if the mapping thread fails.
+
+    Attributes
+    ----------
+    latencies_s : deque of float
+        Of the latest scans, from their stamps until what they changed was published, by the
+        clock of the node.
+
+    Raises
+    ------
+    ConfigError
+        If this version cannot do what the settings ask for.
+
+    """
+
+    def __init__(self, node: Node, config: Config, inbox: Inbox) -> None:
+        """Compile the kernels, then offer topics to read, and services."""
+        self._node = node
+        self.config = config
+        self.mapper = Mapper(config)
+        warm_up(self.mapper, node)
+        self.thread = MappingThread(self.mapper, inbox.fail)
+        self.inputs = Inputs(node, config, self.thread)
+        self.outputs = Outputs(node, self.mapper, self.thread)
+        self.control = Control(node, self.mapper, self.thread, self.outputs)
+        self.latencies_s: deque[float] = deque(maxlen=LATEST)
+        self.thread.start(self._on_update)
+
+    def activate(self) -> None:
+        """Subscribe and publish; raises what ``Inputs.subscribe`` does."""
+        try:
+            self.inputs.subscribe()
+        except SurfelMapperError:
+            self.inputs.unsubscribe()
+            raise
+        self.outputs.start_timers(self.config.publish)
+
+    def deactivate(self) -> None:
+        """Take no more messages and, when those that came are mapped, publish no more."""
+        self.inputs.unsubscribe()
+        self.outputs.stop_timers()
+        with suppress(CancelledError):  # the thread may have failed, which the inbox tells
+            self.thread.call(lambda: None).result()
+
+    def reconfigure(self, config: Config, *, is_active: bool) -> None:
+        """Put new settings to work, from the next scan on."""
+        self.config = config
+        if is_active:
+            self.outputs.start_timers(config.publish)
+        self.thread.post(self._reconfigure)
+
+    def close(self, *, save: bool) -> None:
+        """End the thread when all that came is mapped; save the map if asked, and report."""
+        self.thread.stop()
+        self.mapper.finish()
+        log = self._node.get_logger()
+        if save:
+            try:
+                log.info(f'saved {save_map(self.mapper)}')
+            except (SurfelMapperError, OSError) as error:
+                log.error(f'the map could not be saved: {error}')
+        log.info(report(self.mapper))
+
+    def _on_update(self, update: Update) -> None:
+        """Publish what a scan changed; called in the mapping thread."""
+        self.outputs.publish_update(update)
+        now_ns = self._node.get_clock().now().nanoseconds
+        self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
+
+    def _reconfigure(self) -> None:
+        """Give the mapper the newest settings; called in the mapping thread."""
+        try:
+            self.mapper.reconfigure(self.config)
+        except SurfelMapperError as error:  # the file of filters is not what it was when checked
+            self._node.get_logger().error(f'settings not taken: {error}')
+        self.outputs.expire()
+
+
+def warm_up(mapper: Mapper, node: Node) -> None:
+    """Compile the kernels of a mapper, and say how long it took."""
+    log = node.get_logger()
+    log.info('compiling kernels: a moment, or half a minute the first time')
+    start = time.monotonic()
+    mapper.warm_up()
+    log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
+
+
+def report(mapper: Mapper) -> str:
+    """Return in one line what was mapped."""
+    summary = mapper.summary()
+    scans = summary['scans']
+    dropped = ', '.join(f'{cause} {number}' for cause, number in scans['dropped'].items())
+    return (
+        f'scans received {scans["received"]}, mapped {scans["mapped"]}, '
+        f'gated {scans["gated"]}, dropped: {dropped or "none"}; surfels {summary["surfels"]}, '
+        f'digest {summary["digest"]}'
+    )
