@@ -49,7 +49,9 @@ class Groups:
         return cls(rows, first, np.bincount(rows, minlength=number))
 
 
-def merged_columns(scan: Scan, groups: Groups, *, average: bool = True) -> dict[str, Array]:
+def merged_columns(
+    scan: Scan, groups: Groups, *, average: bool = True, unit: bool = True
+) -> dict[str, Array]:
     """
     Return the columns of the points that groups of points become, (K,) or (K, C) each.
 
@@ -61,11 +63,19 @@ def merged_columns(scan: Scan, groups: Groups, *, average: bool = True) -> dict[
         Which of them become one.
     average : bool
         Whether to average columns by their kind; else those of the first point are kept.
+    unit : bool
+        Whether mean directions get unit length again; else they are shorter where they differ.
 
     """
+
+    def kind(name: str, column: Array) -> Kind:
+        if not average:
+            return Kind.FIRST
+        found = kind_of(name, column)
+        return Kind.NUMBER if found is Kind.DIRECTION and not unit else found
+
     return {
-        name: merged(kind_of(name, column) if average else Kind.FIRST, column, groups)
-        for name, column in scan.columns.items()
+        name: merged(kind(name, column), column, groups) for name, column in scan.columns.items()
     }
 
 

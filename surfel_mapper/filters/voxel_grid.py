@@ -50,6 +50,11 @@ class VoxelGrid(Filter):
         '1: average the columns; 0: keep those of the first point.',
         theirs='averageExistingDescriptors',
     )
+    unit_normals: bool = parameter(
+        True,
+        '1: averaged normals get unit length again; 0: they stay as short as they become.',
+        their_default=False,
+    )
     anchor: str = parameter(
         'origin',
         'Where voxels begin: at the origin, so that they stay where they are, or at the lowest '
@@ -86,7 +91,7 @@ class VoxelGrid(Filter):
         return replace(
             scan,
             points=means.astype(scan.points.dtype, order='F'),
-            columns=merged_columns(scan, groups, average=with_rows),
+            columns=merged_columns(scan, groups, average=with_rows, unit=self.unit_normals),
         )
 
 

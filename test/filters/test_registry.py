@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Finding filters: by either name, by decorator, by entry point; and what is refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters import registry
+from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.registry import all_filters, find, register
+from surfel_mapper.filters.voxel_grid import VoxelGrid
+from test.filters.examples import scan_of
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch):
+    """Leave the registry as it was, whatever a test registers."""
+    registry.load_built_in()
+    monkeypatch.setattr(registry, '_FILTERS', dict(registry._FILTERS))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OddRows(Filter):
+    """Keep every second point."""
+
+    phase: int = parameter(1, 'First point that stays.', low=0, high=1)
+
+    def keep(self, scan):
+        return np.arange(len(scan)) % 2 == self.phase
+
+
+class Broken:
+    """No filter."""
+
+
+def entry_points(monkeypatch, **values):
+    points = [EntryPoint(name, value, registry.GROUP) for name, value in values.items()]
+
+    def found(group, name=None):
+        return [p for p in points if p.group == group and name in (None, p.name)]
+
+    monkeypatch.setattr(registry, 'entry_points', found)
+
+
+def test_a_filter_is_found_by_our_name_and_by_theirs():
+    assert find('voxel_grid') is find('VoxelGridDataPointsFilter') is VoxelGrid
+
+
+def test_an_unknown_name_is_refused_with_the_nearest():
+    with pytest.raises(ConfigError, match=r'voxelgrid: no such filter, .*did you mean voxel_grid'):
+        find('voxelgrid')
+    with pytest.raises(ConfigError, match='did you mean VoxelGridDataPointsFilter'):
+        find('VoxelGridDataPointFilter')
+
+
+def test_a_decorated_class_is_found_under_its_name_in_snake_case():
+    register(OddRows)
+    assert find('odd_rows') is OddRows
+    assert OddRows in all_filters()
+    scan = Chain.from_list([{'odd_rows': {'phase': '0'}}]).apply(scan_of(np.zeros((5, 3))))
+    assert len(scan) == 3
+
+
+def test_a_name_can_be_given_and_taken_once():
+    register(name='odd', theirs='OddDataPointsFilter')(OddRows)
+    assert find('odd') is find('OddDataPointsFilter') is OddRows
+    with pytest.raises(ConfigError, match=r"filter 'voxel_grid' of .*: .*voxel_grid has one of"):
+        register(name='voxel_grid')(OddRows)
+    with pytest.raises(ConfigError, match='expected a class derived from'):
+        register(Broken)
+
+
+def test_an_entry_point_is_found_by_its_name(monkeypatch):
+    entry_points(monkeypatch, every_second=f'{__name__}:OddRows')
+    assert find('every_second') is OddRows
+    assert OddRows in all_filters()
+
+
+def test_a_broken_entry_point_spoils_nothing_but_what_names_it(monkeypatch, caplog):
+    entry_points(monkeypatch, lost='no_such_package:Filter', none=f'{__name__}:Broken')
+    assert find('voxel_grid') is VoxelGrid
+    assert VoxelGrid in all_filters()
+    assert 'no_such_package:Filter does not load' in caplog.text
+    with pytest.raises(ConfigError, match="'lost': entry point no_such_package:Filter does not"):
+        find('lost')
+    with pytest.raises(ConfigError, match='expected a class derived from'):
+        find('none')
+    with pytest.raises(ConfigError, match='did you mean lost'):
+        find('losst')
+
+
+def test_filters_are_listed_sorted_and_once_each():
+    names = [cls.name for cls in all_filters()]
+    assert names == sorted(set(names))
+    assert len([cls for cls in all_filters() if cls.theirs]) == 31

@@ -1,0 +1,219 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""VoxelGrid against what libpointmatcher gave, against a slow twin, and at its limits."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from surfel_mapper.errors import ConfigError, FilterError
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.scan import Scan
+from test.filters.examples import filter_of, random_scan, scan_of
+
+GOLDEN = Path(os.environ.get('SURFEL_MAPPER_TEST_DATA', '')) / 'golden'
+THEIRS = 'VoxelGridDataPointsFilter'
+
+
+def golden_cases():
+    if not os.environ.get('SURFEL_MAPPER_TEST_DATA'):
+        return {}
+    return json.loads((GOLDEN / 'voxel_grid.json').read_text())['cases']
+
+
+CASES = golden_cases()
+
+needs_golden = pytest.mark.skipif(not CASES, reason='SURFEL_MAPPER_TEST_DATA is not set')
+
+
+def names(status=0, centroid=True):
+    return [
+        name
+        for name, case in CASES.items()
+        if case['status'] == status
+        and (status or (case['params'].get('useCentroid') != '0') == centroid)
+    ]
+
+
+@pytest.fixture(scope='module')
+def arrays():
+    with np.load(GOLDEN / 'voxel_grid.npz') as content:
+        return dict(content)
+
+
+def split(values, labels):
+    """Return the descriptors in a matrix by name, (N,) or (N, C)."""
+    ends = np.cumsum([rows for _, rows in labels])
+    parts = np.split(values, ends[:-1], axis=1) if len(ends) else []
+    return {
+        name: part[:, 0] if rows == 1 else part
+        for (name, rows), part in zip(labels, parts, strict=True)
+    }
+
+
+def scan_in(case, arrays):
+    xyz = arrays[case['xyz_key']]
+    points = np.zeros((len(xyz), 3), xyz.dtype)
+    points[:, : case['dim']] = xyz  # a 2-D cloud is one layer
+    columns = {}
+    if case['descriptor_labels']:
+        columns = split(arrays[case['desc_key']], case['descriptor_labels'])
+    if case['has_times']:
+        columns['times'] = arrays[case['times_key']][:, 0]
+    return scan_of(points, **columns)
+
+
+def filtered(case, arrays):
+    return Chain.from_list([{THEIRS: case['params']}]).apply(scan_in(case, arrays))
+
+
+@needs_golden
+@pytest.mark.parametrize('name', [n for n in names() if not n.startswith('real')])
+def test_centroids_columns_and_order_are_libpointmatchers(name, arrays):
+    case = CASES[name]
+    found = filtered(case, arrays)
+    expected = arrays[f'out/{name}/features'][:, : case['dim']]
+    assert len(found) == case['n_out'] == case['n_out_f64_arithmetic']
+    # their sums in float32 err by what the case states, and each rounds the result once
+    tolerance = case['max_abs_centroid_diff_vs_f64'] + np.spacing(np.float32(abs(expected).max()))
+    np.testing.assert_allclose(
+        found.points[:, : case['dim']], expected, rtol=0.0, atol=tolerance
+    )
+    descriptors = split(arrays[f'out/{name}/descriptors'], case['descriptor_labels'])
+    for column, values in descriptors.items():
+        np.testing.assert_allclose(found.columns[column], values, rtol=2e-6, atol=1e-6)
+    if case['has_times']:
+        np.testing.assert_array_equal(
+            found.columns['times'], arrays[f'out/{name}/times'][:, 0]
+        )
+
+
+@needs_golden
+@pytest.mark.parametrize('name', [n for n in names() if n.startswith('real')])
+def test_of_a_real_scan_all_centroids_but_those_at_a_face_are_libpointmatchers(name, arrays):
+    case = CASES[name]
+    found = filtered(case, arrays).points.astype(np.float64)
+    expected = arrays[f'out/{name}/features'][:, :3].astype(np.float64)
+    assert len(found) == len(expected) == case['n_out']
+    for these, those in ((found, expected), (expected, found)):
+        distances, _ = cKDTree(those).query(these)
+        # in float32 one of the 69,792 points is on the other side of a face: two centroids move
+        assert np.count_nonzero(distances > 2e-5) <= 2
+
+
+@needs_golden
+@pytest.mark.parametrize('name', names(centroid=False))
+def test_where_their_centres_are_wrong_ours_are_centres_of_the_same_voxels(name, arrays):
+    case = CASES[name]
+    scan, found = scan_in(case, arrays), filtered(case, arrays)
+    assert len(found) == case['n_out']
+    size = [float(case['params'].get(f'vSize{axis}', 1.0)) for axis in 'XYZ']
+    centres = slow(scan, size, 'minimum', centroid=False)
+    tolerance = 2 * np.spacing(abs(centres).max().astype(scan.points.dtype))
+    np.testing.assert_allclose(found.points, centres, rtol=0.0, atol=tolerance)
+
+
+@needs_golden
+@pytest.mark.parametrize('name', names(status=1))
+def test_what_libpointmatcher_refuses_is_refused(name, arrays):
+    with pytest.raises((ConfigError, FilterError)):
+        filtered(CASES[name], arrays)
+
+
+def slow(scan, size, anchor, centroid=True):
+    """Return the points that voxels leave, in a dictionary and in float64."""
+    points, size = scan.points.astype(np.float64), np.array(size)
+    shift = points.min(axis=0) / size if anchor == 'minimum' else np.zeros(3)
+    voxels = {}
+    for point in points:
+        voxels.setdefault(tuple(np.floor(point / size - shift)), []).append(point)
+    if centroid:
+        return np.array([np.sum(each, axis=0) / len(each) for each in voxels.values()])
+    return (np.array(list(voxels)) + 0.5 + shift) * size
+
+
+@pytest.mark.parametrize('anchor', ['origin', 'minimum'])
+@pytest.mark.parametrize('centroid', [True, False])
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+@pytest.mark.parametrize('number', [1, 40, 9000])
+def test_it_does_what_its_slow_twin_does(anchor, centroid, dtype, number):
+    scan = random_scan(number, dtype=dtype)
+    size = (0.5, 0.3, 0.7)
+    found = filter_of(
+        'voxel_grid', size_x_m=size[0], size_y_m=size[1], size_z_m=size[2],
+        use_centroid=centroid, anchor=anchor,
+    ).apply(scan)
+    expected = slow(scan, size, anchor, centroid)
+    tolerance = 4 * np.finfo(dtype).eps * 4.0  # coordinates are below 4 m
+    np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
+
+
+def test_voxels_anchored_at_the_origin_stay_while_points_come_and_go():
+    scan = random_scan(300)
+    part = scan.select(np.arange(100, 300))
+    centres = {'use_centroid': False}
+    all_, some = (filter_of('voxel_grid', **centres).apply(each) for each in (scan, part))
+    assert set(map(tuple, some.points)) <= set(map(tuple, all_.points))
+    assert (all_.points % 1.0 == 0.5).all()
+
+
+def test_a_voxel_of_each_axis_has_its_own_size():
+    scan = scan_of([[0.1, 0.1, 0.1], [0.9, 0.1, 0.1], [0.1, 3.9, 0.1], [0.1, 0.1, 0.3]])
+    found = filter_of('voxel_grid', size_x_m=1.0, size_y_m=4.0, size_z_m=0.2).apply(scan)
+    np.testing.assert_allclose(found.points, [[1.1 / 3, 4.1 / 3, 0.1], [0.1, 0.1, 0.3]])
+
+
+def test_of_columns_the_first_are_kept_where_averages_are_not_wanted():
+    scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], intensity=[1.0, 3.0], label=[4, 5])
+    averaged = filter_of('voxel_grid').apply(scan).columns
+    first = filter_of('voxel_grid', average_columns=False).apply(scan).columns
+    assert (averaged['intensity'].tolist(), averaged['label'].tolist()) == ([2.0], [4])
+    assert (first['intensity'].tolist(), first['label'].tolist()) == ([1.0], [4])
+
+
+def test_averaged_normals_have_unit_length_but_under_libpointmatchers_name():
+    normals = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], normals=normals)
+    ours = filter_of('voxel_grid').apply(scan).columns['normals']
+    theirs = filter_of(THEIRS).apply(scan).columns['normals']
+    np.testing.assert_allclose(ours, [[0.5**0.5, 0.0, 0.5**0.5]], rtol=1e-15)
+    np.testing.assert_allclose(theirs, [[0.5, 0.0, 0.5]])
+
+
+def test_memory_follows_the_points_and_not_the_extent():
+    # a dense grid of these has 2^57 voxels, and libpointmatcher's wraps at 2^32
+    scan = scan_of([[0.0, 0.0, 0.0], [5e5, 5e5, 5e5], [-5e5, -5e5, -5e5], [0.1, 0.1, 0.1]])
+    sizes = dict.fromkeys(('size_x_m', 'size_y_m', 'size_z_m'), 1.0)
+    assert len(filter_of('voxel_grid', **sizes).apply(scan)) == 3
+
+
+@pytest.mark.parametrize(('far', 'size'), [(5e9, 1.0), (3e6, 1e-3 * 1.0), (1e30, 1.0)])
+def test_an_extent_that_no_key_can_number_is_refused_with_what_to_do(far, size):
+    scan = scan_of([[0.0, 0.0, 0.0], [far, far, far]])
+    sizes = dict.fromkeys(('size_x_m', 'size_y_m', 'size_z_m'), size)
+    with pytest.raises(FilterError, match=r'extends over .* voxels, .*use larger ones'):
+        filter_of('voxel_grid', **sizes).apply(scan)
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize('row', [0, 7])
+def test_a_coordinate_that_is_not_finite_is_refused_wherever_it_stands(value, row):
+    scan = random_scan(20)
+    points = scan.points.copy()
+    points[row, 1] = value
+    with pytest.raises(FilterError, match='nan or infinite; put remove_nan'):
+        filter_of('voxel_grid').apply(Scan(points=points, stamp_ns=0, frame_id='sensor'))
+
+
+def test_a_voxel_may_be_infinite_but_has_no_centre_then():
+    scan = random_scan(50)
+    found = filter_of('voxel_grid', size_x_m=np.inf, size_y_m='inf', size_z_m='.inf').apply(scan)
+    np.testing.assert_allclose(found.points, [scan.points.mean(axis=0)], rtol=0.0, atol=1e-5)
+    with pytest.raises(ConfigError, match='has no centre'):
+        filter_of('voxel_grid', size_x_m=np.inf, use_centroid=False)
