@@ -13,7 +13,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_OFFSET
+from surfel_mapper.kernels.layout import COUNT, INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
 from surfel_mapper.kernels.moments import hash_shift, home
 
 
@@ -150,3 +150,20 @@ def reach(coordinate, radius, voxel_size):
         np.int64(min(max(first, -float(INDEX_OFFSET)), float(INDEX_OFFSET))),
         np.int64(max(min(last, INDEX_OFFSET - 1.0), -INDEX_OFFSET - 1.0)),
     )
+
+
+@njit(cache=True, nogil=True)
+def keys_in_box(rows, used, low, high):
+    """Return the keys of the voxels whose indices are from low to high, (3,) int64 each."""
+    kept = np.empty(used, np.int64)
+    num = 0
+    for row in range(used):
+        key = rows[row, KEY]
+        kx = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        kz = (key & INDEX_MASK) - INDEX_OFFSET
+        inside = low[0] <= kx <= high[0] and low[1] <= ky <= high[1] and low[2] <= kz <= high[2]
+        if inside and rows[row, COUNT] > 0:
+            kept[num] = key
+            num += 1
+    return kept[:num].copy()

@@ -39,6 +39,9 @@ from surfel_mapper.mapping.surfels import derive, Surfels
 from surfel_mapper.mapping.threads import pool
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
+Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
+"""Lowest and highest voxel index, (3,) each."""
+
 LOGGED = 1 << 18
 """At least so many changes are remembered, so that asking for the latest ones is quick."""
 
@@ -289,7 +292,7 @@ class SurfelMap:
 
     __hash__ = None  # type: ignore[assignment]  # a map changes
 
-    def coarsen(self, level: int) -> SurfelMap:
+    def coarsen(self, level: int, within: Box | None = None) -> SurfelMap:
         """
         Return the map of voxels 2^level times larger, from the moments of this one alone.
 
@@ -301,6 +304,8 @@ class SurfelMap:
         ----------
         level : int
             1 doubles the edge of a voxel; 0 copies the map.
+        within : two (3,) int, optional
+            Lowest and highest voxel index of what is to be in it.
 
         Raises
         ------
@@ -315,7 +320,8 @@ class SurfelMap:
         coarse = SurfelMap(
             self.voxel_size_m * 2**level, columns=self.columns, level=self.level + level
         )
-        coarse.insert(coarse_moments(self.moments(), level))
+        inside = unpack_keys(self._table.keys_in_box(*within)) if within else None
+        coarse.insert(coarse_moments(self.moments(inside), level))
         return coarse
 
     def copy(self) -> SurfelMap:
@@ -327,6 +333,18 @@ class SurfelMap:
     def surfels(self, min_points: int = 1) -> Surfels:
         """Return the surfels of all voxels with at least so many points, in no stated order."""
         return self._derive(self._table.changed_after(-1, min_points))
+
+    def num_surfels(self, min_points: int = 1) -> int:
+        """Return how many voxels hold at least so many points."""
+        return len(self._table.changed_after(-1, min_points))
+
+    def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
+        """Return the row of each voxel key, -1 for none; rows hold until the map changes."""
+        return self._table.find(key)
+
+    def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
+        """Return the surfels of some rows, which ``find`` gave."""
+        return self._derive(rows)
 
     def index(self, min_points: int = 1) -> SurfelIndex:
         """Return the surfels with at least so many points, to be asked by place: a snapshot."""

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import hashing, layout
+from surfel_mapper.kernels.queries import keys_in_box
 from surfel_mapper.kernels.surfels import rows_changed_after
 from surfel_mapper.kernels.voxels import (
     add_moments,
@@ -154,6 +155,13 @@ class VoxelTable:
         """Return the rows changed after a version that hold at least so many points."""
         used = int(self._state[hashing.ROWS_USED])
         return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
+
+    def keys_in_box(
+        self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
+    ) -> npt.NDArray[np.int64]:
+        """Return the keys of the voxels with indices from low to high, (3,) each."""
+        used = int(self._state[hashing.ROWS_USED])
+        return np.asarray(keys_in_box(self.rows, used, low, high), np.int64)
 
     @property
     def _hash_table(self) -> tuple[npt.NDArray[Any], ...]:

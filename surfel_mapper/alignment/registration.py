@@ -1,0 +1,307 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Registration: where a scan belongs on a map of surfels.
+
+The scan is reduced to the means of its cells, and Gauss-Newton brings these onto the planes of
+the surfels in whose voxels they lie; there is no search for neighbours. Where the prediction may
+be off by more than a voxel, larger voxels come first, made of the same exact moments. A scan
+that does not fit in the end is tried from other headings, as a hand turns a lidar faster than any
+prediction.
+
+The eigenvalues of the normal equations, turns scaled by the mean distance of what is seen, tell
+which directions of motion the scan says nothing about (a tunnel, a plain). There the prediction
+stays, after Zhang, Kaess and Singh 2016; the share of the information is compared, not its
+amount, for which every sensor would need a threshold of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.alignment.surfel_planes import SurfelPlanes
+from surfel_mapper.config import RegistrationConfig
+from surfel_mapper.geometry import compose, pose_matrix, q_xyzw, se3_exp, Transform
+from surfel_mapper.kernels.layout import BITS, HALF
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.reducer import Reducer
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+TOLERANCE_M = 1e-4
+"""A step that moves what is seen by less is the last."""
+
+COARSE_TOLERANCE = 0.01
+"""In coarser voxels: by less than this share of one."""
+
+SEARCH_STEP_DEG = 7.5
+SEARCH_CELLS = 3000
+"""Headings are compared so many degrees apart, by so many cells."""
+
+SEARCH_STARTS = 3
+"""From the best so many headings the scan is aligned."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Alignment:
+    """
+    Where a scan belongs.
+
+    Attributes
+    ----------
+    T_map_sensor : (4, 4) float64
+        Pose of the sensor.
+    fit : float
+        Share of the cells of the scan that fit the map, in [0, 1].
+    num_cells : int
+        How many there are.
+    converged : bool
+        Whether the last step was small.
+    iterations : int
+        Steps taken.
+    information : (6, 6) float64
+        Inverse of a covariance of position (m) and turn (rad) about the sensor, along the axes of
+        the map; too large where neighbouring points are off alike.
+    degenerate : (D, 6) float64
+        Directions in which the prediction stayed, unit vectors, turns scaled by ``radius_m``.
+    radius_m : float
+        Root mean square of the levers by which what is seen says something about turns.
+
+    """
+
+    T_map_sensor: Transform
+    fit: float
+    num_cells: int
+    converged: bool
+    iterations: int
+    information: npt.NDArray[np.float64]
+    degenerate: npt.NDArray[np.float64]
+    radius_m: float
+
+
+class Registration:
+    """
+    Aligns scans to maps.
+
+    Parameters
+    ----------
+    config : RegistrationConfig
+        The settings; may be replaced at any time.
+    voxel_size_m : float
+        Of the maps.
+
+    """
+
+    def __init__(self, config: RegistrationConfig, voxel_size_m: float) -> None:
+        """Keep the settings."""
+        self.config = config
+        self._voxel_size_m = voxel_size_m
+        self._reducer = Reducer(config.cell_m or 0.5 * voxel_size_m)
+
+    def cells(
+        self, points: npt.ArrayLike, min_range_m: float = 0.0, max_range_m: float = math.inf
+    ) -> npt.NDArray[np.float64]:
+        """Return the means of the points (N, 3) of a scan in its cells, (K, 3) float64, m."""
+        size_m = self.config.cell_m or 0.5 * self._voxel_size_m
+        if size_m != self._reducer.voxel_size_m:
+            self._reducer = Reducer(size_m)
+        moments = self._reducer.reduce(points, min_range_m=min_range_m, max_range_m=max_range_m)
+        step = -(-len(moments) // self.config.max_cells) or 1
+        return means(moments.select(slice(None, None, step)))
+
+    def align(
+        self,
+        cells: npt.NDArray[np.float64],
+        surfel_map: SurfelMap,
+        starts: Sequence[Transform],
+        deviation_m: float,
+        expected_fit: float = 0.0,
+    ) -> Alignment:
+        """
+        Return where a scan belongs on a map.
+
+        Parameters
+        ----------
+        cells : (K, 3) float64, m
+            As ``cells`` returns them.
+        surfel_map : SurfelMap
+            Of the voxel size stated.
+        starts : sequence of (4, 4) float64
+            Where it may be, the likeliest first; degenerate directions stay as there. The others
+            are tried where that does not fit.
+        deviation_m : float
+            How far cells may be off at the first start; decides where to begin and how much is
+            believed.
+        expected_fit : float
+            Other starts and headings are tried where the scan fits less.
+
+        """
+        levels = _Levels(self.config, surfel_map, cells, starts)
+        found = self._descend(cells, levels, starts[0], deviation_m)
+        if not found.converged or found.fit < max(expected_fit, self.config.min_fit):
+            width_m = levels.voxel_size_m(self.config.coarse_levels)
+            others = [
+                self._descend(cells, levels, start, width_m)
+                for start in self._headings(cells, levels, starts)
+            ]
+            found = max([found, *others], key=lambda other: (other.converged, other.fit))
+        return found
+
+    def _descend(
+        self,
+        cells: npt.NDArray[np.float64],
+        levels: _Levels,
+        start: Transform,
+        deviation_m: float,
+    ) -> Alignment:
+        """Align from the level that a deviation asks for down to the map itself."""
+        reach = max(3.0 * deviation_m / levels.voxel_size_m(0), 1.0)
+        coarsest = min(self.config.coarse_levels, math.ceil(math.log2(reach)))
+        pose, iterations = start, 0
+        for level in range(coarsest, -1, -1):
+            size_m = levels.voxel_size_m(level)
+            width_m = min(deviation_m, 0.5 * size_m)
+            tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
+            found = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
+            pose, iterations = found.T_map_sensor, iterations + found.iterations
+        return found
+
+    def _converge(
+        self,
+        cells: npt.NDArray[np.float64],
+        planes: SurfelPlanes,
+        start: Transform,
+        width_m: float,
+        tolerance_m: float,
+    ) -> Alignment:
+        """Take Gauss-Newton steps until they are small."""
+        pose, iteration, moved_m = start, 0, math.inf
+        while True:
+            hessian, gradient, fit = planes.equations(cells, pose, width_m)
+            if moved_m < tolerance_m or iteration == self.config.max_iterations:
+                break
+            step, degenerate, radius_m = solve(hessian, gradient, self.config.min_information)
+            pose = moved(pose, step)
+            moved_m = math.hypot(*step[:3], *(radius_m * step[3:]))
+            iteration += 1
+        return Alignment(
+            T_map_sensor=pose,
+            fit=fit,
+            num_cells=len(cells),
+            converged=moved_m < tolerance_m,
+            iterations=iteration,
+            information=hessian,
+            degenerate=degenerate,
+            radius_m=radius_m,
+        )
+
+    def _headings(
+        self, cells: npt.NDArray[np.float64], levels: _Levels, starts: Sequence[Transform]
+    ) -> list[Transform]:
+        """Return the starts that fit best, turned to all headings searched."""
+        num = int(self.config.search_deg / SEARCH_STEP_DEG)
+        if not num:
+            return list(starts[1:])
+        some = np.ascontiguousarray(cells[:: max(len(cells) // SEARCH_CELLS, 1)])
+        planes = levels.planes(self.config.coarse_levels)
+        width_m = levels.voxel_size_m(self.config.coarse_levels)
+        turned = [
+            moved(start, np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(k * SEARCH_STEP_DEG)]))
+            for start in starts
+            for k in range(-num, num + 1)
+        ]
+        fits = [planes.equations(some, pose, width_m)[2] for pose in turned]
+        best = np.argsort(fits, kind='stable')[::-1][:SEARCH_STARTS]
+        return [turned[place] for place in best]
+
+
+class _Levels:
+    """The map and its coarser levels around a scan, made when first asked for."""
+
+    def __init__(
+        self,
+        config: RegistrationConfig,
+        surfel_map: SurfelMap,
+        cells: npt.NDArray[np.float64],
+        starts: Iterable[Transform],
+    ) -> None:
+        self._config = config
+        self._map = surfel_map
+        self._cells = cells
+        self._starts = list(starts)
+        self._planes: dict[int, SurfelPlanes] = {}
+
+    def voxel_size_m(self, level: int) -> float:
+        """Return the edge of a voxel of a level."""
+        return float(self._map.voxel_size_m * 2**level)
+
+    def planes(self, level: int) -> SurfelPlanes:
+        """Return the planes of a level."""
+        if level not in self._planes:
+            target = self._map.coarsen(level, self._box()) if level else self._map
+            self._planes[level] = SurfelPlanes(
+                target, self._config.min_points, self._config.noise_m
+            )
+        return self._planes[level]
+
+    def _box(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the voxels that the scan may reach, wherever it turns."""
+        reach_m = math.sqrt(float((self._cells**2).sum(axis=1).max(initial=0.0)))
+        reach_m += self.voxel_size_m(self._config.coarse_levels)
+        at = np.array([start[:3, 3] for start in self._starts])
+        low = np.floor((at.min(axis=0) - reach_m) / self._map.voxel_size_m)
+        high = np.floor((at.max(axis=0) + reach_m) / self._map.voxel_size_m)
+        return low.astype(np.int64), high.astype(np.int64)
+
+
+def means(moments: ScanMoments) -> npt.NDArray[np.float64]:
+    """Return the mean of the points of every voxel, (K, 3) float64, m."""
+    inside = moments.total / moments.count[:, None] + (HALF + 0.5)
+    places = (moments.voxel_index + inside / (1 << BITS)) * moments.voxel_size_m
+    return np.ascontiguousarray(places, np.float64)
+
+
+def solve(
+    hessian: npt.NDArray[np.float64], gradient: npt.NDArray[np.float64], min_information: float
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
+    """
+    Return the Gauss-Newton step in the directions that are not degenerate.
+
+    Parameters
+    ----------
+    hessian, gradient : (6, 6), (6,) float64
+        Of position, m, and turn, rad.
+    min_information : float
+        Smallest eigenvalue of a direction that counts, where those of positions sum up to 1 and
+        those of turns, scaled, as well.
+
+    Returns
+    -------
+    step : (6,) float64
+    degenerate : (D, 6) float64
+        The directions left out, unit vectors, turns scaled.
+    radius_m : float
+        By which turns are scaled.
+
+    """
+    weight = float(np.trace(hessian[:3, :3]))
+    if not weight > 0.0:
+        return np.zeros(6), np.eye(6), 1.0
+    radius_m = math.sqrt(float(np.trace(hessian[3:, 3:])) / weight) or 1.0
+    scale = np.array([1.0, 1.0, 1.0, radius_m, radius_m, radius_m])
+    values, vectors = np.linalg.eigh(hessian / (weight * np.outer(scale, scale)))
+    known = values >= max(min_information, 1e-12)
+    inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
+    step = -(vectors @ (inverse * (vectors.T @ (gradient / (weight * scale))))) / scale
+    return step, np.ascontiguousarray(vectors.T[~known]), radius_m
+
+
+def moved(T_map_sensor: Transform, step: npt.NDArray[np.float64]) -> Transform:
+    """Return a pose moved by step[:3], m, and turned about itself by the vector step[3:], rad."""
+    turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))
+    turned = compose(turn, T_map_sensor)
+    return pose_matrix(T_map_sensor[:3, 3] + step[:3], q_xyzw(turned))

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The surfels of a map as planes for the cells of a scan, derived only where a cell meets them.
+
+What an alignment costs depends on the scan and not on the size of the map. How far a cell may
+be from a plane comes from the fit of the plane itself: the variance of a prediction is that of
+the points about the plane, and grows with the distance from their mean as the normal is unsure,
+by e0 e1 / (n (e1 - e0)^2). So a surfel of few points, of one ring of a lidar, or of a pole or a
+bush says little without a threshold that would have to be set.
+
+Source: Kanatani 1996 (Statistical Optimization for Geometric Computation) for the normal.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.geometry import Transform
+from surfel_mapper.kernels.layout import BITS
+from surfel_mapper.kernels.registration import (
+    cell_keys,
+    MEAN,
+    NORMAL,
+    number_rows,
+    PLANE,
+    SPREAD,
+    sum_equations,
+    VARIANCE,
+)
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+
+
+class SurfelPlanes:
+    """
+    Planes of one map, which must not change meanwhile.
+
+    Parameters
+    ----------
+    surfel_map : SurfelMap
+    min_points : int
+        Surfels of fewer points do not count.
+    noise_m : float
+        Standard deviation of a range: no plane is sharper.
+
+    """
+
+    def __init__(self, surfel_map: SurfelMap, min_points: int, noise_m: float) -> None:
+        """Begin without any plane."""
+        self._map = surfel_map
+        self._min_points = min_points
+        self._noise_sq = noise_m * noise_m
+        self._scale = (1 << (BITS + surfel_map.level)) / surfel_map.voxel_size_m
+        self._number = np.empty(0, np.int32)
+        self._planes = np.empty((0, PLANE))
+
+    def equations(
+        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform, width_m: float
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
+        """
+        Return the normal equations of a step from a pose.
+
+        Parameters
+        ----------
+        cells : (K, 3) float64, m
+            In the sensor frame.
+        T_map_sensor : (4, 4) float64
+            The pose.
+        width_m : float
+            Of the robust kernel.
+
+        Returns
+        -------
+        hessian : (6, 6) float64
+            Of position and turn about the sensor, along the axes of the map.
+        gradient : (6,) float64
+        fit : float
+            Share of the cells that fit, in [0, 1].
+
+        """
+        pose = np.ascontiguousarray(T_map_sensor[:3])
+        place = self._place(cells, pose)
+        hessian, gradient = np.empty((6, 6)), np.empty(6)
+        fit = sum_equations(
+            cells, pose, place, self._planes, width_m * width_m, hessian, gradient
+        )
+        return hessian, gradient, fit / max(len(cells), 1)
+
+    def _place(
+        self, cells: npt.NDArray[np.float64], pose: npt.NDArray[np.float64]
+    ) -> npt.NDArray[np.int32]:
+        """Return the row of the plane that each cell meets at a pose, -1 for none."""
+        keys = np.empty(len(cells), np.int64)
+        cell_keys(cells, pose, self._scale, BITS + self._map.level, keys)
+        found = self._map.find(keys)
+        missing = int(found.max(initial=-1)) + 1 - len(self._number)
+        if missing > 0:
+            self._number = np.append(self._number, np.full(missing, -1, np.int32))
+        num_known = len(self._planes)
+        known = np.empty(num_known + len(cells), np.int32)
+        num_now = number_rows(found, self._number, known, num_known)
+        if num_now > num_known:
+            new = self._map.surfels_of(known[num_known:num_now])
+            self._planes = np.concatenate([self._planes, self._as_planes(new)])
+        return found
+
+    def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
+        """Return surfels as rows of planes; those that say nothing have an infinite variance."""
+        planes = np.empty((len(surfels), PLANE))
+        planes[:, MEAN : MEAN + 3] = surfels.position
+        planes[:, NORMAL : NORMAL + 3] = surfels.normal
+        count = surfels.num_points
+        low, middle = surfels.eigenvalues[:, 0] + self._noise_sq, surfels.eigenvalues[:, 1]
+        gap = np.maximum(middle - surfels.eigenvalues[:, 0], 1e-9 * low)
+        planes[:, VARIANCE] = low * (1.0 + 1.0 / count)
+        planes[:, SPREAD] = low * middle / (count * gap * gap)
+        says_nothing = (count < self._min_points) | np.isnan(surfels.planarity)
+        planes[says_nothing, VARIANCE] = math.inf
+        return planes
