@@ -25,6 +25,8 @@ REQUIRED = [
     'scipy>=1.11',  # rotations and spatial search beyond the kernels
     'numba>=0.61',  # compiles the kernels; 0.61 is the first for Python 3.13
     'rosbags>=0.11.6',  # bags of ROS 1 and 2 without ROS; 0.11.5 leaves out damaged topics
+    'zstandard>=0.22',  # compressed bags, as far as they go where they are cut off
+    'lz4>=4.0',  # likewise, and ROS 1
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
     'matplotlib>=3.6',  # map.png
@@ -38,11 +40,18 @@ ROS = [
     f'ros-jazzy-common-interfaces>=5.3; {WHEELS}',  # all messages but tf2_msgs, which PyPI lacks
 ]
 
+FORMATS = [
+    'pyarrow>=14',  # maps as Parquet
+    'pypcd4>=1.1',  # scans in compressed PCD files
+]
+
 TEST = [
+    *FORMATS,
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
     'pytest-timeout>=2.2',  # a test that hangs names itself
     'hypothesis>=6.98',  # random sequences of adds and removes
     'plyfile>=1.0.1',  # an independent reader of what we write
+    'mcap>=1.1',  # an independent writer of what we read
 ]
 
 LINT = [
@@ -73,7 +82,7 @@ setup(
     packages=find_packages(include=[NAME, f'{NAME}.*']),
     package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml']},
     install_requires=REQUIRED,
-    extras_require={'ros': ROS, 'test': TEST, 'lint': LINT},
+    extras_require={'formats': FORMATS, 'ros': ROS, 'test': TEST, 'lint': LINT},
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

@@ -55,9 +55,12 @@ HOMES = {
     'geometry_msgs': 'ros/',
     'lifecycle_msgs': 'ros/',
     'llvmlite': 'kernels/',
+    'lz4': 'io/bag',
     'matplotlib': 'viz/',
     'nav_msgs': 'ros/',
     'numba': 'kernels/',
+    'pyarrow': 'io/parquet',
+    'pypcd4': 'io/pcd',
     'rcl_interfaces': 'ros/',
     'rclpy': 'ros/',
     'rosbags': 'io/bag',  # bag.py reads, bag_writer.py writes
@@ -69,6 +72,7 @@ HOMES = {
     'tf2_msgs': 'ros/',
     'tf2_ros': 'ros/',
     'visualization_msgs': 'ros/',
+    'zstandard': 'io/bag',
 }
 """Where alone a foreign package may be imported."""
 

@@ -1,16 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Messages from a bag: rosbag2 (mcap, sqlite3, zstd) and ROS 1, read by rosbags, imported only here.
+Messages from a bag: rosbag2 (mcap, sqlite3, zstd) and ROS 1.
 
 The files of a rosbag2 directory are opened one by one and merged in record time. So a recording
 that was killed before its metadata.yaml was written still reads, and messages do not go missing
 where the descriptions of a topic in metadata.yaml and in the file differ: rosbags 0.11 then
 yields none, in silence. For the same reason all that is read is counted against what the indexes
-state. Only compressed bags, of which metadata.yaml alone says so, are left to rosbags as a whole.
-
-Damaged files make rosbags raise nearly anything (AssertionError, KeyError, struct.error, ...),
-so whatever comes out of it becomes a BagError here.
+state. A file whose end is missing yields what is whole, and a warning says where it ends.
 """
 
 from __future__ import annotations
@@ -21,24 +18,29 @@ from contextlib import ExitStack
 import heapq
 import logging
 from pathlib import Path
+import tempfile
 from types import TracebackType
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from surfel_mapper.errors import BagError, DependencyError
-from surfel_mapper.io.bag_files import files_of, stated_counts
+from surfel_mapper.io.bag_compression import unpack_file, unpacked_message, ZSTD_MAGIC
+from surfel_mapper.io.bag_files import files_of, is_packed, is_ros1, stated_counts, unpacked_name
+from surfel_mapper.io.bag_scan import ScannedFile
+from surfel_mapper.io.bag_storage import (
+    damaged,
+    described,
+    is_cdr,
+    latches,
+    open_storage,
+    Storage,
+    type_name,
+)
 from surfel_mapper.io.bag_topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.io.raw_cloud import parse_cloud
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
-    from rosbags.rosbag1 import Reader as Reader1
-    from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys.store import Typestore
-
-REPAIR = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
-"""The tool that may help with a file that does not read."""
-
-ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 
 log = logging.getLogger(__name__)
 
@@ -67,6 +69,8 @@ class BagReader:
         By name, with the number of messages that the index states.
     is_ros1 : bool
         Whether messages are serialised as in ROS 1; else they are CDR.
+    cuts : list of str
+        Which files end too early, and where; each is warned about once.
 
     Raises
     ------
@@ -78,17 +82,18 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         """Open the bag and read its index."""
         self.path = Path(path)
-        self.is_ros1 = self.path.suffix == '.bag'
+        self.is_ros1 = is_ros1(self.path)
+        self.cuts: list[str] = []
         self._decoders: dict[str, tuple[Typestore, str]] = {}
-        self._readers: list[Reader1 | Reader2] = []
+        self._storages: list[tuple[Path, Storage]] = []
         with ExitStack() as files:
-            for file in files_of(self.path):
-                self._readers.append(self._open(file))
-                files.callback(self._readers[-1].close)
+            self._open(files_of(self.path), files)
             self.topics = Topics(self.path, self._indexed_topics())
             if not any(topic.count for topic in self.topics):
                 raise BagError(f'{self.path}: a bag without messages')
             self._files = files.pop_all()
+        for cut in self.cuts:
+            log.warning(cut)
 
     def __enter__(self) -> BagReader:
         """Return the reader, to be closed at the end of the block."""
@@ -106,19 +111,23 @@ class BagReader:
     @property
     def start_ns(self) -> int:
         """Record time of the first message."""
-        return min(reader.start_time for reader in self._readers if reader.message_count)
+        return min(s.start_time for _, s in self._storages if s.message_count)
 
     @property
     def end_ns(self) -> int:
         """Record time of the last message."""
-        return max(reader.end_time for reader in self._readers if reader.message_count) - 1
+        return max(s.end_time for _, s in self._storages if s.message_count) - 1
 
     def is_latched(self, name: str) -> bool:
         """Return whether the publisher of a topic kept messages for those who came later."""
-        every = (connection for reader in self._readers for connection in reader.connections)
-        return any(latches(connection) for connection in every if connection.topic == name)
+        return any(latches(c) for c in self._connections() if c.topic == name)
 
-    def messages(self, names: Collection[str] | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self,
+        names: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
         """
         Yield messages in the order of their record time.
 
@@ -126,6 +135,8 @@ class BagReader:
         ----------
         names : collection of str, optional
             The topics to read; all without.
+        start_ns, stop_ns : int, optional
+            Record time of the first message wanted, and of the first not wanted any more.
 
         Raises
         ------
@@ -135,24 +146,15 @@ class BagReader:
 
         """
         read: Counter[str] = Counter()
-        stream = self._stream(names)
-        while True:
-            try:
-                connection, record_ns, raw = next(stream)
-            except StopIteration:
-                break
-            except Exception as error:
-                done = sum(read.values())
-                raise self._damaged(self.path, f'damaged after {done} messages', error) from error
-            if raw[:4] == ZSTD_MAGIC:
-                raise BagError(
-                    f'{self.path}: its messages are compressed, which only metadata.yaml states; '
-                    'name the directory that holds it'
-                )
-            read[connection.topic] += 1
-            type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
-            yield BagMessage(connection.topic, type_, record_ns, raw)
-        self._check_complete(read, names)
+        streams = [
+            self._stream(path, storage, names, start_ns, stop_ns)
+            for path, storage in self._storages
+        ]
+        for message in heapq.merge(*streams, key=lambda message: message.record_ns):
+            read[message.topic] += 1
+            yield message
+        if start_ns is None and stop_ns is None and not self.cuts:
+            self._check_complete(read, names)
 
     def decode(self, message: BagMessage) -> Any:
         """
@@ -179,47 +181,88 @@ class BagReader:
                 f'{message.type}: {described(error)}'
             ) from error
 
-    def _open(self, path: Path) -> Reader1 | Reader2:
-        """Open one file, or a directory that rosbags reads as a whole."""
-        try:
-            from rosbags import rosbag1, rosbag2
-        except ImportError as error:
-            raise DependencyError(
-                f'rosbags cannot be loaded ({error}). It reads the bags; install it with '
-                '`pip install rosbags`'
-            ) from error
-        reader: Reader1 | Reader2
-        try:
-            reader = rosbag1.Reader(path) if self.is_ros1 else rosbag2.Reader(path)
-            reader.open()
-        except Exception as error:
-            raise self._damaged(path, 'cannot be read', error) from error
-        return reader
+    def _open(self, paths: list[Path], files: ExitStack) -> None:
+        """Open the files of the bag; of several the last may hold nothing, as after a crash."""
+        for number, path in enumerate(paths, 1):
+            file = self._unpacked(path, files) if is_packed(path) else path
+            try:
+                storage = open_storage(file, path)
+            except BagError as error:
+                if number == 1 or number < len(paths):
+                    raise
+                self.cuts.append(f'left out, nothing of it can be read: {error}')
+                continue
+            files.callback(storage.close)
+            self._storages.append((path, storage))
+            if isinstance(storage, ScannedFile) and storage.cut_at is not None:
+                self.cuts.append(
+                    f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
+                    f'{storage.size}; the {storage.message_count} messages found are read'
+                )
+            journal = path.with_name(f'{path.name}-wal')
+            if journal.is_file() and journal.stat().st_size:
+                self.cuts.append(
+                    f'{journal}: holds messages that are not read; merge them with '
+                    f'`sqlite3 {path} "PRAGMA wal_checkpoint(TRUNCATE)"`'
+                )
+
+    def _unpacked(self, path: Path, files: ExitStack) -> Path:
+        """Return a packed file unpacked into a temporary directory."""
+        directory = files.enter_context(tempfile.TemporaryDirectory(prefix='surfel_mapper-'))
+        target = Path(directory, unpacked_name(path))
+        if not unpack_file(path, target):
+            size = path.stat().st_size
+            self.cuts.append(f'{path}: the compressed file is cut off at byte {size}')
+        return target
+
+    def _connections(self) -> Iterator[Connection]:
+        """Yield the connections of all files."""
+        for _, storage in self._storages:
+            yield from storage.connections
 
     def _indexed_topics(self) -> list[Topic]:
         """Return the topics in all files with the counts of index or metadata.yaml."""
         types: dict[str, set[str]] = {}
         counts: Counter[str] = Counter()
-        for reader in self._readers:
-            for name, info in reader.topics.items():
-                types.setdefault(name, set()).update(map(type_name, info.connections))
-                counts[name] += info.msgcount
-        counts |= Counter(stated_counts(self.path))
+        for connection in self._connections():
+            types.setdefault(connection.topic, set()).add(type_name(connection))
+            counts[connection.topic] += connection.msgcount
+        if not self.cuts:
+            counts |= Counter(stated_counts(self.path))
         return [
             Topic(name, ', '.join(sorted(names)), counts[name])
             for name, names in sorted(types.items())
         ]
 
-    def _stream(self, names: Collection[str] | None) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield what rosbags yields of all files, in record time; equal times by file."""
-        streams = []
-        for reader in self._readers:
-            wanted = [c for c in reader.connections if is_cdr(c)]
-            if names is not None:
-                wanted = [c for c in wanted if c.topic in names]
-            if wanted:  # of an empty list rosbags would make all
-                streams.append(reader.messages(wanted))
-        return heapq.merge(*streams, key=lambda item: item[1])
+    def _stream(
+        self,
+        path: Path,
+        storage: Storage,
+        names: Collection[str] | None,
+        start_ns: int | None,
+        stop_ns: int | None,
+    ) -> Iterator[BagMessage]:
+        """Yield the messages of one file; packed ones unpacked."""
+        wanted = [c for c in storage.connections if is_cdr(c)]
+        if names is not None:
+            wanted = [c for c in wanted if c.topic in names]
+        if not wanted:  # of an empty list rosbags would make all
+            return
+        messages, done = iter(storage.messages(wanted, start_ns, stop_ns)), 0
+        while True:
+            try:
+                connection, record_ns, raw = next(messages)
+                if raw[:4] == ZSTD_MAGIC and not self.is_ros1:
+                    raw = unpacked_message(raw)
+            except StopIteration:
+                return
+            except DependencyError:
+                raise
+            except Exception as error:
+                raise damaged(path, f'damaged after {done} messages', error) from error
+            done += 1
+            type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
+            yield BagMessage(connection.topic, type_, record_ns, raw)
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare what was read of every topic with what the index states."""
@@ -244,45 +287,7 @@ class BagReader:
 
         if not self.is_ros1:
             return get_typestore(Stores.ROS2_JAZZY), type_
-        every = (connection for reader in self._readers for connection in reader.connections)
-        found = next(connection for connection in every if type_name(connection) == type_)
+        found = next(c for c in self._connections() if type_name(c) == type_)
         store = get_typestore(Stores.EMPTY)
         store.register(get_types_from_msg(found.msgdef.data, found.msgtype))
         return store, found.msgtype
-
-    def _damaged(self, path: Path, what: str, error: Exception) -> BagError:
-        """Return the error for a file that rosbags gives up on."""
-        tool = REPAIR.get(path.suffix, 'ros2 bag reindex')
-        return BagError(
-            f'{path}: {what}: {described(error)}; if it was cut off or never closed, '
-            f'`{tool}` may save what is readable'
-        )
-
-
-def is_cdr(connection: Connection) -> bool:
-    """Return whether the messages are serialised in the way of their ROS version."""
-    return getattr(connection.ext, 'serialization_format', 'cdr') == 'cdr'
-
-
-def latches(connection: Connection) -> bool:
-    """Return whether a publisher offered its last messages to late subscribers."""
-    from rosbags.interfaces import ConnectionExtRosbag1
-
-    ext = connection.ext
-    if isinstance(ext, ConnectionExtRosbag1):
-        return bool(ext.latching)
-    return any(qos.durability.name == 'TRANSIENT_LOCAL' for qos in ext.offered_qos_profiles)
-
-
-def type_name(connection: Connection) -> str:
-    """Return the type of a connection; it says so where the bytes are of a foreign format."""
-    name = SAME_AS.get(connection.msgtype, connection.msgtype)
-    if is_cdr(connection):
-        return name
-    return f'{name} as {connection.ext.serialization_format}'  # type: ignore[union-attr]
-
-
-def described(error: Exception) -> str:
-    """Return what an error of rosbags says; its type too, where that is not meant for readers."""
-    text = str(error).rstrip('.')
-    return text if type(error).__name__ == 'ReaderError' else f'{type(error).__name__}: {text}'

@@ -4,8 +4,7 @@
 Which files make up a bag, and what its metadata.yaml states about them.
 
 A rosbag2 recording is a directory of one or more files and a metadata.yaml, which is written last
-and so is missing where the recorder was killed. It alone states that messages or whole files are
-compressed; the files of such a bag cannot be read one by one.
+and so is missing where the recorder was killed. Files compressed as a whole end in .zstd.
 """
 
 from __future__ import annotations
@@ -18,43 +17,54 @@ from typing import Any
 from surfel_mapper.errors import BagError
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
+PACKED_SUFFIX = '.zstd'
+ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
 
 
 def files_of(path: Path) -> list[Path]:
     """
-    Return what is to be opened for a bag, in the order of recording.
+    Return the files of a bag, in the order of recording.
 
-    That is the file itself, the files of a directory, or the directory where its files or
-    messages are compressed.
+    That is the file itself, or the files of a directory.
 
     Raises
     ------
     BagError
-        If there is no bag at the path, or the file is a compressed part of a larger bag.
+        If there is no bag at the path.
 
     """
     if path.is_dir():
         information = metadata(path)
-        if information is None:
-            return loose_files(path)
-        return [path] if is_compressed(information) else listed_files(path, information)
+        return loose_files(path) if information is None else listed_files(path, information)
     if not path.is_file():
         raise BagError(f'{path}: no such file or directory; expected a bag')
-    information = metadata(path.parent)
-    listed = [] if information is None else listed_files(path.parent, information)
-    if information is not None and path in listed and is_compressed(information):
-        if len(listed) == 1:
-            return [path.parent]
-        raise BagError(
-            f'{path}: one of {len(listed)} compressed files of a bag; name {path.parent} instead'
-        )
-    if path.suffix not in (*STORAGE_SUFFIXES, '.bag'):
+    if not is_storage(path) and not is_ros1(path):
         raise BagError(
             f'{path}: not a bag; expected a rosbag2 directory, or a file ending in .mcap, .db3 '
-            'or .bag'
+            '(perhaps .zstd) or .bag'
         )
     return [path]
+
+
+def is_ros1(path: Path) -> bool:
+    """Return whether a path is that of a ROS 1 bag, closed or not."""
+    return path.name.endswith(ROS1_SUFFIXES)
+
+
+def is_storage(path: Path) -> bool:
+    """Return whether a path is that of a file of rosbag2, packed or not."""
+    return unpacked_name(path).endswith(STORAGE_SUFFIXES)
+
+
+def is_packed(path: Path) -> bool:
+    """Return whether a file is compressed as a whole."""
+    return path.suffix == PACKED_SUFFIX
+
+
+def unpacked_name(path: Path) -> str:
+    """Return the name of a file without what says that it is packed."""
+    return path.name.removesuffix(PACKED_SUFFIX)
 
 
 def stated_counts(path: Path) -> dict[str, int]:
@@ -68,7 +78,7 @@ def stated_counts(path: Path) -> dict[str, int]:
             for row in information['topics_with_message_count']
         }
     except (KeyError, TypeError, ValueError) as error:
-        raise damaged(path / METADATA, error) from error
+        raise damaged_metadata(path / METADATA, error) from error
 
 
 def metadata(directory: Path) -> Mapping[str, Any] | None:
@@ -83,14 +93,9 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
         information = content['rosbag2_bagfile_information']
         if not isinstance(information, Mapping):
             raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, KeyError, TypeError) as error:
-        raise damaged(path, error) from error
+    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
+        raise damaged_metadata(path, error) from error
     return information
-
-
-def is_compressed(information: Mapping[str, Any]) -> bool:
-    """Return whether files or messages are compressed, beyond what a file says of itself."""
-    return str(information.get('compression_mode') or 'none').lower() != 'none'
 
 
 def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
@@ -98,7 +103,7 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
     Return the files that metadata.yaml lists.
 
     Their directory is this one whatever is written there: early versions put the name of the
-    bag before them, and a bag may have been renamed since.
+    bag before them, a bag may have been renamed since, and no name may lead elsewhere.
     """
     names = information.get('relative_file_paths')
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -109,12 +114,17 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
     missing = [file.name for file in files if not file.is_file()]
     if missing:
         raise BagError(f'{directory}: {", ".join(missing)} of its {METADATA} is missing')
+    foreign = [file.name for file in files if not is_storage(file)]
+    if foreign:
+        raise BagError(
+            f'{directory / METADATA}: lists {", ".join(foreign)}, expected .mcap or .db3 files'
+        )
     return files
 
 
 def loose_files(directory: Path) -> list[Path]:
     """Return the storage files in a directory without metadata.yaml, bag_2 before bag_10."""
-    files = [file for file in directory.iterdir() if file.suffix in STORAGE_SUFFIXES]
+    files = [file for file in directory.iterdir() if is_storage(file) and file.is_file()]
     if not files:
         raise BagError(
             f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'
@@ -126,7 +136,7 @@ def loose_files(directory: Path) -> list[Path]:
     return sorted(files, key=by_number)
 
 
-def damaged(path: Path, error: Exception) -> BagError:
+def damaged_metadata(path: Path, error: Exception) -> BagError:
     """Return the error for a metadata.yaml that does not read."""
     return BagError(
         f'{path}: not the metadata of a bag: {type(error).__name__}: {error}; '
