@@ -45,8 +45,21 @@ FORMATS = [
     'pypcd4>=1.1',  # scans in compressed PCD files
 ]
 
+CLUSTER = [
+    'dask>=2024.4',  # bags on many processes and machines
+    'distributed>=2024.4',  # likewise: its scheduler and workers
+    'pyarrow>=14',  # the tiles of a map as Parquet
+]
+
+VIEWER = [
+    'rerun-sdk>=0.23',  # replay --view and --rrd
+]
+
 TEST = [
     *FORMATS,
+    *CLUSTER,
+    *VIEWER,
+    'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
     'pytest-timeout>=2.2',  # a test that hangs names itself
     'hypothesis>=6.98',  # random sequences of adds and removes
@@ -80,9 +93,16 @@ setup(
     ],
     python_requires='>=3.10',
     packages=find_packages(include=[NAME, f'{NAME}.*']),
-    package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml']},
+    package_data={NAME: ['py.typed', 'ros/fastdds_shm.xml', 'viz/page/*']},
     install_requires=REQUIRED,
-    extras_require={'formats': FORMATS, 'ros': ROS, 'test': TEST, 'lint': LINT},
+    extras_require={
+        'formats': FORMATS,
+        'cluster': CLUSTER,
+        'viewer': VIEWER,
+        'ros': ROS,
+        'test': TEST,
+        'lint': LINT,
+    },
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
     data_files=[
         ('share/ament_index/resource_index/packages', [f'resource/{NAME}']),

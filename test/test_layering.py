@@ -63,6 +63,7 @@ HOMES = {
     'pypcd4': 'io/pcd',
     'rcl_interfaces': 'ros/',
     'rclpy': 'ros/',
+    'rerun': 'viz/',
     'rosbags': 'io/bag',  # bag.py reads, bag_writer.py writes
     'rosgraph_msgs': 'ros/',
     'rosidl_runtime_py': 'ros/',

@@ -1,0 +1,329 @@
+// SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+// SPDX-License-Identifier: Apache-2.0
+//
+// The 3D view of report.html: surfels as discs, drawn in one call, and the trajectory.
+//
+// A surfel is 12 bytes: place in the box of the map (3 uint16), radius and value (2 uint8),
+// normal (3 int8) and a spare byte. Discs are hexagons, so that no fragment is discarded and
+// hidden ones cost next to nothing. Every surfel is copied for each of its six corners, 7 MB for
+// 100,000: drawn as instances, of which each has so few corners, they take 30 times as long
+// where there is no graphics card. The picture is drawn only when something has changed, and
+// while it moves with so few surfels, larger ones, that a frame takes no longer than SLOW_MS;
+// they come in random order, so the first are as good as any.
+// The view has z up; it turns about a point that panning moves.
+'use strict';
+
+(() => {
+  const VERTEX = `#version 300 es
+    in float corner;
+    in vec3 place;
+    in vec2 look;
+    in vec3 normal;
+    uniform mat4 camera;
+    uniform vec3 low, size, eye;
+    uniform float largest, hide;
+    uniform int colouring;
+    uniform sampler2D ramp;
+    out vec3 colour;
+    void main() {
+      vec3 centre = low + place * size;
+      vec3 n = normalize(normal);
+      vec3 u = normalize(abs(n.z) < 0.9 ? cross(n, vec3(0, 0, 1)) : cross(n, vec3(1, 0, 0)));
+      float turn = corner * 1.0471975512;
+      vec3 at = centre + look.x * largest * (cos(turn) * u + sin(turn) * cross(n, u));
+      float facing = dot(n, normalize(eye - centre));
+      gl_Position = facing < -0.2 * hide - (1.0 - hide) ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
+      float value = colouring == 0 ? look.y : colouring == 1 ? place.z : abs(n.z);
+      vec3 base = colouring == 3 ? 0.5 + 0.5 * n : texture(ramp, vec2(value, 0.5)).rgb;
+      colour = base * (0.62 + 0.38 * abs(facing));
+    }`;
+  const FRAGMENT = `#version 300 es
+    precision mediump float;
+    in vec3 colour;
+    out vec4 pixel;
+    void main() { pixel = vec4(colour, 1); }`;
+  const LINE_VERTEX = `#version 300 es
+    in vec3 place;
+    uniform mat4 camera;
+    void main() { gl_Position = camera * vec4(place, 1); }`;
+  const LINE_FRAGMENT = `#version 300 es
+    precision mediump float;
+    out vec4 pixel;
+    void main() { pixel = vec4(0.86, 0.16, 0.13, 1); }`;
+
+  const BYTES = 12;
+  const SLOW_MS = 40;
+  const REST_MS = 200;
+  const LEAST = 4000;
+  const HEXAGON = [0, 1, 2, 0, 2, 3, 0, 3, 4, 0, 4, 5];
+  const canvas = document.getElementById('surfels');
+  const data = JSON.parse(document.getElementById('map').textContent);
+  const gl = canvas.getContext('webgl2', { antialias: true });
+  if (!gl) {
+    document.getElementById('picture').hidden = false;
+    canvas.hidden = true;
+    for (const part of document.querySelectorAll('.tools, .scale')) part.hidden = true;
+    return;
+  }
+
+  const bytes = (text) => Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
+
+  function program(vertex, fragment) {
+    const made = gl.createProgram();
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]]) {
+      const shader = gl.createShader(kind);
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(made, shader);
+    }
+    gl.linkProgram(made);
+    if (!gl.getProgramParameter(made, gl.LINK_STATUS)) {
+      throw new Error(gl.getProgramInfoLog(made));
+    }
+    return made;
+  }
+
+  function attribute(made, name, size, type, normalised, stride, offset) {
+    const place = gl.getAttribLocation(made, name);
+    gl.enableVertexAttribArray(place);
+    gl.vertexAttribPointer(place, size, type, normalised, stride, offset);
+  }
+
+  function buffer(values) {
+    gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
+  }
+
+  const discs = program(VERTEX, FRAGMENT);
+  const discArrays = gl.createVertexArray();
+  gl.bindVertexArray(discArrays);
+  const surfels = bytes(data.surfels);
+  const count = surfels.length / BYTES;
+  const corners = new Uint8Array(6 * surfels.length);
+  const triangles = new Uint32Array(12 * count);
+  for (let row = 0; row < count; row++) {
+    for (let corner = 0; corner < 6; corner++) {
+      const from = row * BYTES, to = (6 * row + corner) * BYTES;
+      for (let byte = 0; byte < BYTES; byte++) corners[to + byte] = surfels[from + byte];
+      corners[to + BYTES - 1] = corner;
+    }
+    HEXAGON.forEach((corner, place) => { triangles[12 * row + place] = 6 * row + corner; });
+  }
+  buffer(corners);
+  attribute(discs, 'place', 3, gl.UNSIGNED_SHORT, true, BYTES, 0);
+  attribute(discs, 'look', 2, gl.UNSIGNED_BYTE, true, BYTES, 6);
+  attribute(discs, 'normal', 3, gl.BYTE, true, BYTES, 8);
+  attribute(discs, 'corner', 1, gl.UNSIGNED_BYTE, false, BYTES, 11);
+  gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+  gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, triangles, gl.STATIC_DRAW);
+
+  const line = program(LINE_VERTEX, LINE_FRAGMENT);
+  const lineArrays = gl.createVertexArray();
+  gl.bindVertexArray(lineArrays);
+  const path = new Float32Array(bytes(data.trajectory).buffer);
+  buffer(path);
+  attribute(line, 'place', 3, gl.FLOAT, false, 0, 0);
+
+  const ramp = bytes(data.ramp);
+  gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  gl.texImage2D(
+    gl.TEXTURE_2D, 0, gl.RGB, ramp.length / 3, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, ramp,
+  );
+  for (const side of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) {
+    gl.texParameteri(gl.TEXTURE_2D, side, gl.CLAMP_TO_EDGE);
+  }
+  for (const filter of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) {
+    gl.texParameteri(gl.TEXTURE_2D, filter, gl.LINEAR);
+  }
+
+  // All places are about the middle of the map, so that float32 is precise enough anywhere.
+  const half = data.size.map((side) => side / 2);
+  const radius = Math.max(Math.hypot(...half), 1);
+  const across = data.size[0] >= data.size[1];
+  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, distance: 1.4 * radius };
+  let view, running = false, moved = false, share = 1, last = 0, rest = 0;
+
+  function reset() {
+    view = { ...start, target: [0, 0, -0.15 * half[2]] };
+    redraw();
+  }
+
+  function eyeOf() {
+    const flat = Math.cos(view.pitch) * view.distance;
+    return [
+      view.target[0] + flat * Math.cos(view.yaw),
+      view.target[1] + flat * Math.sin(view.yaw),
+      view.target[2] + Math.sin(view.pitch) * view.distance,
+    ];
+  }
+
+  function axes() {
+    const back = [
+      Math.cos(view.pitch) * Math.cos(view.yaw),
+      Math.cos(view.pitch) * Math.sin(view.yaw),
+      Math.sin(view.pitch),
+    ];
+    const right = [-Math.sin(view.yaw), Math.cos(view.yaw), 0];
+    const up = [
+      back[1] * right[2] - back[2] * right[1],
+      back[2] * right[0] - back[0] * right[2],
+      back[0] * right[1] - back[1] * right[0],
+    ];
+    return [right, up, back];
+  }
+
+  const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+  function camera(eye) {
+    const [right, up, back] = axes();
+    const near = Math.max(view.distance / 500, 0.02);
+    const far = view.distance + 4 * radius;
+    const zoom = 1 / Math.tan(0.35);
+    const wide = zoom * canvas.height / canvas.width;
+    const depth = (far + near) / (near - far);
+    const columns = [0, 1, 2].map((i) => [
+      wide * right[i], zoom * up[i], depth * back[i], -back[i],
+    ]);
+    columns.push([
+      -wide * dot(right, eye), -zoom * dot(up, eye),
+      -depth * dot(back, eye) + 2 * far * near / (near - far), dot(back, eye),
+    ]);
+    return new Float32Array(columns.flat());
+  }
+
+  function draw(part) {
+    const drawn = Math.min(Math.max(Math.ceil(part * count), LEAST), count);
+    const scale = window.devicePixelRatio || 1;
+    const width = Math.max(Math.round(canvas.clientWidth * scale), 1);
+    const height = Math.max(Math.round(canvas.clientHeight * scale), 1);
+    if (canvas.width !== width || canvas.height !== height) {
+      canvas.width = width;
+      canvas.height = height;
+    }
+    const style = getComputedStyle(document.documentElement);
+    const shade = [0, 1, 2].map((i) => Number(style.getPropertyValue(`--view-${i}`)));
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(...shade, 1);
+    gl.enable(gl.DEPTH_TEST);
+    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+    const eye = eyeOf();
+    const matrix = camera(eye);
+    gl.useProgram(discs);
+    gl.bindVertexArray(discArrays);
+    const at = (name) => gl.getUniformLocation(discs, name);
+    gl.uniformMatrix4fv(at('camera'), false, matrix);
+    gl.uniform3f(at('low'), -half[0], -half[1], -half[2]);
+    gl.uniform3f(at('size'), ...data.size);
+    gl.uniform3f(at('eye'), ...eye);
+    gl.uniform1f(at('largest'), data.largest * Math.min(Math.sqrt(count / drawn), 2.5));
+    gl.uniform1f(at('hide'), document.getElementById('hide').checked ? 1 : 0);
+    gl.uniform1i(at('colouring'), document.getElementById('colouring').selectedIndex);
+    gl.drawElements(gl.TRIANGLES, 12 * drawn, gl.UNSIGNED_INT, 0);
+    gl.useProgram(line);
+    gl.bindVertexArray(lineArrays);
+    gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
+    gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
+  }
+
+  function redraw() {
+    if (!running) requestAnimationFrame(() => draw(1));
+  }
+
+  // Frames while the view moves: fewer surfels if the last one took long, all when it rests.
+  function frame(now) {
+    const cost = now - last;
+    last = now;
+    if (cost > SLOW_MS) share = Math.max(share * Math.max(SLOW_MS / cost, 0.1), LEAST / count);
+    else if (cost < SLOW_MS / 2) share = Math.min(share * 1.1, 1);
+    if (moved) {
+      moved = false;
+      rest = now + REST_MS;
+      draw(share);
+    }
+    running = now < rest;
+    if (running) requestAnimationFrame(frame);
+    else draw(1);
+  }
+
+  function move() {
+    moved = true;
+    if (running) return;
+    running = true;
+    requestAnimationFrame((now) => {
+      last = now - SLOW_MS / 2;
+      frame(now);
+    });
+  }
+
+  function pan(dx, dy) {
+    const [right, up] = axes();
+    const step = 2 * Math.tan(0.35) * view.distance / canvas.clientHeight;
+    for (let i = 0; i < 3; i++) view.target[i] += step * (dy * up[i] - dx * right[i]);
+  }
+
+  function rotate(dx, dy) {
+    view.yaw -= dx * 0.006;
+    view.pitch = Math.min(Math.max(view.pitch + dy * 0.006, -1.55), 1.55);
+  }
+
+  function zoom(factor) {
+    view.distance = Math.min(Math.max(view.distance * factor, 0.3), 20 * radius);
+  }
+
+  // One pointer turns, or pans with a key or another button; two pan and zoom.
+  const pointers = new Map();
+  canvas.addEventListener('pointerdown', (event) => {
+    canvas.setPointerCapture(event.pointerId);
+    pointers.set(event.pointerId, [event.clientX, event.clientY]);
+  });
+  for (const end of ['pointerup', 'pointercancel']) {
+    canvas.addEventListener(end, (event) => pointers.delete(event.pointerId));
+  }
+  canvas.addEventListener('pointermove', (event) => {
+    const before = pointers.get(event.pointerId);
+    if (!before) return;
+    const now = [event.clientX, event.clientY];
+    const [dx, dy] = [now[0] - before[0], now[1] - before[1]];
+    if (pointers.size > 1) {
+      const [, other] = [...pointers].find(([id]) => id !== event.pointerId);
+      const gap = (place) => Math.hypot(place[0] - other[0], place[1] - other[1]) || 1;
+      zoom(gap(before) / gap(now));
+      pan(dx / 2, dy / 2);
+    } else if (event.shiftKey || event.ctrlKey || event.buttons !== 1) {
+      pan(dx, dy);
+    } else {
+      rotate(dx, dy);
+    }
+    pointers.set(event.pointerId, now);
+    move();
+  });
+  canvas.addEventListener('contextmenu', (event) => event.preventDefault());
+  canvas.addEventListener('wheel', (event) => {
+    event.preventDefault();
+    zoom(Math.exp(Math.max(-50, Math.min(event.deltaY, 50)) * 0.004));
+    move();
+  }, { passive: false });
+
+  const stops = [0, 32, 64, 96, 128, 160, 192, 224, 255].map(
+    (entry) => `rgb(${ramp.slice(3 * entry, 3 * entry + 3).join()})`,
+  );
+  document.querySelector('.scale .ramp').style.background =
+    `linear-gradient(to right, ${stops.join()})`;
+  const ends = [['0', '1'], data.heights, ['90\u00b0', '0\u00b0'], null];
+  document.getElementById('colouring').addEventListener('change', () => {
+    const chosen = ends[document.getElementById('colouring').selectedIndex];
+    document.querySelector('.scale').hidden = !chosen;
+    if (chosen) {
+      [document.getElementById('least').textContent,
+        document.getElementById('most').textContent] = chosen;
+    }
+    redraw();
+  });
+  document.getElementById('hide').addEventListener('change', redraw);
+  document.getElementById('reset').addEventListener('click', reset);
+  new ResizeObserver(redraw).observe(canvas);
+  matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);
+  reset();
+
+})();

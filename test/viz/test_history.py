@@ -1,0 +1,69 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A history holds what every scan did, and counts surfels now and then, however long it is."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from surfel_mapper.config import Config
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from surfel_mapper.viz.history import History, MAX_COUNTS
+
+IDENTITY = Config().replace({'pose.source': 'identity', 'map.min_points': 2})
+
+
+def mapped(num_scans):
+    mapper, history = Mapper(IDENTITY), History()
+    rng = np.random.default_rng(1)
+    for number in range(num_scans):
+        points = rng.uniform(-5.0, 5.0, (50, 3)).astype(np.float32) + np.float32(5 * number)
+        mapper.add_scan(Scan(points=points, stamp_ns=number * 10**8 + 7, frame_id='odom'))
+        mapper.add_scan(Scan(points=points[:0], stamp_ns=number * 10**8 + 8, frame_id='odom'))
+        for update in mapper.insert_ready():
+            history.add(mapper, update)
+    return mapper, history
+
+
+def test_a_history_ends_where_the_map_does():
+    mapper, history = mapped(5)
+
+    np.testing.assert_array_equal(history.seconds, np.arange(5) / 10.0)
+    assert (np.diff(history.voxels) > 0).all()
+    assert history.voxels[-1] == mapper.map.num_voxels
+    assert history.dropped.tolist() == [1, 2, 3, 4, 5]  # each scan is followed by an empty one
+    np.testing.assert_array_equal(history.trajectory, np.zeros((5, 3)))
+    scans, counts = history.surfels
+    assert scans.tolist() == [0, 1, 2, 3, 4]
+    assert counts[-1] == len(mapper.map.surfels(2)) == mapper.map.num_surfels(2) > 0
+    assert {'reduce', 'insert', 'normals', 'total'} <= set(history.milliseconds)
+    assert all(len(times) == 5 for times in history.milliseconds.values())
+
+
+def test_a_stage_that_comes_and_goes_leaves_gaps():
+    mapper, history = Mapper(IDENTITY), History()
+    for times in ({'total': 1.0}, {'total': 2.0, 'filter': 5.0}, {'filter': 6.0}):
+        update = SimpleNamespace(stamp_ns=0, milliseconds=times, T_fixed_sensor=np.eye(4))
+        history.add(mapper, update)
+
+    np.testing.assert_array_equal(history.milliseconds['total'], [1.0, 2.0, np.nan])
+    np.testing.assert_array_equal(history.milliseconds['filter'], [np.nan, 5.0, 6.0])
+
+
+def test_surfels_are_counted_a_bounded_number_of_times_evenly_spread():
+    mapper, history = Mapper(IDENTITY), History()
+    update = SimpleNamespace(stamp_ns=0, milliseconds={}, T_fixed_sensor=np.eye(4))
+    for _ in range(5000):
+        history.add(mapper, update)
+
+    scans, _ = history.surfels
+    assert MAX_COUNTS / 2 <= len(scans) <= MAX_COUNTS
+    assert len(set(np.diff(scans))) == 1
+    assert scans[-1] > 4900
+
+
+def test_no_scan_at_all_is_an_empty_history():
+    history = History()
+    assert len(history) == len(history.seconds) == len(history.surfels[0]) == 0
+    assert history.trajectory.shape == (0, 3)

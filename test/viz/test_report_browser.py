@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A report in a real browser, headless Chromium: no error, and a map that turns when dragged."""
+
+from __future__ import annotations
+
+import io
+import os
+import shutil
+
+from matplotlib.image import imread
+import numpy as np
+import pytest
+
+from test.viz.test_report import plane, report
+
+playwright = pytest.importorskip(
+    'playwright.sync_api', reason='playwright is not installed (extra test)'
+)
+
+NAMES = ('chromium', 'chromium-browser', 'google-chrome')
+BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
+
+pytestmark = pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+
+SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')
+"""WebGL without a graphics card."""
+
+
+@pytest.fixture(scope='module')
+def browser():
+    # root, as in containers, cannot have the sandbox
+    root = ('--no-sandbox',) if os.geteuid() == 0 else ()
+    with playwright.sync_playwright() as started:
+        chromium = started.chromium.launch(executable_path=BROWSER, args=[*SOFTWARE_GL, *root])
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def opened(browser, tmp_path):
+    """Return a page that shows a report, and what it complained about or asked for."""
+    report(tmp_path, plane(30))
+    complaints, page = [], browser.new_page(viewport={'width': 900, 'height': 800})
+    address = (tmp_path / 'report.html').as_uri()
+    page.on('console', lambda message: complaints.append(message.text))
+    page.on('pageerror', lambda error: complaints.append(str(error)))
+    page.on('request', lambda asked: asked.url == address or complaints.append(asked.url))
+    page.goto(address)
+    page.locator('#surfels').wait_for()
+    settle(page)
+    yield page, complaints
+    page.close()
+
+
+def settle(page):
+    """Wait until what is to be drawn is drawn: past the rest that follows a movement."""
+    page.evaluate(
+        '() => new Promise((done) => setTimeout(() => requestAnimationFrame(done), 400))'
+    )
+
+
+def pixels(page):
+    """Return the picture on the canvas, without what lies over it."""
+    page.add_style_tag(content='.tools, .scale { visibility: hidden; }')
+    return imread(io.BytesIO(page.locator('#surfels').screenshot()))[..., :3]
+
+
+def num_coloured(image):
+    return int((np.ptp(image, axis=2) > 0.1).sum())
+
+
+def test_the_map_is_drawn_without_an_error_and_without_a_request(opened):
+    page, complaints = opened
+
+    image = pixels(page)
+
+    assert complaints == []
+    assert num_coloured(image) > 5000  # discs in the colours of planarity, on grey
+
+
+def test_dragging_turns_the_map_and_reset_turns_it_back(opened):
+    page, complaints = opened
+    before = pixels(page)
+    box = page.locator('#surfels').bounding_box()
+    middle = box['x'] + box['width'] / 2, box['y'] + box['height'] / 2
+
+    page.mouse.move(*middle)
+    page.mouse.down()
+    page.mouse.move(middle[0] + 150, middle[1] + 40, steps=5)
+    page.mouse.up()
+    settle(page)
+    turned = pixels(page)
+    page.locator('#reset').dispatch_event('click')
+    settle(page)
+    again = pixels(page)
+
+    assert np.abs(turned - before).mean() > 0.01
+    np.testing.assert_allclose(again, before, atol=0.02)
+    assert complaints == []
+
+
+def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
+    page, complaints = opened
+    far = pixels(page)
+    box = page.locator('#surfels').bounding_box()
+    page.mouse.move(box['x'] + 200, box['y'] + 200)
+    page.mouse.wheel(0, -400)
+    settle(page)
+    near = pixels(page)
+    page.locator('#colouring').select_option('normal', force=True)
+    settle(page)
+    by_normal = pixels(page)
+
+    assert num_coloured(near) > 1.1 * num_coloured(far)
+    # up is (0.5, 0.5, 1) in the colours of normals: blue is the strongest
+    drawn = np.ptp(by_normal, axis=2) > 0.1
+    assert (by_normal[drawn].argmax(axis=1) == 2).mean() > 0.95
+    assert complaints == []
+
+
+def test_without_webgl_the_page_says_so(browser, tmp_path):
+    report(tmp_path, plane(3))
+    page = browser.new_page()
+    page.add_init_script('HTMLCanvasElement.prototype.getContext = () => null')
+    errors = []
+    page.on('pageerror', lambda error: errors.append(str(error)))
+    page.goto((tmp_path / 'report.html').as_uri())
+
+    assert page.get_by_text('This browser has no WebGL 2.').is_visible()
+    assert not page.locator('#surfels').is_visible()
+    assert errors == []
+    page.close()
