@@ -17,12 +17,13 @@ from pathlib import Path
 import shutil
 import tempfile
 from types import TracebackType
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.pointcloud2 import CloudBytes
+from surfel_mapper.io.pose_messages import StampedPose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, Qos
@@ -31,16 +32,6 @@ STORAGES = ('mcap', 'sqlite3')
 
 METADATA = 'metadata.yaml'
 """The file that makes a directory a bag."""
-
-
-class StampedPose(NamedTuple):
-    """Where a frame is in another at a time; xyz in m, quaternion q_xyzw."""
-
-    stamp_ns: int
-    frame_id: str
-    child_frame_id: str
-    xyz: Iterable[float]
-    q_xyzw: Iterable[float]
 
 
 class BagWriter:
@@ -168,8 +159,8 @@ class BagWriter:
         """Append a tf2_msgs/TFMessage of one transform; latched for static ones."""
         transform = self._new(
             'geometry_msgs/msg/TransformStamped',
-            self._header(pose.stamp_ns, pose.frame_id),
-            pose.child_frame_id,
+            self._header(pose.stamp_ns, pose.parent),
+            pose.child,
             self._new(
                 'geometry_msgs/msg/Transform', self._vector(pose.xyz), self._turn(pose.q_xyzw)
             ),
@@ -188,8 +179,8 @@ class BagWriter:
         motion = self._new('geometry_msgs/msg/Twist', self._vector(v[:3]), self._vector(v[3:]))
         message = self._new(
             'nav_msgs/msg/Odometry',
-            self._header(pose.stamp_ns, pose.frame_id),
-            pose.child_frame_id,
+            self._header(pose.stamp_ns, pose.parent),
+            pose.child,
             self._new('geometry_msgs/msg/PoseWithCovariance', where, unknown),
             self._new('geometry_msgs/msg/TwistWithCovariance', motion, unknown),
         )

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.io.pose_messages import frame_name
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     """
     stamp_ns = checked_stamp_ns(msg.header.stamp, topic)
     data = checked_data(msg, topic)
-    frame_id = str(msg.header.frame_id)
+    frame_id = frame_name(msg.header.frame_id)
     if int(msg.height) * int(msg.width) == 0:
         return Scan(points=np.empty((0, 3), np.float32), stamp_ns=stamp_ns, frame_id=frame_id)
     fields = checked_fields(msg, topic)

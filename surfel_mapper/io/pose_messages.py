@@ -8,7 +8,7 @@ Messages are read by the names of their attributes, so node and replay enter the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 ODOMETRY, POSE, TF = 'odometry', 'pose', 'tf'
@@ -20,8 +20,8 @@ class StampedPose(NamedTuple):
     parent: str
     child: str
     stamp_ns: int
-    xyz: tuple[float, float, float]
-    q_xyzw: tuple[float, float, float, float]
+    xyz: Iterable[float]
+    q_xyzw: Iterable[float]
 
 
 def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
@@ -53,12 +53,17 @@ def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
 def stamped_pose(header: Any, child: str, position: Any, orientation: Any) -> StampedPose:
     """Return a pose from the parts of a message."""
     return StampedPose(
-        parent=header.frame_id,
-        child=child,
+        parent=frame_name(header.frame_id),
+        child=frame_name(child),
         stamp_ns=stamp_ns(header),
         xyz=(position.x, position.y, position.z),
         q_xyzw=(orientation.x, orientation.y, orientation.z, orientation.w),
     )
+
+
+def frame_name(frame_id: str) -> str:
+    """Return the name of a frame without the leading slash that ROS 1 put before it."""
+    return str(frame_id).removeprefix('/')
 
 
 def stamp_ns(header: Any) -> int:

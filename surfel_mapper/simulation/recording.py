@@ -21,8 +21,9 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.errors import ConfigError, FileFormatError
-from surfel_mapper.io.bag_writer import BagWriter, StampedPose
+from surfel_mapper.io.bag_writer import BagWriter
 from surfel_mapper.io.pointcloud2 import CloudBytes, Field
+from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation.drive import Drive, Simulation
 from surfel_mapper.simulation.lidar import Lidar
@@ -93,11 +94,11 @@ def record(
         _write_description(simulation, bag.directory)
         drive = simulation.drive
         mount = drive.base_to_sensor
-        static = StampedPose(drive.start_ns, BASE, SENSOR, mount[:3], mount[3:])
+        static = StampedPose(BASE, SENSOR, drive.start_ns, mount[:3], mount[3:])
         bag.write_transform('/tf_static', drive.start_ns, static, latched=True)
         for record_ns, number in heapq.merge(_pose_times(simulation), _scan_times(simulation)):
             if number < 0:
-                pose = StampedPose(record_ns, ODOM, BASE, *drive.pose(record_ns))
+                pose = StampedPose(ODOM, BASE, record_ns, *drive.pose(record_ns))
                 bag.write_odometry('/odom', record_ns, pose, drive.twist(record_ns))
                 bag.write_transform('/tf', record_ns, pose)
             else:

@@ -9,10 +9,11 @@ import pytest
 
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_writer import BagWriter, StampedPose
+from surfel_mapper.io.bag_writer import BagWriter
 from surfel_mapper.io.pointcloud2 import from_columns, to_scan
+from surfel_mapper.io.pose_messages import StampedPose
 
-POSE = StampedPose(5_000_000_007, 'odom', 'base_link', (1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8))
+POSE = StampedPose('odom', 'base_link', 5_000_000_007, (1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8))
 CLOUD = from_columns({name: np.arange(3.0, dtype=np.float32) + i for i, name in enumerate('xyz')})
 
 

@@ -54,3 +54,19 @@ def test_numbers_are_handed_on_as_they_are():
 
     assert pose.q_xyzw[:3] == (0.1, 0.2, 0.3)
     assert pose.q_xyzw[3] != pose.q_xyzw[3]
+
+
+@pytest.mark.parametrize('kind', ['odometry', 'tf', 'pose'])
+def test_the_leading_slash_of_ros1_frames_is_left_out(kind):
+    entries = Entries()
+    entries.odometry('/odom', STAMP_NS, XYZ)
+    entries.transform('/tf', STAMP_NS, '/odom', '/base_link', XYZ)
+    entries.pose_stamped('/pose', STAMP_NS, XYZ)
+    odometry, transform, pose = (message for *_, message in entries)
+    odometry.header.frame_id, odometry.child_frame_id = '/odom', '/base_link'
+    pose.header.frame_id = '/odom'
+    message = {'odometry': odometry, 'tf': transform, 'pose': pose}[kind]
+
+    (found,) = poses_in(kind, message, 'base_link')
+
+    assert (found.parent, found.child) == ('odom', 'base_link')
