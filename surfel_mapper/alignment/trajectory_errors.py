@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+How far estimated poses are from true ones: absolute, relative, and as drift over distance.
+
+The absolute error says how good a map is as a whole, after the best rigid motion of one
+trajectory onto the other; the relative one how good each step is, whatever came before. Both are
+those of evo's ape and rpe.
+
+Sources: Umeyama 1991 for the motion; Sturm et al. 2012 (A benchmark for the evaluation of RGB-D
+SLAM systems) for the errors; Geiger et al. 2012 (KITTI) for drift over distance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.geometry import Transform
+
+Floats = npt.NDArray[np.float64]
+
+DRIFT_SHARES = (0.125, 0.25, 0.5)
+"""Drift is taken over stretches of these shares of the way."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseErrors:
+    """
+    Errors of some poses.
+
+    Attributes
+    ----------
+    translation_m : (P,) float64
+    rotation_deg : (P,) float64
+        In [0, 180].
+
+    """
+
+    translation_m: Floats
+    rotation_deg: Floats
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return rmse, mean, median and max of both, for reports."""
+        parts = {'translation_m': self.translation_m, 'rotation_deg': self.rotation_deg}
+        return {
+            name: {
+                'rmse': float(np.sqrt(np.mean(np.square(errors)))),
+                'mean': float(np.mean(errors)),
+                'median': float(np.median(errors)),
+                'max': float(np.max(errors)),
+            }
+            for name, errors in parts.items()
+        }
+
+
+def compare(
+    stamp_ns: npt.NDArray[np.int64],
+    T_map_estimated: npt.ArrayLike,
+    true_ns: npt.NDArray[np.int64],
+    T_map_true: npt.ArrayLike,
+    *,
+    max_difference_ns: int = 0,
+) -> dict[str, Any]:
+    """
+    Return all errors of a trajectory in numbers, for files and reports.
+
+    Parameters
+    ----------
+    stamp_ns, true_ns : (S,) and (R,) int64
+        Times of the poses, ascending.
+    T_map_estimated, T_map_true : (S, 4, 4) and (R, 4, 4) float64
+        Poses of one frame, each in a map of its own.
+    max_difference_ns : int
+        Poses at most so far apart in time are compared.
+
+    Returns
+    -------
+    dict
+        num_poses; absolute (after the best motion) and relative (from pose to pose), each with
+        rmse, mean, median and max of translation_m and rotation_deg; drift_m_per_100m and
+        drift_deg_per_100m.
+
+    Raises
+    ------
+    ValueError
+        If fewer than two poses belong together.
+
+    """
+    rows, true_rows = common_stamps(stamp_ns, true_ns, max_difference_ns)
+    if len(rows) < 2:
+        raise ValueError(
+            f'{len(rows)} poses within {max_difference_ns / 1e9:g} s of one another, '
+            f'of {len(stamp_ns)} and {len(true_ns)}; expected at least 2'
+        )
+    estimated, true = np.asarray(T_map_estimated)[rows], np.asarray(T_map_true)[true_rows]
+    drift_m, drift_deg = drift(estimated, true)
+    return {
+        'num_poses': len(rows),
+        'absolute': absolute_errors(estimated, true).summary(),
+        'relative': relative_errors(estimated, true).summary(),
+        'drift_m_per_100m': drift_m,
+        'drift_deg_per_100m': drift_deg,
+    }
+
+
+def absolute_errors(
+    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike, *, align: bool = True
+) -> PoseErrors:
+    """
+    Return the error of every pose.
+
+    Parameters
+    ----------
+    T_map_estimated, T_map_true : (S, 4, 4) float64
+        Poses of one frame at the same times.
+    align : bool
+        First move the estimated ones as a whole to where their positions fit best.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or there is no pose.
+
+    """
+    estimated, true = _pairs(T_map_estimated, T_map_true, 1)
+    if align:
+        estimated = best_motion(estimated[:, :3, 3], true[:, :3, 3]) @ estimated
+    return _errors(_inverse(true) @ estimated)
+
+
+def relative_errors(
+    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike, *, step: int = 1
+) -> PoseErrors:
+    """
+    Return the error of the motion between every pose and the one so many later.
+
+    Parameters
+    ----------
+    T_map_estimated, T_map_true : (S, 4, 4) float64
+        Poses of one frame at the same times.
+    step : int
+        How many poses later.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or there are not more poses than that.
+
+    """
+    if step < 1:
+        raise ValueError(f'step: {step}, expected 1 or more')
+    estimated, true = _pairs(T_map_estimated, T_map_true, step + 1)
+    rows = np.arange(len(true) - step)
+    return _motion_errors(estimated, true, rows, rows + step)
+
+
+def drift(
+    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike
+) -> tuple[float, float]:
+    """
+    Return by how much the estimate goes astray, over stretches from an eighth to half of the way.
+
+    Parameters
+    ----------
+    T_map_estimated, T_map_true : (S, 4, 4) float64
+        Poses of one frame at the same times.
+
+    Returns
+    -------
+    translation_m, rotation_deg : float
+        Root mean square over all stretches, for each 100 m; nan where the way has no length.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ, or there are fewer than two poses.
+
+    """
+    estimated, true = _pairs(T_map_estimated, T_map_true, 2)
+    steps_m = np.sqrt((np.diff(true[:, :3, 3], axis=0) ** 2).sum(axis=1))
+    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    if not way_m[-1] > 0.0:
+        return float('nan'), float('nan')
+    squares = []
+    for share in DRIFT_SHARES:
+        last = np.searchsorted(way_m, way_m + share * way_m[-1])
+        first = np.flatnonzero(last < len(way_m))
+        last = last[first]
+        errors = _motion_errors(estimated, true, first, last)
+        per_100_m = 100.0 / (way_m[last] - way_m[first])
+        squares.append(np.square([errors.translation_m, errors.rotation_deg] * per_100_m))
+    translation_m, rotation_deg = np.sqrt(np.concatenate(squares, axis=1).mean(axis=1))
+    return float(translation_m), float(rotation_deg)
+
+
+def best_motion(estimated: Floats, true: Floats) -> Transform:
+    """
+    Return the rigid transform after which positions (S, 3) are nearest to others, in squares.
+
+    Of positions on a line or in a point, one of the transforms that do.
+    """
+    middle, target = estimated.mean(axis=0), true.mean(axis=0)
+    u, _, vt = np.linalg.svd((true - target).T @ (estimated - middle))
+    mirrored = np.linalg.det(u) * np.linalg.det(vt) < 0.0
+    rotation = u @ np.diag([1.0, 1.0, -1.0 if mirrored else 1.0]) @ vt
+    T_true_estimated = np.eye(4)
+    T_true_estimated[:3, :3] = rotation
+    T_true_estimated[:3, 3] = target - rotation @ middle
+    return T_true_estimated
+
+
+def common_stamps(
+    stamp_ns: npt.NDArray[np.int64], other_ns: npt.NDArray[np.int64], max_difference_ns: int = 0
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """
+    Return the rows of two ascending lists of stamps that belong together.
+
+    Each stamp of the first goes with the nearest of the second, where that is not farther than
+    ``max_difference_ns`` and no other stamp of the first is nearer to it.
+    """
+    if not len(other_ns) or not len(stamp_ns):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    after = np.clip(np.searchsorted(other_ns, stamp_ns), 1, max(len(other_ns) - 1, 1))
+    after = np.minimum(after, len(other_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    is_before = np.abs(other_ns[before] - stamp_ns) <= np.abs(other_ns[after] - stamp_ns)
+    nearest = np.where(is_before, before, after)
+    apart_ns = np.abs(other_ns[nearest] - stamp_ns)
+    order = np.lexsort((apart_ns, nearest))
+    is_first = np.diff(nearest[order], prepend=-1) > 0
+    rows = np.sort(order[is_first & (apart_ns[order] <= max_difference_ns)])
+    return rows.astype(np.int64), nearest[rows].astype(np.int64)
+
+
+def _pairs(estimated: npt.ArrayLike, true: npt.ArrayLike, least: int) -> tuple[Floats, Floats]:
+    """Return two lists of poses as arrays, or refuse them."""
+    first, second = np.asarray(estimated, np.float64), np.asarray(true, np.float64)
+    if first.shape != second.shape or first.ndim != 3 or first.shape[1:] != (4, 4):
+        raise ValueError(
+            f'poses of shapes {first.shape} and {second.shape}, expected (S, 4, 4) of both'
+        )
+    if len(first) < least:
+        raise ValueError(f'{len(first)} poses, expected at least {least}')
+    return first, second
+
+
+def _motion_errors(
+    estimated: Floats, true: Floats, first: npt.NDArray[np.int64], last: npt.NDArray[np.int64]
+) -> PoseErrors:
+    """Return the errors of the motions between rows."""
+    found = _inverse(estimated[first]) @ estimated[last]
+    expected = _inverse(true[first]) @ true[last]
+    return _errors(_inverse(expected) @ found)
+
+
+def _errors(off: Floats) -> PoseErrors:
+    """Return how large transforms (P, 4, 4) are."""
+    skew = off[:, :3, :3] - off[:, :3, :3].transpose(0, 2, 1)
+    sine = np.sqrt((skew**2).sum(axis=(1, 2)) / 8.0)
+    cosine = 0.5 * (np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1.0)
+    return PoseErrors(
+        np.sqrt((off[:, :3, 3] ** 2).sum(axis=1)), np.degrees(np.arctan2(sine, cosine))
+    )
+
+
+def _inverse(poses: Floats) -> Floats:
+    """Return the inverses of rigid transforms (P, 4, 4)."""
+    inverses = np.zeros_like(poses)
+    inverses[:, :3, :3] = poses[:, :3, :3].transpose(0, 2, 1)
+    inverses[:, :3, 3] = -np.einsum('pji,pj->pi', poses[:, :3, :3], poses[:, :3, 3])
+    inverses[:, 3, 3] = 1.0
+    return inverses
