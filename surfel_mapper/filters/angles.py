@@ -83,7 +83,7 @@ class Directions:
         defined = self.planar > 0.0
         if not -180.0 <= limit_deg <= 180.0:
             return np.asarray(defined & ((limit_deg > 180.0) == below))
-        edge = self.planar * cosine(limit_deg, self.x)
+        edge = self.planar * self.x.dtype.type(cosine(limit_deg))
         side = self.y < 0.0 if below else self.y >= 0.0
         if (limit_deg >= 0.0) != below:
             return np.asarray(defined & side & (self.x < edge))
@@ -93,13 +93,8 @@ class Directions:
         """Return where theta is above, or below, a limit."""
         if not 0.0 <= limit_deg <= 180.0:
             return np.asarray((self.distance > 0.0) & ((limit_deg > 180.0) == below))
-        edge = self.distance * cosine(limit_deg, self.z)
+        edge = self.distance * self.z.dtype.type(cosine(limit_deg))
         return np.asarray(self.z > edge if below else self.z < edge)
-
-
-def cosine(angle_deg: float, like: Array) -> Any:
-    """Return a cosine in the type of an array, 0 at 90 deg."""
-    return like.dtype.type(rounded(math.cos(math.radians(angle_deg))))
 
 
 @register
@@ -146,7 +141,7 @@ class FieldOfView(Filter):
             mask &= between(x, y, self.azimuth_min_deg, self.azimuth_max_deg)
         for limit, above in ((self.elevation_min_deg, True), (self.elevation_max_deg, False)):
             if abs(limit) < 90.0:
-                edge = planar * planar.dtype.type(rounded(math.tan(math.radians(limit))))
+                edge = planar * planar.dtype.type(sine(limit) / cosine(limit))
                 mask &= z >= edge if above else z <= edge
         return mask
 
@@ -157,13 +152,20 @@ def between(x: Array, y: Array, start_deg: float, end_deg: float) -> Mask:
 
     By the side of the two edges on which a point is: 20 times faster than by arctan2.
     """
-    start, end = math.radians(start_deg), math.radians(end_deg)
     kind = x.dtype.type
-    after = y * kind(rounded(math.cos(start))) >= x * kind(rounded(math.sin(start)))
-    before = y * kind(rounded(math.cos(end))) <= x * kind(rounded(math.sin(end)))
+    after = y * kind(cosine(start_deg)) >= x * kind(sine(start_deg))
+    before = y * kind(cosine(end_deg)) <= x * kind(sine(end_deg))
     return np.asarray(after | before if end_deg - start_deg > 180.0 else after & before)
 
 
-def rounded(value: float) -> float:
-    """Return a sine, cosine or tangent that is 0 or 1 where it should be, as cos(90 deg)."""
-    return round(value, 15)
+def sine(angle_deg: float) -> float:
+    """Return a sine that is exactly 0 or 1 where it should be."""
+    turned = math.remainder(angle_deg, 360.0)
+    if abs(turned) > 90.0:
+        turned = math.copysign(180.0, turned) - turned
+    return math.sin(math.radians(turned))
+
+
+def cosine(angle_deg: float) -> float:
+    """Return a cosine as exact as the sine, and equal to it at 45 deg."""
+    return sine(90.0 - abs(math.remainder(angle_deg, 360.0)))

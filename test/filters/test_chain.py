@@ -39,7 +39,9 @@ def test_a_chain_runs_in_the_order_of_its_list(tmp_path):
     assert chain.names == (
         '1 remove_nan', '2 voxel_grid', '3 add_descriptor', '4 voxel_grid', '5 identity',
     )
-    assert chain.filters[1] == VoxelGrid(size_x_m=0.5, anchor='minimum')
+    assert chain.filters[1] == VoxelGrid(
+        size_x_m=0.5, unit_normals=False, anchor='minimum'
+    )
     assert chain.filters[2].values == (2.2, 3.0, 6.1)
     assert chain.filters[3] == VoxelGrid(size_x_m=0.25, size_y_m=0.5)
 
