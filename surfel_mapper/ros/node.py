@@ -203,13 +203,13 @@ class MapperNode(LifecycleNodeMixin, Node):
     def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
         """Make a transition that was requested, in the main thread; return whether it was made."""
         name = request.transition.label or str(request.transition.id)
-        before = self.state
+        before, self.refusal = self.state, None
         try:
             done = bool(self._change_state(request, response).success)
-        except rclpy_implementation.RCLError:  # unanswered, it would end rclpy's executor
-            done, self.refusal = False, ConfigError(f'not possible while {before}')
+        except rclpy_implementation.RCLError:  # no such transition; rclpy lets it end the executor
+            done = False
         if not done:
-            reason = self.refusal or f'there is no such transition while {before}'
+            reason = self.refusal or f'not possible while {before}'
             self.get_logger().error(f'transition {name} refused: {reason}')
         return done
 

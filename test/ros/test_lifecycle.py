@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The life cycle of a node that is a process of its own, driven over DDS as ``ros2 lifecycle``."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import signal
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from lifecycle_msgs.msg import Transition, TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+
+from surfel_mapper.io.map_state import load_map
+from test.ros.live import LATCHED, NODE, RVIZ
+from test.ros.test_node import ARGUMENTS, drive, mapped, send
+
+pytestmark = pytest.mark.timeout(120)
+
+STATES = ('unconfigured', 'inactive', 'active', 'finalized')
+WAITING = [*ARGUMENTS, '-p', 'autostart:=false']
+
+
+def transit(peer, label='', number=0):
+    """Ask for a transition by its name or number; return whether it was made."""
+    request = ChangeState.Request(transition=Transition(label=label, id=number))
+    return peer.call('change_state', ChangeState, request).success
+
+
+def state(peer):
+    return peer.call('get_state', GetState).current_state.label
+
+
+def test_a_node_is_configured_activated_and_back_as_it_is_told(start, peer):
+    node = start('node', *WAITING)
+    events = peer.collect(TransitionEvent, f'{NODE}/transition_event', RVIZ)
+    assert state(peer) == 'unconfigured'
+    status, values = peer.diagnosis({'state': 'unconfigured'})
+    assert (status.level, status.message) == (b'\0', 'unconfigured')
+    assert peer.node.count_publishers(f'{NODE}/normals') == 0
+
+    assert transit(peer, 'configure')
+    assert state(peer) == 'inactive'
+    assert 'kernels ready after' in node.output
+    assert peer.node.count_subscribers('/points') == 0
+
+    assert transit(peer, 'activate')
+    messages = drive(4)
+    peer.advertise('/odom', '/points')
+    send(peer, messages[:2])
+    peer.diagnosis({'state': 'active', 'scans.mapped': 2})
+
+    assert transit(peer, 'deactivate')
+    peer.spin_until(lambda: peer.node.count_subscribers('/points') == 0)
+    send(peer, messages[2:3])
+    _, values = peer.diagnosis({'state': 'inactive'})
+    assert (values['scans.received'], values['window_scans']) == ('2', '2')
+
+    assert transit(peer, 'activate')
+    peer.spin_until(lambda: peer.node.count_subscribers('/points') == 1)
+    peer.spin_for(0.5)
+    send(peer, messages[3:])
+    _, values = peer.diagnosis({'state': 'active', 'scans.mapped': 3})
+    assert values['window_scans'] == '3'
+
+    assert transit(peer, 'deactivate')
+    assert transit(peer, 'cleanup')
+    assert state(peer) == 'unconfigured'
+    _, mapper = mapped([*messages[:2], messages[3]])
+    assert 'mapped 3, gated 0, dropped: none; surfels ' in node.output
+    assert f'digest {mapper.map.digest()}' in node.output
+    peer.spin_until(lambda: peer.node.count_publishers(f'{NODE}/normals') == 0)
+
+    assert transit(peer, 'configure')
+    assert peer.diagnosis({'state': 'inactive'})[1]['voxels'] == '0'
+    assert transit(peer, 'shutdown')
+    assert state(peer) == 'finalized'
+    assert node.is_running()
+    goals = [event.goal_state.label for event in events]
+    assert [goal for goal in goals if goal in STATES] == [
+        *('inactive', 'active', 'inactive', 'active', 'inactive', 'unconfigured', 'inactive'),
+        'finalized',
+    ]
+    assert node.stop() == 0
+    assert 'Traceback' not in node.output
+
+
+def test_a_transition_that_is_not_possible_is_refused_and_the_node_goes_on(start, peer):
+    node = start('node', *WAITING)
+    assert not transit(peer, 'activate')
+    assert not transit(peer, 'nonsense')
+    assert not transit(peer, number=Transition.TRANSITION_DEACTIVATE)
+    assert state(peer) == 'unconfigured'
+    for name in ('activate', 'nonsense', str(Transition.TRANSITION_DEACTIVATE)):
+        assert f'transition {name} refused: not possible while unconfigured' in node.output
+    assert transit(peer, 'configure')
+    assert transit(peer, 'activate')
+    assert node.stop(signal.SIGTERM) == 0
+
+
+@pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
+def test_a_transition_that_fails_says_why_and_leaves_the_state_before(start, peer):
+    node = start('node', *WAITING, '-p', 'pose.source:=tf')
+    assert transit(peer, 'configure')
+    assert not transit(peer, 'activate')
+    assert 'refused: pose.source tf needs the package tf2_msgs' in node.output
+    assert state(peer) == 'inactive'
+    assert peer.node.count_subscribers('/points') == 0
+    assert node.stop() == 0
+
+
+def test_settings_that_are_changed_before_configure_hold_after_it(start, peer):
+    start('node', *WAITING)
+    client = peer.parameters()
+    changed = client.set_parameters([Parameter('window.max_scans', value=2)])
+    assert peer.result(changed).results[0].successful
+    assert transit(peer, 'configure')
+    assert transit(peer, 'activate')
+    peer.advertise('/odom', '/points')
+    send(peer, drive(3))
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    assert values['window_scans'] == '2'
+
+
+@pytest.mark.parametrize('how', ['signal', 'shutdown'])
+def test_the_map_is_saved_at_the_end_where_that_is_asked_for(start, peer, tmp_path, how):
+    folder = tmp_path / 'maps'
+    node = start(
+        *('node', *ARGUMENTS, '-p', 'output.save_on_shutdown:=true'),
+        *('-p', f'output.directory:={folder}'),
+    )
+    peer.advertise('/odom', '/points')
+    messages = drive(3)
+    send(peer, messages)
+    peer.diagnosis({'scans.mapped': 3})
+    if how == 'shutdown':
+        assert transit(peer, 'shutdown')
+        assert f'saved {folder / "map.ply"} and .npz' in node.output
+    assert node.stop() == 0
+    assert node.output.count('saved ') == 1
+    _, mapper = mapped(messages)
+    assert load_map(folder / 'map.npz')[0].digest() == mapper.map.digest()
+
+
+def test_a_late_joiner_gets_the_map_of_a_node_that_is_inactive_by_now(start, peer):
+    start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    early = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
+    send(peer, drive(2))
+    peer.diagnosis({'scans.mapped': 2})
+    peer.spin_until(lambda: early)
+    assert transit(peer, 'deactivate')
+    late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
+    peer.spin_until(lambda: late)
+    assert late[0] == early[-1]
