@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where points fall in the image of a camera or a spinning lidar.
+
+Angles come from a polynomial that the compiler turns into vector instructions, eight points at a
+time; 1 microradian off at most, a three-thousandth of a pixel of a lidar of 2048 columns. All is
+float32: the points are differences to the sensor, which were taken in float64.
+
+A sensor is eight float32 numbers. Camera: fx, fy, cx, cy, columns, rows. Lidar: azimuth of column
+0, angle between columns, elevation of row 0, angle between rows (all rad), columns, rows, columns
+of a full turn, smallest column number (0 where the last column neighbours the first, else -0.5).
+A point that is in no pixel has column OUTSIDE.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+CAMERA = 0
+LIDAR = 1
+LIDAR_TABLE = 2
+"""A lidar whose rows are not evenly spaced: their elevations are a table."""
+
+OUTSIDE = np.float32(-2.0)
+
+_PI = np.float32(math.pi)
+_HALF_PI = np.float32(math.pi / 2.0)
+_ZERO = np.float32(0.0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_TINY = np.float32(1e-30)
+_LARGE = np.float32(1e30)
+
+# atan(a) / a as a polynomial of a^2 through the Chebyshev nodes of [0, 1]: 1.2e-8 rad off at most.
+_A0 = np.float32(0.9999999842426361)
+_A1 = np.float32(-0.3333306678069206)
+_A2 = np.float32(0.1999248357850854)
+_A3 = np.float32(-0.14202570511736232)
+_A4 = np.float32(0.1063675409820616)
+_A5 = np.float32(-0.07495445443411952)
+_A6 = np.float32(0.04258760746563534)
+_A7 = np.float32(-0.01600503050332723)
+_A8 = np.float32(0.002834064298875728)
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def arc_tangent(y, x):
+    """Return the angle of (x, y), float32 rad in [-pi, pi]; 0 for (0, 0)."""
+    across, up = abs(x), abs(y)
+    larger = across if across > up else up
+    smaller = up if across > up else across
+    a = smaller / (larger + _TINY)
+    b = a * a
+    p = _A5 + b * (_A6 + b * (_A7 + b * _A8))
+    angle = a * (_A0 + b * (_A1 + b * (_A2 + b * (_A3 + b * (_A4 + b * p)))))
+    angle = _HALF_PI - angle if up > across else angle
+    angle = _PI - angle if x < _ZERO else angle
+    return -angle if y < _ZERO else angle
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def project(x, y, z, kind, sensor, elevations, distance, u, v):
+    """
+    Find distance and place in the image of points.
+
+    x, y, z         (N,) float32 m, in the frame of the sensor
+    elevations      (rows,) float32 rad, descending; used by LIDAR_TABLE alone
+    distance, u, v  (N,) float32, out
+
+    Every loop writes one array and reads few, or the compiler gives up proving that arrays do
+    not overlap and computes one point at a time.
+    """
+    for n in range(len(x)):
+        distance[n] = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
+    if kind == CAMERA:
+        perspective(x, z, sensor[0], sensor[2], u)
+        perspective(y, z, sensor[1], sensor[3], v)
+        keep_within(v, _ZERO, sensor[5], u)
+        keep_within(u, _ZERO, sensor[4], u)
+        keep_within(z, _TINY, _LARGE, u)
+        return
+    columns_of(x, y, sensor, u)
+    elevations_of(x, y, z, v)
+    if kind == LIDAR_TABLE:
+        rows_of_table(elevations, v)
+    else:
+        top, per_row = sensor[2], _ONE / sensor[3]
+        for n in range(len(v)):
+            v[n] = (top - v[n]) * per_row
+    keep_within(v, -_HALF, sensor[5] - _HALF, u)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def perspective(across, depth, focal, centre, pixel):
+    """Find the column of points, or the row."""
+    for n in range(len(across)):
+        pixel[n] = focal * (across[n] / depth[n]) + centre
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def keep_within(values, low, high, u):
+    """Put points outside whose value is not between two bounds."""
+    for n in range(len(u)):
+        u[n] = u[n] if (values[n] >= low) & (values[n] <= high) else OUTSIDE
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def columns_of(x, y, sensor, u):
+    """Find the column of points; OUTSIDE beyond the last unless columns go all around."""
+    first, per_column, turn, lowest = sensor[0], _ONE / sensor[1], sensor[6], sensor[7]
+    beyond = turn + lowest
+    end = beyond if lowest == _ZERO else sensor[4] - _HALF
+    for n in range(len(x)):
+        column = (first - arc_tangent(y[n], x[n])) * per_column
+        column = column + turn if column < lowest else column
+        column = column - turn if column >= beyond else column
+        u[n] = column if column < end else OUTSIDE
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def elevations_of(x, y, z, elevation):
+    """Find the angle of points above the horizon."""
+    for n in range(len(x)):
+        elevation[n] = arc_tangent(z[n], np.sqrt(x[n] * x[n] + y[n] * y[n]))
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def rows_of_table(elevations, v):
+    """Turn elevations into rows of unevenly spaced beams, in place."""
+    last = len(elevations) - 1
+    for n in range(len(v)):
+        low, high = 0, last
+        while high - low > 1:
+            middle = (low + high) // 2
+            if elevations[middle] >= v[n]:
+                low = middle
+            else:
+                high = middle
+        gap = elevations[low] - elevations[low + 1]
+        v[n] = np.float32(low) + (elevations[low] - v[n]) / gap

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Range images from depth images and from points.
+
+A range image holds the length of each ray in metres, float32. 0 says that nothing is known. What
+is farther than the sensor reaches says that there is nothing up to there: such a pixel holds one
+finite value beyond max_range, `clearing`, so that no difference of infinities ever arises.
+"""
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.projection import project
+
+CHUNK = 1024
+"""Points projected at once; their numbers stay in the first cache."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def range_value(range_m, limits):
+    """
+    Return what a pixel holds for a measured range: 0, the range, or clearing.
+
+    limits  (3,) float32 m: min_range, max_range, clearing
+    """
+    if not range_m >= limits[0]:
+        return np.float32(0.0)
+    return limits[2] if range_m > limits[1] else range_m
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def from_depth(depth, scale, ray_length, limits, image):
+    """
+    Turn depths into ranges; return (largest, used).
+
+    depth       (rows, columns) float32, float64 or uint16; scale float32 makes metres of it
+    ray_length  (rows, columns) float32, range at depth 1
+    image       (rows, columns or more) float32 m, out
+
+    largest is the largest range, max_range where a pixel clears; used counts the pixels that say
+    something.
+    """
+    rows, columns = depth.shape
+    largest, used = np.float32(0.0), 0
+    for row in range(rows):
+        for column in range(columns):
+            measured = np.float32(depth[row, column]) * scale * ray_length[row, column]
+            value = range_value(measured, limits)
+            image[row, column] = value
+            used += value > np.float32(0.0)
+            largest = value if value > largest else largest
+    return min(largest, limits[1]), used
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def from_points(points, sensor, limits, image, index):
+    """
+    Put points into the pixels nearest to them, the nearest point first; return (largest, used).
+
+    points  (N, 3) float32 or float64 m, in the frame of the sensor; those not finite are left out
+    sensor  (kind, parameters, elevations), see kernels/projection.py
+    image   (rows, columns or one more) float32 m, in: 0; out, a first column repeated at the end
+    index   (rows, columns) int32, out where a pixel is filled: the point it is from
+
+    largest is the largest range, max_range where a pixel clears; used counts the points in view.
+    """
+    rows, columns = np.int64(index.shape[0]), np.int64(index.shape[1])
+    kind, parameters, elevations = sensor
+    all_around = image.shape[1] > columns
+    scratch = np.empty((6, CHUNK), np.float32)
+    x, y, z = scratch[0], scratch[1], scratch[2]
+    distance, u, v = scratch[3], scratch[4], scratch[5]
+    largest, used = np.float32(0.0), 0
+    for start in range(0, len(points), CHUNK):
+        count = min(CHUNK, len(points) - start)
+        for n in range(count):
+            x[n] = points[start + n, 0]
+            y[n] = points[start + n, 1]
+            z[n] = points[start + n, 2]
+        project(x, y, z, kind, parameters, elevations, distance, u, v)
+        for n in range(count):
+            value = range_value(distance[n], limits)
+            # Not so for nan and inf, whose column may be anything.
+            if value == 0.0 or not (u[n] >= np.float32(-0.5) and distance[n] < np.inf):
+                continue
+            row = np.int64(np.floor(v[n] + np.float32(0.5)))
+            column = np.int64(np.floor(u[n] + np.float32(0.5)))
+            if column == columns and all_around:
+                column = 0
+            if row < 0 or row >= rows or column < 0 or column >= columns:
+                continue
+            used += 1
+            largest = value if value > largest else largest
+            if image[row, column] == 0.0 or value < image[row, column]:
+                image[row, column] = value
+                index[row, column] = start + n
+    if all_around:
+        for row in range(rows):
+            image[row, columns] = image[row, 0]
+    return min(largest, limits[1]), used

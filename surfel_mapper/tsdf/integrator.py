@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Integrator: fuses range images into a block map.
+
+One step is: choose the blocks, place those that are missing, fuse each by itself, and take away
+those placed in vain. Threads share the blocks; what they write does not depend on how many there
+are. See kernels/tsdf.py for what happens in a block.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import logging
+import os
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.tsdf import INTERPOLATIONS, SEMANTICS, TsdfConfig
+from surfel_mapper.errors import PoseError
+from surfel_mapper.kernels import tsdf as kernels
+from surfel_mapper.mapping.threads import pool, split
+from surfel_mapper.tsdf.blocks import BlockMap, Int64
+from surfel_mapper.tsdf.range_image import RangeImage
+from surfel_mapper.tsdf.selection import BlockSelection
+from surfel_mapper.tsdf.sensors import Lidar
+
+logger = logging.getLogger(__name__)
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+NO_COLOR = np.empty((0, 0, 3), np.uint8)
+NO_LABEL = np.empty((0, 0), np.int32)
+NO_MASK = np.empty((0, 0), np.uint8)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Integrated:
+    """
+    What became of a range image.
+
+    Attributes
+    ----------
+    num_blocks : int
+        Blocks that it concerned.
+    num_updated : int
+        Those of which a voxel was observed.
+    num_added : int
+        Those of these that the map did not have before.
+    num_refused : int
+        Blocks that the budget had no room for.
+    num_voxels : int
+        Voxels observed.
+    num_labels_lost : int
+        Labels for which a voxel had no slot left.
+
+    """
+
+    num_blocks: int
+    num_updated: int
+    num_added: int
+    num_refused: int
+    num_voxels: int
+    num_labels_lost: int
+
+
+class Integrator:
+    """
+    Fuses range images into a map.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The map.
+
+    """
+
+    def __init__(self, blocks: BlockMap) -> None:
+        self.blocks = blocks
+        config = blocks.config
+        if config.truncation_m < 2.0 * config.voxel_size_m:
+            logger.warning(
+                'layers.tsdf.truncation_m: %g m is less than two voxels of %g m; surfaces may '
+                'have holes',
+                config.truncation_m,
+                config.voxel_size_m,
+            )
+        self._selection = BlockSelection(config)
+        self._threads = config.threads or os.cpu_count() or 1
+        side = np.arange(config.voxels_per_side) * config.voxel_size_m
+        z, y, x = np.meshgrid(side, side, side, indexing='ij')
+        self._voxels = np.stack([x.ravel(), y.ravel(), z.ravel()])
+        masked = {*config.dynamic_labels, *config.invalid_labels}
+        self._masked_labels = np.array(sorted(masked), np.int32)
+
+    def integrate(
+        self,
+        image: RangeImage,
+        T_map_sensor: Float64,
+        stamp_ns: int = 0,
+        *,
+        allocate_blocks: bool = True,
+    ) -> Integrated:
+        """
+        Fuse a range image into the map.
+
+        Parameters
+        ----------
+        image : RangeImage
+            What was measured.
+        T_map_sensor : (4, 4) float64
+            From where.
+        stamp_ns : int
+            When.
+        allocate_blocks : bool
+            Whether blocks are added; without, only those there are changed.
+
+        Returns
+        -------
+        Integrated
+            What became of it.
+
+        Raises
+        ------
+        PoseError
+            If the pose is not a finite rigid transform.
+        MapLimitError
+            If the range or the place is beyond what the map can index, or there is no memory; the
+            map is unchanged.
+
+        """
+        T = checked_pose(T_map_sensor)
+        index = self._selection.blocks(image, T)
+        blocks = self.blocks
+        before = blocks.num_blocks
+        rows = blocks.place(index) if allocate_blocks else blocks.find(index)
+        there = rows >= 0
+        observed, num_lost = self._fuse(image, T, stamp_ns, index[there], rows[there])
+        updated = rows[there][observed > 0]
+        if len(updated):
+            blocks.touch(updated, stamp_ns)
+        blocks.drop_new(rows)
+        return Integrated(
+            num_blocks=len(index),
+            num_updated=len(updated),
+            num_added=blocks.num_blocks - before,
+            num_refused=int((~there).sum()) if allocate_blocks else 0,
+            num_voxels=int(observed.sum()),
+            num_labels_lost=num_lost,
+        )
+
+    def _fuse(
+        self, image: RangeImage, T_map_sensor: Float64, stamp_ns: int, index: Int64, rows: Int64
+    ) -> tuple[Int64, int]:
+        """Fuse an image into blocks; return the voxels observed in each, and labels lost."""
+        config, sensor = self.blocks.config, image.sensor
+        R_sensor_map = T_map_sensor[:3, :3].T
+        corner = index * config.block_size_m + 0.5 * config.voxel_size_m
+        corners = ((corner - T_map_sensor[:3, 3]) @ R_sensor_map.T).astype(np.float32)
+        offsets = (R_sensor_map @ self._voxels).astype(np.float32)
+        observed = np.empty(len(rows), np.int64)
+        common = (
+            self.blocks.field,
+            sensor.projection,
+            self._images(image),
+            settings(config, image),
+            (INTERPOLATIONS.index(config.interpolation), POWERS[config.weight_mode]),
+            self._channels(stamp_ns),
+        )
+
+        def fuse(part: slice) -> int:
+            return int(
+                kernels.integrate_blocks(
+                    rows[part], corners[part], offsets, *common, observed[part]
+                )
+            )
+
+        helpers = pool(self._threads)
+        parts = split(len(rows), self._threads)
+        lost = [helpers.submit(fuse, part) for part in parts[1:]] if helpers else []
+        return observed, fuse(parts[0]) + sum(one.result() for one in lost)
+
+    def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
+        """Return ranges, colours, labels and mask; without rows what there is not."""
+        mask = image.mask
+        if len(self._masked_labels) and image.label is not None:
+            masked = np.isin(image.label, self._masked_labels).astype(np.uint8)
+            mask = masked if mask is None else masked | mask
+        rows, (left, right) = kernels.BORDER
+        edges = [rows, (left, right - image.sensor.wraps)]
+        return (
+            np.pad(image.range_m, edges),
+            NO_COLOR if image.color is None else image.color,
+            NO_LABEL if image.label is None else image.label,
+            NO_MASK if mask is None else mask,
+        )
+
+    def _channels(self, stamp_ns: int) -> tuple[Any, ...]:
+        """Return what the kernel takes of channels beside distance and weight."""
+        config, blocks = self.blocks.config, self.blocks
+        return (
+            blocks.color,
+            blocks.votes,
+            blocks.stamps,
+            SEMANTICS.index(config.semantics),
+            np.array(config.extra_labels, np.int32),
+            config.skip_extra_channels,
+            stamp_ns,
+        )
+
+
+POWERS = {'constant': 0, 'inverse_square': 1, 'ray_density': 1, 'ray_density_inv_sq': 2}
+"""Weights fall by depth to the power of minus twice this."""
+
+
+def settings(config: TsdfConfig, image: RangeImage) -> Float32:
+    """Return the numbers that the kernel takes, in its order."""
+    sensor, is_lidar = image.sensor, isinstance(image.sensor, Lidar)
+    found = np.zeros(kernels.NUM_SETTINGS, np.float32)
+    found[kernels.TAU] = config.truncation_m
+    found[kernels.EXTRA] = config.extra_distance_m
+    found[kernels.MIN_RANGE] = sensor.min_range_m
+    found[kernels.MAX_RANGE] = sensor.max_range_m
+    found[kernels.LIMIT] = image.largest_m + config.truncation_m
+    found[kernels.MAX_DIFFERENCE] = config.max_difference_m
+    found[kernels.MAX_DIFFERENCE_RATIO] = config.max_difference_ratio
+    found[kernels.MAX_OFFSET] = config.max_ray_offset_voxels * config.voxel_size_m * is_lidar
+    found[kernels.COLUMN_RAD] = sensor.pitch_rad[1]
+    by_density = config.weight_mode.startswith('ray_density')
+    found[kernels.WEIGHT] = sensor.density * config.voxel_size_m**2 if by_density else 1.0
+    found[kernels.DROPOFF] = config.dropoff_start_m if config.weight_dropoff else np.inf
+    found[kernels.MIN_WEIGHT] = config.min_measurement_weight
+    found[kernels.MAX_WEIGHT] = config.max_weight
+    return found
+
+
+def checked_pose(T_map_sensor: Float64) -> Float64:
+    """Return a pose as float64, or raise PoseError if it is not rigid and finite."""
+    T = np.asarray(T_map_sensor, np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise PoseError(f'pose of the sensor: {T.tolist()}, expected finite (4, 4)')
+    R = T[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
+        raise PoseError(f'pose of the sensor: {R.tolist()} is no rotation')
+    if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        raise PoseError(f'pose of the sensor: last row {T[3].tolist()}, expected 0 0 0 1')
+    return T

@@ -1,0 +1,253 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+RangeImage: what one scan or depth image measured, pixel by pixel of its sensor.
+
+The images of a lidar that looks all around repeat the first column after the last, so that
+nothing that reads them has to know of the seam. See kernels/range_image.py for what a pixel holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.kernels import range_image as kernels
+from surfel_mapper.tsdf.sensors import Camera, Sensor
+
+Float32 = npt.NDArray[np.float32]
+
+MAX_LABEL = (1 << 24) - 1
+"""Labels are kept as float32, which holds whole numbers up to here."""
+
+
+CLEARING_M = 2e3
+"""A pixel that clears holds a range so far beyond max_range_m: more than any truncation."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RangeImage:
+    """
+    Ranges, and colours, labels and a mask where there are any, in the pixels of a sensor.
+
+    Attributes
+    ----------
+    sensor : Camera or Lidar
+        Of which the pixels are.
+    range_m : (rows, columns or one more) float32
+        Length of each ray; 0: unknown; more than max_range_m: nothing up to there.
+    largest_m : float
+        The largest range, at most max_range_m; 0 where there is none.
+    num_used : int
+        Pixels or points that say something.
+    color : (rows, columns or one more, 3) uint8, optional
+        Red, green, blue.
+    label : (rows, columns or one more) int32, optional
+        -1: unknown.
+    mask : (rows, columns or one more) uint8, optional
+        1 where something moves or must not leave a surface.
+
+    """
+
+    sensor: Sensor
+    range_m: Float32
+    largest_m: float
+    num_used: int
+    color: npt.NDArray[np.uint8] | None = None
+    label: npt.NDArray[np.int32] | None = None
+    mask: npt.NDArray[np.uint8] | None = None
+
+    def with_images(
+        self,
+        *,
+        color: npt.ArrayLike | None = None,
+        label: npt.ArrayLike | None = None,
+        mask: npt.ArrayLike | None = None,
+    ) -> RangeImage:
+        """
+        Return this range image with images of the same size beside it.
+
+        Parameters
+        ----------
+        color : (rows, columns, 3) uint8, optional
+            Red, green, blue.
+        label : (rows, columns) int, optional
+            From -1, for unknown, to 2^24 - 1.
+        mask : (rows, columns) bool or int, optional
+            Not 0 where something moves: it frees space and leaves no surface.
+
+        Raises
+        ------
+        CloudFormatError
+            If an image is of another size or type.
+
+        """
+        more: dict[str, Any] = {}
+        if color is not None:
+            more['color'] = self._fitted('color', np.asarray(color), (3,))
+            if more['color'].dtype != np.uint8:
+                raise CloudFormatError(f'color: {more["color"].dtype}, expected uint8')
+        if label is not None:
+            found = self._fitted('label', np.asarray(label), ())
+            if found.dtype.kind not in 'iu' or not -1 <= found.min() <= found.max() <= MAX_LABEL:
+                raise CloudFormatError(
+                    f'label: {found.dtype} from {found.min()} to {found.max()}, expected whole '
+                    f'numbers from -1 to {MAX_LABEL}'
+                )
+            more['label'] = found.astype(np.int32)
+        if mask is not None:
+            more['mask'] = (self._fitted('mask', np.asarray(mask), ()) != 0).astype(np.uint8)
+        return replace(self, **more)
+
+    def _fitted(
+        self, name: str, image: npt.NDArray[Any], channels: tuple[int, ...]
+    ) -> npt.NDArray[Any]:
+        expected = (self.sensor.rows, self.sensor.columns, *channels)
+        if image.shape != expected:
+            raise CloudFormatError(f'{name}: {image.shape}, expected {expected} as the sensor has')
+        return repeated(image) if self.sensor.wraps else np.ascontiguousarray(image)
+
+
+def from_depth(
+    sensor: Camera, depth: npt.NDArray[Any], *, scale: float | None = None
+) -> RangeImage:
+    """
+    Return the range image of a depth image.
+
+    Parameters
+    ----------
+    sensor : Camera
+        Which took it.
+    depth : (rows, columns) float32, float64 or uint16
+        Along z; in metres if float, 0, negative and nan: unknown, inf: nothing up to max_range_m;
+        in millimetres if uint16, 0: unknown.
+    scale : float, optional
+        Metres of one unit, where it is not those.
+
+    Raises
+    ------
+    CloudFormatError
+        If the size is not that of the sensor, the type is another or scale is not positive.
+
+    """
+    if depth.shape != (sensor.rows, sensor.columns):
+        raise CloudFormatError(
+            f'depth image of {depth.shape}, expected {(sensor.rows, sensor.columns)} as the '
+            'camera has (rows, columns)'
+        )
+    if depth.dtype not in (np.float32, np.float64, np.uint16):
+        raise CloudFormatError(f'depth: {depth.dtype}, expected float32, float64 or uint16')
+    if scale is None:
+        scale = 1e-3 if depth.dtype == np.uint16 else 1.0
+    if not 0.0 < scale < np.inf:
+        raise CloudFormatError(f'depth scale: {scale}, expected positive and finite')
+    image = np.empty((sensor.rows, sensor.columns), np.float32)
+    native = np.ascontiguousarray(depth, depth.dtype.newbyteorder('='))
+    largest, used = kernels.from_depth(
+        native, np.float32(scale), sensor.ray_length, limits(sensor), image
+    )
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+
+
+def from_points(
+    sensor: Sensor, points: npt.NDArray[Any], *, colors: npt.NDArray[np.uint8] | None = None,
+    labels: npt.NDArray[Any] | None = None,
+) -> RangeImage:
+    """
+    Return the range image of a cloud in any order: in every pixel the nearest of its points.
+
+    Parameters
+    ----------
+    sensor : Camera or Lidar
+        Which measured them.
+    points : (N, 3) float32 or float64
+        In its frame, m; those not finite or out of view are left out.
+    colors : (N, 3) uint8, optional
+        Red, green, blue of each point.
+    labels : (N,) int, optional
+        Label of each point, -1 for unknown.
+
+    Raises
+    ------
+    CloudFormatError
+        If shapes or types are others.
+
+    """
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
+        raise CloudFormatError(f'points: {points.dtype} {points.shape}, expected (N, 3) float')
+    image = np.zeros((sensor.rows, sensor.columns + sensor.wraps), np.float32)
+    source = np.full((sensor.rows, sensor.columns), -1, np.int32)
+    largest, used = kernels.from_points(
+        np.ascontiguousarray(points), sensor.projection, limits(sensor), image, source
+    )
+    found = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+    more: dict[str, npt.NDArray[Any]] = {}
+    if colors is not None:
+        more['color'] = taken('colors', colors, (len(points), 3), source, 0)
+    if labels is not None:
+        more['label'] = taken('labels', labels, (len(points),), source, -1)
+    return found.with_images(**more) if more else found
+
+
+def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
+    """
+    Return the range image of an organised cloud: its ranges as they are, in the sensor's pixels.
+
+    Parameters
+    ----------
+    sensor : Camera or Lidar
+        Which measured them, rows from the highest beam to the lowest.
+    range_m : (rows, columns) float
+        Length of each ray; 0, negative and nan: unknown; inf: nothing up to max_range_m.
+
+    Raises
+    ------
+    CloudFormatError
+        If the size is not that of the sensor.
+
+    """
+    if range_m.shape != (sensor.rows, sensor.columns) or range_m.dtype.kind != 'f':
+        raise CloudFormatError(
+            f'ranges: {range_m.dtype} {range_m.shape}, expected floats '
+            f'{(sensor.rows, sensor.columns)} as the sensor has (rows, columns)'
+        )
+    image = np.empty((sensor.rows, sensor.columns + sensor.wraps), np.float32)
+    native = np.ascontiguousarray(range_m, np.float32)
+    largest, used = kernels.from_depth(
+        native, np.float32(1.0), np.ones_like(native), limits(sensor), image
+    )
+    if sensor.wraps:
+        image[:, -1] = image[:, 0]
+    return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
+
+
+def limits(sensor: Sensor) -> Float32:
+    """Return smallest and largest range, and the value of a pixel that clears, m."""
+    farthest = sensor.max_range_m
+    return np.array([sensor.min_range_m, farthest, farthest + CLEARING_M], np.float32)
+
+
+def taken(
+    name: str,
+    values: npt.NDArray[Any],
+    shape: tuple[int, ...],
+    source: npt.NDArray[np.int32],
+    missing: int,
+) -> npt.NDArray[Any]:
+    """Return the values of the points that pixels are from, as an image."""
+    if values.shape != shape:
+        raise CloudFormatError(f'{name}: {values.shape}, expected {shape} as there are points')
+    if not len(values):
+        return np.full(source.shape + shape[1:], missing, values.dtype)
+    image = values[source]
+    image[source < 0] = missing
+    return image
+
+
+def repeated(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return an image with its first column once more after the last."""
+    return np.concatenate([image, image[:, :1]], axis=1)

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which blocks a range image concerns: those that its rays touch, or all within its view.
+
+The first costs as much as there are rays, the second as much as there is room in view. Where both
+find a block they lead to the same voxels, as a block is fused by itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels.block_marks import count_marks, list_marks, mark_rays
+from surfel_mapper.tsdf.range_image import RangeImage
+
+Int64 = npt.NDArray[np.int64]
+Float64 = npt.NDArray[np.float64]
+
+MAX_SIDE = 2048
+"""Blocks along the edge of the cube that rays stay in: 1 GiB of bits."""
+
+
+class BlockSelection:
+    """
+    Chooses blocks; keeps the memory that it needs for it.
+
+    Parameters
+    ----------
+    config : TsdfConfig
+        Size of voxels and blocks, truncation, allocation, carving.
+
+    """
+
+    def __init__(self, config: TsdfConfig) -> None:
+        self._config = config
+        self._marks = np.zeros(0, np.int64)
+
+    def blocks(self, image: RangeImage, T_map_sensor: Float64) -> Int64:
+        """
+        Return the blocks that a range image concerns, (K, 3) int64, ascending.
+
+        Raises
+        ------
+        MapLimitError
+            If the range is more than MAX_SIDE / 2 blocks.
+
+        """
+        half = half_side(self._config, image)
+        if half == 0:
+            return np.empty((0, 3), np.int64)
+        if 2 * half + 1 > MAX_SIDE:
+            raise MapLimitError(
+                f'a range of {image.largest_m:g} m is {half} blocks of '
+                f'{self._config.block_size_m:g} m, expected at most {MAX_SIDE // 2}; use larger '
+                'voxels or a smaller max_range_m'
+            )
+        if self._config.allocation == 'frustum':
+            return in_view(self._config, image, T_map_sensor, half)
+        return self._touched(image, T_map_sensor, half)
+
+    def _touched(self, image: RangeImage, T_map_sensor: Float64, half: int) -> Int64:
+        """Return the blocks that rays touch."""
+        config, side = self._config, 2 * half + 1
+        if len(self._marks) < side**3 // 64 + 1:
+            self._marks = np.zeros(side**3 // 64 + 1, np.int64)
+        marks = self._marks[: side**3 // 64 + 1]
+        pose = T_map_sensor[:3] / config.block_size_m
+        low = np.floor(pose[:, 3]).astype(np.int64) - half
+        pose[:, 3] -= low
+        mark_rays(image.range_m, image.sensor.directions, pose, reach(config, image), side, marks)
+        index = np.empty((count_marks(marks), 3), np.int64)
+        list_marks(marks, side, low, index)
+        return index
+
+
+def half_side(config: TsdfConfig, image: RangeImage) -> int:
+    """Return how many blocks from the sensor's the farthest one is; 0 if nothing is measured."""
+    if image.largest_m == 0.0:
+        return 0
+    return int((image.largest_m + config.truncation_m) / config.block_size_m) + 2
+
+
+def reach(config: TsdfConfig, image: RangeImage) -> Float64:
+    """Return what rays reach, as kernels/block_marks.py has it."""
+    sensor = image.sensor
+    free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
+    band = [config.voxel_size_m / 2.0 / pitch for pitch in sensor.pitch_rad]
+    common = [config.truncation_m, sensor.min_range_m, sensor.max_range_m, float(config.carve)]
+    return np.array([*common, *free, *band])
+
+
+def in_view(
+    config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: int
+) -> Int64:
+    """Return the blocks that may lie in the view of the sensor, up to its largest range."""
+    size_m, sensor = config.block_size_m, image.sensor
+    radius_m = np.sqrt(0.75) * size_m
+    middle = np.floor(T_map_sensor[:3, 3] / size_m).astype(np.int64)
+    along = np.arange(-half, half + 1)
+    found = []
+    for layer in along:  # by layers: the whole cube may be large
+        grid = np.meshgrid([layer], along, along, indexing='ij')
+        index = middle + np.stack(grid, axis=-1).reshape(-1, 3)
+        centres = ((index + 0.5) * size_m - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
+        distance = np.linalg.norm(centres, axis=1)
+        near = distance >= sensor.min_range_m - radius_m
+        far = distance <= image.largest_m + config.truncation_m + radius_m
+        found.append(index[near & far & sensor.sees(centres, radius_m)])
+    return np.concatenate(found)

@@ -1,0 +1,163 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The integrator once more, in plain numpy and float64: slow, obvious, and independent.
+
+Nothing is shared with the code under test but the sensors' properties and what a range image
+holds. Maps are dictionaries from block to the arrays of its voxels.
+"""
+
+import numpy as np
+
+
+def voxel_centres(config, block):
+    """Return the centres of the voxels of a block, (N, 3) m, x fastest."""
+    side = np.arange(config.voxels_per_side)
+    z, y, x = np.meshgrid(side, side, side, indexing='ij')
+    local = np.stack([x.ravel(), y.ravel(), z.ravel()], axis=1)
+    return (np.asarray(block) * config.voxels_per_side + local + 0.5) * config.voxel_size_m
+
+
+def place_in_image(sensor, p):
+    """Return column and row of (N, 3) points, nan where they are out of view."""
+    with np.errstate(all='ignore'):
+        if hasattr(sensor, 'fx'):
+            u = sensor.fx * p[:, 0] / p[:, 2] + sensor.cx
+            v = sensor.fy * p[:, 1] / p[:, 2] + sensor.cy
+            seen = (p[:, 2] > 0) & (u >= 0) & (u <= sensor.columns)
+            seen &= (v >= 0) & (v <= sensor.rows)
+            return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
+        azimuth = np.arctan2(p[:, 1], p[:, 0])
+        elevation = np.arcsin(p[:, 2] / np.linalg.norm(p, axis=1))
+    first = np.deg2rad(sensor.first_azimuth_deg)
+    if sensor.wraps:
+        u = (first - azimuth) / (2 * np.pi) % 1.0 * sensor.columns
+    else:
+        pitch = np.deg2rad(sensor.horizontal_fov_deg) / (sensor.columns - 1)
+        turn = 2 * np.pi / pitch
+        u = ((first - azimuth) / pitch + 0.5) % turn - 0.5
+        u = np.where(u < sensor.columns - 0.5, u, np.nan)
+    beams = np.deg2rad(
+        sensor.beam_elevations_deg
+        or np.linspace(
+            sensor.vertical_fov_top_deg,
+            sensor.vertical_fov_top_deg - sensor.vertical_fov_deg,
+            sensor.rows,
+        )
+    )
+    # Beyond the first and the last beam rows go on at the pitch between the outermost two.
+    low = beams[0] + (beams[0] - beams[1]), beams[-1] - (beams[-2] - beams[-1])
+    known = np.concatenate([[low[0]], beams, [low[1]]])
+    v = np.interp(-elevation, -known, np.arange(-1, sensor.rows + 1), np.nan, np.nan)
+    seen = (v >= -0.5) & (v <= sensor.rows - 0.5) & ~np.isnan(u)
+    return np.where(seen, u, np.nan), np.where(seen, v, np.nan)
+
+
+def ray(sensor, column, row):
+    """Return the unit vector of one pixel."""
+    return sensor.directions[row, column % sensor.columns].astype(float)
+
+
+def look_up(config, sensor, image, p, u, v):
+    """Return the range at one place, 0 for none, and what it is from: (row, column, share)."""
+    u0, v0 = int(np.floor(u)), int(np.floor(v))
+    du, dv = u - u0, v - v0
+    columns = sensor.columns + sensor.wraps
+    quad = [
+        (v0, u0, (1 - du) * (1 - dv)),
+        (v0, u0 + 1, du * (1 - dv)),
+        (v0 + 1, u0, (1 - du) * dv),
+        (v0 + 1, u0 + 1, du * dv),
+    ]
+    inside = all(0 <= j < sensor.rows and 0 <= i < columns for j, i, _ in quad)
+    if config.interpolation != 'nearest' and inside:
+        q = np.array([float(image[j, i]) for j, i, _ in quad])
+        allowed = max(config.max_difference_m, config.max_difference_ratio * q.min())
+        clear = q > sensor.max_range_m
+        alike = (q > 0).all() and (clear.all() or not clear.any())
+        if alike and (config.interpolation == 'bilinear' or q.max() - q.min() <= allowed):
+            return float(np.dot(q, [share for _, _, share in quad])), quad
+    j, i = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
+    if not (0 <= j < sensor.rows and 0 <= i < columns):
+        return 0.0, []
+    if not hasattr(sensor, 'fx') and config.max_ray_offset_voxels > 0:
+        b = ray(sensor, i, j)
+        if np.linalg.norm(p - (p @ b) * b) > config.max_ray_offset_voxels * config.voxel_size_m:
+            return 0.0, []
+    return float(image[j, i]), [(j, i, 1.0)]
+
+
+def weight(config, sensor, depth, s):
+    """Return the weight of one measurement."""
+    w = 1.0
+    if config.weight_mode.startswith('ray_density'):
+        w = sensor.density * (config.voxel_size_m / depth) ** 2
+    if config.weight_mode in ('inverse_square', 'ray_density_inv_sq'):
+        w /= depth**2
+    start, tau = config.dropoff_m or config.voxel_size_m, config.truncation_m
+    if config.weight_dropoff and s < -start:
+        w *= (tau + s) / (tau - start)
+    return max(w, config.min_measurement_weight)
+
+
+def measurements(config, image, T_map_sensor, block):
+    """Yield voxel, signed distance, weight and pixels for every voxel observed of a block."""
+    sensor, tau = image.sensor, config.truncation_m
+    R, t = T_map_sensor[:3, :3], T_map_sensor[:3, 3]
+    points = (voxel_centres(config, block) - t) @ R
+    u, v = place_in_image(sensor, points)
+    masked = {*config.dynamic_labels, *config.invalid_labels}
+    for n, p in enumerate(points):
+        d = np.linalg.norm(p)
+        if np.isnan(u[n]) or not sensor.min_range_m <= d <= image.largest_m + tau:
+            continue
+        value, pixels = look_up(config, sensor, image.range_m, p, u[n], v[n])
+        if value <= 0 or (value > sensor.max_range_m and d > sensor.max_range_m):
+            continue
+        s = value - d
+        if s < -tau - config.extra_distance_m:
+            continue
+        s = min(max(s, -tau), tau)
+        if s < tau and share_of(pixels, image, masked) > 0.5:
+            continue
+        label = voted(pixels, image.label)
+        if s <= -tau and config.extra_labels and label not in config.extra_labels:
+            continue
+        depth = p[2] if hasattr(sensor, 'fx') else d
+        yield n, s, weight(config, sensor, depth, s), pixels
+
+
+def share_of(pixels, image, masked):
+    """Return the share of the pixels that are masked."""
+    total = 0.0
+    for j, i, share in pixels:
+        by_label = image.label is not None and image.label[j, i] in masked
+        by_mask = image.mask is not None and image.mask[j, i] != 0
+        total += share * (by_label or by_mask)
+    return total
+
+
+def voted(pixels, labels):
+    """Return the label with the largest share, the smaller on a tie."""
+    if labels is None:
+        return -1
+    shares = {}
+    for j, i, share in pixels:
+        shares[labels[j, i]] = shares.get(labels[j, i], 0.0) + share
+    return max(sorted(shares), key=shares.get)
+
+
+def integrate(config, blocks, image, T_map_sensor, index):
+    """Fuse an image into the blocks of a dictionary: index to (D, W, C, W of C)."""
+    size = config.voxels_per_side**3
+    for block in map(tuple, index):
+        new = np.zeros(size), np.zeros(size), np.zeros((size, 3)), np.zeros(size)
+        D, W, C, W_color = blocks.setdefault(block, new)
+        for n, s, w, pixels in measurements(config, image, T_map_sensor, block):
+            D[n] = (D[n] * W[n] + s * w) / (W[n] + w)
+            W[n] = min(W[n] + w, config.max_weight)
+            if image.color is not None and s < config.truncation_m:
+                c = sum(share * image.color[j, i].astype(float) for j, i, share in pixels)
+                C[n] = (C[n] * W_color[n] + c * w) / (W_color[n] + w)
+                W_color[n] += w
+    return blocks
