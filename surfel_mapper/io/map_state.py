@@ -156,8 +156,32 @@ def _scan(
 def _moments(
     arrays: dict[str, npt.NDArray[Any]], prefix: str, surfel_map: SurfelMap
 ) -> ScanMoments:
-    """Return moments from a file, which have to be possible: the kernels rely on it."""
+    """Return the moments under a prefix."""
     parts = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
+    return checked_moments(parts, surfel_map, prefix)
+
+
+def checked_moments(
+    parts: dict[str, npt.NDArray[Any]], surfel_map: SurfelMap, prefix: str
+) -> ScanMoments:
+    """
+    Return moments from a file, which have to be possible: the kernels rely on it.
+
+    Parameters
+    ----------
+    parts : dict of str to array
+        The arrays of ScanMoments by name.
+    surfel_map : SurfelMap
+        The map that they are for.
+    prefix : str
+        What errors call them.
+
+    Raises
+    ------
+    ValueError
+        If shapes or types are wrong, a voxel stands twice or its numbers cannot be.
+
+    """
     key, count = parts['key'], parts['count']
     names = channel_names(surfel_map.columns)
     widths = {'total': (3,), 'product': (6,), 'view': (3,), 'channels': (len(names),)}
