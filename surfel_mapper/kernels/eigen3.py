@@ -62,9 +62,9 @@ def decompose(scatter, num, eigenvalues, normals):
         )
         side = 1.0 if determinant >= 0.0 else -1.0
         half = min(abs(determinant) * 0.5, 1.0)
-        t = 1.7320508075688772 + half * (0.3333333333333333 - 0.0653841409022105 * half)
-        t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))
-        t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))
+        t = 0.0186393677949610 * half - 0.0813823948457717
+        t = (t * half + 0.3306607004416897) * half + 1.7321326590663837  # to 1e-4
+        t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))  # to 1e-8
         t -= ((t * t - 3.0) * t - 2.0 * half) / (3.0 * (t * t - 1.0))
         t *= side
 

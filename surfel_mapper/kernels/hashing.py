@@ -69,6 +69,21 @@ def next_bucket(bucket):
     return (bucket & ~(SEGMENT - 1)) | ((bucket + 1) & (SEGMENT - 1))
 
 
+@njit(cache=True, nogil=True, inline='always')
+def likely_row(hashed, directory, buckets, depth):
+    """
+    Return the first row of a hash, or -1 if the map has none.
+
+    Of two voxels in one segment with the same hash it finds one; the key in the row tells.
+    """
+    bucket = first_bucket(hashed, directory, depth)
+    entry = buckets[bucket]
+    while entry != 0 and (entry >> 32) & _LOW != hashed:
+        bucket = next_bucket(bucket)
+        entry = buckets[bucket]
+    return (entry & _LOW) - 1
+
+
 @njit(cache=True, nogil=True)
 def find_row(key, rows, table, depth):
     """

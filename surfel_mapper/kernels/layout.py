@@ -34,9 +34,9 @@ VIEW_SCALE = 1 << 14
 # Columns of a row. A free row has COUNT 0 and the next free row in KEY.
 KEY = 0
 COUNT = 1
-SUM = 2
-PRODUCT = 5
-VIEW = 11
-VERSION = 14
+VERSION = 2
+SUM = 3
+PRODUCT = 6
+VIEW = 12
 ROW = 16
 """The last column is unused: it pads the row to two cache lines."""

@@ -88,7 +88,7 @@ def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
         quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
         num_runs = find_runs(chunk_keys, len(x), starts)
         if num_rows + num_runs > len(keys):
-            clear_table(table, keys, num_rows)
+            table[:] = -1
             return -1
         num_rows = find_run_rows(chunk_keys, starts, num_runs, scratch, num_rows, run_rows)
         for run in range(num_runs):
@@ -115,7 +115,7 @@ def merge_sums(scratch, num_rows, other_keys, other_sums):
     shift = hash_shift(len(table))
     mask = len(table) - 1
     if num_rows + len(other_keys) > len(keys):
-        clear_table(table, keys, num_rows)
+        table[:] = -1
         return -1
     for other in range(len(other_keys)):
         if other + AHEAD < len(other_keys):
@@ -272,24 +272,6 @@ def reason(x, y, z, range_sq):
     if distance_sq < range_sq[0]:
         return TOO_NEAR
     return TOO_FAR if distance_sq > range_sq[1] else BEYOND
-
-
-@njit(cache=True, nogil=True)
-def clear_table(table, keys, num_rows):
-    """
-    Set back to -1 what reduce_points wrote into its table, by walking its entries.
-
-    table     (B,) int32
-    keys      (E,) int64
-    num_rows  voxels in the table
-    """
-    shift = hash_shift(len(table))
-    mask = len(table) - 1
-    for row in range(num_rows):
-        place = home(keys[row], shift)
-        while table[place] >= 0:
-            table[place] = -1
-            place = (place + 1) & mask
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

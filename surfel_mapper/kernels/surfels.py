@@ -32,6 +32,17 @@ from surfel_mapper.kernels.prefetch import prefetch
 CHUNK = 256
 AHEAD = 16
 
+EXACT_BITS = 54
+"""A product of moments of n points of b bits is below n 4^(b - 1): a float64 for n < 2^(54 - 2 b),
+with a factor to spare."""
+
+# Rows of the chunk of moments: count, sums, products and views as in a row of the slab.
+N = 0
+S = 1
+P = 4
+V = 10
+MOMENTS = 13
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def derive_surfels(rows, chosen, voxel_size, bits, outputs):
@@ -47,85 +58,127 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
 
     One point, or all equal: eigenvalues 0; normal, planarity and curvature nan.
     """
-    _, normal, planarity, curvature, eigenvalues, num_points, _ = outputs
-    unit = voxel_size / (1 << bits)
+    position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
+    moments = np.empty((MOMENTS, CHUNK))
     scatter = np.empty((6, CHUNK))
-    values = np.empty((3, CHUNK))
-    normals = np.empty((3, CHUNK))
+    mean, values, normals = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((3, CHUNK))
+    many = 1 << max(EXACT_BITS - 2 * bits, 0)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
         part = slice(start, start + num)
-        gather(rows, chosen, start, num, scatter)
-        place_means(rows, chosen[part], voxel_size, bits, outputs, start)
+        most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
+        center(moments, num, mean, scatter)
+        if most >= many:
+            center_exactly(rows, chosen[part], scatter)
+        place(mean, num, voxel_size, bits, voxel_index[part], position[part])
         decompose(scatter, num, values, normals)
-        derive_shape(values, num, num_points[part], unit, planarity[part], curvature[part])
+        derive_shape(values, num, moments, voxel_size / (1 << bits), planarity, curvature, start)
+        turn(normals, num, moments)
         for i in range(num):
             out = start + i
-            row = np.int64(chosen[out])
-            nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
-            side = side_seen(nx, ny, nz, rows, row)  # a factor: half of the branches would miss
-            side = math.nan if math.isnan(planarity[out]) else side
-            normal[out, 0], normal[out, 1], normal[out, 2] = nx * side, ny * side, nz * side
-            for j in range(3):
-                eigenvalues[out, j] = values[j, i]
+            # a factor, because half of the branches would miss
+            known = math.nan if math.isnan(planarity[out]) else 1.0
+            for axis in range(3):
+                normal[out, axis] = normals[axis, i] * known
+                eigenvalues[out, axis] = values[axis, i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def gather(rows, chosen, start, num, scatter):
+@njit(cache=True, nogil=True)
+def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     """
-    Collect the scatter of num voxels from start on.
+    Collect the moments of num voxels from start on; return the largest count.
 
-    scatter  (6, CHUNK) float64, out: sum of products of deviations from the mean, lattice units
+    moments      (MOMENTS, CHUNK) float64, out
+    num_points   (K,) int64, out
+    voxel_index  (K, 3) int32, out
     """
     flat = rows.ravel()
+    most = np.int64(0)
     for i in range(num):
-        if start + i + AHEAD < len(chosen):
-            prefetch(flat, np.int64(chosen[start + i + AHEAD]) * ROW)
-            prefetch(flat, np.int64(chosen[start + i + AHEAD]) * ROW + ROW // 2)
-        row = np.int64(chosen[start + i])
-        n = rows[row, COUNT]
-        sx, sy, sz = rows[row, SUM], rows[row, SUM + 1], rows[row, SUM + 2]
-        inverse = 1.0 / n
-        # about the lattice point c nearest to the mean, still in integers
-        cx = np.int64(np.rint(sx * inverse))
-        cy = np.int64(np.rint(sy * inverse))
-        cz = np.int64(np.rint(sz * inverse))
-        dx, dy, dz = sx - n * cx, sy - n * cy, sz - n * cz
-        fx, fy, fz = np.float64(dx), np.float64(dy), np.float64(dz)
-        scatter[0, i] = (rows[row, PRODUCT] - cx * (sx + dx)) - fx * fx * inverse
-        scatter[1, i] = (rows[row, PRODUCT + 1] - cx * sy - cy * dx) - fx * fy * inverse
-        scatter[2, i] = (rows[row, PRODUCT + 2] - cx * sz - cz * dx) - fx * fz * inverse
-        scatter[3, i] = (rows[row, PRODUCT + 3] - cy * (sy + dy)) - fy * fy * inverse
-        scatter[4, i] = (rows[row, PRODUCT + 4] - cy * sz - cz * dy) - fy * fz * inverse
-        scatter[5, i] = (rows[row, PRODUCT + 5] - cz * (sz + dz)) - fz * fz * inverse
+        out = start + i
+        if out + AHEAD < len(chosen):
+            prefetch(flat, np.int64(chosen[out + AHEAD]) * ROW)
+            prefetch(flat, np.int64(chosen[out + AHEAD]) * ROW + ROW // 2)
+        row = np.int64(chosen[out])
+        key, n = rows[row, KEY], rows[row, COUNT]
+        voxel_index[out, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        voxel_index[out, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        voxel_index[out, 2] = (key & INDEX_MASK) - INDEX_OFFSET
+        num_points[out] = n
+        most = max(most, n)
+        moments[N, i] = n
+        for axis in range(3):
+            moments[S + axis, i] = rows[row, SUM + axis]
+            moments[V + axis, i] = rows[row, VIEW + axis]
+        for pair in range(6):
+            moments[P + pair, i] = rows[row, PRODUCT + pair]
+    return most
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def place_means(rows, chosen, voxel_size, bits, outputs, start):
-    """Write position, count and voxel index of a chunk, from row start of the outputs on."""
-    position, _, _, _, _, num_points, voxel_index = outputs
+def center(moments, num, mean, scatter):
+    """
+    Write the means and the scatters about them, lattice units, of a chunk.
+
+    moments  (MOMENTS, CHUNK) float64, of not too many points each, see EXACT_BITS
+    mean     (3, CHUNK) float64, out: about the centre of the voxel
+    scatter  (6, CHUNK) float64, out: sum of products of deviations from the mean
+
+    All but the last product and the last difference are of whole numbers below 2^53, so exact.
+    """
+    for i in range(num):
+        n = moments[N, i]
+        inverse = 1.0 / n
+        sx, sy, sz = moments[S, i], moments[S + 1, i], moments[S + 2, i]
+        mx, my, mz = sx * inverse, sy * inverse, sz * inverse
+        # about the lattice point c nearest to the mean
+        cx, cy, cz = np.rint(mx), np.rint(my), np.rint(mz)
+        dx, dy, dz = sx - n * cx, sy - n * cy, sz - n * cz
+        mean[0, i], mean[1, i], mean[2, i] = mx, my, mz
+        scatter[0, i] = (moments[P, i] - cx * (sx + dx)) - dx * dx * inverse
+        scatter[1, i] = (moments[P + 1, i] - cx * sy - cy * dx) - dx * dy * inverse
+        scatter[2, i] = (moments[P + 2, i] - cx * sz - cz * dx) - dx * dz * inverse
+        scatter[3, i] = (moments[P + 3, i] - cy * (sy + dy)) - dy * dy * inverse
+        scatter[4, i] = (moments[P + 4, i] - cy * sz - cz * dy) - dy * dz * inverse
+        scatter[5, i] = (moments[P + 5, i] - cz * (sz + dz)) - dz * dz * inverse
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def center_exactly(rows, chosen, scatter):
+    """Write the scatters that ``center`` gives for any number of points, through int64."""
+    for i in range(len(chosen)):
+        row = np.int64(chosen[i])
+        n = rows[row, COUNT]
+        inverse = 1.0 / n
+        pair = 0
+        for a in range(3):
+            sa = rows[row, SUM + a]
+            ca = np.int64(np.rint(sa * inverse))
+            da = sa - n * ca
+            for b in range(a, 3):
+                sb = rows[row, SUM + b]
+                cb = np.int64(np.rint(sb * inverse))
+                db = sb - n * cb
+                about = rows[row, PRODUCT + pair] - ca * sb - cb * da
+                scatter[pair, i] = about - np.float64(da) * np.float64(db) * inverse
+                pair += 1
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def place(mean, num, voxel_size, bits, voxel_index, position):
+    """Write the means of a chunk as positions, (num, 3) m."""
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
-    for i in range(len(chosen)):
-        out = start + i
-        row = np.int64(chosen[i])
-        key = rows[row, KEY]
-        n = rows[row, COUNT]
-        num_points[out] = n
-        inverse = 1.0 / n
-        kx = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        kz = (key & INDEX_MASK) - INDEX_OFFSET
-        voxel_index[out, 0], voxel_index[out, 1], voxel_index[out, 2] = kx, ky, kz
-        position[out, 0] = (kx + (rows[row, SUM] * inverse + half) * cell) * voxel_size
-        position[out, 1] = (ky + (rows[row, SUM + 1] * inverse + half) * cell) * voxel_size
-        position[out, 2] = (kz + (rows[row, SUM + 2] * inverse + half) * cell) * voxel_size
+    for i in range(num):
+        for axis in range(3):
+            inside = (mean[axis, i] + half) * cell
+            position[i, axis] = (voxel_index[i, axis] + inside) * voxel_size
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def derive_shape(values, num, num_points, unit, planarity, curvature):
+def derive_shape(values, num, moments, unit, planarity, curvature, start):
     """
-    Write planarity and curvature of a chunk, (num,) each; turn scatter into covariance.
+    Write planarity and curvature of a chunk, from start on; turn scatter into covariance.
 
     values  (3, CHUNK) float64: eigenvalues of the scatter, lattice units; out: of the
             covariance, m^2
@@ -133,39 +186,43 @@ def derive_shape(values, num, num_points, unit, planarity, curvature):
     for i in range(num):
         e0, e1, e2 = values[0, i], values[1, i], values[2, i]
         inverse = 1.0 / ((e0 + e1) + e2)
-        planarity[i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as it should be
-        curvature[i] = e0 * inverse
-        scale = unit * unit / max(np.float64(num_points[i] - 1), 1.0)
+        planarity[start + i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as it should be
+        curvature[start + i] = e0 * inverse
+        scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
         values[0, i] = e0 * scale
         values[1, i] = e1 * scale
         values[2, i] = e2 * scale
 
 
-@njit(cache=True, nogil=True, inline='always')
-def side_seen(nx, ny, nz, rows, row):
+@njit(cache=True, nogil=True)
+def turn(normals, num, moments):
     """
-    Return 1 if a normal points to the side from which its voxel was seen, else -1.
+    Turn the normals (3, CHUNK) of a chunk to the side from which their voxels were seen.
 
-    Where that is unknown or exactly sideways: 1 if the component of largest magnitude is
+    Where that is unknown or exactly sideways: so that the component of largest magnitude is
     positive; of equal ones the first counts.
     """
-    towards = (nx * rows[row, VIEW] + ny * rows[row, VIEW + 1]) + nz * rows[row, VIEW + 2]
-    if towards == 0.0:
-        if abs(nx) >= abs(ny) and abs(nx) >= abs(nz):
-            towards = nx
-        elif abs(ny) >= abs(nz):
-            towards = ny
-        else:
-            towards = nz
-    return -1.0 if towards < 0.0 else 1.0
+    for i in range(num):
+        nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
+        towards = (nx * moments[V, i] + ny * moments[V + 1, i]) + nz * moments[V + 2, i]
+        y_or_z = ny if abs(ny) >= abs(nz) else nz
+        largest = nx if (abs(nx) >= abs(ny)) & (abs(nx) >= abs(nz)) else y_or_z
+        side = -1.0 if (largest if towards == 0.0 else towards) < 0.0 else 1.0
+        normals[0, i] = nx * side
+        normals[1, i] = ny * side
+        normals[2, i] = nz * side
 
 
 @njit(cache=True, nogil=True)
 def rows_changed_at(rows, changed, version, min_points):
     """Return the rows whose last change was at a version and that hold at least so many points."""
     kept = np.empty(len(changed), np.int32)
+    flat = rows.ravel()
     num = 0
-    for row in changed:
+    for place in range(len(changed)):
+        if place + AHEAD < len(changed):
+            prefetch(flat, np.int64(changed[place + AHEAD]) * ROW)
+        row = changed[place]
         if rows[row, VERSION] == version and rows[row, COUNT] >= min_points:
             kept[num] = row
             num += 1

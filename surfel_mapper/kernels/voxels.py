@@ -20,6 +20,7 @@ from surfel_mapper.kernels.hashing import (
     FULL,
     hash_key,
     insert_row,
+    likely_row,
     POINTS,
     remove_row,
     ROWS_USED,
@@ -30,19 +31,30 @@ from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION,
 from surfel_mapper.kernels.prefetch import prefetch
 
 AHEAD = 16
-"""So many voxels ahead the bucket is asked for, and half as many ahead the row."""
+"""Rows known beforehand are asked for so many voxels ahead."""
+
+BLOCK = 32
+"""Voxels looked up together: all buckets are asked for, then all rows, then the rows used."""
 
 
 @njit(cache=True, nogil=True, inline='always')
-def ask_ahead(keys, place, flat, directory, buckets, depth):
-    """Ask for the bucket of the voxel AHEAD of place and for the row of one half as far."""
-    if place + AHEAD < len(keys):
-        hashed = hash_key(keys[place + AHEAD])
+def look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely):
+    """
+    Find the rows of num voxels from start on, and ask for them.
+
+    flat    (R * 16,) int64, the rows
+    hashes  (BLOCK,) int64, out
+    likely  (BLOCK,) int64, out: a row with the hash of the voxel, and almost surely its key;
+            -1 where the map has none
+    """
+    for i in range(num):
+        hashed = hash_key(keys[start + i])
+        hashes[i] = hashed
         prefetch(buckets, first_bucket(hashed, directory, depth))
-    if place + AHEAD // 2 < len(keys):
-        hashed = hash_key(keys[place + AHEAD // 2])
-        row = (buckets[first_bucket(hashed, directory, depth)] & 0xFFFFFFFF) - 1
-        if row >= 0:  # a guess: the voxel may be in a later bucket
+    for i in range(num):
+        row = likely_row(hashes[i], directory, buckets, depth)
+        likely[i] = row
+        if row >= 0:
             prefetch(flat, row * ROW)
             prefetch(flat, row * ROW + ROW // 2)
 
@@ -58,9 +70,15 @@ def find_rows(keys, rows, table, state, found):
     directory, buckets, _, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    for place in range(len(keys)):
-        ask_ahead(keys, place, flat, directory, buckets, depth)
-        found[place] = find_row(keys[place], rows, table, depth)
+    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    for start in range(0, len(keys), BLOCK):
+        num = min(BLOCK, len(keys) - start)
+        look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely)
+        for i in range(num):
+            row = likely[i]
+            if row >= 0 and rows[row, KEY] != keys[start + i]:
+                row = find_row(keys[start + i], rows, table, depth)
+            found[start + i] = row
 
 
 @njit(cache=True, nogil=True)
@@ -77,44 +95,66 @@ def add_moments(moments, view_weight, rows, table, state, version, start, change
     make room and go on from there.
     """
     keys, count, total, product, view = moments
-    directory, buckets, held, _ = table
+    directory, buckets, _, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    for place in range(start, len(keys)):
-        ask_ahead(keys, place, flat, directory, buckets, depth)
-        key = keys[place]
-        row = find_row(key, rows, table, depth)
-        if row < 0:
-            hashed = hash_key(key)
-            while held[directory[hashed >> (32 - depth)]] >= FULL:
-                if not split_segment(hashed, table, state):
+    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    num_changed, num_points = state[CHANGED], np.int64(0)
+    done = start
+    while done < len(keys):
+        num = min(BLOCK, len(keys) - done)
+        look_up(keys, done, num, flat, directory, buckets, depth, hashes, likely)
+        for i in range(num):
+            place = done + i
+            key = keys[place]
+            row = likely[i]
+            if row >= 0 and rows[row, KEY] != key:
+                row = find_row(key, rows, table, depth)
+            if row < 0:
+                row = new_row(key, hashes[i], rows, table, state)
+                if row < 0:
+                    state[CHANGED], state[POINTS] = num_changed, state[POINTS] + num_points
                     return place
-            row = state[FREE_ROW]
-            if row >= 0:
-                state[FREE_ROW] = rows[row, KEY]
-            elif state[ROWS_USED] < len(rows):
-                row = state[ROWS_USED]
-                state[ROWS_USED] = row + 1
-            else:
-                return place
-            rows[row, :] = 0
-            rows[row, KEY] = key
-            insert_row(hashed, row, table, depth)
-            state[VOXELS] += 1
-        n = np.int64(count[place])
-        weight = n if view_weight == 0 else np.int64(1)
-        state[POINTS] += n
-        rows[row, COUNT] += n
-        for axis in range(3):
-            rows[row, SUM + axis] += total[place, axis]
-            rows[row, VIEW + axis] += weight * view[place, axis]
-        for pair in range(6):
-            rows[row, PRODUCT + pair] += product[place, pair]
-        if rows[row, VERSION] != version:
-            rows[row, VERSION] = version
-            changed[state[CHANGED]] = row
-            state[CHANGED] += 1
-    return len(keys)
+            n = np.int64(count[place])
+            weight = n if view_weight == 0 else np.int64(1)
+            num_points += n
+            rows[row, COUNT] += n
+            for axis in range(3):
+                rows[row, SUM + axis] += total[place, axis]
+                rows[row, VIEW + axis] += weight * view[place, axis]
+            for pair in range(6):
+                rows[row, PRODUCT + pair] += product[place, pair]
+            if rows[row, VERSION] != version:
+                rows[row, VERSION] = version
+                changed[num_changed] = row
+                num_changed += 1
+        done += num
+    state[CHANGED], state[POINTS] = num_changed, state[POINTS] + num_points
+    return done
+
+
+@njit(cache=True, nogil=True)
+def new_row(key, hashed, rows, table, state):
+    """Return a row of zeros for a voxel that the map has not, or -1 where there is no room."""
+    directory, _, held, _ = table
+    depth = state[DEPTH]
+    while held[directory[hashed >> (32 - depth)]] >= FULL:
+        if not split_segment(hashed, table, state):
+            return np.int64(-1)
+    row = state[FREE_ROW]
+    if row >= 0:
+        state[FREE_ROW] = rows[row, KEY]
+        prefetch(rows.ravel(), state[FREE_ROW] * ROW)  # the next new voxel's
+    elif state[ROWS_USED] < len(rows):
+        row = state[ROWS_USED]
+        state[ROWS_USED] = row + 1
+    else:
+        return np.int64(-1)
+    rows[row, :] = 0
+    rows[row, KEY] = key
+    insert_row(hashed, row, table, depth)
+    state[VOXELS] += 1
+    return row
 
 
 @njit(cache=True, nogil=True)

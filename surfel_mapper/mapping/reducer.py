@@ -24,7 +24,6 @@ from surfel_mapper.kernels.channels import sum_channels
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.kernels.moments import (
     BEYOND,
-    clear_table,
     merge_sums,
     NOT_FINITE,
     pack_moments,
@@ -83,9 +82,9 @@ class Scratch:
                 return int(num)
             self.reserve(2 * len(self.keys))
 
-    def clear(self, num_voxels: int) -> None:
-        """Empty the table of so many voxels."""
-        clear_table(self.table, self.keys, num_voxels)
+    def clear(self) -> None:
+        """Empty the table: faster as a whole than by the entries in use, which lie anywhere."""
+        self.table.fill(-1)
 
 
 class Reducer:
@@ -152,14 +151,14 @@ class Reducer:
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
         num = self._sum(points.T, quantisation)
         scratch = self._scratch[0]
-        scratch.clear(num)
+        scratch.clear()
         moments = self._pack(num, np.ascontiguousarray(seen_from))
         if values is None:
             return moments
         build_table(moments.key, scratch.table)
         sums = np.empty((num, values.shape[1]), np.int64)
         sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
-        scratch.clear(num)
+        scratch.clear()
         return replace(moments, channel_names=channel_names(self._columns), channels=sums)
 
     def _sum(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
@@ -173,8 +172,8 @@ class Reducer:
         ]
         num = first.fill(xyz, own, quantisation)
         nums = [future.result() for future in futures]
-        for scratch, found in zip(others, nums, strict=True):
-            scratch.clear(found)
+        for scratch in others:
+            scratch.clear()
         for scratch, found in zip(others, nums, strict=True):
             num = int(merge_sums(first.arrays, num, scratch.keys[:found], scratch.sums[:found]))
             if num < 0:  # once more, with room for all
@@ -217,6 +216,18 @@ class Reducer:
         left_out = np.sum([scratch.left_out for scratch in self._scratch], axis=0)
         counts = {name: int(left_out[row]) for name, row in CAUSES.items()}
         return {name: number for name, number in counts.items() if number}
+
+
+def within(
+    points: npt.NDArray[Any], min_range_m: float, max_range_m: float
+) -> npt.NDArray[np.bool_]:
+    """Return which points (N, 3) the range lets enter, just as the kernel has it; 0: no limit."""
+    x, y, z = points.astype(np.float64).T
+    range_sq = (x * x + y * y) + z * z
+    far_sq = max_range_m**2 if max_range_m else np.inf
+    return np.asarray(
+        np.isfinite(range_sq) & (range_sq >= min_range_m**2) & (range_sq <= far_sq)
+    )
 
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:

@@ -15,11 +15,11 @@ from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION,
 from surfel_mapper.kernels.surfels import (
     CHUNK,
     derive_surfels,
-    gather,
-    place_means,
+    MOMENTS,
     rows_changed_after,
     rows_changed_at,
-    side_seen,
+    turn,
+    V,
 )
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
@@ -94,28 +94,36 @@ def test_chosen_rows_are_derived_in_their_order(call, num, wide):
 
 
 @both
-@pytest.mark.parametrize('times', [1, 7, 49, 98, 10**6 + 3, 2**31])
+@pytest.mark.parametrize('times', [1, 7, 49, 98, 10**6 + 3, 2**22, 2**31])
 @pytest.mark.parametrize('place', [(0, 0, 0), (1, -1, 3), (-32768, 32767, 12345)])
-def test_equal_points_have_a_scatter_of_exactly_0(call, times, place):
-    scatter = np.full((6, CHUNK), np.nan)
+def test_equal_points_spread_by_exactly_0(call, times, place):
+    outputs = outputs_for(1)
     rows = np.array([row_of([place], times=times)])
-    call(gather, rows, np.zeros(1, np.int32), 0, 1, scatter)
-    assert scatter[:, 0].tolist() == [0.0] * 6
+    call(derive_surfels, rows, np.zeros(1, np.int32), 0.5, 16, outputs)
+    assert outputs[4].tolist() == [[0.0] * 3]
+    assert np.isnan(outputs[1]).all()
 
 
 @both
-@pytest.mark.parametrize('times', [1, 3, 10**5, 2**30])
-def test_the_scatter_is_exact_to_rounding_up_to_2_to_the_31_points(call, times):
+@pytest.mark.parametrize('bits', [16, 20])
+@pytest.mark.parametrize('times', [1, 3, 10**5, 2**21 - 1, 2**21, 2**30])
+def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times, bits):
     rng = np.random.default_rng(3)
+    if times > (1 << 30) >> (2 * (bits - 16)):
+        pytest.skip('a map of this level refuses so many')
     for spread in (1, 3, 100, 32767):
-        places = rng.integers(-spread, spread + 1, (2, 3))
+        places = rng.integers(-spread, spread + 1, (3, 3)) << (bits - 16)
         row = row_of(places, times=times)
-        scatter = np.full((6, CHUNK), np.nan)
-        call(gather, np.array([row]), np.zeros(1, np.int32), 0, 1, scatter)
+        outputs = outputs_for(1)
+        call(derive_surfels, np.array([row]), np.zeros(1, np.int32), 0.5, bits, outputs)
         exact = twin_of(row, (0, 0, 0), 1.0)['scatter']
         trace = sum(exact[i][i] for i in range(3))
-        for value, (i, j) in zip(scatter[:, 0].tolist(), reference.PAIRS, strict=True):
-            assert abs(Fraction(value) - exact[i][j]) <= trace * Fraction(1, 10**15)
+        norm_sq = sum(exact[i][j] ** 2 for i in range(3) for j in range(3))
+        unit = Fraction(0.5 / 2**bits) ** 2 / max(row[COUNT] - 1, 1)
+        values = [Fraction(value) / unit for value in outputs[4][0].tolist()]
+        # trace and sum of squares are those of the matrix, and of its eigenvalues
+        assert abs(sum(values) - trace) <= trace * Fraction(1, 10**14)
+        assert abs(sum(v**2 for v in values) - norm_sq) <= norm_sq * Fraction(1, 10**14)
 
 
 @both
@@ -125,7 +133,7 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     places = [(-reach, 0, reach - 1), (-reach, 1, reach - 1)]
     outputs = outputs_for(1)
     rows = np.array([row_of(places, (2, -3, 0))])
-    call(place_means, rows, np.zeros(1, np.int32), 2.0, bits, outputs, 0)
+    call(derive_surfels, rows, np.zeros(1, np.int32), 2.0, bits, outputs)
     cell = 2.0 / 2**bits
     # half a cell from the faces along x and z, a whole one above the middle along y
     expected = [4.0 + cell / 2, -5.0 + cell, 2.0 - cell / 2]
@@ -151,8 +159,12 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     ],
 )
 def test_normals_that_look_away_are_known(call, normal, view, away):
-    rows = np.array([row_of([(0, 0, 0)], view=view)])
-    assert call(side_seen, *map(float, normal), rows, 0) == (-1.0 if away else 1.0)
+    moments = np.zeros((MOMENTS, CHUNK))
+    moments[V : V + 3, 0] = view
+    normals = np.zeros((3, CHUNK))
+    normals[:, 0] = normal
+    call(turn, normals, 1, moments)
+    assert normals[:, 0].tolist() == [(-1.0 if away else 1.0) * value for value in normal]
 
 
 @both
