@@ -22,7 +22,7 @@ class AlignConfig(Stage):
         live=True,
     )
     voxel_size_m: float = setting(
-        1.0, 'Edge of the surfels of a scan that are matched, m.', low=0.01, high=100.0, live=True
+        1.0, 'Edge of the surfels of a scan that are matched, m.', low=0.01, high=100.0
     )
     key_distance_m: float = setting(
         1.0,

@@ -71,6 +71,11 @@ class Config:
                 'deskew.enabled: true, but clouds that are in the fixed frame already '
                 '(pose.source identity) cannot be deskewed'
             )
+        if self.align.every_scans and not self.window.keep_points:
+            raise ConfigError(
+                f'align.every_scans: {self.align.every_scans}, but window.keep_points is false; '
+                'scans are moved by their points'
+            )
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Config:

@@ -11,15 +11,16 @@ before old ones leave, so that a voxel seen by both never comes and goes.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import WindowConfig
-from surfel_mapper.mapping.moments import point_keys, ScanMoments
+from surfel_mapper.errors import MapError
+from surfel_mapper.mapping.moments import pack_keys, point_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 
@@ -37,7 +38,9 @@ class WindowedScan:
     T_map_sensor : (4, 4) float64
         The pose it was added at.
     points : (N, 3) float32 or float64, m, optional
-        Its points in the sensor frame, where they are kept.
+        Its points in the sensor frame, where they are kept: those that the moments are of.
+    columns : mapping of str to (N,) array
+        What else of them the map sums.
 
     """
 
@@ -45,11 +48,13 @@ class WindowedScan:
     stamp_ns: int
     T_map_sensor: npt.NDArray[np.float64]
     points: npt.NDArray[Any] | None = None
+    columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of moments and points."""
-        return self.moments.nbytes + (0 if self.points is None else self.points.nbytes)
+        """Bytes of moments, points and columns."""
+        kept = [*self.columns.values(), *([] if self.points is None else [self.points])]
+        return self.moments.nbytes + sum(array.nbytes for array in kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -201,6 +206,59 @@ class SlidingWindow:
         self._nbytes = sum(scan.nbytes for scan in self)
         return fallen
 
+    def move(
+        self, scans: Mapping[int, WindowedScan], min_points: int = 1
+    ) -> npt.NDArray[np.int32]:
+        """
+        Move scans: remove them where they are, add them where they are to be.
+
+        Parameters
+        ----------
+        scans : mapping of int to WindowedScan
+            Places in the window, counted from the oldest scan that is kept, and what is to be
+            there: the same scan with the moments that it has at another pose.
+        min_points : int
+            From how many points on a voxel counts for the result.
+
+        Returns
+        -------
+        (E, 3) int32
+            Indices of the voxels that held ``min_points`` before and hold fewer now.
+
+        Raises
+        ------
+        MapError
+            If the map refuses a scan; nothing has changed then.
+
+        """
+        old = list(self)
+        done: list[int] = []
+        fallen = [np.empty((0, 3), np.int32)]
+        try:
+            for place, scan in scans.items():
+                self._map.insert(scan.moments)
+                fallen.append(self._map.remove(old[place].moments, min_points))
+                done.append(place)
+        except MapError:
+            for place in done:
+                self._map.insert(old[place].moments)
+                self._map.remove(scans[place].moments)
+            raise
+        travelled_m = self._scans[0][1] if self._scans else 0.0
+        self._scans.clear()
+        self._nbytes, self._travelled_m = 0, travelled_m
+        for place, scan in enumerate(old):
+            self._append(scans.get(place, scan))
+        return self._below(np.unique(np.concatenate(fallen), axis=0), min_points)
+
+    def _below(
+        self, voxel_index: npt.NDArray[np.int32], min_points: int
+    ) -> npt.NDArray[np.int32]:
+        """Return those of some voxels that hold fewer points now."""
+        held = self._map.moments(voxel_index)
+        full = held.key[held.count >= min_points]
+        return voxel_index[~np.isin(pack_keys(voxel_index), full)]
+
     def clear(self) -> None:
         """Forget all scans and clear the map."""
         self._forget()
@@ -248,11 +306,13 @@ def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
     hit = contains(keys, scan.moments.key)
     if not hit.any():
         return scan
-    points = scan.points
-    if points is not None:
-        size_m = scan.moments.voxel_size_m
-        points = points[~contains(keys, point_keys(points, scan.T_map_sensor, size_m))]
-    return replace(scan, moments=scan.moments.select(~hit), points=points)
+    rest = replace(scan, moments=scan.moments.select(~hit))
+    if scan.points is None:
+        return rest
+    size_m = scan.moments.voxel_size_m
+    stay = ~contains(keys, point_keys(scan.points, scan.T_map_sensor, size_m))
+    columns = {name: column[stay] for name, column in scan.columns.items()}
+    return replace(rest, points=scan.points[stay], columns=columns)
 
 
 def contains(keys: npt.NDArray[np.int64], wanted: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:

@@ -4,5 +4,6 @@
 
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.update import Update
+from surfel_mapper.pipeline.window_aligner import Aligned
 
-__all__ = ['Mapper', 'Update']
+__all__ = ['Aligned', 'Mapper', 'Update']

@@ -24,6 +24,7 @@ from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.deskew import deskewed, point_times
 from surfel_mapper.errors import (
+    AlignmentError,
     CloudFormatError,
     ConfigError,
     FilterError,
@@ -34,14 +35,16 @@ from surfel_mapper.errors import (
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
-from surfel_mapper.mapping.reducer import NARROW_COUNT
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.reducer import NARROW_COUNT, within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_queue import ScanQueue
-from surfel_mapper.pipeline.update import Update
+from surfel_mapper.pipeline.update import removed_voxels, Update
+from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 
@@ -84,6 +87,7 @@ class Mapper:
             self.map, self.config.window, max_voxels=self.config.map.max_voxels
         )
         self.transforms = TransformBuffer(reset_after_s=self.config.input.reset_after_s)
+        self._aligner = WindowAligner(self._moments_at)
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._mounted: set[str] = set()
@@ -222,6 +226,33 @@ class Mapper:
         """Forget all scans, waiting ones too (counted); poses and counts stay."""
         self._queue.drop_all('cleared', 'the map was cleared')
         self.window.clear()
+        self._aligner.reset()
+
+    def align(self) -> Aligned:
+        """
+        Move the scans of the window to where they agree; see the settings ``align``.
+
+        The map then equals, to the bit, one that was built at the corrected poses. Scans to come
+        are corrected like the newest one.
+
+        Raises
+        ------
+        AlignmentError
+            If points are not kept (``window.keep_points``), there are fewer than two scans, or
+            no poses follow. Nothing has changed then.
+        MapError
+            If a scan cannot be where it belongs. Nothing has changed then.
+
+        """
+        with self.counters.timed('align'):
+            aligned = self._aligner.align(self.window, self.config)
+        _log.info('aligned: %s', aligned)
+        return aligned
+
+    @property
+    def map_frame(self) -> str:
+        """The frame of the map: that of the poses, unless alignment gives it its own."""
+        return self.config.align.map_frame or self.config.frames.fixed
 
     def clear_region(self, region: Region) -> npt.NDArray[np.int32]:
         """
@@ -360,6 +391,7 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan; None where the motion gate or the map leaves it out."""
+        pose = self._aligner.to_map(pose)
         last = self.window.newest
         if last is not None and stands_still(last.T_map_sensor, pose, self.config.window):
             self.counters.gated += 1
@@ -385,20 +417,36 @@ class Mapper:
             self._drops.scan(scan, 'map_limit', str(error))
             return None
         laps.end('insert')
+        aligned = self._align_when_due()
+        if aligned is not None:
+            pose = aligned.T_map_sensor[-1]
+            laps.end('align')
         changed = self.map.surfels_changed(version, self.config.map.min_points)
         laps.end('normals')
         self._count(windowed, evictions, laps.milliseconds)
-        fallen = [eviction.fallen for eviction in evictions]
         return Update(
             stamp_ns=scan.stamp_ns,
-            frame_id=self.config.frames.fixed,
+            frame_id=self.map_frame,
             T_fixed_sensor=pose,
             num_points=windowed.moments.num_points,
             changed=changed,
-            removed_voxel_index=np.concatenate(fallen) if fallen else np.empty((0, 3), np.int32),
+            removed_voxel_index=removed_voxels(evictions, aligned, changed),
             evictions=tuple(evictions),
             milliseconds=laps.milliseconds,
+            aligned=aligned,
         )
+
+    def _align_when_due(self) -> Aligned | None:
+        """Align the window if so many scans were mapped since; warn where that fails."""
+        if not self._aligner.is_due(self.config.align.every_scans):
+            return None
+        try:
+            aligned = self._aligner.align(self.window, self.config)
+        except (AlignmentError, MapError) as error:
+            self._drops.warn('alignment', f'the window is not aligned: {error}')
+            return None
+        _log.debug('aligned: %s', aligned)
+        return aligned
 
     def _filter(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Scan | None:
         """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
@@ -424,23 +472,34 @@ class Mapper:
         return filtered
 
     def _reduce(self, scan: Scan, pose: npt.NDArray[np.float64]) -> WindowedScan:
-        """Reduce a scan to its moments; where the sensor is unknown, normals stay unturned."""
+        """Reduce a scan to its moments."""
         limits = self.config.input
         moments = self.map.reduce(
             scan.points,
             pose,
-            origin=None if self.config.pose.source == 'identity' else pose[:3, 3],
+            origin=self._origin(pose),
             min_range_m=limits.min_range_m,
             max_range_m=limits.max_range_m or np.inf,
             columns=scan.columns,
         )
         self.counters.points_left_out.update(moments.left_out)
-        return WindowedScan(
-            moments=moments,
-            stamp_ns=scan.stamp_ns,
-            T_map_sensor=pose,
-            points=scan.points if self.config.window.keep_points else None,
+        windowed = WindowedScan(moments=moments, stamp_ns=scan.stamp_ns, T_map_sensor=pose)
+        if not self.config.window.keep_points:
+            return windowed
+        entered = scan.select(within(scan.points, limits.min_range_m, limits.max_range_m))
+        columns = {name: entered.columns[name] for name in self.map.columns}
+        return replace(windowed, points=entered.points, columns=columns)
+
+    def _moments_at(self, scan: WindowedScan, pose: npt.NDArray[np.float64]) -> ScanMoments:
+        """Return the moments of a scan of the window at another pose."""
+        assert scan.points is not None, 'only scans with points are moved'
+        return self.map.reduce(
+            scan.points, pose, origin=self._origin(pose), columns=scan.columns
         )
+
+    def _origin(self, pose: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
+        """Return where the sensor is; None where that is unknown, and normals stay unturned."""
+        return None if self.config.pose.source == 'identity' else pose[:3, 3]
 
     def _count(
         self, scan: WindowedScan, evictions: list[Eviction], times: dict[str, float]

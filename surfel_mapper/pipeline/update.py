@@ -4,13 +4,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
+from surfel_mapper.pipeline.window_aligner import Aligned
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -34,6 +37,8 @@ class Update:
         Voxels that were surfels and, after an eviction, have too few points.
     evictions : tuple of Eviction
         The scans that left, oldest first.
+    aligned : Aligned, optional
+        What the alignment of the window did that was due after this scan.
     milliseconds : dict of str to float
         Time by stage: filter (where there are any), reduce, insert (evictions included),
         normals, total.
@@ -48,3 +53,15 @@ class Update:
     removed_voxel_index: npt.NDArray[np.int32]
     evictions: tuple[Eviction, ...]
     milliseconds: dict[str, float]
+    aligned: Aligned | None = None
+
+
+def removed_voxels(
+    evictions: Sequence[Eviction], aligned: Aligned | None, changed: Surfels
+) -> npt.NDArray[np.int32]:
+    """Return the voxels (K, 3) that were surfels before evictions and an alignment, only."""
+    fallen = [np.empty((0, 3), np.int32), *(eviction.fallen for eviction in evictions)]
+    if aligned is None:
+        return np.concatenate(fallen)
+    gone = np.unique(np.concatenate([*fallen, aligned.removed_voxel_index]), axis=0)
+    return gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]

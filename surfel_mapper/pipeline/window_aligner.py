@@ -1,0 +1,183 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Alignment of the window: scans that were mapped at poses that drift are moved to where they agree.
+
+A scan is reduced anew at its corrected pose and takes the place of what the map holds of it, so
+that the map equals, bit for bit, one that was built at the corrected poses. The oldest scan stays
+where it is. What corrects the newest one corrects those to come as well: it is the transform
+from the map, which jumps, to the fixed frame of the poses, which drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.alignment import align_scans, Samples, WindowAlignment
+from surfel_mapper.config import Config
+from surfel_mapper.errors import AlignmentError
+from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
+
+MIN_POINTS = 6
+"""Surfels of fewer points of one scan are not matched."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Aligned:
+    """
+    What an alignment did to the window.
+
+    Attributes
+    ----------
+    alignment : WindowAlignment
+        The poses found, and how well scans agree.
+    stamps_ns : (S,) int64
+        Of the scans of the window, oldest first.
+    T_map_sensor : (S, 4, 4) float64
+        Where they are in the map now: those that hardly changed are where they were.
+    T_map_fixed : (4, 4) float64
+        From the fixed frame of the poses that come in to the map.
+    num_moved : int
+        Scans that were moved.
+    largest_m, largest_deg : float
+        The most that a scan was moved and turned by.
+    removed_voxel_index : (K, 3) int32
+        Voxels that were surfels and have too few points now.
+
+    """
+
+    alignment: WindowAlignment
+    stamps_ns: npt.NDArray[np.int64]
+    T_map_sensor: npt.NDArray[np.float64]
+    T_map_fixed: Transform
+    num_moved: int
+    largest_m: float
+    largest_deg: float
+    removed_voxel_index: npt.NDArray[np.int32]
+
+    def __str__(self) -> str:
+        """Say it in a sentence, for logs and services."""
+        settled = 'settled' if self.alignment.settled else 'not settled'
+        return (
+            f'{self.num_moved} of {len(self.stamps_ns)} scans moved, by at most '
+            f'{self.largest_m:.3f} m and {self.largest_deg:.3f} deg; {settled} after '
+            f'{self.alignment.rounds} rounds'
+        )
+
+
+class WindowAligner:
+    """
+    Moves the scans of a window, and remembers what they were corrected by.
+
+    Parameters
+    ----------
+    moments_at : callable
+        Of a scan with its points and a pose: the moments that it has there.
+
+    Attributes
+    ----------
+    T_map_fixed : (4, 4) float64
+        From the fixed frame of the poses that come in to the map; the identity at first.
+
+    """
+
+    def __init__(self, moments_at: Callable[[WindowedScan, Transform], ScanMoments]) -> None:
+        """Correct nothing yet."""
+        self._moments_at = moments_at
+        self.reset()
+
+    def reset(self) -> None:
+        """Correct nothing any more, as for an empty map."""
+        self.T_map_fixed: Transform = np.eye(4)
+        self._samples: dict[int, tuple[object, Samples]] = {}
+        self._num_new = 0
+
+    def to_map(self, T_fixed_sensor: Transform) -> Transform:
+        """Return the pose in the map of what has a pose in the fixed frame."""
+        if np.array_equal(self.T_map_fixed, np.eye(4)):
+            return T_fixed_sensor  # to the bit
+        return compose(self.T_map_fixed, T_fixed_sensor)
+
+    def is_due(self, every_scans: int) -> bool:
+        """Count a scan, and return whether it is time to align."""
+        self._num_new += 1
+        return 0 < every_scans <= self._num_new
+
+    def align(self, window: SlidingWindow, config: Config) -> Aligned:
+        """
+        Align the scans of a window and move them.
+
+        Raises
+        ------
+        AlignmentError
+            If there are fewer than two scans, points are not kept, or no poses follow. Nothing
+            has changed then.
+        MapError
+            If the map refuses a scan at its new pose. Nothing has changed then.
+
+        """
+        self._num_new = 0
+        scans = list(window)
+        self._check(len(window), scans)
+        before = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
+        samples = self._samples_of(scans, config.align.voxel_size_m)
+        alignment = align_scans(samples, before, config.align)
+        moved, changes = {}, [(0.0, 0.0)]
+        for place, (scan, pose) in enumerate(zip(scans, alignment.T_map_sensor, strict=True)):
+            change = compose(inverse(scan.T_map_sensor), pose)
+            distance_m = float(np.linalg.norm(change[:3, 3]))
+            angle_deg = float(np.degrees(rotation_angle(change)))
+            if distance_m > config.align.move_m or angle_deg > config.align.move_deg:
+                moments = self._moments_at(scan, pose)
+                moved[place] = replace(scan, moments=moments, T_map_sensor=pose)
+                changes.append((distance_m, angle_deg))
+        fallen = window.move(moved, config.map.min_points)
+        after = np.array([scan.T_map_sensor for scan in window])
+        # what the newest scan was moved by, in the map
+        correction = compose(after[-1], inverse(before[-1]))
+        if len(scans) - 1 in moved:
+            self.T_map_fixed = compose(correction, self.T_map_fixed)
+        largest = np.max(changes, axis=0).tolist()
+        return Aligned(
+            alignment=alignment,
+            stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
+            T_map_sensor=after,
+            T_map_fixed=self.T_map_fixed,
+            num_moved=len(moved),
+            largest_m=largest[0],
+            largest_deg=largest[1],
+            removed_voxel_index=fallen,
+        )
+
+    def _check(self, num_scans: int, scans: list[WindowedScan]) -> None:
+        num_kept = sum(scan.points is not None for scan in scans)
+        if num_kept < num_scans:
+            raise AlignmentError(
+                f'{num_kept} of {num_scans} scans have their points; alignment moves scans by '
+                'their points, so window.keep_points is needed from the start'
+            )
+        if num_scans < 2:
+            raise AlignmentError(f'{num_scans} scans in the map, expected two or more to align')
+
+    def _samples_of(self, scans: list[WindowedScan], voxel_size_m: float) -> list[Samples]:
+        """Return the surfels of each scan in its own frame, made once a scan."""
+        kept: dict[int, tuple[object, Samples]] = {}
+        for scan in scans:
+            known = self._samples.get(id(scan.points))  # alive, as it is kept here
+            kept[id(scan.points)] = known or (scan.points, _samples(scan, voxel_size_m))
+        self._samples = kept
+        return [kept[id(scan.points)][1] for scan in scans]
+
+
+def _samples(scan: WindowedScan, voxel_size_m: float) -> Samples:
+    surfel_map = SurfelMap(voxel_size_m)
+    assert scan.points is not None, 'checked before'
+    surfel_map.add(scan.points, origin=np.zeros(3))
+    return Samples.of_surfels(surfel_map.surfels(MIN_POINTS))
