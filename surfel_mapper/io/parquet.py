@@ -61,14 +61,7 @@ def write_map(path: str | Path, surfel_map: SurfelMap) -> str:
 
     """
     arrow, parquet = import_pyarrow()
-    attributes = {
-        'kind': KIND,
-        'version': VERSION,
-        'voxel_size_m': surfel_map.voxel_size_m,
-        'level': surfel_map.level,
-        'columns': surfel_map.columns,
-        'digest': surfel_map.digest(),
-    }
+    attributes = attributes_of(surfel_map)
     table = arrow.table(map_columns(surfel_map))
     table = table.replace_schema_metadata({METADATA: json.dumps(attributes)})
     with replace_file(path) as file:
@@ -122,16 +115,24 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
     return surfel_map
 
 
-def map_columns(surfel_map: SurfelMap) -> Columns:
-    """Return every column of the file, sorted by voxel."""
-    moments, surfels = surfel_map.moments(), surfel_map.surfels()
-    surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
+def attributes_of(surfel_map: SurfelMap) -> dict[str, Any]:
+    """Return what a file says of its map."""
+    return {
+        'kind': KIND,
+        'version': VERSION,
+        'voxel_size_m': surfel_map.voxel_size_m,
+        'level': surfel_map.level,
+        'columns': surfel_map.columns,
+        'digest': surfel_map.digest(),
+    }
+
+
+def map_columns(surfel_map: SurfelMap, *, derived: bool = True) -> Columns:
+    """Return every column of the file, sorted by voxel; those derived only where wanted."""
+    moments = surfel_map.moments()
     columns: Columns = {
-        **named(INDEX, surfels.voxel_index),
-        **named(('x', 'y', 'z'), surfels.position),
-        **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
-        'planarity': surfels.planarity.astype(np.float32),
-        'curvature': surfels.curvature.astype(np.float32),
+        **named(INDEX, moments.voxel_index),
+        **(derived_columns(surfel_map) if derived else {}),
         'num_points': moments.count,
         **named(SUMS, moments.total),
         **named(PRODUCTS, moments.product),
@@ -139,6 +140,18 @@ def map_columns(surfel_map: SurfelMap) -> Columns:
         **named(channel_columns(surfel_map), moments.channels),
     }
     return {name: np.ascontiguousarray(values) for name, values in columns.items()}
+
+
+def derived_columns(surfel_map: SurfelMap) -> Columns:
+    """Return what a map derives from its moments, sorted by voxel."""
+    surfels = surfel_map.surfels()
+    surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
+    return {
+        **named(('x', 'y', 'z'), surfels.position),
+        **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
+        'planarity': surfels.planarity.astype(np.float32),
+        'curvature': surfels.curvature.astype(np.float32),
+    }
 
 
 def named(names: tuple[str, ...], table: npt.NDArray[Any]) -> Columns:
