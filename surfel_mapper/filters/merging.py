@@ -10,6 +10,7 @@ in float64, or exactly in integers.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -104,7 +105,7 @@ def by_component(average: Any, column: Array, groups: Groups) -> Array:
     """Return the averages of a column, of each of its components if it has several."""
     if column.ndim == 1:
         return np.asarray(average(column, groups))
-    parts = column.reshape(len(column), -1)
+    parts = column.reshape(len(column), math.prod(column.shape[1:]))
     means = [average(parts[:, i], groups) for i in range(parts.shape[1])]
     shape = (len(groups.first), *column.shape[1:])
     return np.stack(means, axis=1).reshape(shape) if means else np.empty(shape, column.dtype)

@@ -87,8 +87,8 @@ def neighbourhoods(
         return
     in_tree = np.append(worth_searching(points, number), len(points))
     tree = search_tree(points[in_tree[:-1]])
-    # scipy's bound is exclusive
-    bound = float(np.nextafter(max_distance_m, math.inf))
+    # scipy's bound is exclusive, and its square must not vanish
+    bound = max(float(np.nextafter(max_distance_m, math.inf)), 1e-150)
     step = max(AT_ONCE // number, 1)
     for start in range(0, len(points), step):
         rows = slice(start, start + step)

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What becomes of columns where several points become one, for every kind of column."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.filters.base import generator, select, with_columns
+from surfel_mapper.filters.columns import Kind, kind_of
+from surfel_mapper.filters.merging import Groups, merged_columns
+from test.filters.examples import scan_of
+
+GROUPS = Groups.of(np.array([1, 0, 1, 0, 1]), 2)
+
+
+def merged(column, **settings):
+    scan = scan_of(np.zeros((5, 3)), **{settings.pop('name', 'value'): column})
+    (found,) = merged_columns(scan, GROUPS, **settings).values()
+    assert found.dtype == np.asarray(column).dtype
+    return found
+
+
+def test_groups_know_their_first_points_and_sizes():
+    assert (GROUPS.first.tolist(), GROUPS.count.tolist()) == ([1, 0], [2, 3])
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_numbers_are_averaged(dtype):
+    assert merged(np.array([1, 2, 3, 5, 8], dtype)).tolist() == [3.5, 4.0]
+    many = np.arange(10, dtype=dtype).reshape(5, 2)
+    np.testing.assert_array_equal(merged(many), [[4.0, 5.0], [4.0, 5.0]])
+
+
+@pytest.mark.parametrize('dtype', [np.uint8, np.int16, np.uint32, np.int32])
+def test_whole_numbers_are_averaged_and_rounded(dtype):
+    assert merged(np.array([1, 2, 2, 5, 2], dtype)).tolist() == [4, 2]  # 3.5 to even, 5/3
+
+
+def test_booleans_are_what_half_of_them_are():
+    assert merged(np.array([True, True, False, False, False])).tolist() == [True, False]
+
+
+def test_labels_and_other_identities_are_the_first():
+    values = np.array([7, 1, 8, 2, 9], np.int32)
+    for name in ('label', 'ring', 'instance', 'matchedIds'):
+        assert merged(values, name=name).tolist() == [1, 7]
+    assert merged(np.array(list('abcde'))).tolist() == ['b', 'a']
+
+
+def test_stamps_are_averaged_exactly_and_towards_zero():
+    epoch = 1_700_000_000_000_000_000
+    values = np.array([epoch, epoch + 1, epoch + 1, epoch + 4, epoch + 4], np.int64)
+    assert merged(values).tolist() == [epoch + 2, epoch + 1]  # 5/2, 5/3
+    assert merged(-values).tolist() == [-epoch - 2, -epoch - 1]
+    assert merged(values.astype(np.uint64)).tolist() == [epoch + 2, epoch + 1]
+
+
+def test_seven_stamps_do_not_overflow():
+    scan = scan_of(np.zeros((7, 3)), times=np.full(7, 2**62, np.int64))
+    found = merged_columns(scan, Groups.of(np.zeros(7, np.int64), 1))['times']
+    assert found.tolist() == [2**62]
+
+
+def test_normals_are_averaged_as_directions():
+    normals = np.array([[1, 0, 0], [0, 0, 1], [0, 1, 0], [0, 0, -1], [1, 0, 0]], np.float64)
+    found = merged(normals, name='normals')
+    np.testing.assert_allclose(found[1], np.array([2.0, 1.0, 0.0]) / 5**0.5)
+    np.testing.assert_array_equal(found[0], [0.0, 0.0, 1.0])  # opposite ones cancel: the first
+    plain = merged(normals, name='normals', unit=False)
+    np.testing.assert_allclose(plain, [[0, 0, 0], [2 / 3, 1 / 3, 0]])
+
+
+def test_colours_are_averaged_by_channel():
+    red, blue = 0x00FF0000, 0x000000FF
+    values = np.array([0, red, 0, blue, 0x00030000], np.uint32)
+    assert merged(values, name='rgb').tolist() == [0x00800080, 0x00010000]
+    packed = values.view(np.float32)
+    assert merged(packed, name='rgb').view(np.uint32).tolist() == [0x00800080, 0x00010000]
+
+
+def test_the_first_are_kept_where_averages_are_not_wanted():
+    assert merged(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), average=False).tolist() == [2.0, 1.0]
+
+
+def test_no_points_leave_no_rows():
+    scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
+    found = merged_columns(scan, Groups.of(np.zeros(0, np.int64), 0))
+    assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
+
+
+@pytest.mark.parametrize(
+    ('name', 'dtype', 'kind'),
+    [
+        ('intensity', np.float32, Kind.NUMBER),
+        ('t', np.uint32, Kind.NUMBER),
+        ('t', np.int64, Kind.TIME),
+        ('normals', np.float32, Kind.DIRECTION),
+        ('rgb', np.float32, Kind.COLOUR),
+        ('label', np.float32, Kind.FIRST),
+        ('name', 'U4', Kind.FIRST),
+    ],
+)
+def test_the_kind_of_a_column_follows_its_name_or_its_type(name, dtype, kind):
+    assert kind_of(name, np.zeros(1, dtype)) is kind
+
+
+def test_points_can_be_selected_by_mask_or_by_rows():
+    scan = scan_of(np.arange(12.0).reshape(4, 3), row=range(4))
+    assert select(scan, np.ones(4, np.bool_)) is scan
+    by_mask = select(scan, np.array([True, False, False, True]))
+    by_rows = select(scan, np.array([3, 0]))
+    assert (by_mask.columns['row'].tolist(), by_rows.columns['row'].tolist()) == ([0, 3], [3, 0])
+    np.testing.assert_array_equal(by_rows.points, scan.points[[3, 0]])
+    assert by_mask.points.flags.f_contiguous
+    with pytest.raises(ValueError, match=r'mask of shape \(3,\), expected \(4,\)'):
+        select(scan, np.ones(3, np.bool_))
+
+
+def test_columns_are_added_to_a_copy():
+    scan = scan_of(np.zeros((1, 3)), a=[1])
+    found = with_columns(scan, b=np.array([2]))
+    assert (list(scan.columns), list(found.columns)) == (['a'], ['a', 'b'])
+
+
+def test_random_numbers_follow_seed_and_stamp_alone():
+    one, two = scan_of(np.zeros((1, 3)), stamp_ns=1), scan_of(np.ones((2, 3)), stamp_ns=1)
+    later = scan_of(np.zeros((1, 3)), stamp_ns=-1)
+    assert generator(one, 5).random() == generator(two, 5).random()
+    assert len({generator(one, 5).random(), generator(one, -1).random(),
+                generator(later, 5).random()}) == 3
