@@ -13,6 +13,7 @@ import json
 from pathlib import Path
 import sys
 
+from surfel_mapper.io.heap import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
@@ -82,6 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     if args.scans is not None and args.scans < 1:
         parser().error(f'--scans: {args.scans}, expected one or more')
+    keep_freed_memory()  # as node and replay do
     machine, chosen = facts(), options(args)
     print(', '.join(f'{name} {value}' for name, value in machine.items()))
     print(f'window {chosen.window}, {chosen.scans} scans timed, {chosen.num_points} points\n')

@@ -24,7 +24,7 @@ from test.bench.ours import Ours
 from test.bench.report import rates, Row, spread
 from test.bench.street import Street
 
-BUDGET_MS = {0.5: 8.0, 0.2: 25.0}
+BUDGET_MS = {0.5: 4.0, 0.2: 10.0}
 """What a scan of 131,072 points may cost in a window of 100, by voxel size."""
 
 Times = dict[str, list[float]]
