@@ -3,10 +3,10 @@
 """
 Ground: which points lie on surfaces that are nearly level.
 
-Points are grouped into voxels, and the surfel of a voxel, the plane through its points, says how
-steep the surface is there. Where the floor meets a wall the plane leans, and neither is ground;
-smaller voxels keep that strip narrow. A table or a roof is as level as the floor: ``max_height_m``
-leaves out what is above the robot's wheels.
+Points are grouped into voxels that stand upright, and the surfel of a voxel, the plane through
+its points, says how steep the surface is there. Where the floor meets a wall the plane leans, and
+neither is ground; smaller voxels keep that strip narrow. A table or a roof is as level as the
+floor: ``max_height_m`` leaves out what is above the robot's wheels.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import math
 import numpy as np
 
 from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.angles import cosine
 from surfel_mapper.filters.base import Filter, Mask, select, with_columns
 from surfel_mapper.filters.neighbours import coordinates, Points
 from surfel_mapper.filters.parameters import parameter
@@ -44,7 +45,7 @@ class Ground(Filter):
         5, 'With fewer points a voxel has no slope and is not ground.', low=3, high=2**31 - 1
     )
     min_planarity: float = parameter(
-        0.3, 'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
+        0.05, 'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
         low=0.0, high=1.0,
     )
     max_height_m: float = parameter(
@@ -68,40 +69,40 @@ class Ground(Filter):
 
     def is_ground(self, scan: Scan, points: Points) -> Mask:
         """Return which points are ground."""
-        up = self.upwards(scan)
+        R_up_sensor = self.upright(scan)
         if not len(points):
             return np.zeros(0, np.bool_)
+        points = points @ R_up_sensor.T
         grid = Grid.over(points, np.full(3, self.voxel_size_m), 'origin')
         _, _, groups = grid.group(points, True)
         moments = Moments.of_groups(points, groups.rows, len(groups.first))
         values, vectors = eigen(moments.covariance)
-        cosine = np.abs(vectors[:, 0] @ up)
-        level = cosine >= math.cos(math.radians(self.max_slope_deg))
+        level = np.abs(vectors[:, 0, 2]) >= cosine(self.max_slope_deg)
         level &= moments.count >= self.min_points
         level &= shares(values)[:, 0] >= self.min_planarity
         if self.max_height_m < math.inf:
-            level &= self.height_m(scan, moments.mean) <= self.max_height_m
+            height_m = moments.mean[:, 2] - (R_up_sensor @ self.robot(scan))[2]
+            level &= height_m <= self.max_height_m
         return np.asarray(level[groups.rows])
 
-    def upwards(self, scan: Scan) -> Points:
-        """Return the direction upwards in the frame of the points, (3,)."""
+    def upright(self, scan: Scan) -> Points:
+        """Return the rotation that takes the points to a frame whose z is up, (3, 3)."""
         if self.up == 'sensor':
-            return np.array([0.0, 0.0, 1.0])
+            return np.eye(3)
         pose = scan.T_fixed_sensor if self.up == 'fixed' else scan.T_base_sensor
         if pose is None:
             raise FilterError(
                 f'the pose of {scan.frame_id!r} in the {self.up} frame is not known, so up is '
                 'not; let poses come in, or set up: sensor'
             )
-        return np.asarray(pose[2, :3], np.float64)
+        return np.asarray(pose[:3, :3], np.float64)
 
-    def height_m(self, scan: Scan, places: Points) -> Points:
-        """Return how high places in the frame of the points are above the robot, m."""
+    def robot(self, scan: Scan) -> Points:
+        """Return where the origin of the robot is in the frame of the points, (3,) m."""
         if scan.T_base_sensor is None:
             raise FilterError(
                 f'the place of {scan.frame_id!r} on the robot is not known, so max_height_m has '
                 'no origin; set frames.base_to_sensor, or let /tf_static have it'
             )
-        rotation, place = scan.T_base_sensor[:3, :3], scan.T_base_sensor[:3, 3]
-        base_in_sensor = -rotation.T @ place
-        return np.asarray((places - base_in_sensor) @ self.upwards(scan), np.float64)
+        R_base_sensor, sensor_in_base = scan.T_base_sensor[:3, :3], scan.T_base_sensor[:3, 3]
+        return np.asarray(-R_base_sensor.T @ sensor_in_base, np.float64)

@@ -28,6 +28,9 @@ from surfel_mapper.scan import Scan
 
 UINT32_MAX = 2**32 - 1
 
+UNHELD = 1e-9
+"""Motions held by less than this share of what holds the strongest are held by rounding."""
+
 
 @register(theirs='NormalSpaceDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -111,7 +114,8 @@ class CovarianceSampling(Filter):
         Point to plane distances change with translation along n and rotation along p x n. The
         eigenvectors of the sum of their products are motions that the scan resists, strongly or
         weakly. Again and again the one resisted least by the points chosen so far gets the point
-        that resists it most.
+        that resists it most. Motions that nothing resists, as along a tunnel, are left out; in
+        libpointmatcher they get all the points.
         """
         normals, points = normals_of(self, scan), coordinates(scan)
         if len(scan) <= self.num_points:
@@ -126,7 +130,7 @@ class CovarianceSampling(Filter):
 
 
 def resistance(points: Points, normals: Points, torque_norm: int) -> Points:
-    """Return how every point resists each of six motions, (N, 6), those of its scan."""
+    """Return how every point resists each motion that the scan resists at all, (N, up to 6)."""
     if not len(points):
         return np.empty((0, 6))
     arms = points - points.mean(axis=0)
@@ -134,8 +138,8 @@ def resistance(points: Points, normals: Points, torque_norm: int) -> Points:
     length = (1.0, distances.mean(), distances.max())[torque_norm]
     turns = np.cross(arms, normals) / (length if length > 0.0 else 1.0)
     forces = np.hstack([turns, normals])
-    _, motions = np.linalg.eigh(forces.T @ forces)
-    return np.asarray(forces @ motions)
+    strengths, motions = np.linalg.eigh(forces.T @ forces)
+    return np.asarray(forces @ motions[:, strengths >= UNHELD * strengths[-1]])
 
 
 def normals_of(each: Filter, scan: Scan) -> Points:

@@ -15,18 +15,19 @@ def choose(resists, by_motion, number, chosen):
     """
     Choose points.
 
-    resists    (N, 6) float64, how each point resists each motion
-    by_motion  (6, N) int64, points by how much they resist a motion, most first
+    resists    (N, M) float64, how each point resists each motion
+    by_motion  (M, N) int64, points by how much they resist a motion, most first
     number     points to choose, at most N
     chosen     (N,) bool, in: false, out: whether chosen
     """
-    held = np.zeros(6)
-    place = np.zeros(6, np.int64)
+    num_motions = resists.shape[1]
+    held = np.zeros(num_motions)
+    place = np.zeros(num_motions, np.int64)
     for _ in range(number):
         motion = np.argmin(held)
         while chosen[by_motion[motion, place[motion]]]:
             place[motion] += 1
         point = by_motion[motion, place[motion]]
         chosen[point] = True
-        for k in range(6):
+        for k in range(num_motions):
             held[k] += resists[point, k] * resists[point, k]
