@@ -20,7 +20,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import MapError
-from surfel_mapper.mapping.moments import pack_keys, point_keys, ScanMoments
+from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 
@@ -232,12 +232,13 @@ class SlidingWindow:
 
         """
         old = list(self)
+        left = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])
+        full = self._full(left, min_points)
         done: list[int] = []
-        fallen = [np.empty((0, 3), np.int32)]
         try:
             for place, scan in scans.items():
                 self._map.insert(scan.moments)
-                fallen.append(self._map.remove(old[place].moments, min_points))
+                self._map.remove(old[place].moments)
                 done.append(place)
         except MapError:
             for place in done:
@@ -249,15 +250,12 @@ class SlidingWindow:
         self._nbytes, self._travelled_m = 0, travelled_m
         for place, scan in enumerate(old):
             self._append(scans.get(place, scan))
-        return self._below(np.unique(np.concatenate(fallen), axis=0), min_points)
+        return unpack_keys(np.setdiff1d(full, self._full(left, min_points)))
 
-    def _below(
-        self, voxel_index: npt.NDArray[np.int32], min_points: int
-    ) -> npt.NDArray[np.int32]:
-        """Return those of some voxels that hold fewer points now."""
-        held = self._map.moments(voxel_index)
-        full = held.key[held.count >= min_points]
-        return voxel_index[~np.isin(pack_keys(voxel_index), full)]
+    def _full(self, keys: npt.NDArray[np.int64], min_points: int) -> npt.NDArray[np.int64]:
+        """Return the keys of those of some voxels that hold enough points."""
+        held = self._map.moments(unpack_keys(keys))
+        return held.key[held.count >= min_points]
 
     def clear(self) -> None:
         """Forget all scans and clear the map."""

@@ -1,0 +1,226 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Mapper.align: scans move in the map, exactly, whatever was done to their points before."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import AlignmentError, ConfigError
+from surfel_mapper.geometry import q_xyzw
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.regions import Ball
+from test.alignment.street import drifted, relative_errors, street_scans
+
+NUM_SCANS = 8
+
+SETTINGS = {
+    'pose.source': 'odometry',
+    'window.keep_points': True,
+    'align.key_distance_m': 0.0,
+    'frames.base': 'lidar',
+}
+
+
+@pytest.fixture(scope='module')
+def drive():
+    scans, true = street_scans(30)
+    return scans[:NUM_SCANS], true[:NUM_SCANS], drifted(true[:NUM_SCANS], 0.02, 0.2)
+
+
+def mapped(drive, settings=(), number=NUM_SCANS):
+    """Return a mapper that has mapped scans where drifting odometry has them."""
+    mapper = Mapper(Config.from_mapping({**SETTINGS, **dict(settings)}))
+    return mapper, feed(mapper, drive, range(number))
+
+
+def feed(mapper, drive, numbers):
+    scans, _, poses = drive
+    updates = []
+    for number in numbers:
+        scan, pose = scans[number], poses[number]
+        mapper.add_pose('odom', 'lidar', scan.stamp_ns, pose[:3, 3], q_xyzw(pose))
+        mapper.add_scan(scan)
+        updates += mapper.insert_ready()
+    return updates
+
+
+def rebuilt(mapper, reduced):
+    """Return the map of scans at the poses that they have in the window now."""
+    limits = mapper.config.input
+    surfel_map = SurfelMap(mapper.config.map.voxel_size_m, columns=mapper.map.columns)
+    for scan, windowed in zip(reduced, mapper.window, strict=True):
+        pose = windowed.T_map_sensor
+        moments = surfel_map.reduce(
+            scan.points, pose, origin=pose[:3, 3], columns=scan.columns,
+            min_range_m=limits.min_range_m, max_range_m=limits.max_range_m or math.inf,
+        )  # fmt: skip
+        surfel_map.insert(moments)
+    return surfel_map
+
+
+def test_the_map_equals_one_built_at_the_corrected_poses(drive):
+    mapper, _ = mapped(drive)
+    before = mapper.map.digest()
+
+    aligned = mapper.align()
+
+    assert aligned.num_moved > 0
+    assert mapper.map.digest() != before
+    assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
+    np.testing.assert_array_equal(
+        aligned.T_map_sensor, [scan.T_map_sensor for scan in mapper.window]
+    )
+
+
+def test_errors_of_relative_poses_fall(drive):
+    mapper, _ = mapped(drive)
+
+    aligned = mapper.align()
+
+    found = relative_errors(aligned.T_map_sensor, drive[1], NUM_SCANS - 1)
+    drift = relative_errors(drive[2], drive[1], NUM_SCANS - 1)
+    assert found[0] < drift[0] / 10.0
+    assert found[1] < drift[1] / 10.0
+
+
+def test_limits_of_range_and_columns_hold_for_moved_scans(drive):
+    scans = [
+        replace(scan, points=scan.points.astype(dtype))
+        for scan, dtype in zip(drive[0], [np.float32, np.float64] * 4, strict=True)
+    ]
+    limits = {'input.min_range_m': 4.0, 'input.max_range_m': 30.0, 'map.intensity': True}
+    mapper, _ = mapped((scans, *drive[1:]), limits)
+
+    assert mapper.align().num_moved > 0
+    assert mapper.map.digest() == rebuilt(mapper, scans).digest()
+
+
+def test_what_filters_took_away_does_not_come_back(drive, tmp_path):
+    chain = tmp_path / 'chain.yaml'
+    chain.write_text('- RandomSamplingDataPointsFilter:\n    prob: 0.5\n')
+    mapper, _ = mapped(drive, {'filters': str(chain)})
+    kept = [
+        replace(scan, points=windowed.points, columns={})
+        for scan, windowed in zip(drive[0], mapper.window, strict=True)
+    ]
+    num_points = mapper.map.num_points
+
+    assert mapper.align().num_moved > 0
+    assert mapper.map.num_points == num_points
+    assert mapper.map.digest() == rebuilt(mapper, kept).digest()
+
+
+def test_what_was_cleared_does_not_come_back(drive):
+    mapper, _ = mapped(drive)
+    center = tuple(drive[2][3][:3, 3])
+    mapper.clear_region(Ball(center, 8.0))
+    num_points = mapper.map.num_points
+
+    assert mapper.align().num_moved > 0
+    assert mapper.map.num_points == num_points
+
+
+def test_later_scans_are_corrected_like_the_newest(drive):
+    mapper, _ = mapped(drive, number=6)
+    aligned = mapper.align()
+
+    update = feed(mapper, drive, [6])[-1]
+
+    step = np.linalg.inv(drive[2][5]) @ drive[2][6]
+    np.testing.assert_allclose(
+        update.T_fixed_sensor, aligned.T_map_sensor[-1] @ step, rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        aligned.T_map_fixed @ drive[2][5], aligned.T_map_sensor[-1], rtol=0, atol=1e-9
+    )
+
+
+def test_aligning_again_moves_next_to_nothing(drive):
+    mapper, _ = mapped(drive)
+    mapper.align()
+
+    again = mapper.align()
+
+    assert again.largest_m < 0.01
+    assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
+
+
+def test_every_so_many_scans_the_window_is_aligned(drive):
+    mapper, updates = mapped(drive, {'align.every_scans': 3})
+
+    assert [update.aligned is not None for update in updates] == [False, False, True] * 2 + [
+        False,
+        False,
+    ]
+    due = updates[5]
+    np.testing.assert_array_equal(due.T_fixed_sensor, due.aligned.T_map_sensor[-1])
+    assert len(due.aligned.stamps_ns) == 6
+    assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
+    assert 'align' in mapper.counters.milliseconds
+
+
+def test_changes_and_removals_of_an_update_cover_the_alignment(drive):
+    settings = {'align.every_scans': NUM_SCANS, 'map.min_points': 5}
+    mapper, _ = mapped(drive, settings, number=NUM_SCANS - 1)
+    known = {tuple(i) for i in mapper.map.surfels(5).voxel_index.tolist()}
+
+    update = feed(mapper, drive, [NUM_SCANS - 1])[-1]
+
+    assert update.aligned is not None
+    known |= {tuple(i) for i in update.changed.voxel_index.tolist()}
+    known -= {tuple(i) for i in update.removed_voxel_index.tolist()}
+    assert known == {tuple(i) for i in mapper.map.surfels(5).voxel_index.tolist()}
+
+
+def test_moved_scans_leave_the_window_exactly(drive):
+    mapper, _ = mapped(drive, {'window.max_scans': 4}, number=4)
+    mapper.align()
+
+    feed(mapper, drive, [4, 5])
+
+    assert mapper.map.digest() == rebuilt(mapper, drive[0][2:6]).digest()
+
+
+def test_clearing_forgets_the_correction(drive):
+    mapper, _ = mapped(drive, number=6)
+    mapper.align()
+    mapper.clear()
+
+    update = feed(mapper, drive, [6])[-1]
+
+    np.testing.assert_allclose(update.T_fixed_sensor, drive[2][6], rtol=0, atol=1e-12)
+
+
+def test_the_map_has_the_frame_that_it_is_given(drive):
+    _, updates = mapped(drive, {'align.map_frame': 'map'}, number=1)
+
+    assert updates[0].frame_id == 'map'
+    assert mapped(drive, number=1)[1][0].frame_id == 'odom'
+
+
+def test_windows_without_points_are_refused_and_stay(drive):
+    mapper, _ = mapped(drive, {'window.keep_points': False}, number=3)
+    before = mapper.map.digest()
+
+    with pytest.raises(AlignmentError, match=r'0 of 3 scans .* window.keep_points'):
+        mapper.align()
+
+    assert mapper.map.digest() == before
+
+
+@pytest.mark.parametrize('number', [0, 1])
+def test_fewer_than_two_scans_are_refused(drive, number):
+    with pytest.raises(AlignmentError, match=f'{number} scans'):
+        mapped(drive, number=number)[0].align()
+
+
+def test_aligning_by_itself_needs_points():
+    with pytest.raises(ConfigError, match=r'align.every_scans: 5, but window.keep_points'):
+        Config.from_mapping({'align.every_scans': 5})
