@@ -4,7 +4,7 @@
 What happened so far: scans used and dropped, points left out, milliseconds by stage.
 
 Everything that is dropped is counted here under a cause, so that the numbers of the summary and
-of the diagnostics add up: scans received = mapped + gated + dropped + waiting.
+of the diagnostics add up: scans received = mapped + gated + localised + dropped + waiting.
 """
 
 from __future__ import annotations
@@ -38,8 +38,9 @@ class Counters:
 
     Attributes
     ----------
-    received, mapped, gated : int
-        Scans that came in, entered the map, were left out by the motion gate.
+    received, mapped, gated, localised : int
+        Scans that came in, entered the map, were left out by the motion gate, were only aligned
+        to a frozen map.
     evicted : Counter of str
         Scans that left the map again, by the limit reached.
     resets : int
@@ -64,6 +65,7 @@ class Counters:
     received: int = 0
     mapped: int = 0
     gated: int = 0
+    localised: int = 0
     resets: int = 0
     points: int = 0
     evicted: Counter[str] = field(default_factory=Counter)
@@ -116,6 +118,7 @@ class Counters:
                 'received': self.received,
                 'mapped': self.mapped,
                 'gated': self.gated,
+                **({'localised': self.localised} if self.localised else {}),
                 'evicted': dict(self.evicted),
                 'dropped': dict(self.dropped),
                 'dropped_by_frame': {k: dict(v) for k, v in self.dropped_by_frame.items()},

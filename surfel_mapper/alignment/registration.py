@@ -142,7 +142,7 @@ class Registration:
         """
         levels = _Levels(self.config, surfel_map, cells, starts)
         found = self._descend(cells, levels, starts[0], deviation_m)
-        if not found.converged or found.fit < max(expected_fit, self.config.min_fit):
+        if not found.converged or found.fit < max(expected_fit, self.config.min_fit_ratio):
             width_m = levels.voxel_size_m(self.config.coarse_levels)
             others = [
                 self._descend(cells, levels, start, width_m)
@@ -180,11 +180,12 @@ class Registration:
     ) -> Alignment:
         """Take Gauss-Newton steps until they are small."""
         pose, iteration, moved_m = start, 0, math.inf
+        least = self.config.min_information_ratio
         while True:
             hessian, gradient, fit = planes.equations(cells, pose, width_m)
             if moved_m < tolerance_m or iteration == self.config.max_iterations:
                 break
-            step, degenerate, radius_m = solve(hessian, gradient, self.config.min_information)
+            step, degenerate, radius_m = solve(hessian, gradient, least)
             pose = moved(pose, step)
             moved_m = math.hypot(*step[:3], *(radius_m * step[3:]))
             iteration += 1
@@ -266,7 +267,7 @@ def means(moments: ScanMoments) -> npt.NDArray[np.float64]:
 
 
 def solve(
-    hessian: npt.NDArray[np.float64], gradient: npt.NDArray[np.float64], min_information: float
+    hessian: npt.NDArray[np.float64], gradient: npt.NDArray[np.float64], min_ratio: float
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
     """
     Return the Gauss-Newton step in the directions that are not degenerate.
@@ -275,7 +276,7 @@ def solve(
     ----------
     hessian, gradient : (6, 6), (6,) float64
         Of position, m, and turn, rad.
-    min_information : float
+    min_ratio : float
         Smallest eigenvalue of a direction that counts, where those of positions sum up to 1 and
         those of turns, scaled, as well.
 
@@ -294,7 +295,7 @@ def solve(
     radius_m = math.sqrt(float(np.trace(hessian[3:, 3:])) / weight) or 1.0
     scale = np.array([1.0, 1.0, 1.0, radius_m, radius_m, radius_m])
     values, vectors = np.linalg.eigh(hessian / (weight * np.outer(scale, scale)))
-    known = values >= max(min_information, 1e-12)
+    known = values >= max(min_ratio, 1e-12)
     inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
     step = -(vectors @ (inverse * (vectors.T @ (gradient / (weight * scale))))) / scale
     return step, np.ascontiguousarray(vectors.T[~known]), radius_m

@@ -3,8 +3,9 @@
 """
 Tracking: the pose of scan after scan, each predicted from those before.
 
-The sensor is taken to go on as it moved between the last two scans. By how much that was wrong
-lately decides how far the next alignment looks and how much of what is off it believes.
+What carries the sensor is taken to go on as it moved between the last two scans. By how much
+that was wrong lately decides how far the next alignment looks and how much of what is off it
+believes; how well scans fitted lately decides whether the next one is in the right place.
 
 Source: Vizzo et al. 2023 (KISS-ICP) for the threshold out of deviations.
 """
@@ -18,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import Alignment, Registration
+from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import (
     compose,
     inverse,
@@ -29,7 +31,7 @@ from surfel_mapper.geometry import (
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 REMEMBERED = 10
-"""Deviations of so many scans are remembered."""
+"""Deviations and fits of so many scans are remembered."""
 
 EXPECTED_FIT = 0.85
 """A scan that fits less than this share of what is usual may be in the wrong place."""
@@ -40,14 +42,19 @@ FLOOR_NOISES = 3.0
 
 class Tracker:
     """
-    Follows a sensor on a map.
+    Follows a sensor, or what carries it, on a map.
 
     Parameters
     ----------
     registration : Registration
         Aligns the scans.
     start : (4, 4) float64
-        T_map_sensor of the first scan.
+        Where it is at first.
+
+    Attributes
+    ----------
+    pose : (4, 4) float64
+        T_fixed_body, where it was last.
 
     """
 
@@ -56,20 +63,24 @@ class Tracker:
         self._registration = registration
         self.restart(start)
 
-    def restart(self, T_map_sensor: Transform) -> None:
+    def restart(self, T_fixed_body: Transform) -> None:
         """Go on from a pose, with nothing known of the motion."""
-        self._pose = T_map_sensor
+        self.pose = T_fixed_body
         self._stamp_ns: int | None = None
+        self.stop()
+
+    def stop(self) -> None:
+        """Go on from where it was last, with nothing known of the motion."""
         self._twist = np.zeros(6)
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
         self._fits: deque[float] = deque(maxlen=REMEMBERED)
 
     def predict(self, stamp_ns: int) -> Transform:
-        """Return where the sensor is at a stamp, if it goes on as before."""
+        """Return T_fixed_body at a stamp, if the motion goes on as before."""
         if self._stamp_ns is None:
-            return self._pose
+            return self.pose
         step = se3_exp(self._twist * ((stamp_ns - self._stamp_ns) / 1e9))
-        return compose(self._pose, step)
+        return compose(self.pose, step)
 
     @property
     def deviation_m(self) -> float:
@@ -80,52 +91,70 @@ class Tracker:
         mean_sq = sum(deviation**2 for deviation in self._deviations) / len(self._deviations)
         return max(math.sqrt(mean_sq), FLOOR_NOISES * config.noise_m)
 
-    def align(
-        self, cells: npt.NDArray[np.float64], stamp_ns: int, surfel_map: SurfelMap
+    def track(
+        self,
+        cells: npt.NDArray[np.float64],
+        stamp_ns: int,
+        surfel_map: SurfelMap,
+        T_map_fixed: Transform,
     ) -> Alignment:
         """
-        Return where a scan belongs, without going on; see Registration.align.
+        Align a scan, and go on from where it belongs.
 
         Parameters
         ----------
         cells : (K, 3) float64, m
-            Of the scan, in the sensor frame.
+            Of the scan, in the frame that is followed.
         stamp_ns : int
-            Its time.
+            Its time, after that of the one before.
         surfel_map : SurfelMap
             The map.
+        T_map_fixed : (4, 4) float64
+            From the frame of the poses to that of the map.
+
+        Raises
+        ------
+        AlignmentError
+            If the scan does not fit the map. Nothing is known of the motion any more then.
 
         """
-        starts = [self.predict(stamp_ns)]
+        starts = [compose(T_map_fixed, self.predict(stamp_ns))]
         if self._stamp_ns is not None:
-            starts.append(self._pose)
+            starts.append(compose(T_map_fixed, self.pose))
         usual = sorted(self._fits)[len(self._fits) // 2] if self._fits else 0.0
-        expected = EXPECTED_FIT * usual
-        return self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
+        found = self._registration.align(
+            cells, surfel_map, starts, self.deviation_m, EXPECTED_FIT * usual
+        )
+        least = self._registration.config.min_fit_ratio
+        if found.fit < (least if found.converged else max(least, EXPECTED_FIT * usual)):
+            self.stop()
+            raise AlignmentError(
+                f'{found.fit:.0%} of its {found.num_cells} cells fit the map, expected '
+                f'{max(least, EXPECTED_FIT * usual):.0%} (registration.min_fit_ratio)'
+            )
+        self._fits.append(found.fit)
+        pose = compose(inverse(T_map_fixed), found.T_map_sensor)
+        self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
+        return found
 
-    def advance(
-        self, T_map_sensor: Transform, stamp_ns: int, reach_m: float = 0.0, fit: float = 0.0
-    ) -> None:
+    def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """
-        Go on from where a scan was found.
+        Go on from a pose, and learn from it about the motion.
 
         Parameters
         ----------
-        T_map_sensor : (4, 4) float64
-            Its pose.
+        T_fixed_body : (4, 4) float64
+            Where it is.
         stamp_ns : int
-            Its time.
+            When.
         reach_m : float
-            How far away what it saw is, by which a wrong turn counts.
-        fit : float
-            Of its alignment.
+            How far away what it sees is, by which a wrong turn counts.
 
         """
         if self._stamp_ns is not None:
-            self._fits.append(fit)
-            off = compose(inverse(self.predict(stamp_ns)), T_map_sensor)
+            off = compose(inverse(self.predict(stamp_ns)), T_fixed_body)
             turned_m = 2.0 * reach_m * math.sin(0.5 * rotation_angle(off))
             self._deviations.append(math.hypot(*off[:3, 3], turned_m))
-            motion = compose(inverse(self._pose), T_map_sensor)
+            motion = compose(inverse(self.pose), T_fixed_body)
             self._twist = se3_log(motion) / ((stamp_ns - self._stamp_ns) / 1e9)
-        self._pose, self._stamp_ns = T_map_sensor, stamp_ns
+        self.pose, self._stamp_ns = T_fixed_body, stamp_ns

@@ -28,6 +28,11 @@ if TYPE_CHECKING:
 
 SUMMARY = 'Map the clouds of a bag and write the map, a picture and figures.'
 
+STAGES = (
+    'decode', 'deskew', 'filter', 'register', 'reduce', 'insert', 'align', 'normals', 'total'
+)  # fmt: skip
+"""Of which the report states the times."""
+
 EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
 
 
@@ -53,6 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help="let scans leave the map by the configuration's window, as the node does",
     )
+    parser.add_argument(
+        '--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text'
+    )
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
 
 
@@ -62,13 +70,15 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.io.bag import BagReader
     from surfel_mapper.io.bag_topics import CLOUD
     from surfel_mapper.io.heap import keep_freed_memory
-    from surfel_mapper.offline.replay import ALL_SCANS, pose_topics
+    from surfel_mapper.io.trajectory import write_tum
+    from surfel_mapper.offline.replay import ALL_SCANS, load_start, pose_topics
     from surfel_mapper.pipeline import Mapper
 
     config = load_config(args.config)
     if args.filters is not None:
         config = config.replace({'filters': args.filters})
     mapper = Mapper(config if args.window else config.replace(ALL_SCANS))
+    load_start(mapper)
     output = output_directory(args.bag, args.output)
     with BagReader(args.bag) as reader:
         topic = reader.topics.choose(CLOUD, args.topic)
@@ -76,7 +86,7 @@ def run(args: argparse.Namespace) -> int:
         keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
         mapper.warm_up()
         start = time.perf_counter()
-        trajectory = map_bag(reader, mapper, topic, poses)
+        stamps_ns, trajectory = map_bag(reader, mapper, topic, poses)
         source = {
             'bag': str(args.bag),
             'topic': topic,
@@ -86,8 +96,10 @@ def run(args: argparse.Namespace) -> int:
             'window': args.window,
         }
     refuse_empty(args.bag, topic, mapper)
+    if args.poses_out is not None:
+        write_tum(args.poses_out, stamps_ns, trajectory)
     summary = {**source, **mapper.summary(), 'settings': mapper.config.to_mapping()}
-    write(output, args.bag, mapper, trajectory, summary)
+    write(output, args.bag, mapper, trajectory[:, :3, 3], summary)
     print(json.dumps(summary) if args.json else report(summary, output))
     return 0
 
@@ -109,23 +121,24 @@ def output_directory(bag: Path, wanted: Path | None) -> Path:
 
 def map_bag(
     reader: BagReader, mapper: Mapper, topic: str, poses: PoseTopics
-) -> npt.NDArray[np.float64]:
-    """Map all clouds of a topic with a progress bar; return where the sensor was, (S, 3) m."""
+) -> tuple[list[int], npt.NDArray[np.float64]]:
+    """Map all clouds of a topic with a progress bar; return stamps and poses, (S, 4, 4)."""
     import numpy as np
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
     from surfel_mapper.offline.replay import replay
 
-    positions = []
+    stamps_ns, trajectory = [], []
     total = reader.topics.num_messages([topic])
     hidden = not sys.stderr.isatty()
     with logging_redirect_tqdm(), tqdm(total=total, unit='scan', disable=hidden) as bar:
         for update in replay(reader, mapper, topic, poses):
-            positions.append(update.T_fixed_sensor[:3, 3])
+            stamps_ns.append(update.stamp_ns)
+            trajectory.append(update.T_fixed_sensor)
             bar.update(mapper.counters.received - bar.n)
         bar.update(mapper.counters.received - bar.n)
-    return np.array(positions).reshape(-1, 3)
+    return stamps_ns, np.array(trajectory).reshape(-1, 4, 4)
 
 
 def refuse_empty(bag: Path, topic: str, mapper: Mapper) -> None:
@@ -133,7 +146,7 @@ def refuse_empty(bag: Path, topic: str, mapper: Mapper) -> None:
     from surfel_mapper.errors import BagError
 
     counters = mapper.counters
-    if not counters.mapped:
+    if not (counters.mapped or counters.localised):
         raise BagError(
             f'{bag}: none of {counters.received} clouds of {topic} was mapped '
             f'({causes(counters.dropped)}); `surfel-mapper info {bag}` shows what poses it has'
@@ -170,9 +183,10 @@ def report(summary: dict[str, Any], output: Path) -> str:
     scans, times = summary['scans'], summary['milliseconds']
     out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
     gated = f' ({scans["gated"]} left out by the motion gate)'
+    localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
     stages = '   '.join(
         f'{stage} {times[stage]["median"]:.1f} ms'
-        for stage in ('decode', 'filter', 'reduce', 'insert', 'normals', 'total')
+        for stage in STAGES
         if stage in times
     )
     filters = ''.join(
@@ -183,7 +197,7 @@ def report(summary: dict[str, Any], output: Path) -> str:
     speed = summary['recorded_s'] / summary['replay_s']
     return (
         f'scans {scans["received"]}{out if scans["dropped"] else ""}'
-        f'{gated if scans["gated"] else ""}   points {rounded(summary["points"])}   '
+        f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
         f'{filters}'

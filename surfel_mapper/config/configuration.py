@@ -12,6 +12,7 @@ from typing import Any
 
 from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.deskew import DeskewConfig
+from surfel_mapper.config.grid import GridConfig
 from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
 from surfel_mapper.config.registration import RegistrationConfig
 from surfel_mapper.config.settings import (
@@ -48,6 +49,7 @@ class Config:
     input: InputConfig = field(default_factory=InputConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
     publish: PublishConfig = field(default_factory=PublishConfig)
+    grid: GridConfig = field(default_factory=GridConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
     clear: ClearConfig = field(default_factory=ClearConfig)

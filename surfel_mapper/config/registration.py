@@ -5,14 +5,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 from surfel_mapper.config.settings import setting, Stage
+from surfel_mapper.errors import ConfigError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationConfig(Stage):
     """How a scan is aligned to the map."""
 
+    start: tuple[float, ...] = setting(
+        (),
+        'Where it begins: pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: at '
+        'the origin.',
+    )
     cell_m: float = setting(
         0.0,
         'Points of a scan are replaced by their means in cells of this edge, m; '
@@ -32,7 +39,10 @@ class RegistrationConfig(Stage):
         5, 'Surfels of fewer points are not aligned to.', low=3, high=2**31 - 1, live=True
     )
     noise_m: float = setting(
-        0.02, 'Standard deviation of a range; surfaces are no sharper, m.', low=1e-5, high=10.0,
+        0.02,
+        'Standard deviation of a range; surfaces are no sharper, m.',
+        low=1e-5,
+        high=10.0,
         live=True,
     )
     max_deviation_m: float = setting(
@@ -54,7 +64,7 @@ class RegistrationConfig(Stage):
     max_iterations: int = setting(
         30, 'Steps at most, of each level.', low=1, high=10_000, live=True
     )
-    min_fit: float = setting(
+    min_fit_ratio: float = setting(
         0.25,
         'A scan of which less than this share fits the map is dropped.',
         low=0.0,
@@ -68,7 +78,7 @@ class RegistrationConfig(Stage):
         high=180.0,
         live=True,
     )
-    min_information: float = setting(
+    min_information_ratio: float = setting(
         0.003,
         'A direction of motion of which the surfaces seen say less than this, as a share of all '
         'they say, is degenerate: there the prediction stays.',
@@ -76,3 +86,13 @@ class RegistrationConfig(Stage):
         high=1.0,
         live=True,
     )
+
+    def check(self, stage: str) -> None:
+        """Refuse a start that is no pose."""
+        if self.start and (
+            len(self.start) != 7 or not abs(math.hypot(*self.start[3:]) - 1.0) <= 1e-3
+        ):
+            raise ConfigError(
+                f'{stage}.start: {list(self.start)}, expected x y z and a unit quaternion '
+                'qx qy qz qw, or nothing'
+            )

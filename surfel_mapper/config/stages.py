@@ -12,6 +12,10 @@ from surfel_mapper.errors import ConfigError
 
 POSE_SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
 
+INPUT_KINDS = ('cloud', 'depth')
+
+MARKER_COLORS = ('planarity', 'normal', 'age')
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapConfig(Stage):
@@ -28,6 +32,16 @@ class MapConfig(Stage):
         high=2**31 - 1,
         live=True,
     )
+    mode: str = setting(
+        'live',
+        'live: scans are added to the map; frozen: they are only aligned to the map of map.load, '
+        'which stays as it is.',
+        choices=('live', 'frozen'),
+    )
+    load: str = setting(
+        '',
+        'Map to begin with, a .npz file of ~/save_map; its surfels never leave. Empty: none.',
+    )
     threads: int = setting(
         1, 'How many threads share the work of a scan; the map is the same.', low=1, high=64
     )
@@ -37,6 +51,11 @@ class MapConfig(Stage):
     color: bool = setting(
         False, 'Sum the colour (rgb) of the points too; clouds without one are dropped.'
     )
+
+    def check(self, stage: str) -> None:
+        """Refuse a frozen map of nothing."""
+        if self.mode == 'frozen' and not self.load:
+            raise ConfigError(f'{stage}.load: empty, expected a map to freeze (map.mode frozen)')
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -100,7 +119,7 @@ class PoseConfig(Stage):
     source: str = setting(
         'tf',
         'tf: the tree in /tf; odometry: nav_msgs/Odometry; pose: geometry_msgs/PoseStamped; '
-        'identity: clouds are in the fixed frame.',
+        'identity: clouds are in the fixed frame; registration: scans are aligned to the map.',
         choices=POSE_SOURCES,
     )
     max_wait_s: float = setting(
@@ -124,9 +143,15 @@ class FramesConfig(Stage):
 
     fixed: str = setting('odom', 'The frame of the map and of all output.')
     base: str = setting('base_link', 'The frame whose pose odometry or pose messages give.')
+    sensors: tuple[str, ...] = setting(
+        (),
+        'Frames that base_to_sensor gives poses of, in its order; empty: it is that of all.',
+        items=str,
+    )
     base_to_sensor: tuple[float, ...] = setting(
         (),
-        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw; empty: from /tf_static.',
+        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw, and of further sensors '
+        'behind it; empty: from /tf_static.',
     )
 
     def check(self, stage: str) -> None:
@@ -134,23 +159,47 @@ class FramesConfig(Stage):
         for name in ('fixed', 'base'):
             if not getattr(self, name):
                 raise ConfigError(f'{stage}.{name}: empty, expected the name of a frame')
-        values = self.base_to_sensor
-        if len(values) not in (0, 7):
+        if len(set(self.sensors)) < len(self.sensors) or '' in self.sensors:
+            raise ConfigError(f'{stage}.sensors: {self.sensors}, expected names that differ')
+        values, number = self.base_to_sensor, len(self.sensors)
+        if len(values) not in ((7 * number,) if number else (0, 7)):
+            expected = f'7 for each of {number} sensors' if number else 'or none'
             raise ConfigError(
                 f'{stage}.base_to_sensor: {len(values)} values, '
-                'expected 7 (x y z qx qy qz qw) or none'
+                f'expected 7 (x y z qx qy qz qw) {expected}'
             )
-        if values and abs(math.hypot(*values[3:]) - 1.0) > 1e-3:
-            raise ConfigError(
-                f'{stage}.base_to_sensor: quaternion {list(values[3:])} has norm '
-                f'{math.hypot(*values[3:]):.6g}, expected 1 (order x y z w)'
-            )
+        for first in range(0, len(values), 7):
+            q_xyzw = values[first + 3 : first + 7]
+            if abs(math.hypot(*q_xyzw) - 1.0) > 1e-3:
+                raise ConfigError(
+                    f'{stage}.base_to_sensor: quaternion {list(q_xyzw)} has norm '
+                    f'{math.hypot(*q_xyzw):.6g}, expected 1 (order x y z w)'
+                )
+
+    def mount_of(self, frame_id: str) -> tuple[float, ...]:
+        """Return the pose of a sensor in the base frame, 7 numbers; empty where none is set."""
+        if not self.sensors:
+            return self.base_to_sensor
+        if frame_id not in self.sensors:
+            return ()
+        first = 7 * self.sensors.index(frame_id)
+        return self.base_to_sensor[first : first + 7]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputConfig(Stage):
-    """What is taken of the clouds that come in."""
+    """What comes in, and what is taken of it."""
 
+    kind: str = setting(
+        'cloud',
+        'cloud: sensor_msgs/PointCloud2; depth: sensor_msgs/Image of depth, with its camera_info.',
+        choices=INPUT_KINDS,
+    )
+    topics: tuple[str, ...] = setting(
+        (),
+        'Topics of the clouds or images, one a sensor; empty: points, or depth/image.',
+        items=str,
+    )
     min_range_m: float = setting(
         0.1, 'Points nearer to the origin of their frame are left out, m.', low=0.0, high=1e6
     )
@@ -172,7 +221,9 @@ class InputConfig(Stage):
     )
 
     def check(self, stage: str) -> None:
-        """Refuse an empty range."""
+        """Refuse an empty range, and topics that are none."""
+        if '' in self.topics or len(set(self.topics)) < len(self.topics):
+            raise ConfigError(f'{stage}.topics: {self.topics}, expected names that differ')
         if 0.0 < self.max_range_m <= self.min_range_m:
             raise ConfigError(
                 f'{stage}.max_range_m: {self.max_range_m}, expected more than '
@@ -193,6 +244,18 @@ class PublishConfig(Stage):
     )
     max_markers: int = setting(
         20_000, 'At most this many surfels are drawn in ~/markers.', low=1, high=10**7, live=True
+    )
+    marker_color: str = setting(
+        'planarity',
+        'Colour of the discs of ~/markers; age: of the newest scan that saw the voxel.',
+        choices=MARKER_COLORS,
+        live=True,
+    )
+    moments: bool = setting(
+        False,
+        'Add the exact moments to ~/normals and ~/changed, of all voxels, so that clients can '
+        'mirror the map.',
+        live=True,
     )
     diagnostics_rate_hz: float = setting(
         1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0

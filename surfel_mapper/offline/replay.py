@@ -9,16 +9,20 @@ looked up ahead, although a bag would allow it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
+from surfel_mapper.io.map_state import load_map
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.offline.pose_path import PosePath
+from surfel_mapper.offline.span import Span, WHOLE
 
 if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not need
     from surfel_mapper.pipeline import Mapper, Update
@@ -40,10 +44,27 @@ ALL_SCANS = {
 
 @dataclass(frozen=True, slots=True)
 class PoseTopics:
-    """Where the poses of a replay come from: topics by kind, and topics of static transforms."""
+    """
+    Where the poses of a replay come from.
+
+    Attributes
+    ----------
+    kinds : dict of str to str
+        By topic the pose.source that reads it.
+    static : tuple of str
+        Topics of static transforms.
+    path : PosePath, optional
+        Poses from a file.
+    mounts : mapping of str to 7 floats
+        By topic of clouds the pose of its sensor in frames.base, x y z qx qy qz qw. Its clouds
+        get a frame of the topic's name, whatever frame they state.
+
+    """
 
     kinds: dict[str, str]
     static: tuple[str, ...] = ()
+    path: PosePath | None = None
+    mounts: Mapping[str, Sequence[float]] = field(default_factory=dict)
 
 
 def pose_topics(topics: Topics, config: Config, name: str | None = None) -> PoseTopics:
@@ -69,6 +90,8 @@ def pose_topics(topics: Topics, config: Config, name: str | None = None) -> Pose
     source = config.pose.source
     if source == 'identity':
         return PoseTopics({})
+    if source == 'registration':
+        return PoseTopics({}, () if config.frames.base_to_sensor else static_topics(topics))
     if not topics.of_type(TYPES[source]):
         raise BagError(
             f'{topics.path}: pose.source is {source}, but no topic is of type {TYPES[source]}; '
@@ -105,13 +128,52 @@ def offered_sources(topics: Topics) -> str:
     return ', '.join(found) or 'no poses at all; identity maps clouds that are in a fixed frame'
 
 
+def load_start(mapper: Mapper) -> None:
+    """
+    Give a mapper the map that ``map.load`` names, if any; its surfels never leave.
+
+    Raises
+    ------
+    FileFormatError
+        If it cannot be read, or is of another voxel size.
+    MapError
+        If it has other columns than are configured.
+
+    """
+    path = mapper.config.map.load
+    if path:
+        surfel_map, _ = load_map(path, voxel_size_m=mapper.map.voxel_size_m)
+        mapper.restore(surfel_map, [])
+
+
 def replay(
-    reader: BagReader, mapper: Mapper, cloud_topic: str, poses: PoseTopics
+    reader: BagReader,
+    mapper: Mapper,
+    cloud_topics: str | Collection[str],
+    poses: PoseTopics,
+    *,
+    span: Span = WHOLE,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Iterator[Update]:
     """
     Feed a bag to a mapper; yield what each scan did.
 
     Clouds and poses that cannot be decoded are counted, the first of each is warned about.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    mapper : Mapper
+        Maps it.
+    cloud_topics : str or collection of str
+        One topic of clouds, or several; their sensors are told apart by their frames.
+    poses : PoseTopics
+        Where poses come from.
+    span : Span
+        Which clouds.
+    stopped : callable
+        Asked before every message; once it is true no more are read.
 
     Raises
     ------
@@ -119,23 +181,59 @@ def replay(
         If the bag is damaged.
 
     """
-    for message in reader.messages({cloud_topic, *poses.kinds, *poses.static}):
-        if message.topic == cloud_topic:
-            add_cloud(reader, mapper, message)
-        else:
+    clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
+    for topic, mount in poses.mounts.items():
+        base = mapper.config.frames.base
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    first = numbers_before(reader, clouds, poses, span)
+    seen: Counter[str] = Counter()
+    for message in messages(reader, clouds, poses, span):
+        if stopped():
+            break
+        if message.topic not in clouds:
             add_poses(reader, mapper, message, poses)
+        elif span.holds(message.record_ns):
+            if seen[message.topic] % span.every == 0:
+                number = first[message.topic] + seen[message.topic]
+                add_cloud(reader, mapper, message, poses, number)
+            seen[message.topic] += 1
         yield from mapper.insert_ready()
     mapper.finish()
 
 
-def add_cloud(reader: BagReader, mapper: Mapper, message: BagMessage) -> None:
-    """Decode a cloud and queue it as a scan; a bad one is counted."""
+def messages(
+    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
+) -> Iterator[BagMessage]:
+    """Yield what a part needs: static transforms from before it, its clouds and their poses."""
+    if poses.static and span.poses_start_ns is not None:
+        yield from reader.messages(poses.static, None, span.poses_start_ns)
+    names = {*clouds, *poses.kinds, *poses.static}
+    yield from reader.messages(names, span.poses_start_ns, span.poses_stop_ns)
+
+
+def numbers_before(
+    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
+) -> Counter[str]:
+    """Return how many clouds come before a part, where poses are known by their number."""
+    if poses.path is None or poses.path.has_stamps or span.start_ns is None:
+        return Counter()
+    return Counter(message.topic for message in reader.messages(clouds, None, span.start_ns))
+
+
+def add_cloud(
+    reader: BagReader, mapper: Mapper, message: BagMessage, poses: PoseTopics, number: int
+) -> None:
+    """Decode a cloud and queue it as a scan, with its pose where a file has it."""
     try:
         with mapper.counters.timed('decode'):
             scan = to_scan(reader.decode(message), message.topic)
     except CloudFormatError as error:
         mapper.refuse_clouds('bad_cloud', message.topic, str(error))
         return
+    if message.topic in poses.mounts:
+        scan = replace(scan, frame_id=message.topic)
+    if poses.path is not None:
+        poses.path.add_for(mapper, scan.stamp_ns, number)
     mapper.add_scan(scan)
 
 

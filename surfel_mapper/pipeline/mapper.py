@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.deskew import deskewed, point_times
@@ -33,7 +34,7 @@ from surfel_mapper.errors import (
     PoseNotYetError,
 )
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.geometry import compose, inverse, pose_matrix
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import NARROW_COUNT, within
@@ -42,6 +43,7 @@ from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.regions import Region
+from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
 from surfel_mapper.pipeline.update import removed_voxels, Update
 from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
@@ -63,19 +65,13 @@ class Mapper:
     Raises
     ------
     ConfigError
-        If ``pose.source`` is registration, which this version cannot do, or ``filters`` names a
-        file that holds no chain.
+        If ``filters`` names a file that holds no chain.
 
     """
 
     def __init__(self, config: Config | None = None) -> None:
         """Make an empty map with the settings of a configuration."""
         self.config = config or Config()
-        if self.config.pose.source == 'registration':
-            raise ConfigError(
-                'pose.source: registration is not available in this version; '
-                'expected tf, odometry, pose or identity'
-            )
         self.counters = Counters()
         self.chain = Chain.load(self.config.filters) if self.config.filters else Chain()
         self.map = SurfelMap(
@@ -91,6 +87,9 @@ class Mapper:
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._mounted: set[str] = set()
+        self.registered: RegisteredPoses | None = None
+        if self.config.pose.source == 'registration':
+            self.registered = RegisteredPoses(self.config, self.transforms)
 
     def add_pose(
         self,
@@ -218,13 +217,45 @@ class Mapper:
             if update is not None:
                 yield update
 
+    def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> None:
+        """
+        Go on from a pose of the robot that somebody states, with registration; else warn.
+
+        Parameters
+        ----------
+        frame_id : str
+            The frame that the pose is in; has to be that of the map.
+        xyz : (3,) float, m
+            Position of the base, or of the sensor where it is not known how it sits on a base.
+        q_xyzw : (4,) float
+            Its orientation.
+
+        """
+        if self.registered is None:
+            reason = f'poses come from pose.source {self.config.pose.source}'
+        elif frame_id != self.map_frame:
+            reason = f'it is in frame {frame_id!r}, expected {self.map_frame!r}'
+        else:
+            try:
+                T_map_body = pose_matrix(xyz, q_xyzw)
+            except ValueError as error:
+                reason = str(error)
+            else:
+                self.registered.restart(compose(inverse(self._aligner.T_map_fixed), T_map_body))
+                return
+        self._drops.message('initial_pose', f'initial pose ignored: {reason}')
+
     def finish(self) -> None:
         """End the input: what still waits for a pose is dropped and counted."""
         self._queue.drop_all('no_pose', 'no pose until the end of the input')
 
     def clear(self) -> None:
-        """Forget all scans, waiting ones too (counted); poses and counts stay."""
+        """Forget all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
         self._queue.drop_all('cleared', 'the map was cleared')
+        if self.config.map.mode != 'frozen':
+            self._empty()
+
+    def _empty(self) -> None:
         self.window.clear()
         self._aligner.reset()
 
@@ -286,6 +317,7 @@ class Mapper:
             if found != expected:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
         self.clear()
+        self._empty()
         self.map.insert(surfel_map.moments())
         self.window.restore(scans)
 
@@ -311,6 +343,8 @@ class Mapper:
             chain.warm_up()
             self.chain = chain
         self.config = config
+        if self.registered is not None:
+            self.registered.reconfigure(config)
         self.window.config = config.window
         self.window.max_voxels = config.map.max_voxels
 
@@ -326,12 +360,15 @@ class Mapper:
             many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
             surfel_map.remove(many)
         surfel_map.digest()
+        if self.registered is not None:
+            self.registered.warm_up()
 
     def summary(self) -> dict[str, Any]:
         """Return counts and times, and what the map is: for files, reports and diagnostics."""
         return {
             **self.counters.summary(),
             'filter_chain': self.chain.to_list(),
+            **({'registration': self.registered.summary()} if self.registered else {}),
             'voxel_size_m': self.map.voxel_size_m,
             'window_scans': len(self.window),
             'voxels': self.map.num_voxels,
@@ -351,6 +388,8 @@ class Mapper:
         )
         self.counters.resets += 1
         self.clear()
+        if self.registered is not None:
+            self.registered.restart()
         self._queue.forget_stamps()
         newest_pose = self.transforms.newest_ns
         if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
@@ -363,7 +402,7 @@ class Mapper:
 
     def _mount(self, frame_id: str) -> None:
         """Enter the configured extrinsics of a sensor when its frame is first seen."""
-        values, base = self.config.frames.base_to_sensor, self.config.frames.base
+        values, base = self.config.frames.mount_of(frame_id), self.config.frames.base
         if values and frame_id != base and frame_id not in self._mounted:
             self._mounted.add(frame_id)
             self.add_pose(base, frame_id, 0, values[:3], values[3:], static=True)
@@ -380,6 +419,8 @@ class Mapper:
 
     def _pose_at(self, frame_id: str, stamp_ns: int) -> npt.NDArray[np.float64]:
         """Return T_fixed_sensor at a time."""
+        if self.registered is not None:
+            return self.registered.predict(frame_id, stamp_ns)
         return self.transforms.lookup(self.config.frames.fixed, frame_id, stamp_ns)
 
     def _deskewed(self, scan: Scan, times: PointTimes) -> Scan:
@@ -391,21 +432,13 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan; None where the motion gate or the map leaves it out."""
-        pose = self._aligner.to_map(pose)
-        last = self.window.newest
-        if last is not None and stands_still(last.T_map_sensor, pose, self.config.window):
-            self.counters.gated += 1
-            return None
         laps, version = Laps(), self.map.version
-        if scan.times is not None:
-            scan = self._deskewed(scan, scan.times)
-            laps.end('deskew')
-        filtered: Scan | None = scan
-        if len(self.chain):
-            filtered = self._filter(scan, pose)
-            laps.end('filter')
-        if filtered is None:
+        prepared = self._prepare(scan, self._aligner.to_map(pose), laps)
+        if prepared is None:
             return None
+        scan, filtered, pose, alignment = prepared
+        if self.config.map.mode == 'frozen':
+            return self._only_posed(scan, pose, alignment, laps)
         try:
             windowed = self._reduce(filtered, pose)
             laps.end('reduce')
@@ -425,6 +458,7 @@ class Mapper:
         laps.end('normals')
         self._count(windowed, evictions, laps.milliseconds)
         return Update(
+            scan=scan,
             stamp_ns=scan.stamp_ns,
             frame_id=self.map_frame,
             T_fixed_sensor=pose,
@@ -434,6 +468,70 @@ class Mapper:
             evictions=tuple(evictions),
             milliseconds=laps.milliseconds,
             aligned=aligned,
+            alignment=alignment,
+        )
+
+    def _prepare(
+        self, scan: Scan, pose: npt.NDArray[np.float64], laps: Laps
+    ) -> tuple[Scan, Scan, npt.NDArray[np.float64], Alignment | None] | None:
+        """Deskew, filter and register a scan: deskewed, filtered, its pose; None if it is left."""
+        if self.registered is None and self._is_gated(pose):
+            return None
+        if scan.times is not None:
+            scan = self._deskewed(scan, scan.times)
+            laps.end('deskew')
+        filtered: Scan | None = scan
+        if len(self.chain):
+            filtered = self._filter(scan, pose)
+            laps.end('filter')
+        if filtered is None or self.registered is None:
+            return None if filtered is None else (scan, filtered, pose, None)
+        try:
+            alignment = self.registered.find(filtered, self.map, self._aligner.T_map_fixed)
+        except (AlignmentError, PoseError) as error:
+            self._drops.scan(scan, 'not_aligned', str(error))
+            return None
+        laps.end('register')
+        if alignment is not None and len(alignment.degenerate):
+            num = len(alignment.degenerate)
+            self._drops.warn(
+                'degenerate',
+                f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
+                'of motion open; there the prediction is kept',
+            )
+        pose = self._aligner.to_map(self._pose_at(scan.frame_id, scan.stamp_ns))
+        return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
+
+    def _is_gated(self, pose: npt.NDArray[np.float64]) -> bool:
+        """Return whether the motion gate leaves out a scan at a pose, and count it."""
+        last = self.window.newest
+        if last is None or not stands_still(last.T_map_sensor, pose, self.config.window):
+            return False
+        self.counters.gated += 1
+        return True
+
+    def _only_posed(
+        self,
+        scan: Scan,
+        pose: npt.NDArray[np.float64],
+        alignment: Alignment | None,
+        laps: Laps,
+    ) -> Update:
+        """Say where a scan was taken; a frozen map takes none."""
+        self.counters.localised += 1
+        for stage, milliseconds in laps.milliseconds.items():
+            self.counters.add_time(stage, milliseconds)
+        return Update(
+            scan=scan,
+            stamp_ns=scan.stamp_ns,
+            frame_id=self.map_frame,
+            T_fixed_sensor=pose,
+            num_points=0,
+            changed=self.map.surfels_changed(self.map.version),
+            removed_voxel_index=np.empty((0, 3), np.int32),
+            evictions=(),
+            milliseconds=laps.milliseconds,
+            alignment=alignment,
         )
 
     def _align_when_due(self) -> Aligned | None:

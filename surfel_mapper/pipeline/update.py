@@ -10,10 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
 from surfel_mapper.pipeline.window_aligner import Aligned
+from surfel_mapper.scan import Scan
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -23,6 +25,8 @@ class Update:
 
     Attributes
     ----------
+    scan : Scan
+        As it came in, but deskewed; filters have not touched it.
     stamp_ns : int
         Stamp of the scan.
     frame_id : str
@@ -39,12 +43,15 @@ class Update:
         The scans that left, oldest first.
     aligned : Aligned, optional
         What the alignment of the window did that was due after this scan.
+    alignment : Alignment, optional
+        How the pose was found, where it comes from registration.
     milliseconds : dict of str to float
         Time by stage: filter (where there are any), reduce, insert (evictions included),
         normals, total.
 
     """
 
+    scan: Scan
     stamp_ns: int
     frame_id: str
     T_fixed_sensor: npt.NDArray[np.float64]
@@ -54,6 +61,7 @@ class Update:
     evictions: tuple[Eviction, ...]
     milliseconds: dict[str, float]
     aligned: Aligned | None = None
+    alignment: Alignment | None = None
 
 
 def removed_voxels(

@@ -173,7 +173,7 @@ class Totals:
 def figures(session: Session) -> dict[str, Any]:
     """Return counts, times and sizes of a session."""
     mapper, counters = session.mapper, session.mapper.counters
-    done = counters.mapped + counters.gated + counters.dropped.total()
+    done = counters.mapped + counters.gated + counters.localised + counters.dropped.total()
     return {
         'clouds_lost': session.inputs.clouds_lost,
         'queue': session.thread.num_clouds,

@@ -114,7 +114,7 @@ def test_dropped_scans_are_reported_by_cause(tmp_path, capsys):
 
 
 @pytest.mark.parametrize(
-    'text', ['pose: {source: registration}', 'map: {voxel_size: 1}', 'map: {voxel_size_m: -1}']
+    'text', ['pose: {source: guess}', 'map: {voxel_size: 1}', 'map: {voxel_size_m: -1}']
 )
 def test_a_bad_configuration_is_refused(bag, tmp_path, capsys, text):
     config = settings_file(tmp_path, text)

@@ -154,11 +154,6 @@ def test_a_sensor_whose_frame_is_the_base_needs_no_mounting():
     assert dict(mapper.counters.messages_ignored) == {}
 
 
-def test_registration_is_refused_and_says_what_there_is():
-    with pytest.raises(ConfigError, match=r'registration is not available.*tf, odometry, pose'):
-        mapper_with(pose__source='registration')
-
-
 @pytest.mark.parametrize(
     ('xyz', 'q_xyzw', 'parent', 'child'),
     [
