@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
+from test.bench import accuracy
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -50,8 +51,8 @@ def options(tmp_path_factory):
     )
 
 
-@pytest.mark.parametrize('name', bench.BENCHES)
-def test_every_bench_gives_rows_of_figures(options, name, capsys):
+@pytest.mark.parametrize('name', ['mapping', 'scaling', 'compare'])
+def test_every_bench_of_times_gives_rows_of_figures(options, name, capsys):
     rows = bench.run([name], options)
 
     assert {row['voxel_m'] for row in rows} == {0.5, 0.2}
@@ -62,6 +63,27 @@ def test_every_bench_gives_rows_of_figures(options, name, capsys):
     printed = capsys.readouterr().out.splitlines()
     assert printed[0] == f'{name}: {bench.summary(name)}'
     assert len(printed) == len(rows) + 4
+
+
+def test_every_bench_is_a_module_that_says_what_it_is():
+    for name in bench.BENCHES:
+        assert bench.summary(name).endswith('.')
+
+
+def test_normals_are_compared_with_the_true_ones(options):
+    rows = bench.run(['accuracy'], options)
+    assert [(row['voxel_m'], row['at']) for row in rows] == [
+        (size_m, at) for size_m in (0.5, 0.2) for at in ('surfels', 'points')
+    ]
+    for row in rows:
+        assert 0.0 < row['median_deg'] < row['p95_deg'] <= 90.0
+
+
+def test_errors_are_angles_between_axes():
+    normals = np.array([[0, 0, 1.0], [0, 0, -1], [1, 0, 0], [0, 0.6, 0.8], [np.nan] * 3])
+    found = accuracy.errors(normals, np.tile([0.0, 0.0, 1.0], (5, 1)))
+    assert (found['num'], found['unknown']) == (4, 1)
+    assert found['mean_deg'] == pytest.approx((90.0 + np.degrees(np.arctan(0.75))) / 4)
 
 
 def test_the_stages_of_mapping_are_all_there(options):

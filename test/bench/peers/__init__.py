@@ -72,3 +72,13 @@ PEERS = (
         less='keeps 20 points a voxel, removes by distance; no moments, no normals',
     ),
 )
+
+NORMAL_PEERS = (
+    PeerSpec(name='Open3D, k nearest', module='test.bench.peers.open3d_normals', requires=OPEN3D),
+    PeerSpec(
+        name='small_gicp, k nearest',
+        module='test.bench.peers.small_gicp_normals',
+        requires=SMALL_GICP,
+    ),
+)
+"""Those whose normals are compared; a module has ``normals(points, support)``, (N, 3) each."""

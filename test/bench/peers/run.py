@@ -15,6 +15,7 @@ from typing import Any
 import venv
 
 import numpy as np
+import numpy.typing as npt
 
 from test.bench.options import Options
 from test.bench.peers import PeerSpec
@@ -59,6 +60,27 @@ def run_peer(
         command = [str(python), '-m', 'test.bench.peers.driver']
         result = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
     return result['milliseconds'], result['num_voxels']
+
+
+def run_normals(
+    python: str | Path, peer: PeerSpec, points: npt.NDArray[np.float64], support: int
+) -> npt.NDArray[np.float64]:
+    """
+    Return the normals of points, (N, 3), from so many nearest neighbours.
+
+    Raises
+    ------
+    PeerError
+        With the last line that the peer said.
+
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        files = [str(Path(scratch) / name) for name in ('points.npy', 'normals.npy')]
+        np.save(files[0], points)
+        command = [str(python), '-m', 'test.bench.peers.normals_driver', peer.module, *files]
+        output([*command, str(support)], cwd=ROOT)
+        normals: npt.NDArray[np.float64] = np.load(files[1])
+    return normals
 
 
 def environment(peer: PeerSpec, cache: Path) -> Path:
