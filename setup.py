@@ -42,7 +42,7 @@ ROS = [
 
 FORMATS = [
     'pyarrow>=14',  # maps as Parquet
-    'pypcd4>=1.1',  # scans in compressed PCD files
+    'python-neo-lzf>=0.3',  # scans in compressed PCD files
 ]
 
 CLUSTER = [
@@ -64,6 +64,7 @@ TEST = [
     'pytest-timeout>=2.2',  # a test that hangs names itself
     'hypothesis>=6.98',  # random sequences of adds and removes
     'plyfile>=1.0.1',  # an independent reader of what we write
+    'pypcd4>=1.1',  # likewise
     'mcap>=1.1',  # an independent writer of what we read
 ]
 

@@ -35,12 +35,12 @@ LEVELS = {
     'tsdf': 3,
     'io': 4,
     'pipeline': 4,
-    'cluster': 5,
     'offline': 5,
     'ros': 5,
     'simulation': 5,
     'viz': 5,
-    'cli': 6,
+    'cluster': 6,
+    'cli': 7,
 }
 """Level of every module and folder of the package."""
 
@@ -56,11 +56,11 @@ HOMES = {
     'lifecycle_msgs': 'ros/',
     'llvmlite': 'kernels/',
     'lz4': 'io/bag',
+    'lzf': 'io/pcd',
     'matplotlib': 'viz/',
     'nav_msgs': 'ros/',
     'numba': 'kernels/',
     'pyarrow': 'io/parquet',
-    'pypcd4': 'io/pcd',
     'rcl_interfaces': 'ros/',
     'rclpy': 'ros/',
     'rerun': 'viz/',

@@ -39,7 +39,7 @@ TYPES = {
 
 NAMES = {np.dtype(TYPES[name]): name for name in list(TYPES)[:8]}
 
-ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>'}
+ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
 
 MAX_HEADER_BYTES = 65536
 
@@ -115,8 +115,8 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     Parameters
     ----------
     path : str or Path
-        A binary PLY file. Its first element has to be the vertices, and these have to be plain
-        numbers; elements after them (faces) are not read.
+        A PLY file, binary or ascii. Its first element has to be the vertices, and these have to
+        be plain numbers; elements after them (faces) are not read.
 
     Raises
     ------
@@ -126,7 +126,9 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     """
     try:
         with open(path, 'rb') as file:
-            count, layout = read_header(path, file)
+            count, layout, is_text = read_header(path, file)
+            if is_text:
+                return text_columns(path, count, layout, file)
             size, left = count * layout.itemsize, os.fstat(file.fileno()).st_size - file.tell()
             if size > left:
                 raise FileFormatError(
@@ -142,8 +144,31 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     }
 
 
-def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any]]:
-    """Return the number and the layout of the vertices; leave the file at the first of them."""
+def text_columns(
+    path: str | Path, count: int, layout: np.dtype[Any], file: BinaryIO
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the properties of the vertices of an ascii file."""
+    names = layout.names or ()
+    words = file.read().split()[: count * len(names)]
+    if len(words) < count * len(names):
+        raise FileFormatError(
+            f'{path}: {len(words)} numbers, expected {count * len(names)} for {count} vertices; '
+            'truncated?'
+        )
+    try:
+        table = np.array(words, 'S').astype(np.float64).reshape(count, len(names))
+    except ValueError as error:
+        raise FileFormatError(f'{path}: {error}') from error
+    with np.errstate(invalid='ignore'):  # what is no whole number of its type becomes any
+        return {name: table[:, at].astype(layout[name]) for at, name in enumerate(names)}
+
+
+def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool]:
+    """
+    Return the number and layout of the vertices, and whether they are text.
+
+    The file is left at the first of them.
+    """
     header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
     lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
     if not found or not lines or lines[0] != ['ply']:
@@ -159,11 +184,11 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any]]:
         number = int(count)
     except (ValueError, KeyError) as error:
         raise FileFormatError(
-            f'{path}: not a binary PLY whose first element has plain numbers alone'
+            f'{path}: not a PLY whose first element has plain numbers alone'
         ) from error
     if version != '1.0' or element != 'vertex' or number < 0 or not properties:
         raise FileFormatError(
             f'{path}: version {version}, first element {count} x {element} of {len(properties)} '
             'properties, expected 1.0 and vertices of at least one'
         )
-    return number, layout
+    return number, layout, encoding == 'ascii'

@@ -100,15 +100,18 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
         ('', 'no header of a PLY file'),
         ('solid stl\nend_header\n', 'no header'),
         (HEADER + 'element vertex 1\nproperty float x\n', 'no header'),
-        (HEADER + 'end_header\n', 'not a binary PLY'),
+        (HEADER + 'end_header\n', 'not a PLY whose'),
         (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
-        (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a binary PLY'),
-        (HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n', 'not a binary PLY'),
-        (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a binary PLY'),
+        (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a PLY whose'),
         (HEADER + 'element vertex -1\nproperty float x\nend_header\n', '-1 x vertex'),
         (HEADER + 'element face 1\nproperty float x\nend_header\n', '1 x face'),
         (HEADER + 'element vertex 1\n' + 'property float x\n' * 2 + 'end_header\n', 'not a '),
-        ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'binary'),
+        ('ply\nformat latin 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'a PLY'),
+        ('ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n',
+         '1 numbers, expected 2 for 2 vertices'),
+        ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\na\n', 'float'),
         ('ply\nformat binary_big_endian 2.0\nelement vertex 1\nproperty int x\nend_header\n',
          'version 2.0'),
         (HEADER + 'element vertex 2\nproperty float x\nend_header\n1234567',
@@ -151,3 +154,18 @@ def test_intensity_and_colour_are_written_where_the_map_has_them(tmp_path):
     assert vertex['intensity'].tolist() == [1.5]
     assert [vertex[name].tolist() for name in ('red', 'green', 'blue')] == [[255], [0], [7]]
     assert vertex['red'].dtype == np.uint8
+
+
+def test_an_ascii_file_of_plyfile_reads_like_its_binary(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    rows = [(1.5, -2.25, 7), (np.nan, 1e30, 255)]
+    table = np.array(rows, [('x', 'f4'), ('y', 'f8'), ('ring', 'u1')])
+    found = []
+    for name, text in (('text.ply', True), ('binary.ply', False)):
+        vertices = plyfile.PlyElement.describe(table, 'vertex')
+        plyfile.PlyData([vertices], text=text).write(str(tmp_path / name))
+        found.append(read_points(tmp_path / name))
+
+    for name in table.dtype.names:
+        assert found[0][name].dtype == found[1][name].dtype
+        np.testing.assert_array_equal(found[0][name], found[1][name])
