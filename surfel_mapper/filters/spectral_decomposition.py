@@ -3,10 +3,12 @@
 """
 SpectralDecomposition: make surfaces, curves and corners equally dense each, by tensor voting.
 
-The eigenvalues that votes of unknown neighbours add up to are known for points spread evenly on a
-curve, on a surface and in space. A point all of whose eigenvalues are above what its neighbours
-would give it if they filled the radius has them nearer than that: its place is too dense, and
-chance decides whether it stays. Then all vote again, until hardly any have to go.
+Where nothing is known of the neighbours, the eigenvalues that their votes add up to have known
+ratios for points spread evenly on a curve, on a surface and in space; the nearest of these is
+what a point is taken for. Where the largest is more than neighbours that fill the radius would
+make it, they are nearer than that: the place is too dense, and every other point of it, drawn by
+chance, goes. Then all vote again, until hardly any have to go. libpointmatcher tests every point
+for all three, drops four of five at once, and ends well below the density asked for.
 
 Points for which no neighbour is near enough to vote are outliers and are dropped.
 
@@ -30,6 +32,10 @@ from surfel_mapper.scan import Scan
 
 EVEN = 5
 """Fewer points to go in a round mean that the density is even."""
+
+
+RATIOS = np.array([[0.5, 1.0], [0.75, 0.75], [1.0, 1.0]])
+"""Of the smallest and the middle eigenvalue to the largest on a curve, a surface, in space."""
 
 
 @register(theirs='SpectralDecompositionDataPointsFilter')
@@ -80,17 +86,16 @@ class SpectralDecomposition(VotingFilter):
     def stays(self, votes: Votes, random: np.random.Generator) -> Mask:
         """Return which points stay for the next round."""
         lowest, middle, highest = votes.values.T / votes.num_neighbours
-        stays = np.ones(len(lowest), np.bool_)
-        # by dimension: shares of the decay that eigenvalues are, radius, chance of a dense point
-        for dimension, (low, mid, high), radius_m, chance in (
-            (3, (5 / 6, 5 / 6, 5 / 6), self.radius_m, 0.2),
-            (1, (0.5, 1.0, 1.0), 0.5 * self.radius_m, 0.5),
-            (2, (0.75, 0.75, 1.0), self.radius_m, 0.5),
-        ):
-            decay = mean_decay(dimension, self.sigma, radius_m)
-            dense = (lowest >= low * decay) & (middle >= mid * decay) & (highest >= high * decay)
-            stays &= ~dense | (random.random(len(stays)) < chance)
-        return stays
+        with np.errstate(invalid='ignore'):  # nan where there are no votes: then not dense either
+            ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
+        nearest = ((ratios[:, None] - RATIOS) ** 2).sum(axis=2).argmin(axis=1)
+        expected = np.array([
+            mean_decay(1, self.sigma, 0.5 * self.radius_m),
+            mean_decay(2, self.sigma, self.radius_m),
+            mean_decay(3, self.sigma, self.radius_m) * 5.0 / 6.0,
+        ])
+        is_dense = highest > expected[nearest]
+        return np.asarray(~is_dense | (random.random(len(is_dense)) < 0.5))
 
 
 def mean_decay(dimension: int, sigma: float, radius_m: float) -> float:
