@@ -1,0 +1,400 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""LUM: the graph and what it refuses, convergence from afar, weights, and far from the origin."""
+
+from __future__ import annotations
+
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from surfel_mapper.alignment import Graph, LUM
+from surfel_mapper.alignment.angles import poses_of, transforms
+from surfel_mapper.errors import AlignmentError
+
+
+def random_transforms(rng, num, angle_rad, reach_m=3.0):
+    """Return the origin and transforms turned by up to an angle about any axis."""
+    T = np.tile(np.eye(4), (num, 1, 1))
+    for v in range(1, num):
+        axis = rng.normal(size=3)
+        turn = axis / np.linalg.norm(axis) * angle_rad * rng.uniform(0.5, 1.0)
+        T[v, :3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        T[v, :3, 3] = rng.uniform(-reach_m, reach_m, 3)
+    return T
+
+
+def make(rng, T, edges, *, sigma=0.01, num=60, offset=0.0, **settings):
+    """Return a LUM whose pairs see points about an offset from poses T, with noise."""
+    clouds = [[] for _ in T]
+    pairs = []
+    for ends in edges:
+        seen = rng.uniform(-5.0, 5.0, (num, 3)) + offset
+        rows = []
+        for v in ends:
+            local = (seen - T[v, :3, 3]) @ T[v, :3, :3]
+            rows.append(np.arange(num) + num * len(clouds[v]))
+            clouds[v].append(local + rng.normal(scale=sigma, size=seen.shape))
+        pairs.append(np.stack(rows, axis=1))
+    lum = LUM(**settings)
+    for parts in clouds:
+        lum.add_point_cloud(np.concatenate(parts))
+    for ends, rows in zip(edges, pairs, strict=True):
+        lum.set_correspondences(*ends, rows)
+    return lum
+
+
+def chain(num, loops=()):
+    return [*itertools.pairwise(range(num)), *loops]
+
+
+@pytest.mark.parametrize('angle_rad', [0.5, 1.5, 2.8])
+@pytest.mark.parametrize('seed', range(3))
+def test_it_converges_from_no_pose_at_all_whatever_the_rotations(angle_rad, seed):
+    rng = np.random.default_rng(seed)
+    T = random_transforms(rng, 12, angle_rad)
+    lum = make(rng, T, chain(12, [(11, 0), (7, 2), (3, 9)]), max_iterations=60,
+               convergence_threshold=1e-7)  # fmt: skip
+
+    result = lum.compute()
+
+    assert result.converged
+    for v in range(12):
+        np.testing.assert_allclose(lum.transformation(v), T[v], atol=0.02)
+
+
+def test_one_kilometre_from_the_origin_it_is_as_good_as_at_it():
+    errors = []
+    for offset in (0.0, 1000.0):
+        rng = np.random.default_rng(5)
+        T = random_transforms(rng, 5, 0.1)
+        lum = make(rng, T, chain(5, [(4, 0)]), offset=offset, max_iterations=20)
+        lum.compute()
+        seen = [np.linalg.inv(T[v]) @ [offset, offset, offset, 1.0] for v in range(5)]
+        errors.append(
+            max(np.abs((lum.transformation(v) - T[v]) @ seen[v]).max() for v in range(5))
+        )
+
+    assert errors[1] < 0.01
+    assert errors[1] < 3.0 * errors[0]
+
+
+def test_result_is_the_least_squares_of_the_gaps_over_their_variance():
+    # with one edge the optimum is that of the pairs themselves, which scipy finds its own way
+    rng = np.random.default_rng(6)
+    lum = make(rng, random_transforms(rng, 2, 1.0), [(0, 1)], sigma=0.1, max_iterations=50)
+    lum.compute()
+    pairs = lum.correspondences(0, 1)
+    a, b = lum.point_cloud(0)[pairs[:, 0]], lum.point_cloud(1)[pairs[:, 1]]
+
+    def gaps(p):
+        T = transforms(p[None])[0]
+        return (b @ T[:3, :3].T + T[:3, 3] - a).ravel()
+
+    best = least_squares(gaps, lum.pose(1) + 0.01, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+
+    np.testing.assert_allclose(lum.pose(1), best.x, atol=1e-6)
+
+
+def test_exact_pairs_count_in_full_beside_noisy_ones():
+    rng = np.random.default_rng(7)
+    T = random_transforms(rng, 3, 0.3)
+    lum = make(rng, T, [(0, 1), (0, 2)], sigma=0.05, max_iterations=30)
+    exact = rng.uniform(-5.0, 5.0, (50, 3))
+    for v in (1, 2):
+        local = (exact - T[v, :3, 3]) @ T[v, :3, :3]
+        lum.set_point_cloud(v, np.concatenate([lum.point_cloud(v), local]))
+    rows = np.arange(60, 110)
+    lum.set_correspondences(1, 2, np.stack([rows, rows], axis=1))
+
+    result = lum.compute()
+
+    assert not result.dropped
+    relative = np.linalg.inv(lum.transformation(1)) @ lum.transformation(2)
+    np.testing.assert_allclose(relative, np.linalg.inv(T[1]) @ T[2], atol=1e-6)
+
+
+def test_both_directions_count_alike():
+    poses = []
+    for reverse in (False, True):
+        rng = np.random.default_rng(8)
+        edges = chain(4, [(3, 0)])
+        lum = make(rng, random_transforms(rng, 4, 0.4), edges, max_iterations=20)
+        if reverse:
+            turned = LUM(max_iterations=20)
+            for v in range(4):
+                turned.add_point_cloud(lum.point_cloud(v))
+            for s, t in edges:
+                turned.set_correspondences(t, s, lum.correspondences(s, t)[:, ::-1])
+            lum = turned
+        lum.compute()
+        poses.append([lum.pose(v) for v in range(4)])
+
+    np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
+
+
+def test_equal_weights_end_where_none_do():
+    rng = np.random.default_rng(9)
+    T = random_transforms(rng, 2, 1.0)
+    lum = make(rng, T, [(1, 0)], sigma=0.1, max_iterations=50)
+    lum.compute()
+    expected, pairs = lum.transformation(1), lum.correspondences(1, 0)
+    lum.set_pose(1, np.zeros(6))
+    lum.set_correspondences(1, 0, pairs, np.tile(7.0 * np.eye(3), (len(pairs), 1, 1)))
+
+    lum.compute()
+
+    np.testing.assert_allclose(lum.transformation(1), expected, atol=1e-5)
+
+
+def test_planes_hold_each_other_across_alone():
+    # three walls of a room, seen at other places: only weights along the normals agree
+    rng = np.random.default_rng(10)
+    T = random_transforms(rng, 2, 0.2, 0.3)
+    normal = np.repeat(np.eye(3), 40, axis=0)
+    walls = []
+    for v in range(2):
+        seen = rng.uniform(-4.0, 4.0, (120, 3)) * (1.0 - normal) + 5.0 * normal
+        walls.append((seen - T[v, :3, 3]) @ T[v, :3, :3])
+    lum = LUM(max_iterations=50, convergence_threshold=1e-10)
+    for points in walls:
+        lum.add_point_cloud(points)
+    rows = np.arange(120)
+    lum.set_correspondences(
+        1, 0, np.stack([rows, rows], axis=1), normal[:, :, None] * normal[:, None, :]
+    )
+
+    result = lum.compute()
+
+    assert result.converged
+    np.testing.assert_allclose(lum.transformation(1), T[1], atol=1e-6)
+    assert result.residuals[1, 0] < 1e-6
+
+
+def test_edges_with_and_without_weights_go_together():
+    rng = np.random.default_rng(11)
+    T = random_transforms(rng, 4, 0.5)
+    lum = make(rng, T, chain(4, [(3, 0)]), max_iterations=30, convergence_threshold=1e-7)
+    pairs = lum.correspondences(1, 2)
+    lum.set_correspondences(1, 2, pairs, np.tile(np.eye(3), (len(pairs), 1, 1)))
+    lum.set_correspondences(2, 0, np.empty((0, 2), int))
+
+    result = lum.compute()
+
+    assert result.converged
+    assert set(result.dropped) == {(2, 0)}
+    assert list(result.residuals) == [(0, 1), (1, 2), (2, 3), (3, 0), (2, 0)]
+    assert np.isnan(result.residuals[2, 0])
+    for v in range(4):
+        np.testing.assert_allclose(lum.transformation(v), T[v], atol=0.02)
+
+
+def test_points_with_nan_are_passed_over():
+    rng = np.random.default_rng(12)
+    T = random_transforms(rng, 2, 0.3)
+    lum = make(rng, T, [(0, 1)], max_iterations=20)
+    points = lum.point_cloud(1).copy()
+    points[::4] = np.nan
+
+    lum.set_point_cloud(1, points)
+    result = lum.compute()
+
+    assert not result.dropped
+    np.testing.assert_allclose(lum.transformation(1), T[1], atol=0.02)
+    assert np.isnan(lum.transformed_cloud(1)[::4]).all()
+
+
+def test_steps_end_at_the_threshold():
+    rng = np.random.default_rng(13)
+    T = random_transforms(rng, 6, 0.4)
+    few, many = (
+        make(np.random.default_rng(1), T, chain(6), max_iterations=50,
+             convergence_threshold=threshold)
+        for threshold in (1e-2, 1e-9)
+    )  # fmt: skip
+
+    assert few.compute().iterations < many.compute().iterations < 50
+
+
+def test_clouds_and_poses_are_given_back():
+    lum = LUM()
+    points = np.arange(12, dtype=np.float32).reshape(4, 3)
+
+    assert lum.add_point_cloud(points) == 0
+    assert lum.add_point_cloud(points + 1.0, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) == 1
+    points[:] = -1.0  # what was given in is copied
+
+    assert lum.num_vertices == 2
+    np.testing.assert_array_equal(lum.point_cloud(0)[0], [0.0, 1.0, 2.0])
+    np.testing.assert_array_equal(lum.pose(0), np.zeros(6))
+    np.testing.assert_array_equal(lum.pose(1), [1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    expected = Rotation.from_euler('xyz', [0.1, 0.2, 0.3]).as_matrix()
+    np.testing.assert_allclose(lum.transformation(1)[:3, :3], expected, atol=1e-15)
+    moved = lum.point_cloud(1) @ expected.T + [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(lum.transformed_cloud(1), moved)
+    np.testing.assert_allclose(lum.concatenated_cloud(), [*lum.point_cloud(0), *moved])
+    assert LUM().concatenated_cloud().shape == (0, 3)
+
+
+def test_several_graphs_take_turns_in_one_object():
+    rng = np.random.default_rng(14)
+    first = make(rng, random_transforms(rng, 3, 0.3), chain(3))
+    lum = LUM(max_iterations=20)
+    empty = lum.graph
+
+    lum.graph = first.graph
+    lum.compute()
+
+    assert lum.num_vertices == first.num_vertices == 3
+    assert np.abs(first.pose(2)).max() > 0.0
+    lum.graph = empty
+    assert lum.num_vertices == 0
+
+
+def test_other_points_keep_their_pairs():
+    rng = np.random.default_rng(15)
+    T = random_transforms(rng, 2, 0.3)
+    lum = make(rng, T, [(0, 1)], max_iterations=20)
+    lum.compute()
+
+    lum.set_point_cloud(1, lum.point_cloud(1) + np.array([1.0, 0.0, 0.0]))
+    lum.compute()
+
+    expected = T[1] @ [-1.0, 0.0, 0.0, 1.0]
+    np.testing.assert_allclose(lum.pose(1)[:3], expected[:3], atol=0.02)
+
+
+@pytest.fixture
+def pair():
+    lum = LUM()
+    for _ in range(2):
+        lum.add_point_cloud(np.eye(3))
+    lum.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]])
+    return lum
+
+
+@pytest.mark.parametrize(
+    ('refused', 'message'),
+    [
+        (lambda lum: lum.add_point_cloud(np.empty((0, 3))), 'vertex 2: no points'),
+        (lambda lum: lum.add_point_cloud([1.0, 2.0]), r'vertex 2: points of shape \(2,\)'),
+        (lambda lum: lum.add_point_cloud(np.eye(3), [0.0] * 5), 'vertex 2: pose'),
+        (lambda lum: lum.add_point_cloud(np.eye(3), [np.nan] * 6), 'vertex 2: pose'),
+        (lambda lum: lum.set_pose(0, [0.0] * 6), 'vertex 0 is the reference'),
+        (lambda lum: lum.set_pose(1, [np.inf] * 6), 'vertex 1: pose'),
+        (lambda lum: lum.set_pose(2, [0.0] * 6), 'no vertex 2 among 2'),
+        (lambda lum: lum.pose(-1), 'no vertex -1 among 2'),
+        (lambda lum: lum.set_correspondences(0, 5, [[0, 0]]), 'no vertex 5'),
+        (lambda lum: lum.set_correspondences(1, 1, [[0, 0]]), 'edge 1 -> 1: from a vertex to'),
+        (lambda lum: lum.set_correspondences(0, 1, [[0, 3]]), 'names point 3 of vertex 1'),
+        (lambda lum: lum.set_correspondences(0, 1, [[-1, 0]]), 'names point -1 of vertex 0'),
+        (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'whole numbers'),
+        (lambda lum: lum.set_correspondences(0, 1, [0, 1, 2]), r'pairs of shape \(3,\)'),
+        (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], np.eye(3)), 'weights of shape'),
+        (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.full((3, 3), np.nan)]),
+         'all finite'),
+        (lambda lum: lum.correspondences(1, 0), 'no edge 1 -> 0'),
+        (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
+        (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
+        (lambda lum: setattr(lum, 'convergence_threshold', np.nan), 'convergence_threshold nan'),
+        (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
+        (lambda _: LUM().compute(), '0 vertices'),
+    ],
+)  # fmt: skip
+def test_bad_input_is_refused_and_changes_nothing(pair, refused, message):
+    with pytest.raises(AlignmentError, match=message):
+        refused(pair)
+
+    assert pair.num_vertices == 2
+    np.testing.assert_array_equal(pair.correspondences(0, 1), [[0, 0], [1, 1], [2, 2]])
+    np.testing.assert_array_equal(pair.point_cloud(1), np.eye(3))
+    np.testing.assert_array_equal(pair.pose(1), np.zeros(6))
+
+
+def test_pairs_in_one_point_say_nothing(pair):
+    pair.set_correspondences(0, 1, [[0, 0]] * 5)
+
+    result = pair.compute()
+
+    assert result.dropped == {(0, 1): 'all its pairs lie in one point'}
+    assert result.unconnected == (1,)
+
+
+def test_weights_that_are_all_zero_say_nothing(pair):
+    pair.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]], np.zeros((3, 3, 3)))
+
+    assert pair.compute().dropped == {(0, 1): 'all its weights are zero'}
+
+
+def test_the_steps_of_pcl_know_no_weights(pair):
+    pair.jacobian = 'pcl'
+    pair.set_correspondences(0, 1, [[0, 0]] * 3, [np.eye(3)] * 3)
+
+    with pytest.raises(AlignmentError, match='weights'):
+        pair.compute()
+
+
+def test_the_steps_of_pcl_are_refused_where_they_are_singular():
+    rng = np.random.default_rng(16)
+    lum = make(rng, random_transforms(rng, 2, 0.3), [(0, 1)], jacobian='pcl')
+    lum.set_pose(1, [0.0, 0.0, 0.0, 0.0, np.pi / 2, 0.0])
+    before = lum.pose(1)
+
+    try:
+        lum.compute()
+    except AlignmentError:
+        np.testing.assert_array_equal(lum.pose(1), before)
+
+
+def test_a_first_pose_is_ignored_with_a_warning(caplog):
+    lum = LUM()
+
+    lum.add_point_cloud(np.eye(3), [1.0] * 6)
+
+    np.testing.assert_array_equal(lum.pose(0), np.zeros(6))
+    assert 'vertex 0' in caplog.text
+
+
+def test_a_long_chain_with_loops_is_solved():
+    rng = np.random.default_rng(17)
+    T = random_transforms(rng, 200, 0.2)
+    loops = [(20 * k + 19, 20 * k) for k in range(10)]
+    lum = make(rng, T, chain(200, loops), num=20, max_iterations=40, convergence_threshold=1e-6)
+
+    assert lum.compute().converged
+    relative = np.linalg.inv(lum.transformation(198)) @ lum.transformation(199)
+    np.testing.assert_allclose(relative, np.linalg.inv(T[198]) @ T[199], atol=0.03)
+
+
+ANGLES = st.floats(-20.0, 20.0)
+
+
+@given(st.tuples(ANGLES, ANGLES, ANGLES))
+def test_angles_are_found_again_next_to_what_they_were(angles):
+    pose = np.array([[1.0, 2.0, 3.0, *angles]])
+    if abs(np.cos(angles[1])) < 1e-4:
+        return  # roll and yaw are one there
+
+    found = poses_of(transforms(pose), near=pose)
+
+    np.testing.assert_allclose(found, pose, atol=1e-9)
+
+
+def test_at_a_pitch_of_a_quarter_turn_the_rotation_is_kept():
+    pose = np.array([[0.0, 0.0, 0.0, 0.4, np.pi / 2, -0.3]])
+
+    found = poses_of(transforms(pose), near=pose)
+
+    np.testing.assert_allclose(transforms(found), transforms(pose), atol=1e-14)
+
+
+def test_an_empty_graph_has_no_edges():
+    graph = Graph()
+
+    assert graph.ends.shape == (0, 2)
+    assert graph.poses.shape == (0, 6)
