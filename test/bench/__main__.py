@@ -18,7 +18,7 @@ from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
-BENCHES = ('mapping', 'scaling', 'compare', 'accuracy')
+BENCHES = ('mapping', 'scaling', 'compare', 'lum', 'accuracy')
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 

@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The benchmark of LUM makes the graphs that it says it does; how fast is not tested."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from surfel_mapper.alignment import LUM
+from test.bench.lum import Case, CASES, chain, loops, ours, pcl, points
+
+
+def test_graphs_are_connected_and_have_the_edges_they_are_named_for():
+    assert (CASES[0].vertices, len(CASES[0].ends), CASES[0].pairs) == (20, 100, 5000)
+    assert (CASES[1].vertices, len(CASES[1].ends)) == (200, 209)
+    for case in CASES:
+        assert len(set(case.ends)) == len(case.ends)
+        assert {v for ends in case.ends for v in ends} == set(range(case.vertices))
+    assert loops(6, 2)[-2:] == ((0, 2), (3, 5))
+
+
+def test_a_case_is_timed_and_aligned():
+    case = Case('small', 5, chain(5, (1, 2), 7), 30, 4)
+    clouds = points(case)
+
+    assert all(milliseconds > 0.0 for milliseconds in ours(case, clouds))
+
+    lum = LUM(max_iterations=case.iterations)
+    for cloud in clouds:
+        lum.add_point_cloud(cloud)
+    pairs = np.repeat(np.arange(case.pairs)[:, None], 2, axis=1)
+    for ends in case.ends:
+        lum.set_correspondences(*ends, pairs)
+    assert max(lum.compute().residuals.values()) < 0.1
+
+
+def test_without_pcl_its_stated_figures_are_marked_so():
+    assert pcl(CASES[0], points(CASES[0]), None)['pcl'] == 'as stated, not measured'
+    assert pcl(CASES[2], points(CASES[2]), None) == {}
