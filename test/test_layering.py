@@ -48,7 +48,9 @@ PACKAGE_LEVEL = 5
 """The package itself hands on names of up to level 4."""
 
 HOMES = {
+    'backports': 'io/bag',  # zstd
     'builtin_interfaces': 'ros/',
+    'compression': 'io/bag',  # zstd from Python 3.14 on
     'dask': 'cluster/',
     'diagnostic_msgs': 'ros/',
     'distributed': 'cluster/',
@@ -73,7 +75,6 @@ HOMES = {
     'tf2_msgs': 'ros/',
     'tf2_ros': 'ros/',
     'visualization_msgs': 'ros/',
-    'zstandard': 'io/bag',
 }
 """Where alone a foreign package may be imported."""
 

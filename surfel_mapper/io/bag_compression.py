@@ -4,13 +4,14 @@
 Unpacking what bags pack: chunks with zstd, lz4 or bz2, messages and whole files with zstd.
 
 All of it goes piece by piece, so that of bytes that end too early everything before the end is
-had, and so that nothing gets larger than it claims to be.
+had, and so that nothing gets larger than it claims to be. zstd and lz4 are what rosbags brings.
 """
 
 from __future__ import annotations
 
 import bz2
 from pathlib import Path
+import sys
 from typing import Any
 
 from surfel_mapper.errors import BagError, DependencyError
@@ -48,7 +49,6 @@ def unpacked(packed: bytes, compression: str, most: int) -> bytes:
 
 def unpacked_message(packed: bytes | memoryview) -> bytes:
     """Return a message that the recorder packed with zstd."""
-    import_zstd()
     machine = decompressor('zstd')
     content: bytes = machine.decompress(bytes(packed))
     if not machine.eof:
@@ -87,7 +87,7 @@ def decompressor(compression: str) -> Any:
     if compression == 'bz2':
         return bz2.BZ2Decompressor()
     if compression == 'zstd':
-        return import_zstd().ZstdDecompressor().decompressobj()
+        return import_zstd().ZstdDecompressor()
     if compression == 'lz4':
         from lz4.frame import LZ4FrameDecompressor
 
@@ -96,12 +96,15 @@ def decompressor(compression: str) -> Any:
 
 
 def import_zstd() -> Any:
-    """Return the module of zstd."""
+    """Return the module of zstd: of Python's library from 3.14 on, before that a copy of it."""
     try:
-        import zstandard
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
+            from backports import zstd
     except ImportError as error:
         raise DependencyError(
-            f'zstandard cannot be loaded ({error}). It unpacks compressed bags; install it with '
-            '`pip install zstandard`'
+            f'backports.zstd cannot be loaded ({error}). It unpacks compressed bags; install it '
+            'with `pip install backports.zstd`'
         ) from error
-    return zstandard
+    return zstd
