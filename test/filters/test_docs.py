@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""docs/filters.md: its chain loads, its example of an own filter runs, its table is complete."""
+
+from __future__ import annotations
+
+import configparser
+from importlib import import_module
+import inspect
+from pathlib import Path
+import re
+
+import pytest
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters import registry
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.registry import all_filters
+
+PAGE = (Path(__file__).parents[2] / 'docs/filters.md').read_text(encoding='utf-8')
+
+
+@pytest.fixture(autouse=True)
+def own_registry(monkeypatch):
+    """Leave the registry as it was, whatever the example registers."""
+    registry.load_built_in()
+    monkeypatch.setattr(registry, '_FILTERS', dict(registry._FILTERS))
+
+
+def blocks(language):
+    return re.findall(rf'```{language}\n(.*?)```', PAGE, re.DOTALL)
+
+
+def test_the_chain_loads(tmp_path):
+    (text,) = blocks('yaml')
+    (tmp_path / 'chain.yaml').write_text(text)
+    names = ('1 remove_nan', '2 body_box', '3 range_limit', '4 voxel_grid')
+    assert Chain.load(tmp_path / 'chain.yaml').names == names
+
+
+def test_the_example_of_an_own_filter_runs_and_is_checked_like_others(tmp_path, monkeypatch):
+    (tmp_path / 'documented_filter.py').write_text('\n'.join(blocks('python')))
+    monkeypatch.syspath_prepend(tmp_path)
+    module = import_module('documented_filter')  # asserts what the page says
+    assert registry.find('drop_dim') is module.DropDim
+    with pytest.raises(ConfigError, match=r'min_intensity: -1, expected a value in \[0, inf\]'):
+        Chain.from_list([{'drop_dim': {'min_intensity': -1}}])
+
+
+def test_the_entry_point_has_the_group_that_is_looked_for():
+    (text,) = blocks('ini')
+    content = configparser.ConfigParser()
+    content.read_string(text)
+    assert registry.GROUP in content['options.entry_points']
+    assert 'drop_dim = ' in content['options.entry_points'][registry.GROUP]
+
+
+def test_the_table_has_every_filter_with_its_line():
+    rows = re.findall(r'^\| `(\w+)` \| (\w*) \| (.*) \|$', PAGE, re.MULTILINE)
+    assert rows == [
+        (
+            cls.name,
+            cls.theirs.removesuffix('DataPointsFilter'),
+            inspect.getdoc(cls).partition('\n')[0],
+        )
+        for cls in all_filters()
+    ]

@@ -1,0 +1,246 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Chains with the filters and values that others' public documentation shows, run as they are.
+
+Sources: libpointmatcher, doc/ (DataFilters, ApplyingDataFilters, ICPIntro, DefaultICPConfig) and
+examples/; norlab_icp_mapper, docs/ (MapperConfiguration, UsingInRos) and examples/config;
+norlab_icp_mapper_ros, config/.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters.chain import Chain
+from test.filters.examples import scan_of
+
+CONVERT = """
+- BoundingBoxDataPointsFilter:
+   xMin: -4.0
+   xMax: 4.0
+   yMin: -4.0
+   yMax: 4.0
+   zMin: -4.0
+   zMax: 4.0
+   removeInside: 1
+- SamplingSurfaceNormalDataPointsFilter:
+    knn: 10
+- ObservationDirectionDataPointsFilter
+- OrientNormalsDataPointsFilter
+"""
+
+ICP = """
+readingDataPointsFilters:
+  - RandomSamplingDataPointsFilter:
+      prob: 0.5
+referenceDataPointsFilters:
+  - SamplingSurfaceNormalDataPointsFilter:
+      knn: 10
+matcher:
+  KDTreeMatcher:
+    knn: 1
+outlierFilters:
+  - TrimmedDistOutlierFilter:
+      ratio: 0.9
+errorMinimizer:
+  PointToPlaneErrorMinimizer
+inspector:
+  VTKFileInspector:
+     baseFileName : vissteps
+     dumpDataLinks : 1
+logger:
+  FileLogger
+"""
+
+EMPTY_ICP = """
+readingDataPointsFilters:
+  - IdentityDataPointsFilter
+referenceDataPointsFilters:
+  - IdentityDataPointsFilter
+matcher:
+  KDTreeMatcher
+"""
+
+DEVIATION = """
+- AddDescriptorDataPointsFilter:
+        descriptorName: deviation
+        descriptorDimension: 9
+        descriptorValues: [0.0009, 0, 0, 0, 0.0009, 0, 0, 0, 0.0009]
+"""
+
+MAPPER = """
+input:
+  - BoundingBoxDataPointsFilter:
+      xMin: -1.5
+      xMax: 0.5
+      yMin: -1
+      yMax: 1
+      zMin: -1
+      zMax: 0.5
+      removeInside: 1
+
+  - BoundingBoxDataPointsFilter:
+      xMin: -6
+      xMax: -1.5
+      yMin: -2.5
+      yMax: 2.5
+      zMin: -1
+      zMax: 1
+      removeInside: 1
+
+  - AddDescriptorDataPointsFilter:
+      descriptorName: probabilityDynamic
+      descriptorDimension: 1
+      descriptorValues: [0.6] # at first
+
+post:
+    - SurfaceNormalDataPointsFilter:
+        knn: 15
+
+    - CutAtDescriptorThresholdDataPointsFilter:
+        descName: probabilityDynamic
+        useLargerThan: 1
+        threshold: 0.65
+
+mapper:
+  updateCondition:
+    type: distance
+    value: 1.0
+  sensorMaxRange: 200
+"""
+
+INPUT = """
+input:
+  - RandomSamplingDataPointsFilter:
+      prob: 0.3
+      randomSamplingMethod: 1
+      seed: 0
+"""
+
+MAPPER_ROS = """
+input:
+    - RandomSamplingDataPointsFilter:
+          prob: 0.1
+    - AddDescriptorDataPointsFilter:
+          descriptorName: probabilityDynamic
+          descriptorDimension: 1
+          descriptorValues: [0.6]
+    - ObservationDirectionDataPointsFilter:
+    - SamplingSurfaceNormalDataPointsFilter:
+          ratio: 0.5
+          knn: 7
+          samplingMethod: 0
+          maxBoxDim: inf
+          averageExistingDescriptors: 1
+          keepNormals: 1
+          keepDensities: 0
+          keepEigenValues: 0
+          keepEigenVectors: 0
+icp:
+    readingDataPointsFilters:
+        - RandomSamplingDataPointsFilter:
+              prob: 0.1
+    referenceDataPointsFilters:
+post:
+"""
+
+EXAMPLES = """
+- BoundingBoxDataPointsFilter: {xMin: -1.0, xMax: 1.0, yMin: -1.0, yMax: 1.0, zMin: -1.0,
+                                zMax: 2.0, removeInside: 1}
+- MaxDistDataPointsFilter: {maxDist: 10.0, dim: -1}
+- DistanceLimitDataPointsFilter: {dist: 10.0, dim: -1, removeInside: 0}
+- MaxQuantileOnAxisDataPointsFilter: {dim: 0, ratio: 0.5, removeBeyond: 1}
+- RandomSamplingDataPointsFilter: {prob: 0.9}
+- VoxelGridDataPointsFilter: {vSizeX: 0.2, vSizeY: 0.2, vSizeZ: 0.2, useCentroid: 1}
+- OctreeGridDataPointsFilter: {maxSizeByNode: 0.2, samplingMethod: 3}
+- ObservationDirectionDataPointsFilter: {x: 0, y: 0, z: 0}
+- SurfaceNormalDataPointsFilter: {knn: 20, epsilon: 0, keepNormals: 1, keepDensities: 1}
+- OrientNormalsDataPointsFilter: {towardCenter: 1}
+- NormalSpaceDataPointsFilter: {nbSample: 5000, seed: 1, epsilon: 0.09817477042}
+- CovarianceSamplingDataPointsFilter: {nbSample: 25000, torqueNorm: 1}
+- MaxDensityDataPointsFilter: {maxDensity: 50000}
+- SimpleSensorNoiseDataPointsFilter: {sensorType: 1}
+- SaliencyDataPointsFilter: {k: 50, sigma: 0.2}
+- SpectralDecompositionDataPointsFilter: {k: 50, sigma: 0.2, radius: 0.2}
+- SamplingSurfaceNormalDataPointsFilter: {knn: 100, ratio: 0.5, samplingMethod: 1}
+- MaxPointCountDataPointsFilter: {seed: 1, maxCount: 1000}
+- ShadowDataPointsFilter
+"""
+"""The examples of the page that lists the filters, one after another."""
+
+
+def room(number=3000, seed=1):
+    """Return the walls, the floor and the ceiling of a room of 12 by 8 by 3 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform([-6, -4, -1], [6, 4, 2], (number, 3))
+    side = rng.integers(0, 6, number)
+    limits = np.array([[-6.0, 6.0], [-4.0, 4.0], [-1.0, 2.0]])
+    points[np.arange(number), side % 3] = limits[side % 3, side // 3]
+    return scan_of(points.astype(np.float32), intensity=rng.uniform(0, 1, number))
+
+
+def run(tmp_path, text, *keys):
+    path = tmp_path / 'chain.yaml'
+    path.write_text(text, encoding='utf-8')
+    scan = room()
+    for key in keys or ('',):
+        chain = Chain.load(f'{path}#{key}')
+        scan, _ = chain.run(scan)
+    return scan
+
+
+def test_the_chain_of_the_conversion_tutorial(tmp_path):
+    found = run(tmp_path, CONVERT)
+    assert (np.abs(found.points) >= 4.0).any(axis=1).all()
+    assert 0.35 < len(found) / len(room()) < 0.55
+    towards = (found.columns['normals'] * found.columns['observationDirections']).sum(axis=1)
+    assert (towards >= 0.0).all()
+
+
+def test_the_filters_of_the_registration_tutorial(tmp_path):
+    assert abs(len(run(tmp_path, ICP, 'readingDataPointsFilters')) - 1500) < 150
+    assert 'normals' in run(tmp_path, ICP, 'referenceDataPointsFilters').columns
+    found = run(tmp_path, EMPTY_ICP, 'readingDataPointsFilters', 'referenceDataPointsFilters')
+    np.testing.assert_array_equal(found.points, room().points)
+
+
+def test_what_is_no_filter_of_points_is_refused_by_name(tmp_path):
+    with pytest.raises(ConfigError, match='TrimmedDistOutlierFilter: no such filter'):
+        run(tmp_path, ICP, 'outlierFilters')
+    with pytest.raises(ConfigError, match=r'a mapping, .*#readingDataPointsFilters'):
+        run(tmp_path, ICP)
+
+
+def test_the_deviation_of_points(tmp_path):
+    found = run(tmp_path, DEVIATION)
+    np.testing.assert_allclose(
+        found.columns['deviation'].reshape(-1, 3, 3), np.tile(0.0009 * np.eye(3), (3000, 1, 1)),
+        rtol=1e-6,
+    )
+
+
+def test_the_filters_of_the_mappers_examples(tmp_path):
+    found = run(tmp_path, MAPPER, 'input', 'post')
+    x, y, z = found.points.T
+    assert not ((np.abs(y) < 1.0) & (x > -1.5) & (x < 0.5) & (z > -1.0) & (z < 0.5)).any()
+    assert set(found.columns) == {'intensity', 'probabilityDynamic', 'normals'}
+    assert len(run(tmp_path, INPUT, 'input')) == pytest.approx(900, abs=130)
+
+
+def test_the_filters_of_the_mapper_for_ros(tmp_path):
+    keys = ('icp.readingDataPointsFilters', 'icp.referenceDataPointsFilters', 'post')
+    found = run(tmp_path, MAPPER_ROS, 'input', *keys)
+    assert 2 < len(found) < 60
+    assert {'normals', 'observationDirections', 'probabilityDynamic'} <= set(found.columns)
+
+
+def test_the_examples_of_every_filter_one_after_another(tmp_path):
+    path = tmp_path / 'chain.yaml'
+    path.write_text(EXAMPLES, encoding='utf-8')
+    found, steps = Chain.load(path).run(room(20_000))
+    assert len(steps) == 19
+    assert 10 < len(found) <= 1000
+    assert {'normals', 'densities', 'simpleSensorNoise', 'labels', 'lambda1'} <= set(found.columns)

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A chain in the pipeline: what filters learn of the robot, and what is reported of them."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+
+S = 10**9
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def mapper_with(tmp_path, chain, mount=(0.0, 0.0, 1.0, *LEVEL)):
+    path = tmp_path / 'filters.yaml'
+    path.write_text(chain, encoding='utf-8')
+    mapper = Mapper(Config.from_mapping({
+        'pose.source': 'odometry',
+        'frames.base_to_sensor': mount,
+        'filters': str(path),
+        'map.min_points': 1,
+    }))
+    mapper.add_pose('odom', 'base_link', 0, (0.0, 0.0, 0.0), LEVEL)
+    mapper.add_pose('odom', 'base_link', 5 * S, (0.0, 0.0, 0.0), LEVEL)
+    return mapper
+
+
+def cloud(number=500, seed=1):
+    return np.random.default_rng(seed).uniform(-5.0, 5.0, (number, 3)).astype(np.float32)
+
+
+def insert(mapper, *clouds):
+    updates = []
+    for second, points in enumerate(clouds, start=1):
+        mapper.add_scan(Scan(points=points, stamp_ns=second * S, frame_id='lidar'))
+        updates += mapper.insert_ready()
+    return updates
+
+
+def test_only_what_the_chain_leaves_is_mapped_and_each_filter_is_reported(tmp_path):
+    mapper = mapper_with(tmp_path, '- range_limit: {min_m: 0.0, max_m: 4.0}\n- max_point_count')
+    clouds = [cloud(seed=seed) for seed in (1, 2)]
+    updates = insert(mapper, *clouds)
+    near = [points[np.linalg.norm(points, axis=1) <= 4.0] for points in clouds]
+    expected = SurfelMap(0.5)
+    for points in near:
+        pose = np.eye(4)
+        pose[2, 3] = 1.0
+        expected.insert(expected.reduce(points, pose, origin=pose[:3, 3], min_range_m=0.1))
+    assert mapper.map.digest() == expected.digest()
+    assert all(update.milliseconds['filter'] >= 0.0 for update in updates)
+
+    number = sum(map(len, near))
+    summary = json.loads(json.dumps(mapper.summary()))
+    assert list(summary['filters']) == ['1 range_limit', '2 max_point_count']
+    first, second = summary['filters'].values()
+    assert (first['points_in'], first['points_out']) == (1000, number)
+    assert (second['points_in'], second['points_out']) == (number, number)
+    assert set(first['milliseconds']) >= {'median', 'p99'}
+    assert summary['points_left_out']['filtered'] == 1000 - number
+    assert Chain.from_list(summary['filter_chain']).filters == mapper.chain.filters
+
+
+def test_filters_know_where_the_sensor_is_on_the_robot(tmp_path):
+    box = '{x_min_m: -9, x_max_m: 9, y_min_m: -9, y_max_m: 9, z_min_m: -9, z_max_m: 0}'
+    mapper = mapper_with(tmp_path, f'- body_box: {box}')
+    insert(mapper, np.array([[1.0, 1.0, -0.9], [1.0, 1.0, -1.1]], np.float32))
+    assert mapper.counters.points == 1
+
+
+def test_a_scan_that_a_filter_cannot_take_is_dropped_and_counted(tmp_path):
+    mapper = mapper_with(tmp_path, '- shadow')
+    insert(mapper, cloud())
+    assert dict(mapper.counters.dropped) == {'filter': 1}
+
+
+def test_a_scan_of_which_nothing_is_left_is_dropped_and_counted(tmp_path):
+    mapper = mapper_with(tmp_path, '- max_dist: {max_m: 0}')
+    insert(mapper, cloud())
+    assert dict(mapper.counters.dropped) == {'filtered_out': 1}
+
+
+def test_a_chain_that_cannot_be_built_is_refused_at_once(tmp_path):
+    with pytest.raises(ConfigError, match=r'filters.yaml: filter 1: shadw: .*did you mean shadow'):
+        mapper_with(tmp_path, '- shadw')
+
+
+def test_all_kernels_are_compiled_before_the_first_scan(tmp_path):
+    mapper = mapper_with(tmp_path, '- voxel_grid\n- ground\n- saliency: {num_neighbours: 6}')
+    mapper.warm_up()
+    assert mapper.counters.filters == {}
+    insert(mapper, cloud())
+    assert mapper.counters.mapped == 1
+
+
+def test_diagnostics_have_points_and_times_of_every_filter(tmp_path):
+    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    from surfel_mapper.ros.diagnostics import diagnostics
+
+    mapper = mapper_with(tmp_path, '- remove_nan')
+    insert(mapper, cloud())
+    message = diagnostics('node', 0, 0, 'ok', mapper.counters.summary())
+    values = {each.key: each.value for each in message.status[0].values}
+    assert values['filters.1 remove_nan.points_in'] == '500'
+    assert values['filters.1 remove_nan.points_out'] == '500'
+    assert float(values['filters.1 remove_nan.milliseconds.median']) >= 0.0
