@@ -165,6 +165,11 @@ class TsdfConfig(Stage):
         return self.dropoff_m or self.voxel_size_m
 
     @property
+    def reach_behind_m(self) -> float:
+        """How far behind a surface voxels change."""
+        return self.truncation_m + self.extra_distance_m
+
+    @property
     def votes_per_voxel(self) -> int:
         """How many numbers a voxel keeps for its label."""
         widths = {'majority': self.num_labels, 'first_k': 2 * self.first_k}

@@ -21,62 +21,40 @@ from numba import njit
 import numpy as np
 
 # What rays reach, float64 m.
-TAU = 0
-NEAR = 1
-MAX_RANGE = 2
-CARVE = 3
+BEFORE = 0
+"""How far before a surface rays matter."""
+BEHIND = 1
+NEAR = 2
+MAX_RANGE = 3
+CARVE = 4
 """Not 0: from the sensor on."""
-ROW_FREE = 4
+ROW_FREE = 5
 """Range up to which neighbouring rows are an eighth of a block apart."""
-COLUMN_FREE = 5
-ROW_BAND = 6
+COLUMN_FREE = 6
+ROW_BAND = 7
 """Range up to which neighbouring rows are half a voxel apart."""
-COLUMN_BAND = 7
-NUM_REACH = 8
+COLUMN_BAND = 8
+NUM_REACH = 9
 
-_TOP = np.int64(1) << 40
+@njit(cache=True, nogil=True)
+def lowest_bits(count):
+    """Return the largest power of two that divides each number from 0 on; a large one for 0."""
+    bits = np.empty(count, np.float64)
+    for number in range(count):
+        bits[number] = number & -number
+    bits[0] = 1e12
+    return bits
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def lowest_bit(number):
-    """Return the largest power of two that divides a number; a large one for 0."""
-    return number & -number if number > 0 else _TOP
-
-
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def covered(image, row, column, reach):
+def covered(image, row, column, down, across, reach):
     """Return up to where coarser rays are so near to a ray that it need not be walked, m."""
-    across, down = lowest_bit(column), lowest_bit(row)
     beside = above = 0.0
     if column > 0:
-        beside = min(reach[COLUMN_FREE] / across, np.float64(image[row, column - across]))
+        beside = min(reach[COLUMN_FREE] / across, np.float64(image[row, column - np.int64(across)]))
     if row > 0:
-        above = min(reach[ROW_FREE] / down, np.float64(image[row - down, column]))
+        above = min(reach[ROW_FREE] / down, np.float64(image[row - np.int64(down), column]))
     return max(beside, above)
-
-
-@njit(cache=True, nogil=True, error_model='numpy', inline='always')
-def stretch(image, row, column, reach):
-    """Return from where to where a ray is walked, m; the end is before the start if nowhere."""
-    range_m = np.float64(image[row, column])
-    if range_m <= 0.0:
-        return 1.0, 0.0
-    carve, clears = reach[CARVE] != 0.0, range_m > reach[MAX_RANGE]
-    in_band = (
-        not clears
-        and 2 * lowest_bit(column) * range_m > reach[COLUMN_BAND]
-        and 2 * lowest_bit(row) * range_m > reach[ROW_BAND]
-    )
-    if not carve:
-        if not in_band:
-            return 1.0, 0.0
-        return max(reach[NEAR], range_m - reach[TAU]), range_m + reach[TAU]
-    start = covered(image, row, column, reach)
-    if clears:
-        return max(start, reach[NEAR]), reach[MAX_RANGE]
-    if not in_band:
-        return max(start, reach[NEAR]), range_m - reach[TAU]
-    return max(min(start, range_m - reach[TAU]), reach[NEAR]), range_m + reach[TAU]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -91,10 +69,29 @@ def mark_rays(image, directions, pose, reach, side, marks):
     side        blocks along the edge of the cube, which all rays stay in
     marks       (side^3 / 64,) int64, bit by bit, z fastest
     """
-    for row in range(directions.shape[0]):
-        for column in range(directions.shape[1]):
-            start, end = stretch(image, row, column, reach)
-            if end < start:
+    rows, columns = directions.shape[0], directions.shape[1]
+    down, across = lowest_bits(rows), lowest_bits(columns)
+    least_column = (reach[COLUMN_BAND] / 2.0 / across).astype(np.float32)
+    near, max_range = reach[NEAR], reach[MAX_RANGE]
+    carve = reach[CARVE] != 0.0
+    for row in range(rows):
+        least_row = np.float32(reach[ROW_BAND] / 2.0 / down[row])
+        for column in range(columns):
+            measured = image[row, column]
+            in_band = measured > max(least_row, least_column[column])
+            if measured <= 0.0 or not (in_band or carve):
+                continue
+            range_m = np.float64(measured)
+            clears = range_m > max_range
+            start = range_m - reach[BEFORE]
+            end = range_m + reach[BEHIND] if in_band else start
+            if clears:
+                start, end = max_range, max_range
+            if carve:
+                free = covered(image, row, column, down[row], across[column], reach)
+                start = min(free, start) if in_band else free
+            start = max(start, near)
+            if end < start or (clears and not carve):
                 continue
             x = np.float64(directions[row, column, 0])
             y = np.float64(directions[row, column, 1])

@@ -278,10 +278,10 @@ def fuse(signed, weight, max_weight, mean, total):
     signed, weight, mean, total  (N,) float32
     """
     for n in range(len(mean)):
-        w = weight[n]
-        together = total[n] + w
-        value = (mean[n] * total[n] + signed[n] * w) / together
-        mean[n] = value if w > _ZERO else mean[n]
+        # So written, a first measurement and one equal to the mean leave no rounding.
+        gain = weight[n] / (total[n] + weight[n])
+        value = mean[n] + (signed[n] - mean[n]) * gain
+        mean[n] = value if weight[n] > _ZERO else mean[n]
     for n in range(len(mean)):
         together = total[n] + weight[n]
         total[n] = together if together < max_weight else max_weight

@@ -69,8 +69,8 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
         if w == _ZERO or s >= tau or (skip_extra and s <= -tau):
             continue
         i, j, du, dv = pixel(u[n], v[n], mixed[n])
-        before = color[3, n]
-        together = before + w
+        together = color[3, n] + w
+        gain = w / together
         for channel in range(3):
             value = np.float32(image[j, i, channel])
             if mixed[n] != 0:
@@ -79,7 +79,7 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
                 left = np.float32(image[j + 1, i, channel])
                 right = np.float32(image[j + 1, i + 1, channel])
                 value = upper + dv * (left + du * (right - left) - upper)
-            color[channel, n] = (color[channel, n] * before + value * w) / together
+            color[channel, n] += (value - color[channel, n]) * gain
         color[3, n] = together
 
 

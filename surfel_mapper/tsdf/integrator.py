@@ -224,7 +224,7 @@ def settings(config: TsdfConfig, image: RangeImage) -> Float32:
     found[kernels.EXTRA] = config.extra_distance_m
     found[kernels.MIN_RANGE] = sensor.min_range_m
     found[kernels.MAX_RANGE] = sensor.max_range_m
-    found[kernels.LIMIT] = image.largest_m + config.truncation_m
+    found[kernels.LIMIT] = image.largest_m + config.reach_behind_m
     found[kernels.MAX_DIFFERENCE] = config.max_difference_m
     found[kernels.MAX_DIFFERENCE_RATIO] = config.max_difference_ratio
     found[kernels.MAX_OFFSET] = config.max_ray_offset_voxels * config.voxel_size_m * is_lidar

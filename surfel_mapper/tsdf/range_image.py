@@ -139,14 +139,15 @@ def from_depth(
             f'depth image of {depth.shape}, expected {(sensor.rows, sensor.columns)} as the '
             'camera has (rows, columns)'
         )
-    if depth.dtype not in (np.float32, np.float64, np.uint16):
+    native_type = depth.dtype.newbyteorder('=')
+    if native_type not in (np.float32, np.float64, np.uint16):
         raise CloudFormatError(f'depth: {depth.dtype}, expected float32, float64 or uint16')
     if scale is None:
-        scale = 1e-3 if depth.dtype == np.uint16 else 1.0
+        scale = 1e-3 if native_type == np.uint16 else 1.0
     if not 0.0 < scale < np.inf:
         raise CloudFormatError(f'depth scale: {scale}, expected positive and finite')
     image = np.empty((sensor.rows, sensor.columns), np.float32)
-    native = np.ascontiguousarray(depth, depth.dtype.newbyteorder('='))
+    native = np.ascontiguousarray(depth, native_type)
     largest, used = kernels.from_depth(
         native, np.float32(scale), sensor.ray_length, limits(sensor), image
     )

@@ -81,7 +81,7 @@ def half_side(config: TsdfConfig, image: RangeImage) -> int:
     """Return how many blocks from the sensor's the farthest one is; 0 if nothing is measured."""
     if image.largest_m == 0.0:
         return 0
-    return int((image.largest_m + config.truncation_m) / config.block_size_m) + 2
+    return int((image.largest_m + config.reach_behind_m) / config.block_size_m) + 2
 
 
 def reach(config: TsdfConfig, image: RangeImage) -> Float64:
@@ -89,8 +89,8 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [config.voxel_size_m / 2.0 / pitch for pitch in sensor.pitch_rad]
-    common = [config.truncation_m, sensor.min_range_m, sensor.max_range_m, float(config.carve)]
-    return np.array([*common, *free, *band])
+    ends = [config.truncation_m, config.reach_behind_m, sensor.min_range_m, sensor.max_range_m]
+    return np.array([*ends, float(config.carve), *free, *band])
 
 
 def in_view(
@@ -108,6 +108,6 @@ def in_view(
         centres = ((index + 0.5) * size_m - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
         distance = np.linalg.norm(centres, axis=1)
         near = distance >= sensor.min_range_m - radius_m
-        far = distance <= image.largest_m + config.truncation_m + radius_m
+        far = distance <= image.largest_m + config.reach_behind_m + radius_m
         found.append(index[near & far & sensor.sees(centres, radius_m)])
     return np.concatenate(found)

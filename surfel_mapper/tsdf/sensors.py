@@ -102,7 +102,7 @@ class Camera:
         """Range of each pixel at depth 1, (rows, columns)."""
         x = (np.arange(self.columns) - self.cx) / self.fx
         y = (np.arange(self.rows) - self.cy) / self.fy
-        length: Float32 = np.sqrt(x * x + (y * y)[:, None] + 1.0).astype(np.float32)
+        length: Float32 = np.asarray(np.sqrt(x * x + (y * y)[:, None] + 1.0), np.float32)
         return length
 
     @cached_property
@@ -210,14 +210,14 @@ class Lidar:
         descends = all(high > low for high, low in itertools.pairwise(beams))
         checks = [
             *range_checks(self),
+            ('beam_elevations_deg', len(beams) in (0, self.rows), 'one for each row'),
+            ('beam_elevations_deg', descends, 'descending'),
             ('rows', self.rows >= 2, 'at least 2 beams'),
             ('columns', self.columns >= 2, 'at least 2'),
             ('vertical_fov_deg', 0.0 < self.vertical_fov_deg < 180.0, 'between 0 and 180'),
             ('vertical_fov_top_deg', bottom > -90.0 and top < 90.0, 'beams between -90 and 90'),
             ('horizontal_fov_deg', 0.0 < self.horizontal_fov_deg <= 360.0, 'in (0, 360]'),
             ('first_azimuth_deg', -360.0 <= self.first_azimuth_deg <= 360.0, 'in [-360, 360]'),
-            ('beam_elevations_deg', len(beams) in (0, self.rows), 'one for each row'),
-            ('beam_elevations_deg', descends, 'descending'),
         ]
         refuse_unless(self, checks)
 
@@ -267,7 +267,7 @@ class Lidar:
     @cached_property
     def azimuths_rad(self) -> Float64:
         """Azimuth of each column."""
-        steps: Float64 = np.arange(self.columns) * self._column_rad
+        steps = np.arange(self.columns, dtype=np.float64) * self._column_rad
         return math.radians(self.first_azimuth_deg) - steps
 
     @property

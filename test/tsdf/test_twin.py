@@ -66,7 +66,7 @@ def test_the_kernel_equals_its_numpy_twin(sensor, settings):
         T = POSE.copy()
         T[0, 3] += 0.3 * number
         index = BlockSelection(config).blocks(image, T)
-        twin.integrate(config, expected, image, T, index[index @ [1, 2, 4] % 3 == 0])
+        twin.integrate(config, expected, image, T, index[index @ [1, 2, 4] % 7 == 0])
         one.integrate(image, T, number)
     checked = 0
     for block, (D, W, C, W_color) in expected.items():
@@ -81,7 +81,7 @@ def test_the_kernel_equals_its_numpy_twin(sensor, settings):
         assert close(one.blocks.color[row, :3].T, C, 2e-3)[same].all()
         assert close(one.blocks.color[row, 3], W_color)[same].all()
         checked += (W > 0).sum()
-    assert checked > 500
+    assert checked > 100
 
 
 def close(found, expected, absolute=1e-5):

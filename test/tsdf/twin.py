@@ -109,7 +109,8 @@ def measurements(config, image, T_map_sensor, block):
     masked = {*config.dynamic_labels, *config.invalid_labels}
     for n, p in enumerate(points):
         d = np.linalg.norm(p)
-        if np.isnan(u[n]) or not sensor.min_range_m <= d <= image.largest_m + tau:
+        farthest = image.largest_m + config.reach_behind_m
+        if np.isnan(u[n]) or not sensor.min_range_m <= d <= farthest:
             continue
         value, pixels = look_up(config, sensor, image.range_m, p, u[n], v[n])
         if value <= 0 or (value > sensor.max_range_m and d > sensor.max_range_m):

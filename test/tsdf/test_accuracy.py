@@ -1,0 +1,135 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""T1 to T4, T10, T19: distances and zero levels against surfaces whose equations are known."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.tsdf.sensors import Camera, Lidar
+from test.tsdf.scenes import fused, image_of, plane, sphere, VGA, voxels, zero_crossings
+
+ANGLES = (0.0, 45.0, 70.0)
+
+
+def interior(sensor, points):
+    """
+    Return which points are in the middle of the view of a camera.
+
+    60 pixels are 6.5 deg: towards the edges of the image rays meet the plane at other angles.
+    """
+    u = sensor.fx * points[:, 0] / points[:, 2] + sensor.cx
+    v = sensor.fy * points[:, 1] / points[:, 2] + sensor.cy
+    return (abs(u - 320) < 60) & (abs(v - 240) < 60)
+
+
+@pytest.mark.parametrize(
+    ('interpolation', 'bounds'),
+    [('adaptive', (1e-4, 1e-4, 1e-4)), ('nearest', (0.002, 0.008, 0.015))],
+)
+def test_distances_to_a_plane_are_those_along_the_rays(interpolation, bounds):
+    for angle, bound in zip(ANGLES, bounds, strict=True):
+        range_m, normal = plane(VGA, angle)
+        sizes = dict(voxel_size_m=0.05, truncation_m=0.15)
+        blocks = fused(image_of(VGA, range_m), **sizes, interpolation=interpolation)
+        points, D, _ = voxels(blocks)
+        d = np.linalg.norm(points, axis=1)
+        truth = 2.0 * normal[2] / (points @ normal) * d - d
+        inside = interior(VGA, points) & (abs(truth) < 0.14)
+        error = abs(D - truth)[inside]
+        assert inside.sum() > 50
+        found = np.percentile(error, 99) if interpolation == 'adaptive' else error.max()
+        assert found <= bound, angle
+
+
+def test_the_zero_level_of_a_plane_lies_on_it():
+    # At 70 deg a ray's range is so curved that on an edge of a cube, h = 0.05 m across the rays,
+    # linear interpolation is R'' h^2 / 8 cos(70 deg) = 0.017 voxels off in the middle.
+    for angle, bound in zip(ANGLES, (0.005, 0.006, 0.018), strict=True):
+        range_m, normal = plane(VGA, angle)
+        blocks = fused(image_of(VGA, range_m), voxel_size_m=0.05, truncation_m=0.15)
+        vertices = zero_crossings(blocks)
+        vertices = vertices[interior(VGA, vertices)]
+        assert len(vertices) > 20
+        error = abs(vertices @ normal - 2.0 * normal[2]) / 0.05
+        assert error.max() <= bound, angle
+        assert error.mean() <= 0.012, angle
+
+
+def test_the_zero_level_of_a_ball_lies_on_it_and_not_behind_its_silhouette():
+    centre = np.array([0.0, 0.0, 2.0])
+    blocks = fused(
+        image_of(VGA, sphere(VGA, centre, 0.5)), voxel_size_m=0.05, truncation_m=0.15
+    )
+    vertices = zero_crossings(blocks)
+    error = abs(np.linalg.norm(vertices - centre, axis=1) - 0.5)
+    assert len(vertices) > 400
+    assert error.mean() <= 0.03 * 0.05
+    assert np.percentile(error, 95) <= 0.08 * 0.05
+    # The silhouette is seen where rays touch: at (4 - 0.25) / 2 m depth.
+    assert vertices[:, 2].max() <= (4.0 - 0.25) / 2.0 + 0.05
+
+
+@pytest.mark.parametrize(
+    'sensor',
+    [
+        Camera(columns=200, rows=150, fx=160.0, fy=160.0, cx=100.0, cy=75.0),
+        Lidar(rows=32, columns=512, vertical_fov_deg=40.0),
+    ],
+    ids=['camera', 'lidar'],
+)
+def test_a_surface_of_one_range_has_a_zero_level(sensor):
+    blocks = fused(
+        image_of(sensor, np.full((sensor.rows, sensor.columns), 2.0)),
+        voxel_size_m=0.1,
+        truncation_m=0.3,
+    )
+    vertices = zero_crossings(blocks)
+    assert len(vertices) > 200
+    assert abs(np.linalg.norm(vertices, axis=1) - 2.0).max() < 0.005
+
+
+def test_between_a_near_and_a_far_wall_there_is_no_curtain_unless_all_is_mixed():
+    row, column = np.indices((480, 640))  # a slanted edge, so that voxels lie about it anyhow
+    depth = np.where(column + 0.37 * row < 400, 1.0, 3.0)
+    curtain = {}
+    for interpolation in ('adaptive', 'bilinear'):
+        blocks = fused(
+            image_of(VGA, depth * VGA.ray_length),
+            voxel_size_m=0.02,
+            truncation_m=0.1,
+            interpolation=interpolation,
+        )
+        points, D, _ = voxels(blocks)
+        # Surface between the walls: 1 + tau < z + s < 3 - tau.
+        z = points[:, 2] * (1.0 + D / np.linalg.norm(points, axis=1))
+        curtain[interpolation] = ((abs(D) < 0.09) & (z > 1.1) & (z < 2.9)).sum()
+    assert curtain['adaptive'] == 0
+    assert curtain['bilinear'] > 0
+
+
+def test_far_from_the_origin_distances_are_as_exact():
+    T = np.eye(4)
+    T[:3, 3] = [1e5, -1e5, 3e4]  # whole voxels of 1/16 m
+    range_m, _ = plane(VGA, 30.0)
+    sizes = dict(voxel_size_m=0.0625, truncation_m=0.1875)
+    here, there = fused(image_of(VGA, range_m), **sizes), fused(image_of(VGA, range_m), T, **sizes)
+    found = here.index(here.rows()) + (T[:3, 3] / here.config.block_size_m).astype(int)
+    rows = there.find(found)
+    assert (rows >= 0).all()
+    assert len(rows) == there.num_blocks
+    assert abs(there.distance[rows] - here.distance[here.rows()]).max() < 1e-4
+
+
+def test_on_the_negative_side_of_the_origin_the_field_is_mirrored():
+    sensor = Camera(columns=101, rows=101, fx=80.0, fy=80.0, cx=50.0, cy=50.0)
+    range_m, _ = plane(sensor, 0.0)
+    blocks = fused(image_of(sensor, range_m), voxel_size_m=0.05, truncation_m=0.15)
+    rows = blocks.rows()
+    index = blocks.index(rows)
+    mirrored = blocks.find(index * [-1, -1, 1] - [1, 1, 0])
+    assert (mirrored >= 0).all()
+    field, other = (blocks.field[part].reshape(-1, 2, 8, 8, 8) for part in (rows, mirrored))
+    other = other[..., ::-1, ::-1]
+    both = (field[:, 1] > 0) & (other[:, 1] > 0)  # half a pixel at two edges has no counterpart
+    assert both.sum() > 0.95 * (field[:, 1] > 0).sum()
+    assert abs(field[:, 0] - other[:, 0])[both].max() < 1e-5

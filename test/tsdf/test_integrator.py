@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""T5 to T8, T12, T13, T17 and what is refused: one step of fusing, and several."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.tsdf import TsdfConfig, WEIGHT_MODES
+from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
+from surfel_mapper.tsdf.sensors import Lidar
+from test.tsdf.scenes import fused, image_of, integrator, SMALL, voxels, zero_crossings
+
+SIZES = dict(voxel_size_m=0.1, truncation_m=0.3)
+LIDAR = Lidar(rows=32, columns=256, vertical_fov_deg=60.0, max_range_m=10.0)
+
+
+def wall(sensor, range_m, **images):
+    """Return an image of one range."""
+    image = image_of(sensor, np.full((sensor.rows, sensor.columns), range_m))
+    return image.with_images(**images)
+
+
+def field(one):
+    """Return blocks by index: distances and weights."""
+    blocks, rows = one.blocks, one.blocks.rows()
+    return dict(zip(map(tuple, blocks.index(rows)), blocks.field[rows].copy(), strict=True))
+
+
+@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
+@pytest.mark.parametrize('mode', WEIGHT_MODES)
+def test_weights_have_their_closed_form(sensor, mode):
+    blocks = fused(wall(sensor, 3.0), **SIZES, weight_mode=mode)
+    points, D, W = voxels(blocks)
+    depth = points[:, 2] if sensor is SMALL else np.linalg.norm(points, axis=1)
+    density = {
+        SMALL: 65.0 * 65.0,
+        LIDAR: (256 * 90 / 360 / 2) * (32 * 90 / 60 / 2),
+    }[sensor] * 0.01
+    full = {
+        'constant': 1.0,
+        'inverse_square': depth**-2.0,
+        'ray_density': density * depth**-2.0,
+        'ray_density_inv_sq': density * depth**-4.0,
+    }[mode]
+    # 1 down to one voxel behind the surface, from there linearly to 0 at the truncation.
+    expected = full * np.clip((0.3 + D) / (0.3 - 0.1), None, 1.0)
+    assert len(W) > 1000
+    assert {-1, 0, 1} <= set(np.sign(np.round(D / 0.1)))
+    np.testing.assert_allclose(W, np.maximum(expected, 1e-4), rtol=2e-4, atol=2e-6)
+
+
+@pytest.mark.parametrize(
+    ('signed', 'share'), [(0.3, 1.0), (0.0, 1.0), (-0.1, 1.0), (-0.2, 0.5), (-0.3, 0.0)]
+)
+def test_the_weight_drops_off_behind_the_surface(signed, share):
+    # One voxel straight ahead of a camera, its range chosen to be `signed` from the surface.
+    one = integrator(**SIZES, weight_mode='constant', interpolation='nearest')
+    centre = np.array([0.05, 0.05, 2.05])
+    one.integrate(wall(SMALL, np.linalg.norm(centre) + signed + 1e-6), np.eye(4))
+    row = one.blocks.find([0, 0, 2])
+    n = 4 * 64
+    assert one.blocks.distance[row, n] == pytest.approx(signed, abs=1e-5)
+    assert one.blocks.weight[row, n] == pytest.approx(max(share, 1e-4), abs=2e-5)
+
+
+def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap():
+    one, cap = integrator(**SIZES, weight_mode='constant', max_weight=4.5), 4.5
+    one.integrate(wall(SMALL, 2.0), np.eye(4))
+    first = field(one)
+    for count in range(2, 8):
+        one.integrate(wall(SMALL, 2.0), np.eye(4))
+        for block, (D, W) in field(one).items():
+            np.testing.assert_allclose(D, first[block][0], atol=1e-6)
+            np.testing.assert_allclose(W, np.minimum(count * first[block][1], cap), rtol=1e-5)
+
+
+def test_at_the_cap_a_step_decays_by_the_gain_of_one_measurement():
+    one = integrator(**SIZES, weight_mode='constant', max_weight=4.0, weight_dropoff=False)
+    for _ in range(10):
+        one.integrate(wall(SMALL, 2.0), np.eye(4))
+    before = field(one)
+    gain = 1.0 / (4.0 + 1.0)
+    for count in range(1, 5):
+        one.integrate(wall(SMALL, 2.1), np.eye(4))
+        for block, (D, W) in before.items():
+            inside = (W == 4.0) & (abs(D) < 0.15)
+            after = field(one)[block][0][inside]
+            expected = D[inside] + 0.1 * (1.0 - (1.0 - gain) ** count)
+            np.testing.assert_allclose(after, expected, atol=2e-5)
+
+
+def test_the_order_of_measurements_does_not_matter():
+    images = [wall(SMALL, range_m) for range_m in (2.0, 2.1, 1.95)]
+    states = []
+    for order in ([0, 1, 2], [2, 0, 1]):
+        one = integrator(**SIZES)
+        for number in order:
+            one.integrate(images[number], np.eye(4))
+        states.append(field(one))
+    assert states[0].keys() == states[1].keys()
+    for block, expected in states[0].items():
+        np.testing.assert_allclose(states[1][block], expected, atol=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
+@pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, -np.inf, 0.01])
+def test_pixels_that_say_nothing_change_nothing(sensor, value):
+    for allocation in ('band', 'frustum'):
+        one = integrator(**SIZES, allocation=allocation)
+        result = one.integrate(wall(sensor, value), np.eye(4))
+        assert (result.num_blocks, result.num_voxels, one.blocks.num_blocks) == (0, 0, 0)
+
+
+@pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
+@pytest.mark.parametrize('value', [np.inf, 50.0])
+def test_pixels_beyond_the_range_free_space_up_to_it_and_no_surface(sensor, value):
+    blocks = fused(wall(sensor, value), voxel_size_m=0.2, truncation_m=0.6)
+    points, D, _ = voxels(blocks)
+    d = np.linalg.norm(points, axis=1)
+    assert set(D) == {np.float32(0.6)}
+    assert d.max() <= sensor.max_range_m
+    assert d.max() > sensor.max_range_m - 0.3
+    assert d.min() >= sensor.min_range_m
+
+
+def test_without_carving_only_the_band_is_touched():
+    points, D, _ = voxels(fused(wall(SMALL, 4.0), **SIZES, carve=False))
+    assert np.linalg.norm(points, axis=1).min() > 4.0 - 0.3 - np.sqrt(3.0) * 0.8
+    assert (D < 0).any()
+    carved, _, _ = voxels(fused(wall(SMALL, 4.0), **SIZES))
+    assert np.linalg.norm(carved, axis=1).min() < 0.3
+
+
+def test_blocks_placed_in_vain_go_and_those_there_stay():
+    one = integrator(**SIZES)
+    one.integrate(wall(SMALL, 2.0), np.eye(4))
+    before, there = field(one), one.blocks.num_blocks
+    masked = wall(SMALL, 1.0, mask=np.ones((60, 80)))
+    aside = np.eye(4)
+    aside[:3, 3] = [30.0, 0.0, 0.0]
+    result = one.integrate(image_of(SMALL, np.full((60, 80), np.nan)), aside)
+    assert (result.num_blocks, result.num_added) == (0, 0)
+    result = one.integrate(masked, aside)
+    assert result.num_added == one.blocks.num_blocks - there
+    assert all((one.blocks.weight[row] > 0).any() for row in one.blocks.rows())
+    after = field(one)
+    assert all(np.array_equal(after[block], before[block]) for block in before)
+
+
+def test_without_allocation_only_blocks_there_change():
+    one = integrator(**SIZES)
+    assert one.integrate(wall(SMALL, 2.0), np.eye(4), allocate_blocks=False).num_updated == 0
+    one.integrate(wall(SMALL, 2.0), np.eye(4))
+    there = set(field(one))
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    one.integrate(wall(SMALL, 2.0), turned, allocate_blocks=False)
+    assert one.integrate(wall(SMALL, 2.0), np.eye(4), allocate_blocks=False).num_updated > 0
+    assert set(field(one)) == there
+
+
+@pytest.mark.parametrize('by', ['dynamic_labels', 'invalid_labels', 'mask'])
+def test_what_moves_frees_space_and_leaves_no_surface(by):
+    half = np.arange(80) * np.ones((60, 1)) < 40
+    images = {'mask': half} if by == 'mask' else {'label': np.where(half, 7, 2)}
+    settings = {} if by == 'mask' else {by: [7.0]}
+    one = integrator(**SIZES, **settings)
+    one.integrate(wall(SMALL, 2.0, **images), np.eye(4))
+    points, D, _ = voxels(one.blocks)
+    left = points[:, 0] < -0.05 * points[:, 2]
+    assert (D[left] == np.float32(0.3)).all()
+    assert (abs(D[~left]) < 0.3).any()
+    assert (points[left, 2] > 1.0).any()
+
+    one.integrate(wall(SMALL, 2.0), np.eye(4))
+    points, D, _ = voxels(one.blocks)
+    assert (abs(D[points[:, 0] < -0.05 * points[:, 2]]) < 0.05).any()
+
+
+def test_one_hit_gives_its_colour_and_two_their_mean():
+    first = np.zeros((60, 80, 3), np.uint8) + np.array([10, 100, 250], np.uint8)
+    second = np.zeros((60, 80, 3), np.uint8) + np.array([30, 0, 251], np.uint8)
+    one = integrator(**SIZES, color=True)
+    one.integrate(wall(SMALL, 2.0), np.eye(4))  # without a colour: must not count as black
+    assert not one.blocks.color.any()
+    for image, expected in ((first, [10, 100, 250]), (second, [20, 50, 250.5])):
+        one.integrate(wall(SMALL, 2.0, color=image), np.eye(4))
+        blocks, rows = one.blocks, one.blocks.rows()
+        in_band = (abs(blocks.distance[rows]) < 0.299) & (blocks.weight[rows] > 0)
+        assert in_band.sum() > 300
+        colors = blocks.color[rows].transpose(0, 2, 1)
+        np.testing.assert_allclose(colors[in_band][:, :3], [expected] * in_band.sum(), atol=1e-3)
+        assert not colors[blocks.distance[rows] > 0.2999].any()
+
+
+def test_stamps_are_the_first_and_the_last():
+    one = integrator(**SIZES, tracking=True)
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0])
+    for stamp, T in ((10, np.eye(4)), (20, turned), (30, np.eye(4))):
+        one.integrate(wall(SMALL, 2.0), T, stamp)
+    rows = one.blocks.rows()
+    seen, stamps = one.blocks.weight[rows] > 0, one.blocks.stamps[rows]
+    pairs = {tuple(pair) for pair in stamps.transpose(0, 2, 1)[seen]}
+    assert pairs == {(10, 30), (20, 20)}
+    assert not stamps.transpose(0, 2, 1)[~seen].any()
+
+
+def test_the_extra_band_closes_what_lies_behind_for_all_or_for_some_labels():
+    labels = np.where(np.arange(80) < 40, 1, 2) * np.ones((60, 1), int)
+    image = wall(SMALL, 2.0, label=labels)
+    deep = {}
+    for name, settings in {
+        'none': {},
+        'all': {'extra_distance_m': 0.5},
+        'some': {'extra_distance_m': 0.5, 'extra_labels': [1.0]},
+    }.items():
+        points, D, _ = voxels(fused(image, **SIZES, **settings))
+        behind = (np.linalg.norm(points, axis=1) > 2.35) & (D < -0.2999)
+        aside = points[:, 0] / points[:, 2]
+        deep[name] = (behind & (aside < -0.05)).sum(), (behind & (aside > 0.05)).sum()
+    assert deep['none'] == (0, 0)
+    assert deep['all'][0] == deep['some'][0] > 100
+    assert deep['all'][1] > 100
+    assert deep['some'][1] == 0
+
+
+def test_colours_of_the_extra_band_can_be_left_out():
+    image = wall(SMALL, 2.0, color=np.full((60, 80, 3), 200, np.uint8))
+    counts = [
+        (fused(image, **SIZES, color=True, extra_distance_m=0.5, skip_extra_channels=skip)
+         .color[:, 3] > 0).sum()
+        for skip in (False, True)
+    ]
+    assert counts[0] > counts[1] > 0
+
+
+def test_a_tiny_budget_is_kept_and_counted():
+    one = integrator(**SIZES, max_blocks=5)
+    result = one.integrate(wall(SMALL, 2.0), np.eye(4))
+    assert one.blocks.num_blocks == result.num_added <= 5
+    assert result.num_refused == result.num_blocks - 5
+    again = one.integrate(wall(SMALL, 2.0), np.eye(4))
+    assert again.num_updated == one.blocks.num_blocks
+
+
+@pytest.mark.parametrize(
+    'T', [np.full((4, 4), np.nan), np.eye(3), np.diag([1, 1, -1, 1]), np.diag([2, 2, 2, 1]),
+          np.diag([1.0, 1, 1, 2]), np.diag([1, 1, np.inf, 1])],
+)
+def test_what_is_no_pose_is_refused(T):
+    one = integrator(**SIZES)
+    with pytest.raises(PoseError, match='pose of the sensor'):
+        one.integrate(wall(SMALL, 2.0), T)
+    assert one.blocks.num_blocks == 0
+
+
+def test_what_the_map_cannot_index_is_refused_and_changes_nothing():
+    one = integrator(**SIZES)
+    far = np.eye(4)
+    far[0, 3] = 0.8 * (1 << 20) - 1.0
+    with pytest.raises(MapLimitError, match='local frame'):
+        one.integrate(wall(SMALL, 3.0), far)
+    with pytest.raises(MapLimitError, match='larger voxels'):
+        integrator(voxel_size_m=0.001, truncation_m=0.003).integrate(
+            wall(LIDAR, 9.9), np.eye(4)
+        )
+    assert one.blocks.num_blocks == 0
+    one.integrate(wall(SMALL, 2.0), np.eye(4))
+    assert len(zero_crossings(one.blocks)) > 0
+
+
+def test_a_short_truncation_is_warned_of(caplog):
+    integrator(voxel_size_m=0.2, truncation_m=0.3)
+    assert 'less than two voxels' in caplog.text
+
+
+@pytest.mark.parametrize(
+    ('settings', 'message'),
+    [
+        ({'voxels_per_side': 6}, 'voxels_per_side: 6, expected a power of two'),
+        ({'truncation_m': 0.05}, 'dropoff_m: .*less than truncation_m'),
+        ({'semantics': 'majority'}, 'num_labels: 0, expected positive'),
+        ({'extra_labels': [1.5]}, 'extra_labels: 1.5, expected whole'),
+        ({'dynamic_labels': [-1.0]}, 'dynamic_labels: -1.0, expected whole'),
+        ({'skip_extra_channels': True, 'extra_labels': [1.0]}, 'skip_extra_channels: True'),
+    ],
+)
+def test_settings_that_do_not_go_together_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=rf'layers\.tsdf\.{message}'):
+        TsdfConfig(**settings)

@@ -1,0 +1,232 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""T8, T9, T16: what pixels hold, where points fall, how images are read between pixels."""
+
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import CloudFormatError, ConfigError
+from surfel_mapper.kernels import tsdf as kernels
+from surfel_mapper.kernels.projection import OUTSIDE, project
+from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
+from surfel_mapper.tsdf.sensors import Camera, Lidar
+from test.tsdf import twin
+from test.tsdf.scenes import SMALL, VLP16
+
+LIDARS = {
+    'around': VLP16,
+    'narrow': Lidar(rows=10, columns=50, vertical_fov_deg=20.0, horizontal_fov_deg=100.0),
+    'turned': Lidar(rows=8, columns=100, vertical_fov_deg=30.0, first_azimuth_deg=10.0),
+    'table': Lidar(rows=4, columns=90, beam_elevations_deg=(15.0, 2.0, 0.0, -25.0)),
+}
+
+
+def projected(sensor, points):
+    p = np.ascontiguousarray(np.asarray(points, np.float32).T)
+    out = np.empty((3, p.shape[1]), np.float32)
+    project(p[0], p[1], p[2], *sensor.projection, out[0], out[1], out[2])
+    return out[1], out[2]
+
+
+@pytest.mark.parametrize('sensor', [SMALL, *LIDARS.values()], ids=['camera', *LIDARS])
+def test_every_pixel_falls_onto_itself(sensor):
+    points = 3.0 * sensor.directions.reshape(-1, 3)
+    u, v = projected(sensor, points)
+    row, column = np.indices((sensor.rows, sensor.columns)).reshape(2, -1)
+    if sensor.wraps:
+        u = np.where(u > sensor.columns - 0.5, u - sensor.columns, u)
+    seen = u > OUTSIDE
+    assert seen.mean() > 0.99
+    np.testing.assert_allclose(u[seen], column[seen], atol=2e-3)
+    np.testing.assert_allclose(v[seen], row[seen], atol=2e-3)
+
+
+@pytest.mark.parametrize('sensor', [SMALL, *LIDARS.values()], ids=['camera', *LIDARS])
+def test_points_fall_where_the_equations_say(sensor):
+    points = np.random.default_rng(1).standard_normal((5000, 3)) * [3.0, 3.0, 1.5]
+    points[:5] = [[0, 0, 0], [0, 0, 1], [0, 0, -1], [-1, 0, 0], [1, 0, 0]]
+    u, v = projected(sensor, points)
+    expected_u, expected_v = twin.place_in_image(sensor, points)
+    clear = np.arange(5000) >= 5  # of the poles and the seam
+    seen = ~np.isnan(expected_u)
+    assert ((u > OUTSIDE) != seen)[clear].sum() <= 5  # on the very border
+    both = seen & (u > OUTSIDE) & clear
+    assert both.sum() > 100
+    np.testing.assert_allclose(u[both], expected_u[both], atol=2e-3)
+    np.testing.assert_allclose(v[both], expected_v[both], atol=2e-3)
+
+
+def test_sixteen_beams_are_sixteen_rows():
+    made = Lidar.from_resolution(
+        vertical_fov_deg=30.0, vertical_resolution_deg=2.0, horizontal_resolution_deg=0.2
+    )
+    assert (made.rows, made.columns, made.wraps) == (16, 1800, True)
+    half = Lidar.from_resolution(
+        vertical_fov_deg=33.2,
+        vertical_resolution_deg=0.527,
+        horizontal_resolution_deg=0.5,
+        horizontal_fov_deg=180.0,
+    )
+    assert (half.rows, half.columns, half.wraps) == (64, 361, False)
+    angles = np.deg2rad(np.arange(15.0, -16.0, -2.0))
+    points = 5.0 * np.stack([np.cos(angles), 0.0 * angles, np.sin(angles)], axis=1)
+    image = from_points(made, points)
+    assert ((image.range_m[:, :-1] > 0).sum(axis=1) == 1).all()
+
+
+@pytest.mark.parametrize('azimuth_deg', [180.0, -180.0, 179.9, -179.9, 180.0 - 1e-5])
+def test_at_the_seam_a_point_lands_in_one_pixel(azimuth_deg):
+    angle = math.radians(azimuth_deg)
+    image = from_points(VLP16, np.array([[4 * math.cos(angle), 4 * math.sin(angle), 0.05]]))
+    assert np.argwhere(image.range_m[:, :-1] > 0).tolist() == [[7, 0]]
+    assert (image.range_m[:, -1] == image.range_m[:, 0]).all()
+    assert image.num_used == 1
+
+
+def test_the_nearest_return_wins_whatever_the_order():
+    ray = VLP16.directions[3, 20].astype(float)
+    points = np.outer([7.0, 5.0, 6.0, 0.1, 50.0], ray)
+    colors = np.arange(15, dtype=np.uint8).reshape(5, 3)
+    for order in ([0, 1, 2, 3, 4], [4, 3, 2, 1, 0]):
+        image = from_points(
+            VLP16, points[order], colors=colors[order], labels=np.array([4, 5, 6, 7, 8])[order]
+        )
+        assert image.range_m[3, 20] == pytest.approx(5.0, abs=1e-5)
+        assert image.color[3, 20].tolist() == [3, 4, 5]
+        assert image.label[3, 20] == 5
+        assert (image.label >= 0).sum() == 1
+        assert image.num_used == 4  # all but the one nearer than min_range_m
+
+
+def test_points_not_finite_or_out_of_view_are_left_out():
+    points = np.array(
+        [[np.nan, 0, 0], [np.inf, 0, 0], [0, -np.inf, np.nan], [0, 0, 5], [0, 0, 0], [1, 0, 9]]
+    )
+    image = from_points(VLP16, points)
+    assert (image.num_used, image.largest_m, image.range_m.any()) == (0, 0.0, False)
+    assert from_points(VLP16, np.empty((0, 3))).num_used == 0
+    assert from_points(SMALL, np.array([[0.0, 0.0, -2.0], [9.0, 0.0, 1.0]])).num_used == 0
+
+
+def test_depths_become_ranges_and_say_what_they_know():
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[0, :7] = [np.nan, np.inf, -np.inf, 0.0, -1.0, 0.05, 9.0]
+    image = from_depth(SMALL, depth)
+    assert image.range_m[0, [0, 2, 3, 4, 5]].tolist() == [0.0] * 5
+    assert (image.range_m[0, [1, 6]] > 1000.0).all()
+    assert image.largest_m == SMALL.max_range_m
+    assert image.num_used == 60 * 80 - 5
+    expected = 2.0 * np.sqrt(((0 - 40) / 65) ** 2 + ((59 - 30) / 65) ** 2 + 1)
+    assert image.range_m[59, 0] == pytest.approx(expected, rel=1e-6)
+
+
+def test_whole_numbers_are_millimetres_unless_told():
+    depth = np.full((60, 80), 2000, np.uint16)
+    depth[0, 0] = 0
+    image, scaled = from_depth(SMALL, depth), from_depth(SMALL, depth, scale=1 / 5000)
+    assert image.range_m[30, 40] == pytest.approx(2.0)
+    assert scaled.range_m[30, 40] == pytest.approx(0.4)
+    assert image.range_m[0, 0] == 0.0
+    swapped = from_depth(SMALL, depth.astype('>u2'))
+    assert np.array_equal(swapped.range_m, image.range_m)
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (lambda: from_depth(SMALL, np.zeros((80, 60), np.float32)), r'\(80, 60\), expected'),
+        (lambda: from_depth(SMALL, np.zeros((60, 80), np.int32)), 'int32, expected float32'),
+        (lambda: from_depth(SMALL, np.zeros((60, 80), np.uint16), scale=0.0), 'depth scale: 0'),
+        (lambda: from_ranges(VLP16, np.zeros((16, 361))), r'expected floats \(16, 360\)'),
+        (lambda: from_points(VLP16, np.zeros((5, 2))), r'expected \(N, 3\)'),
+        (lambda: from_points(VLP16, np.zeros((5, 3), int)), r'expected \(N, 3\) float'),
+        (lambda: from_points(VLP16, np.zeros((5, 3)), labels=np.zeros(4, int)), 'labels: '),
+        (lambda: blank().with_images(color=np.zeros((60, 81, 3), np.uint8)), 'color: '),
+        (lambda: blank().with_images(color=np.zeros((60, 80, 3))), 'float64, expected uint8'),
+        (lambda: blank().with_images(label=np.full((60, 80), 1 << 24)), 'label: '),
+        (lambda: blank().with_images(label=np.zeros((60, 80))), 'label: float64'),
+        (lambda: blank().with_images(mask=np.zeros((60,))), 'mask: '),
+    ],
+)
+def test_images_of_other_sizes_and_types_are_refused(make, message):
+    with pytest.raises(CloudFormatError, match=message):
+        make()
+
+
+def blank():
+    return from_depth(SMALL, np.zeros((60, 80), np.float32))
+
+
+@pytest.mark.parametrize(
+    ('make', 'message'),
+    [
+        (lambda: Camera(columns=0, rows=2, fx=1, fy=1, cx=1, cy=1), 'columns: 0'),
+        (lambda: Camera(columns=4, rows=2, fx=0, fy=1, cx=1, cy=1), 'fx: 0'),
+        (lambda: Camera(columns=4, rows=2, fx=math.nan, fy=1, cx=1, cy=1), 'fx: nan'),
+        (lambda: Camera(columns=4, rows=2, fx=1, fy=1, cx=5, cy=1), 'cx: 5'),
+        (lambda: Camera(columns=4, rows=2, fx=1, fy=1, cx=1, cy=3), 'cy: 3'),
+        (lambda: Lidar(max_range_m=math.inf), 'max_range_m: inf, expected more .*, finite'),
+        (lambda: Lidar(min_range_m=0.0), 'min_range_m: 0'),
+        (lambda: Lidar(min_range_m=9.0, max_range_m=8.0), 'max_range_m: 8'),
+        (lambda: Lidar(rows=1), 'rows: 1'),
+        (lambda: Lidar(vertical_fov_deg=0.0), 'vertical_fov_deg: 0'),
+        (lambda: Lidar(vertical_fov_top_deg=95.0), 'vertical_fov_top_deg: 95'),
+        (lambda: Lidar(horizontal_fov_deg=361.0), 'horizontal_fov_deg: 361'),
+        (lambda: Lidar(rows=2, beam_elevations_deg=(1.0, 2.0)), 'beam_elevations_deg: .*desc'),
+        (lambda: Lidar(rows=3, beam_elevations_deg=(2.0, 1.0)), 'beam_elevations_deg: .*one for'),
+    ],
+)
+def test_sensors_that_cannot_be_are_refused(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()
+
+
+def looked_up(image, u, v, method, allowed):
+    """Return the range at places in an image, negative where the nearest pixel was taken."""
+    padded = np.pad(np.asarray(image, np.float32), kernels.BORDER)
+    found = np.zeros(kernels.NUM_SETTINGS, np.float32)
+    found[kernels.LIMIT] = found[kernels.MAX_RANGE] = 100.0
+    found[kernels.MAX_DIFFERENCE] = allowed
+    u, v = np.asarray(u, np.float32), np.asarray(v, np.float32)
+    place, value = np.empty(len(u), np.int32), np.empty(len(u), np.float32)
+    pixels = np.empty((4, len(u)), np.float32)
+    kernels.locate(np.ones(len(u), np.float32), u, v, padded.shape[1], found, place)
+    kernels.gather(padded.ravel(), padded.shape[1], place, pixels)
+    kernels.mix(*pixels, u, v, method, found, value)
+    return value
+
+
+def test_pixels_are_mixed_where_they_differ_little():
+    image = [[1.0, 2.0], [3.0, 4.0]]
+    u, v = [0.25, 0.5, 0.75, 0.1], [0.25, 0.25, 0.5, 0.9]
+    mixed = [1 + a + 2 * b for a, b in zip(u, v, strict=True)]
+    nearest = [1.0, 2.0, 4.0, 3.0]
+    for method, allowed, expected in (
+        (kernels.ADAPTIVE, 3.5, mixed),
+        (kernels.ADAPTIVE, 0.2, np.negative(nearest)),
+        (kernels.BILINEAR, 0.2, mixed),
+        (kernels.NEAREST, 9.0, np.negative(nearest)),
+    ):
+        np.testing.assert_allclose(looked_up(image, u, v, method, allowed), expected, rtol=1e-6)
+    # Beyond the last row or column, and above the first, only the nearest pixel is left.
+    edges = looked_up(image, [1.9, 1.4, -0.4, 0.2], [0.9, 0.9, 0.0, -0.4], kernels.ADAPTIVE, 3.5)
+    np.testing.assert_allclose(edges, [0.0, -4.0, -1.0, -1.0])
+
+
+def test_a_pixel_that_says_nothing_is_never_mixed():
+    image = [[1.0, 0.0], [1.0, 1.0]]
+    found = looked_up(image, [0.3, 0.8], [0.3, 0.2], kernels.BILINEAR, 9.0)
+    assert found.tolist() == [-1.0, 0.0]
+    clearing = [[1.0, 2100.0], [1.0, 1.0]]
+    found = looked_up(clearing, [0.3, 0.8], [0.3, 0.2], kernels.BILINEAR, 9.0)
+    assert found.tolist() == [-1.0, -2100.0]
+
+
+def test_across_the_seam_pixels_are_mixed():
+    range_m = np.full((16, 360), 5.0)
+    range_m[:, 0], range_m[:, -1] = 5.0, 5.1
+    image = from_ranges(VLP16, range_m)
+    found = looked_up(image.range_m, [359.25, 359.75], [3.0, 3.5], kernels.ADAPTIVE, 0.2)
+    np.testing.assert_allclose(found, [5.075, 5.025], rtol=1e-6)

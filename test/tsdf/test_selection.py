@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""T11: the blocks that are chosen, against all blocks and rays there are."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.selection import BlockSelection
+from surfel_mapper.tsdf.sensors import Camera, Lidar
+from test.tsdf.scenes import image_of
+
+SENSORS = {
+    'camera': Camera(columns=48, rows=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0, max_range_m=5.0),
+    'lidar': Lidar(rows=16, columns=90, vertical_fov_deg=50.0, max_range_m=5.0),
+}
+SIZES = dict(voxel_size_m=0.125, truncation_m=0.3, voxels_per_side=4)
+
+
+def random_pose(rng):
+    q = rng.standard_normal(4)
+    return pose_matrix(rng.uniform(-20.0, 20.0, 3), q / np.linalg.norm(q))
+
+
+def random_image(sensor, rng, nearest_m=0.5):
+    range_m = rng.uniform(nearest_m, 4.9, (sensor.rows, sensor.columns))
+    range_m[rng.random(range_m.shape) < 0.1] = np.nan
+    return image_of(sensor, range_m)
+
+
+def everywhere(T, reach_m, size_m):
+    """Return all blocks of a cube about a pose."""
+    middle, half = np.floor(T[:3, 3] / size_m).astype(int), int(reach_m / size_m) + 2
+    return middle + np.indices(3 * [2 * half + 1]).reshape(3, -1).T - half
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
+    rng, sensor = np.random.default_rng(5), SENSORS[sensor]
+    config = TsdfConfig(**SIZES, allocation='frustum')
+    for _ in range(20):
+        T, image = random_pose(rng), random_image(sensor, rng)
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T))}
+        one = Integrator(BlockMap(config))
+        index = everywhere(T, 5.4, config.block_size_m)
+        rows = one.blocks.place(index)
+        observed, _ = one._fuse(image, T, 0, index, rows)
+        assert (observed > 0).sum() > 100
+        assert {*map(tuple, index[observed > 0])} <= chosen
+        touched = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T)
+        assert {*map(tuple, touched)} <= chosen
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+def test_blocks_of_both_ways_hold_the_same(sensor):
+    rng, sensor = np.random.default_rng(6), SENSORS[sensor]
+    T, image = random_pose(rng), random_image(sensor, rng)
+    maps = {}
+    for allocation in ('band', 'frustum'):
+        one = Integrator(BlockMap(TsdfConfig(**SIZES, allocation=allocation)))
+        one.integrate(image, T)
+        maps[allocation] = one.blocks
+    band, frustum = maps.values()
+    rows = band.rows()
+    other = frustum.find(band.index(rows))
+    assert len(rows) > 100
+    assert (other >= 0).all()
+    assert np.array_equal(band.field[rows], frustum.field[other])
+
+
+@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('extra_m', [0.0, 0.4])
+def test_rays_touch_every_block_of_their_band(sensor, extra_m):
+    rng, sensor = np.random.default_rng(7), SENSORS[sensor]
+    config = TsdfConfig(**SIZES, carve=False, extra_distance_m=extra_m)
+    for _ in range(5):
+        # So far away pixels are more than half a voxel apart, and none is passed over.
+        T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T))}
+        range_m = image.range_m[:, : sensor.columns]
+        rays = sensor.directions.astype(float) @ T[:3, :3].T
+        sampled = set()
+        for along in np.linspace(-0.3, 0.3 + extra_m, 40):
+            at = np.maximum(range_m + along, sensor.min_range_m)[..., None] * rays + T[:3, 3]
+            sampled |= {*map(tuple, np.floor(at[range_m > 0] / config.block_size_m).astype(int))}
+        assert sampled <= chosen
+        assert len(chosen) < 1.2 * len(sampled)
+
+
+def test_through_a_dense_image_rays_are_thinned_but_no_voxel_of_the_surface_is_lost():
+    sensor = Camera(columns=320, rows=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)
+    row, column = np.indices((240, 320))
+    image = image_of(sensor, 2.0 + 0.3 * np.sin(column / 30.0) + 0.2 * np.cos(row / 20.0))
+    counts = {}
+    for allocation in ('band', 'frustum'):
+        one = Integrator(
+            BlockMap(
+                TsdfConfig(
+                    voxel_size_m=0.04, truncation_m=0.12, carve=False, allocation=allocation
+                )
+            )
+        )
+        one.integrate(image, np.eye(4))
+        rows = one.blocks.rows()
+        near = (abs(one.blocks.distance[rows]) < 0.04) & (one.blocks.weight[rows] > 0)
+        counts[allocation] = near.sum()
+    assert counts['band'] == counts['frustum'] > 4000
+
+
+def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
+    sensor = Lidar(rows=64, columns=1024, vertical_fov_deg=45.0, max_range_m=20.0)
+    rng = np.random.default_rng(8)
+    range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
+    image, T = image_of(sensor, range_m), random_pose(rng)
+    config = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3)
+    chosen = BlockSelection(config).blocks(image, T)
+    keys = {*map(tuple, chosen)}
+    rays = sensor.directions.astype(float) @ T[:3, :3].T
+    size, deep, missed = config.block_size_m, 0, 0
+    for along in np.linspace(0.0, 1.0, 60):
+        at = (0.5 + along * (range_m - 0.5))[..., None] * rays + T[:3, 3]
+        block, place = np.divmod(at.reshape(-1, 3), size)
+        # Deeper inside than what may be passed over.
+        inside = (abs(place - size / 2) < size / 4).all(axis=1)
+        found = {*map(tuple, block[inside].astype(int))}
+        deep += len(found)
+        missed += len(found - keys)
+    assert deep > 10_000
+    assert missed == 0
+
+
+def test_without_a_measurement_there_is_no_block():
+    for allocation in ('band', 'frustum'):
+        image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
+        config = TsdfConfig(**SIZES, allocation=allocation)
+        assert BlockSelection(config).blocks(image, np.eye(4)).shape == (0, 3)
