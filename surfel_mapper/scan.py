@@ -57,6 +57,8 @@ class Scan:
         not known. Filters that look at the robot or at the vertical need them.
     times : PointTimes, optional
         When the points were measured, for deskewing; None: all at the stamp.
+    msg : sensor_msgs/PointCloud2, optional
+        The cloud that it was read from, whose points are these: as many, in this order.
 
     Raises
     ------
@@ -72,6 +74,7 @@ class Scan:
     T_base_sensor: npt.NDArray[np.float64] | None = None
     T_fixed_sensor: npt.NDArray[np.float64] | None = None
     times: PointTimes | None = None
+    msg: Any = None
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -108,4 +111,4 @@ class Scan:
         """
         columns = {name: column[rows] for name, column in self.columns.items()}
         times = self.times and replace(self.times, offsets=self.times.offsets[rows])
-        return replace(self, points=self.points[rows], columns=columns, times=times)
+        return replace(self, points=self.points[rows], columns=columns, times=times, msg=None)

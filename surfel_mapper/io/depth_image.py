@@ -25,14 +25,14 @@ ENCODINGS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 """Numpy's name of the pixels of each encoding that holds depth; some drivers say mono16."""
 
 MAX_EARLY = 10
-"""So many images of a camera are kept until its first camera_info; the oldest are dropped."""
+"""So many images of a camera wait for its first camera_info; then the oldest is given up."""
 
 
 class CameraImage(NamedTuple):
-    """A depth image and the camera that took it."""
+    """A depth image and the camera that took it; None where that never became known."""
 
     msg: Any
-    camera: PinholeCamera
+    camera: PinholeCamera | None
 
 
 class DepthImages:
@@ -41,17 +41,10 @@ class DepthImages:
 
     A calibration holds from when it comes until the next; images that come before the first
     wait for it, so that what is mapped does not depend on which of two topics is quicker.
-
-    Attributes
-    ----------
-    num_dropped : int
-        Images that were dropped because no calibration came.
-
     """
 
     def __init__(self) -> None:
         """Know no camera."""
-        self.num_dropped = 0
         self._cameras: dict[str, PinholeCamera] = {}
         self._early: dict[str, deque[Any]] = {}
 
@@ -69,15 +62,12 @@ class DepthImages:
         return [CameraImage(image, camera) for image in self._early.pop(topic, ())]
 
     def add_image(self, topic: str, msg: Any) -> list[CameraImage]:
-        """Take an image; return it unless it has to wait."""
+        """Take an image; return it, or if it has to wait, the one that has waited too long."""
         if topic in self._cameras:
             return [CameraImage(msg, self._cameras[topic])]
         early = self._early.setdefault(topic, deque())
         early.append(msg)
-        if len(early) > MAX_EARLY:
-            early.popleft()
-            self.num_dropped += 1
-        return []
+        return [CameraImage(early.popleft(), None)] if len(early) > MAX_EARLY else []
 
 
 def camera_info_topic(image_topic: str) -> str:
@@ -134,10 +124,15 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
     Raises
     ------
     CloudFormatError
-        If sizes, encoding and data do not fit together, or the image is not the camera's size.
+        If sizes, encoding and data do not fit together, the image is not the camera's size, or
+        the camera is not known.
 
     """
     msg = image.msg
+    if image.camera is None:
+        raise CloudFormatError(
+            f'{topic}: no calibration; does anybody publish {camera_info_topic(topic)}?'
+        )
     stamp_ns, depth = checked_stamp_ns(msg.header.stamp, topic), depth_in(msg, topic)
     try:
         points = depth_points(depth, image.camera)

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfels as markers: discs coloured by planarity, normals as lines.
+Surfels as markers: coloured discs, and normals as lines.
 
-A disc is a regular polygon cut into a fan of triangles. Eight corners look round and take 18
-vertices of 40 bytes: 20,000 discs are 14 MB. Corners are computed once each and copied to the
-triangles as opaque items of 24 bytes, which is four times as fast as indexing rows of three
-numbers.
+Eight corners make a disc look round and take 18 vertices of 40 bytes: 20,000 discs are 14 MB. All
+discs are one marker and all lines another, so that each message replaces what was drawn before:
+surfels that have left the map are gone from the picture too.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 from typing import TYPE_CHECKING
 
@@ -18,11 +18,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.io.cdr import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
+from surfel_mapper.kernels.discs import draw_discs, draw_normals
+from surfel_mapper.mapping.ages import last_seen_ns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
+    from surfel_mapper.mapping.window import WindowedScan
 
 SEGMENTS = 8
+
+ANGLES = np.arange(SEGMENTS) * (2.0 * math.pi / SEGMENTS)
+
+CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
+"""The corners of a disc."""
 
 PALETTE = np.array(
     [
@@ -36,11 +44,22 @@ PALETTE = np.array(
     ]
 )
 """
-Colours of planarity 0 to 1 at equal distances, red green blue: violet, blue, green, yellow.
+Colours of 0 to 1 at equal distances, red green blue: violet, blue, green, yellow.
 
 Lightness rises evenly from 0.34 to 0.92 while the hue turns from 305 to 105 deg in Oklab, each
 as colourful as the screen allows: the order can be seen in grey, and by the colour-blind.
 """
+
+SHADES = 256
+
+TABLE = np.stack(
+    [
+        np.interp(np.linspace(0, 1, SHADES), np.linspace(0, 1, len(PALETTE)), channel)
+        for channel in (*PALETTE.T, np.ones(len(PALETTE)))
+    ],
+    axis=1,
+).astype(np.float32)
+"""The palette in fine steps, with opacity."""
 
 NORMAL_COLOR = (0.9, 0.9, 0.9, 0.8)
 
@@ -48,10 +67,10 @@ NORMAL_COLOR = (0.9, 0.9, 0.9, 0.8)
 def surfel_markers(
     surfels: Surfels,
     voxel_size_m: float,
+    colors: npt.NDArray[np.float32],
     *,
     stamp_ns: int,
     frame_id: str,
-    max_markers: int = 20_000,
 ) -> list[Marker]:
     """
     Return two markers that draw surfels: their discs, and their normals as lines.
@@ -62,10 +81,10 @@ def surfel_markers(
         Those without a normal are left out.
     voxel_size_m : float
         Bounds the radius of a disc at half the diagonal of a voxel's face.
+    colors : (K, 4) float32
+        Red, green, blue and opacity of each surfel in [0, 1]; see shades and normal_colors.
     stamp_ns, frame_id : int, str
         Of the map.
-    max_markers : int
-        If there are more surfels, so many are drawn, evenly spread; see thinned.
 
     Returns
     -------
@@ -75,23 +94,23 @@ def surfel_markers(
 
     """
     rows = np.flatnonzero(np.isfinite(surfels.normal).all(axis=1))
-    if len(rows) > max_markers:
-        rows = rows[thinned(surfels.voxel_index[rows], max_markers)]
-    position, normal = surfels.position[rows], surfels.normal[rows]
+    drawn = (surfels.position, surfels.normal)
+    discs = np.empty((len(rows) * 3 * (SEGMENTS - 2), 3))
+    disc_colors = np.empty((len(discs), 4), np.float32)
     radius = disc_radius(surfels.eigenvalues[rows], voxel_size_m)
-    colors = np.repeat(planarity_colors(surfels.planarity[rows]), 3 * (SEGMENTS - 2), axis=0)
-    lines = np.stack([position, position + 0.5 * voxel_size_m * normal], axis=1)
+    draw_discs(drawn, rows, radius, colors[rows], CIRCLE, discs, disc_colors)
+    lines = np.empty((2 * len(rows), 3))
+    draw_normals(drawn, rows, 0.5 * voxel_size_m, lines)
     action = ADD if len(rows) else DELETE
     return [
         Marker(
             ns='discs', id=0, type=TRIANGLE_LIST, action=action,
-            frame_id=frame_id, stamp_ns=stamp_ns,
-            points=disc_triangles(position, normal, radius, SEGMENTS), colors=colors,
+            frame_id=frame_id, stamp_ns=stamp_ns, points=discs, colors=disc_colors,
         ),
         Marker(
             ns='normals', id=0, type=LINE_LIST, action=action,
             frame_id=frame_id, stamp_ns=stamp_ns,
-            scale=(0.02 * voxel_size_m, 0.0, 0.0), color=NORMAL_COLOR, points=lines.reshape(-1, 3),
+            scale=(0.02 * voxel_size_m, 0.0, 0.0), color=NORMAL_COLOR, points=lines,
         ),
     ]  # fmt: skip
 
@@ -109,82 +128,41 @@ def disc_radius(
     return np.minimum(radius, math.sqrt(0.5) * voxel_size_m, out=radius)
 
 
-def disc_triangles(
-    position: npt.NDArray[np.float64],
-    normal: npt.NDArray[np.float64],
-    radius: npt.NDArray[np.float64],
-    segments: int,
-) -> npt.NDArray[np.float64]:
+def shades(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """Return the colours of values in [0, 1], (K, 4): dark to bright; nan counts as 0."""
+    steps = np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0)) * (SHADES - 1))
+    return np.asarray(TABLE[steps.astype(np.uint8)])
+
+
+def disc_colors(
+    kind: str, surfels: Surfels, scans: Iterable[WindowedScan] = ()
+) -> npt.NDArray[np.float32]:
     """
-    Return regular polygons as triangles, counter-clockwise seen from where the normals point.
+    Return the colours of surfels, (K, 4).
 
     Parameters
     ----------
-    position : (K, 3) float64, m
-        Centres.
-    normal : (K, 3) float64
-        Unit vectors.
-    radius : (K,) float64, m
-        From the centre to the corners.
-    segments : int
-        Corners of a polygon, 3 or more.
-
-    Returns
-    -------
-    (K * (segments - 2) * 3, 3) float64, m
-        Three corners a triangle, polygon by polygon.
+    kind : str
+        planarity, normal or age: the newest of the scans that saw the voxel, from dark for the
+        oldest scan to bright for the newest.
+    surfels : Surfels
+        K of them.
+    scans : iterable of WindowedScan
+        Those of the window.
 
     """
-    u, v = (radius[:, None] * axis for axis in tangents(normal))
-    corners = np.empty((segments, len(position), 3))
-    for i in range(segments):
-        angle = 2.0 * math.pi * i / segments
-        corners[i] = position + math.cos(angle) * u + math.sin(angle) * v
-    item = np.dtype((np.void, corners.itemsize * 3))
-    fan = [corner for i in range(1, segments - 1) for corner in (0, i, i + 1)]
-    triangles = np.empty((len(position), len(fan)), item)
-    for place, corner in enumerate(fan):
-        triangles[:, place] = corners[corner].view(item)[:, 0]
-    return triangles.view(np.float64).reshape(-1, 3)
+    if kind == 'normal':
+        return normal_colors(surfels.normal)
+    if kind == 'planarity':
+        return shades(surfels.planarity)
+    held = list(scans)
+    stamps = [scan.stamp_ns for scan in held] or [0]
+    span_ns = max(max(stamps) - min(stamps), 1)
+    return shades((last_seen_ns(surfels.voxel_index, held) - min(stamps)) / span_ns)
 
 
-def tangents(
-    normal: npt.NDArray[np.float64],
-) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """
-    Return two unit vectors that make a right-handed frame with each normal, (K, 3) both.
-
-    Source: Duff et al. 2017, Building an Orthonormal Basis, Revisited: no branch, and no normal
-    near which it loses digits.
-    """
-    x, y, z = normal.T
-    sign = np.copysign(1.0, z)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    u = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    v = np.stack([b, sign + y * y * a, -y], axis=1)
-    return u, v
-
-
-def planarity_colors(planarity: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Return red, green, blue and opacity of each planarity, (K, 4)."""
-    colors = np.ones((len(planarity), 4), np.float32)
-    anchors = np.linspace(0.0, 1.0, len(PALETTE))
-    for channel in range(3):
-        colors[:, channel] = np.interp(planarity, anchors, PALETTE[:, channel])
+def normal_colors(normal: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
+    """Return the colours of normals, (K, 4): red, green, blue are x, y, z from -1 to 1."""
+    colors = np.ones((len(normal), 4), np.float32)
+    colors[:, :3] = 0.5 * normal + 0.5
     return colors
-
-
-def thinned(voxel_index: npt.NDArray[np.int32], number: int) -> npt.NDArray[np.int64]:
-    """
-    Return the rows of so many voxels, evenly spread and in order.
-
-    They are those of the smallest hashes, so that a voxel drawn stays drawn while the map grows:
-    any rule that looks at rows would redraw the map with others every time.
-    """
-    mixed = np.zeros(len(voxel_index), np.uint64)
-    for axis in range(3):
-        mixed ^= voxel_index[:, axis].astype(np.uint64)
-        mixed *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
-        mixed ^= mixed >> np.uint64(29)
-    return np.sort(np.argpartition(mixed, number - 1)[:number])

@@ -105,6 +105,7 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
             for name, field in fields.items()
             if name not in ('x', 'y', 'z')
         },
+        msg=msg,
     )
 
 

@@ -36,6 +36,7 @@ from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
+from surfel_mapper.mapping.thinning import thinned
 from surfel_mapper.mapping.threads import pool
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
@@ -330,9 +331,22 @@ class SurfelMap:
         other.insert(self.moments())
         return other
 
-    def surfels(self, min_points: int = 1) -> Surfels:
-        """Return the surfels of all voxels with at least so many points, in no stated order."""
-        return self._derive(self._table.changed_after(-1, min_points))
+    def surfels(self, min_points: int = 1, at_most: int | None = None) -> Surfels:
+        """
+        Return the surfels of all voxels with at least so many points, in no stated order.
+
+        Parameters
+        ----------
+        min_points : int
+            Voxels with fewer points are passed over.
+        at_most : int, optional
+            If there are more, so many are returned, evenly spread and always the same ones.
+
+        """
+        chosen = self._table.changed_after(-1, min_points)
+        if at_most is not None and len(chosen) > at_most:
+            chosen = chosen[thinned(self._table.rows[chosen, layout.KEY], at_most)]
+        return self._derive(chosen)
 
     def num_surfels(self, min_points: int = 1) -> int:
         """Return how many voxels hold at least so many points."""

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node subscribes to: clouds, and the poses that ``pose.source`` names.
+What the node subscribes to: clouds or depth images, and the poses that ``pose.source`` names.
 
 Callbacks pass messages on to the mapping thread and do nothing else, so that nothing waits in
 the middleware: where a queue of messages is full there, the oldest is overwritten and nobody is
@@ -10,7 +10,7 @@ told. What the middleware does tell, that messages were lost on the way, is coun
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 import copy
 from functools import partial
 from typing import Any
@@ -20,15 +20,20 @@ from nav_msgs.msg import Odometry
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from surfel_mapper.config import Config
-from surfel_mapper.errors import ConfigError, DependencyError
+from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError
+from surfel_mapper.io.depth_image import camera_info_topic, CameraImage, depth_scan, DepthImages
 from surfel_mapper.io.pose_messages import ODOMETRY, POSE, poses_in, TF
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.scan import Scan
+
+DEFAULT_TOPICS = {'cloud': 'points', 'depth': 'depth/image'}
+"""Where clouds or images come in unless ``input.topics`` says so."""
 
 CLOUDS = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches every publisher; holds 2 s of a lidar at 10 Hz, should a service take as long."""
@@ -43,6 +48,17 @@ STATIC_TRANSFORMS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
+OVERRIDABLE = (
+    QoSPolicyKind.HISTORY,
+    QoSPolicyKind.DEPTH,
+    QoSPolicyKind.RELIABILITY,
+    QoSPolicyKind.DURABILITY,
+)
+"""What a user may set of a subscription, in ``qos_overrides``."""
+
+LARGE_BYTES = 500_000
+"""Messages from here on do not fit into the shared memory that Fast DDS has by default."""
+
 
 class Inputs:
     """
@@ -53,23 +69,26 @@ class Inputs:
     node : Node
         Whose subscriptions they are.
     config : Config
-        Its ``pose.source`` and ``frames.base``.
+        Its stages input, pose and frames.
     thread : MappingThread
         Takes what comes in.
 
     Attributes
     ----------
-    cloud_topic : str
-        The full name of the topic of clouds.
-    clouds_lost : int
-        Clouds that were published but never came, as far as the middleware knows.
+    cloud_topics : list of str
+        The full names of the topics of clouds, or of depth images.
+    lost : dict of str to int
+        Clouds that were published but never came, by topic, as far as the middleware knows.
 
     """
 
     def __init__(self, node: Node, config: Config, thread: MappingThread) -> None:
         """Prepare; ``subscribe`` subscribes."""
-        self.cloud_topic = node.resolve_topic_name('points')
-        self.clouds_lost = 0
+        names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
+        self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
+        self.lost: dict[str, int] = {}
+        self._images = DepthImages()
+        self._largest_bytes = 0
         self._node = node
         self._config = config
         self._thread = thread
@@ -97,8 +116,10 @@ class Inputs:
             message = transform_message()
             self._subscribe(message, '/tf_static', self._on_static, STATIC_TRANSFORMS)
             self._subscribe(message, '/tf', on_pose, TRANSFORMS)
-        lost = SubscriptionEventCallbacks(message_lost=self._on_lost)
-        self._subscribe(PointCloud2, 'points', self._on_cloud, CLOUDS, lost)
+        if source in (ODOMETRY, POSE) and not self._config.frames.base_to_sensor:
+            self._subscribe_static()
+        for topic in self.cloud_topics:
+            self._subscribe_clouds(topic)
 
     def unsubscribe(self) -> None:
         """Take no more messages."""
@@ -112,13 +133,50 @@ class Inputs:
 
     def loss(self) -> str:
         """Return how many clouds were lost on the way and what to do about it, or nothing."""
-        if not self.clouds_lost:
+        if not self.lost:
             return ''
-        return (
-            f'{self.clouds_lost} clouds of {self.cloud_topic} lost on the way: large best-effort '
-            'messages need more shared memory than Fast DDS has by default; start their '
-            'publisher with the profile fastdds_shm.xml, see README.md'
+        which = ', '.join(f'{number} of {topic}' for topic, number in self.lost.items())
+        remedy = 'they come faster than they are taken; is the machine overloaded?'
+        if self._largest_bytes > LARGE_BYTES:
+            remedy = (
+                f'best-effort messages of {self._largest_bytes} bytes need more shared memory '
+                'than Fast DDS has by default; start their publisher with the profile '
+                'fastdds_shm.xml, see docs/inputs.md'
+            )
+        return f'clouds lost on the way ({which}): {remedy}'
+
+    @property
+    def cloud_topic(self) -> str:
+        """The first of the topics."""
+        return self.cloud_topics[0]
+
+    @property
+    def clouds_lost(self) -> int:
+        """How many clouds were lost on all topics."""
+        return sum(self.lost.values())
+
+    def _subscribe_clouds(self, topic: str) -> None:
+        """Subscribe to one sensor."""
+        lost = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
+        if self._config.input.kind == 'cloud':
+            self._subscribe(PointCloud2, topic, partial(self._on_cloud, topic), CLOUDS, lost)
+            return
+        self._subscribe(
+            CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic), CLOUDS
         )
+        self._subscribe(Image, topic, partial(self._on_image, topic), CLOUDS, lost)
+
+    def _subscribe_static(self) -> None:
+        """Subscribe to how sensors are mounted, which odometry does not say."""
+        try:
+            message = transform_message()
+        except DependencyError:
+            self._node.get_logger().warning(
+                'tf2_msgs is not installed, so /tf_static is not read: clouds have to be in '
+                f'{self._config.frames.base}, or set frames.base_to_sensor'
+            )
+            return
+        self._subscribe(message, '/tf_static', self._on_static, STATIC_TRANSFORMS)
 
     def _subscribe(
         self,
@@ -136,15 +194,30 @@ class Inputs:
                 callback,
                 copy.copy(qos),  # rclpy enters the overrides in what it is given
                 event_callbacks=events,
-                qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                qos_overriding_options=QoSOverridingOptions(policy_kinds=OVERRIDABLE),
             )
         except (ParameterException, InvalidQosOverridesError, RuntimeError) as error:
             name = self._node.resolve_topic_name(topic)
             raise ConfigError(f'qos_overrides.{name}.subscription: {error}') from error
         self._subscriptions.append(subscription)
 
-    def _on_cloud(self, msg: PointCloud2) -> None:
-        self._thread.put_cloud(msg, self.cloud_topic)
+    def _on_cloud(self, topic: str, msg: PointCloud2) -> None:
+        self._largest_bytes = max(self._largest_bytes, len(msg.data))
+        self._thread.put_cloud(msg, topic)
+
+    def _on_image(self, topic: str, msg: Image) -> None:
+        self._largest_bytes = max(self._largest_bytes, len(msg.data))
+        self._put_images(topic, self._images.add_image(topic, msg))
+
+    def _on_camera_info(self, topic: str, msg: CameraInfo) -> None:
+        try:
+            self._put_images(topic, self._images.add_info(topic, msg))
+        except CloudFormatError as error:
+            self._node.get_logger().error(str(error), throttle_duration_sec=10.0)
+
+    def _put_images(self, topic: str, images: Iterable[CameraImage]) -> None:
+        for image in images:
+            self._thread.put_cloud(image.msg, topic, partial(decode_image, image))
 
     def _on_pose(self, kind: str, msg: Any) -> None:
         self._thread.put_poses(poses_in(kind, msg, self._config.frames.base))
@@ -152,9 +225,14 @@ class Inputs:
     def _on_static(self, msg: Any) -> None:
         self._thread.put_poses(poses_in(TF, msg, self._config.frames.base), static=True)
 
-    def _on_lost(self, event: QoSMessageLostInfo) -> None:
-        self.clouds_lost = event.total_count
+    def _on_lost(self, topic: str, event: QoSMessageLostInfo) -> None:
+        self.lost[topic] = event.total_count
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
+
+
+def decode_image(image: CameraImage, _: Image, topic: str) -> Scan:
+    """Return the scan of an image, as the mapping thread asks for it."""
+    return depth_scan(image, topic)
 
 
 def transform_message() -> Any:

@@ -21,6 +21,7 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.scan import Scan
 
 MAX_POSES = 10_000
 """Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
@@ -29,10 +30,11 @@ Result = TypeVar('Result')
 
 
 class Cloud(NamedTuple):
-    """A message that waits to be mapped."""
+    """A message that waits to be mapped, and what makes a scan of it."""
 
     msg: Any
     topic: str
+    decode: Callable[[Any, str], Scan]
 
 
 class Call(NamedTuple):
@@ -103,10 +105,12 @@ class MappingThread:
                 self._poses_lost += 1
             self._changed.notify()
 
-    def put_cloud(self, msg: Any, topic: str) -> None:
-        """Queue a cloud; where too many wait, the oldest is dropped."""
+    def put_cloud(
+        self, msg: Any, topic: str, decode: Callable[[Any, str], Scan] = to_scan
+    ) -> None:
+        """Queue a cloud, or an image to be decoded; where too many wait, the oldest is dropped."""
         with self._changed:
-            self._work.append(Cloud(msg, topic))
+            self._work.append(Cloud(msg, topic, decode))
             self._num_clouds += 1
             if self._num_clouds > self._max_clouds:
                 oldest = next(item for item in self._work if isinstance(item, Cloud))
@@ -135,7 +139,7 @@ class MappingThread:
                 self._changed.notify()
         return future
 
-    def post(self, function: Callable[[], None]) -> None:
+    def post(self, function: Callable[[], object]) -> None:
         """Have a function called in this thread, unless it waits to be called already."""
         call = Call(function)
         with self._changed:
@@ -199,7 +203,7 @@ class MappingThread:
             return
         try:
             with self._mapper.counters.timed('decode'):
-                scan = to_scan(cloud.msg, cloud.topic)
+                scan = cloud.decode(cloud.msg, cloud.topic)
         except CloudFormatError as error:
             reason = f'in frame {frame_id!r}, {error}'
             self._mapper.refuse_clouds('bad_cloud', cloud.topic, reason, frame_id=frame_id)

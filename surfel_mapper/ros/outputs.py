@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node publishes of the map: all of it, its changes, markers.
+What the node publishes of the map: all of it, its changes, the scan with normals, pictures.
 
 Timers run in the executor's thread and only ask whether there is news and somebody to read it;
 messages are made in the mapping thread, between two scans, where the map does not change. Rates
@@ -10,24 +10,46 @@ are those of a steady clock: they hold while simulated time stands still or jump
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import CancelledError
+from typing import Any
+
+from nav_msgs.msg import OccupancyGrid
+import numpy as np
+import numpy.typing as npt
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import PublishConfig
 from surfel_mapper.io.cdr import marker_array
-from surfel_mapper.io.markers import surfel_markers
+from surfel_mapper.io.map_cloud import moment_columns, voxel_columns
+from surfel_mapper.io.markers import disc_colors, surfel_markers
+from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
+from surfel_mapper.io.scan_normals import scan_with_normals
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.messages import surfel_cloud
+from surfel_mapper.ros.messages import cloud_message, grid_message
+from surfel_mapper.ros.waiting import result_of
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 """The last message is kept for those who subscribe later."""
+
+CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
+"""Holds 5 s at 20 Hz, so that a client that mirrors the map may be slow for a while."""
+
+
+NO_VOXELS = np.empty((0, 3), np.int32)
 
 
 class Outputs:
@@ -50,34 +72,57 @@ class Outputs:
         self._node = node
         self._mapper = mapper
         self._thread = thread
+        self._changes = Changes(mapper)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
-        self._changed = node.create_publisher(PointCloud2, '~/changed', 10)
+        self._changed = node.create_publisher(PointCloud2, '~/changed', CHANGES)
+        self._removed = node.create_publisher(PointCloud2, '~/removed', CHANGES)
+        self._scan_normals = node.create_publisher(PointCloud2, '~/scan_normals', 10)
         self._markers = node.create_publisher(MarkerArray, '~/markers', LATCHED)
+        self._grid = node.create_publisher(OccupancyGrid, '~/grid', LATCHED)
         self._stamp_ns = 0
-        self._normals_version = self._markers_version = mapper.map.version
+        self._center = np.zeros(2)
+        published = (self._normals, self._markers, self._grid)
+        self._published: dict[Any, int] = dict.fromkeys(published, mapper.map.version)
         self._timers: list[Timer] = []
+        group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on
+        node.create_service(
+            Trigger, '~/publish_normals', self._on_publish_normals, callback_group=group
+        )
 
     def publish_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
-        self._stamp_ns = update.stamp_ns
-        if self._mapper.config.publish.changed and self._changed.get_subscription_count():
-            self._changed.publish(surfel_cloud(update.changed, update.stamp_ns, update.frame_id))
+        self._stamp_ns, self._center = update.stamp_ns, update.T_fixed_sensor[:2, 3]
+        if self._has_clients():
+            self._publish_change(self._changes.of(update))
+        else:
+            self._changes.forget()
+        if self._scan_normals.get_subscription_count():
+            self._publish_scan_normals(update)
 
     def expire(self) -> None:
-        """Publish all anew, as other settings make other surfels; called in the mapping thread."""
-        self._normals_version = self._markers_version = -1
+        """
+        Publish all anew, and what else than a scan has changed; called in the mapping thread.
+
+        To be called whenever the map or its settings have changed in another way.
+        """
+        self._published.clear()
+        if self._has_clients():
+            self._publish_change(self._changes.since_last())
 
     def start_timers(self, rates: PublishConfig) -> None:
         """Publish at these rates from now on; called in the executor's thread."""
         self.stop_timers()
-        for rate_hz, callback in (
-            (rates.normals_rate_hz, self._on_normals_timer),
-            (rates.markers_rate_hz, self._on_markers_timer),
+        for rate_hz, publisher, publish in (
+            (rates.normals_rate_hz, self._normals, self._publish_normals),
+            (rates.markers_rate_hz, self._markers, self._publish_markers),
+            (self._mapper.config.grid.rate_hz, self._grid, self._publish_grid),
         ):
             if rate_hz:
                 steady = Clock(clock_type=ClockType.STEADY_TIME)
-                timer = self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
-                self._timers.append(timer)
+                callback = self._poster(publisher, publish)
+                self._timers.append(
+                    self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
+                )
 
     def stop_timers(self) -> None:
         """Publish nothing at a rate any more."""
@@ -85,29 +130,82 @@ class Outputs:
             self._node.destroy_timer(timer)
         self._timers.clear()
 
-    def _on_normals_timer(self) -> None:
-        if self._normals_version != self._mapper.map.version:
-            self._thread.post(self._publish_normals)
+    def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
+        """Return a callback that has the mapping thread publish where there is news to read."""
+        is_latched_for_all = publisher is self._normals or publisher is self._grid
 
-    def _on_markers_timer(self) -> None:
-        news = self._markers_version != self._mapper.map.version
-        if news and self._markers.get_subscription_count():
-            self._thread.post(self._publish_markers)
+        def post() -> None:
+            is_new = self._published.get(publisher) != self._mapper.map.version
+            if is_new and (is_latched_for_all or publisher.get_subscription_count()):
+                self._thread.post(publish)
 
-    def _publish_normals(self) -> None:
-        config, surfel_map = self._mapper.config, self._mapper.map
-        surfels = surfel_map.surfels(config.map.min_points)
-        self._normals.publish(surfel_cloud(surfels, self._stamp_ns, config.frames.fixed))
-        self._normals_version = surfel_map.version
+        return post
+
+    async def _on_publish_normals(
+        self, _: Trigger.Request, response: Trigger.Response
+    ) -> Trigger.Response:
+        try:
+            number = await result_of(self._thread.call(self._publish_normals), self._node.executor)
+            response.success, response.message = True, f'{number} surfels published'
+        except CancelledError:
+            response.message = 'the node is about to end'
+        return response
+
+    # What follows is called in the mapping thread.
+
+    def _has_clients(self) -> bool:
+        wants_changed = self._mapper.config.publish.changed
+        return bool(
+            (wants_changed and self._changed.get_subscription_count())
+            or self._removed.get_subscription_count()
+        )
+
+    def _publish_change(self, change: Change) -> None:
+        mapper = self._mapper
+        if mapper.config.publish.changed:
+            self._changed.publish(self._surfel_cloud(change.surfels, change.removed))
+        columns = voxel_columns(change.removed, mapper.map.voxel_size_m)
+        content = from_columns(columns)
+        self._removed.publish(cloud_message(content, self._stamp_ns, mapper.map_frame))
+
+    def _surfel_cloud(
+        self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
+    ) -> PointCloud2:
+        """Return surfels as a cloud; with moments also what is gone, if they are asked for."""
+        columns = surfel_columns(surfels)
+        if self._mapper.config.publish.moments:
+            moments = self._mapper.map.moments(surfels.voxel_index)
+            columns = moment_columns(surfels, moments, removed)
+        return cloud_message(from_columns(columns), self._stamp_ns, self._mapper.map_frame)
+
+    def _publish_scan_normals(self, update: Update) -> None:
+        scan, surfel_map = update.scan, self._mapper.map
+        min_points = self._mapper.config.map.min_points
+        content = scan_with_normals(scan, update.T_fixed_sensor, surfel_map, min_points)
+        self._scan_normals.publish(cloud_message(content, scan.stamp_ns, scan.frame_id))
+
+    def _publish_normals(self) -> int:
+        surfels = self._mapper.map.surfels(self._changes.min_points)
+        self._normals.publish(self._surfel_cloud(surfels))
+        self._published[self._normals] = self._mapper.map.version
+        return len(surfels)
 
     def _publish_markers(self) -> None:
         config, surfel_map = self._mapper.config, self._mapper.map
+        surfels = surfel_map.surfels(config.map.min_points, config.publish.max_markers)
         markers = surfel_markers(
-            surfel_map.surfels(config.map.min_points),
+            surfels,
             surfel_map.voxel_size_m,
+            disc_colors(config.publish.marker_color, surfels, self._mapper.window),
             stamp_ns=self._stamp_ns,
-            frame_id=config.frames.fixed,
-            max_markers=config.publish.max_markers,
+            frame_id=self._mapper.map_frame,
         )
         self._markers.publish(marker_array(markers))
-        self._markers_version = surfel_map.version
+        self._published[self._markers] = surfel_map.version
+
+    def _publish_grid(self) -> None:
+        config, surfel_map = self._mapper.config, self._mapper.map
+        surfels = surfel_map.surfels(config.map.min_points)
+        grid = traversability(surfels, surfel_map.voxel_size_m, self._center, config.grid)
+        self._grid.publish(grid_message(grid, self._stamp_ns, self._mapper.map_frame))
+        self._published[self._grid] = surfel_map.version

@@ -127,18 +127,19 @@ def test_images_wait_for_the_first_calibration_of_their_own_camera():
     first, second, other = image(), image(), image()
     assert images.add_image('/a', first) == images.add_image('/a', second) == []
     assert images.add_image('/b', other) == []
-    assert images.add_info('/a', info()) == [CameraImage(first, CAMERA), CameraImage(second, CAMERA)]
+    ready = images.add_info('/a', info())
+    assert ready == [CameraImage(first, CAMERA), CameraImage(second, CAMERA)]
     assert images.add_info('/a', info()) == []
     assert images.add_image('/a', first) == [CameraImage(first, CAMERA)]
-    assert images.num_dropped == 0
 
 
-def test_only_so_many_images_wait():
+def test_only_so_many_images_wait_and_the_oldest_is_given_up():
     images = DepthImages()
-    for number in range(MAX_EARLY + 3):
-        images.add_image('/a', number)
-    assert images.num_dropped == 3
+    given_up = [found for n in range(MAX_EARLY + 3) for found in images.add_image('/a', n)]
+    assert given_up == [CameraImage(number, None) for number in range(3)]
     assert [found.msg for found in images.add_info('/a', info())] == list(range(3, MAX_EARLY + 3))
+    with pytest.raises(CloudFormatError, match='does anybody publish /camera/depth/camera_info'):
+        depth_scan(CameraImage(image(), None), TOPIC)
 
 
 def test_a_later_calibration_holds_from_then_on():

@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A grid of what ground is worth driving on: how steep it is, and how high its steps are.
+
+A cell is a column of voxels. Its ground is made of its lowest surfel and those not higher above
+it than a robot can pass under. A slope is no step: heights of neighbours are compared where
+their cells meet, after each has been continued along its own slope to there.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import GridConfig
+from surfel_mapper.mapping.surfels import Surfels
+
+UNKNOWN = -1
+
+OBSTACLE = 100
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TraversabilityGrid:
+    """
+    Costs of the cells around a place.
+
+    Attributes
+    ----------
+    resolution_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        x and y of the outer corner of the first cell.
+    cost : (rows along y, columns along x) int8
+        0 flat, 100 obstacle, -1 never seen.
+
+    """
+
+    resolution_m: float
+    origin: npt.NDArray[np.float64]
+    cost: npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ground:
+    """What is known of the cells that hold surfels, one row each, by ascending cell."""
+
+    cell: npt.NDArray[np.int64]
+    top: npt.NDArray[np.int64]
+    lowest: npt.NDArray[np.int64]
+    upright: npt.NDArray[np.float64]
+
+
+def traversability(
+    surfels: Surfels, voxel_size_m: float, center: npt.ArrayLike, limits: GridConfig
+) -> TraversabilityGrid:
+    """
+    Return the grid of a map.
+
+    Parameters
+    ----------
+    surfels : Surfels
+        In a frame whose z is up; those without a normal say nothing.
+    voxel_size_m : float
+        Edge of a voxel, and of a cell.
+    center : (2,) float, m
+        About where.
+    limits : GridConfig
+        Size of the grid, and what makes an obstacle.
+
+    Returns
+    -------
+    TraversabilityGrid
+        The larger of slope and step, in percent of its limit; 100 from the limit on.
+
+    """
+    number = max(math.ceil(limits.size_m / voxel_size_m), 1)
+    first = np.floor(np.asarray(center, np.float64) / voxel_size_m).astype(np.int64) - number // 2
+    place = surfels.voxel_index[:, :2] - first
+    inside = ((place >= 0) & (place < number)).all(axis=1) & np.isfinite(surfels.planarity)
+    cost = np.full(number * number, UNKNOWN, np.int8)
+    if inside.any():
+        chosen = surfels.select(inside)
+        cell = place[inside, 1] * number + place[inside, 0]
+        ground = ground_of(chosen, cell, limits.clearance_m)
+        slope_deg = np.degrees(np.arccos(np.minimum(ground.upright, 1.0)))
+        step_m = steps(chosen, ground, voxel_size_m, number, limits.max_slope_deg)
+        share = np.maximum(slope_deg / limits.max_slope_deg, step_m / limits.max_step_m)
+        cost[ground.cell] = np.minimum(share * OBSTACLE, OBSTACLE).astype(np.int8)
+    origin = first.astype(np.float64) * voxel_size_m
+    return TraversabilityGrid(voxel_size_m, origin, cost.reshape(number, number))
+
+
+def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float) -> Ground:
+    """Return the ground of every cell: its lowest and its top surfel, and its steepest one."""
+    height = surfels.position[:, 2]
+    order = np.lexsort((height, cell))
+    starts = np.flatnonzero(np.diff(cell[order], prepend=-1))
+    lowest = order[starts]
+    bottom = np.repeat(height[lowest], np.diff(starts, append=len(order)))
+    is_ground = height[order] <= bottom + clearance_m
+    number = np.add.reduceat(is_ground.astype(np.int64), starts)
+    upright = np.where(is_ground, np.abs(surfels.normal[order, 2]), 1.0)
+    return Ground(
+        cell=cell[lowest],
+        top=order[starts + number - 1],
+        lowest=lowest,
+        upright=np.minimum.reduceat(upright, starts),
+    )
+
+
+def steps(
+    surfels: Surfels, ground: Ground, voxel_size_m: float, number: int, max_slope_deg: float
+) -> npt.NDArray[np.float64]:
+    """Return the highest step within each cell and towards its four neighbours, m."""
+    steepest = math.tan(math.radians(min(max_slope_deg, 89.0)))
+    top, lowest = surfels.position[ground.top], surfels.position[ground.lowest]
+    normal = surfels.normal[ground.top]
+    upright = np.where(normal[:, 2] == 0.0, 1e-9, normal[:, 2])
+    slope = np.clip(-normal[:, :2] / upright[:, None], -steepest, steepest)
+    rise = ((top - lowest)[:, :2] * slope).sum(axis=1)
+    highest = np.abs(top[:, 2] - lowest[:, 2] - rise)
+    row_of = np.full(number * number, -1)
+    row_of[ground.cell] = np.arange(len(ground.cell))
+    index = surfels.voxel_index[ground.top, :2]
+    for axis, stride in ((0, 1), (1, number)):
+        has_next = ground.cell // (number if axis else 1) % number < number - 1
+        here = np.flatnonzero(has_next)
+        there = row_of[ground.cell[here] + stride]
+        here, there = here[there >= 0], there[there >= 0]
+        border = (index[here] + 0.5) * voxel_size_m
+        border[:, axis] += 0.5 * voxel_size_m
+        heights = [
+            top[rows, 2] + ((border - top[rows, :2]) * slope[rows]).sum(axis=1)
+            for rows in (here, there)
+        ]
+        step = np.abs(heights[0] - heights[1])
+        for rows in (here, there):  # each row is the neighbour of one at most
+            highest[rows] = np.maximum(highest[rows], step)
+    return np.asarray(highest)
