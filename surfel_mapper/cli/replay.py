@@ -28,11 +28,6 @@ if TYPE_CHECKING:
 
 SUMMARY = 'Map the clouds of a bag and write the map, a picture and figures.'
 
-STAGES = (
-    'decode', 'deskew', 'filter', 'register', 'reduce', 'insert', 'align', 'normals', 'total'
-)  # fmt: skip
-"""Of which the report states the times."""
-
 EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
 
 
@@ -59,6 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="let scans leave the map by the configuration's window, as the node does",
     )
     parser.add_argument(
+        '--align',
+        action='store_true',
+        help='move the scans in the end to where they agree with each other; keeps all points '
+        'in memory until then',
+    )
+    parser.add_argument(
         '--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text'
     )
     parser.add_argument('--json', action='store_true', help='print the summary as JSON')
@@ -71,12 +72,14 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.io.bag_topics import CLOUD
     from surfel_mapper.io.heap import keep_freed_memory
     from surfel_mapper.io.trajectory import write_tum
-    from surfel_mapper.offline.replay import ALL_SCANS, load_start, pose_topics
+    from surfel_mapper.offline.replay import ALL_SCANS, load_start, pose_topics, poses_now
     from surfel_mapper.pipeline import Mapper
 
     config = load_config(args.config)
     if args.filters is not None:
         config = config.replace({'filters': args.filters})
+    if args.align:
+        config = config.replace({'window.keep_points': True})
     mapper = Mapper(config if args.window else config.replace(ALL_SCANS))
     load_start(mapper)
     output = output_directory(args.bag, args.output)
@@ -96,6 +99,9 @@ def run(args: argparse.Namespace) -> int:
             'window': args.window,
         }
     refuse_empty(args.bag, topic, mapper)
+    if args.align:
+        source['alignment'] = mapper.align().summary()
+    trajectory = poses_now(mapper, stamps_ns, trajectory)
     if args.poses_out is not None:
         write_tum(args.poses_out, stamps_ns, trajectory)
     summary = {**source, **mapper.summary(), 'settings': mapper.config.to_mapping()}
@@ -176,44 +182,3 @@ def write(
     draw_map(surfels, output / 'map.png', title, trajectory=trajectory)
     with replace_file(output / 'summary.json') as file:
         file.write((json.dumps(summary, indent=2) + '\n').encode())
-
-
-def report(summary: dict[str, Any], output: Path) -> str:
-    """Return the summary in a few lines for people."""
-    scans, times = summary['scans'], summary['milliseconds']
-    out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
-    gated = f' ({scans["gated"]} left out by the motion gate)'
-    localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
-    stages = '   '.join(
-        f'{stage} {times[stage]["median"]:.1f} ms'
-        for stage in STAGES
-        if stage in times
-    )
-    filters = ''.join(
-        f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
-        f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
-        for name, done in summary['filters'].items()
-    )
-    speed = summary['recorded_s'] / summary['replay_s']
-    return (
-        f'scans {scans["received"]}{out if scans["dropped"] else ""}'
-        f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
-        f'surfels {summary["surfels"]}\n'
-        f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
-        f'{filters}'
-        f'digest {summary["digest"]}\n'
-        f'{output / "map.ply"}   {output / "map.png"}   {output / "summary.json"}'
-    )
-
-
-def causes(counts: dict[str, int]) -> str:
-    """Return counts by cause for people: no pose 4, no points 1."""
-    return ', '.join(f'{cause.replace("_", " ")} {count}' for cause, count in counts.items())
-
-
-def rounded(number: int) -> str:
-    """Return a number with three digits and k or M."""
-    for factor, letter in ((10**9, 'G'), (10**6, 'M'), (10**3, 'k')):
-        if number >= factor:
-            return f'{number / factor:.3g} {letter}'
-    return str(number)

@@ -25,6 +25,9 @@ from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.span import Span, WHOLE
 
 if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not need
+    import numpy as np
+    import numpy.typing as npt
+
     from surfel_mapper.pipeline import Mapper, Update
 
 TYPES = {'tf': TF, 'odometry': ODOMETRY, 'pose': POSE}
@@ -218,6 +221,30 @@ def numbers_before(
     if poses.path is None or poses.path.has_stamps or span.start_ns is None:
         return Counter()
     return Counter(message.topic for message in reader.messages(clouds, None, span.start_ns))
+
+
+def poses_now(
+    mapper: Mapper, stamps_ns: Sequence[int], T_map_sensor: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """
+    Return the poses of scans as alignment left them, as far as they are in the window.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        Which mapped the scans.
+    stamps_ns : sequence of int
+        Of the scans, in the order in which they were mapped.
+    T_map_sensor : (S, 4, 4) float64
+        Where each was when it was mapped.
+
+    """
+    result: npt.NDArray[np.float64] = T_map_sensor.copy()
+    for place, scan in enumerate(reversed(list(mapper.window)), start=1):
+        if place > len(stamps_ns) or stamps_ns[-place] != scan.stamp_ns:
+            break
+        result[-place] = scan.T_map_sensor
+    return result
 
 
 def add_cloud(

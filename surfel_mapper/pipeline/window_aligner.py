@@ -13,6 +13,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -61,6 +63,23 @@ class Aligned:
     largest_m: float
     largest_deg: float
     removed_voxel_index: npt.NDArray[np.int32]
+
+    def summary(self) -> dict[str, Any]:
+        """Return it as plain numbers, and in words."""
+        gaps = [gap for gap in self.alignment.residuals.values() if math.isfinite(gap)]
+        return {
+            'scans': len(self.stamps_ns),
+            'moved': self.num_moved,
+            'largest_m': self.largest_m,
+            'largest_deg': self.largest_deg,
+            'settled': self.alignment.settled,
+            'rounds': self.alignment.rounds,
+            'compared': len(self.alignment.residuals),
+            'dropped': len(self.alignment.dropped),
+            'unconnected': len(self.alignment.unconnected),
+            'median_gap_m': float(np.median(gaps)) if gaps else None,
+            'text': str(self),
+        }
 
     def __str__(self) -> str:
         """Say it in a sentence, for logs and services."""
