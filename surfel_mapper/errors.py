@@ -15,6 +15,7 @@ Every exception that this package raises on purpose.
       AlignmentError       scans, pairs or poses from which no poses follow           (ValueError)
       BagError             a bag that cannot be read, or lacks what is asked of it
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
+      ClusterError         workers or a scheduler that cannot be reached, or die again and again
       DependencyError      an optional package is missing; says how to install it     (ImportError)
 
 A caller that only wants to go on with the next scan catches SurfelMapperError.
@@ -71,6 +72,10 @@ class FileFormatError(SurfelMapperError, ValueError):
 
 class SubscriberError(SurfelMapperError):
     """Nobody subscribes to what is to be published."""
+
+
+class ClusterError(SurfelMapperError):
+    """Workers or their scheduler cannot be reached, or died again and again."""
 
 
 class DependencyError(SurfelMapperError, ImportError):

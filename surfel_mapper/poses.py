@@ -193,6 +193,30 @@ class TransformBuffer:
         held = (edge.stamps for edge in above if not edge.is_static)
         return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
 
+    def held(self, since_ns: int | None = None) -> list[tuple[str, str, list[int], bytes]]:
+        """
+        Return all that answers to lookups from a stamp on depend on, to compare two buffers.
+
+        Parameters
+        ----------
+        since_ns : int, optional
+            The oldest stamp that will be asked for; any without it.
+
+        Returns
+        -------
+        list of (str, str, list of int, bytes)
+            For each edge, sorted: child, parent, stamps (none where static), transforms.
+
+        """
+        found = []
+        for child, edge in sorted(self._edges.items()):
+            first = 0
+            if since_ns is not None and not edge.is_static:
+                first = max(bisect_right(edge.stamps, since_ns) - 1, 0)
+            content = b''.join(transform.tobytes() for transform in edge.transforms[first:])
+            found.append((child, edge.parent, edge.stamps[first:], content))
+        return found
+
     def clear(self) -> None:
         """Forget the dynamic edges; static ones stay."""
         self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}

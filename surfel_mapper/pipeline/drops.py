@@ -22,7 +22,17 @@ WARN_EVERY_S = 1.0
 
 
 class Drops:
-    """Counts what is left out into the counters of a pipeline, and warns about it."""
+    """
+    Counts what is left out into the counters of a pipeline, and warns about it.
+
+    Attributes
+    ----------
+    is_silent : bool
+        Whether it only counts.
+
+    """
+
+    is_silent = False
 
     def __init__(self, counters: Counters) -> None:
         """Count into these counters."""
@@ -47,6 +57,6 @@ class Drops:
     def warn(self, cause: str, message: str) -> None:
         """Log a warning, unless one of the same cause was logged just before."""
         now_s = time.monotonic()
-        if now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
+        if not self.is_silent and now_s - self._warned_s.get(cause, -WARN_EVERY_S) >= WARN_EVERY_S:
             self._warned_s[cause] = now_s
             _log.warning('%s', message)

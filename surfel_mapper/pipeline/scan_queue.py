@@ -45,9 +45,24 @@ class ScanQueue:
         return self._scans[0] if self._scans else None
 
     @property
+    def second(self) -> Scan | None:
+        """The one that comes after it."""
+        return self._scans[1] if len(self._scans) > 1 else None
+
+    @property
     def newest_ns(self) -> int | None:
         """The newest stamp that came in, whether its scan waits still or not."""
         return max(self._newest_ns.values(), default=None)
+
+    @property
+    def stamps(self) -> dict[str, int]:
+        """The newest stamp of every frame, ns."""
+        return dict(self._newest_ns)
+
+    @property
+    def waiting(self) -> list[tuple[str, int]]:
+        """Frame and stamp of every scan that waits, in order."""
+        return [(scan.frame_id, scan.stamp_ns) for scan in self._scans]
 
     def back_s(self, scan: Scan) -> float:
         """Return by how much the stamp of a scan is before the newest, s; 0 where it is not."""

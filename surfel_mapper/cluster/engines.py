@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Who does the work: this process, local workers, or those of a Dask scheduler anywhere.
+
+A task is a function of this package and its arguments; what it makes goes to files, what it
+returns is small. So a task that a lost worker was at is simply done again by another, by Dask
+itself, and several attempts leave the same files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Protocol, TypeVar
+
+from surfel_mapper.errors import ClusterError, DependencyError
+
+Item = TypeVar('Item')
+Result = TypeVar('Result')
+
+CONNECT_S = 20
+"""A scheduler has to answer within this time."""
+
+LOSSES = 5
+"""A task at which so many workers died is given up."""
+
+
+class Engine(Protocol):
+    """Runs tasks."""
+
+    @property
+    def num_workers(self) -> int:
+        """How many tasks run at a time."""
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of each item and what the function returns, as they get done."""
+
+
+class InProcess:
+    """Runs one task after the other, here."""
+
+    num_workers = 1
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result]]:
+        """Yield the number of each item and what the function returns."""
+        for number, item in enumerate(items):
+            yield number, function(item)
+
+
+class OnDask:
+    """
+    Runs tasks on the workers of a Dask client.
+
+    Parameters
+    ----------
+    client : distributed.Client
+        Whose workers are to be used.
+
+    """
+
+    def __init__(self, client: Any) -> None:
+        """Take a client."""
+        self._client = client
+
+    @property
+    def num_workers(self) -> int:
+        """How many workers there are now."""
+        return max(len(self._client.scheduler_info(n_workers=-1)['workers']), 1)
+
+    def run(
+        self, function: Callable[[Item], Result], items: Sequence[Item]
+    ) -> Iterator[tuple[int, Result]]:
+        """
+        Yield the number of each item and what the function returns, as they get done.
+
+        Raises
+        ------
+        ClusterError
+            If workers died at a task again and again, or the scheduler is gone.
+
+        """
+        from distributed import as_completed, CancelledError, KilledWorker
+
+        futures = {
+            self._client.submit(function, item, pure=False): number
+            for number, item in enumerate(items)
+        }
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+                future.release()
+        except KilledWorker as error:
+            raise ClusterError(
+                f'{LOSSES} workers died at the same task; is their memory large enough? {error}'
+            ) from error
+        except (CancelledError, OSError) as error:
+            raise ClusterError(f'the scheduler is gone: {error}') from error
+        finally:
+            self._client.cancel(list(futures))
+
+
+@contextmanager
+def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
+    """
+    Give whatever runs tasks, and close it at the end.
+
+    Parameters
+    ----------
+    workers : int, optional
+        So many processes on this machine.
+    scheduler : str, optional
+        Address of a Dask scheduler, tcp://host:8786, whose workers can read and write the same
+        paths as this process.
+
+    Raises
+    ------
+    ClusterError
+        If the scheduler does not answer, or has no workers.
+    DependencyError
+        If Dask is needed and not installed.
+
+    """
+    if workers is None and scheduler is None:
+        yield InProcess()
+        return
+    try:
+        import dask
+        from distributed import Client, LocalCluster
+    except ImportError as error:
+        raise DependencyError(
+            f'dask cannot be loaded ({error}). It runs the workers; install it with '
+            '`pip install surfel_mapper[cluster]`'
+        ) from error
+    settings = {
+        'distributed.scheduler.allowed-failures': LOSSES,
+        'distributed.comm.timeouts.connect': f'{CONNECT_S}s',
+    }
+    with dask.config.set(settings):
+        if scheduler is None:
+            with (
+                LocalCluster(
+                    n_workers=workers, threads_per_worker=1, dashboard_address=None
+                ) as cluster,
+                Client(cluster) as client,
+            ):
+                yield OnDask(client)
+            return
+        try:
+            client = Client(scheduler, timeout=CONNECT_S)
+        except (OSError, ValueError) as error:
+            raise ClusterError(f'{scheduler}: no Dask scheduler answers: {error}') from error
+        with client:
+            if not client.scheduler_info(n_workers=-1)['workers']:
+                raise ClusterError(f'{scheduler}: no workers; start some with `dask worker`')
+            yield OnDask(client)

@@ -1,0 +1,317 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From shards or finished maps to one map in tiles.
+
+The tiles are written to a directory beside the one wanted, which takes its name when all is
+done, so that an earlier map is there, whole, until then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, fields, replace
+import logging
+from pathlib import Path
+import secrets
+import shutil
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.cluster.engines import Engine
+from surfel_mapper.cluster.merging import (
+    DATASET,
+    gathered,
+    merge_tile,
+    Parts,
+    parts_of_map,
+    TileTask,
+)
+from surfel_mapper.cluster.shards import LONGER, map_shard, Shard, ShardResult
+from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.io.parquet_tiles import dataset_digest, Part, Tile
+from surfel_mapper.mapping.surfels import Surfels
+
+log = logging.getLogger(__name__)
+
+SAMPLE = 100_000
+"""About so many surfels are sent back for pictures."""
+
+OnDone = Callable[[str, float], object]
+"""Told how many seconds of recordings ('map') or tiles ('merge') got done."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TiledMap:
+    """
+    A map in tiles.
+
+    Attributes
+    ----------
+    directory : Path
+        The dataset.
+    digest : str
+        Equal to SurfelMap.digest of the same map.
+    voxels, points, surfels, tiles : int
+    sample : Surfels
+        Some of its surfels, for pictures.
+    peak_bytes : int
+        The most memory that a process had which merged.
+
+    """
+
+    directory: Path
+    digest: str
+    voxels: int
+    points: int
+    surfels: int
+    tiles: int
+    sample: Surfels
+    peak_bytes: int
+
+
+@dataclass(slots=True, kw_only=True)
+class Mapped:
+    """
+    What became of all shards.
+
+    Attributes
+    ----------
+    map : TiledMap
+    results : list of ShardResult
+        In the order of the shards.
+    repeated : int
+        Shards that were mapped again because they had begun too late.
+
+    """
+
+    map: TiledMap
+    results: list[ShardResult]
+    repeated: int
+
+    @property
+    def places(self) -> npt.NDArray[np.float64]:
+        """Where the sensor was, (P, 3) m."""
+        return np.concatenate([np.empty((0, 3)), *(result.places for result in self.results)])
+
+    def counts(self) -> dict[str, Any]:
+        """Return the counts of all shards together, as Counters.summary has them."""
+        total: dict[str, Any] = {}
+        for result in self.results:
+            total = added(total, result.counts)
+        return total
+
+
+def map_bags(
+    shards: Sequence[Shard],
+    engine: Engine,
+    directory: Path,
+    on_done: OnDone = lambda kind, amount: None,
+) -> Mapped:
+    """
+    Map shards into a dataset of tiles.
+
+    Parameters
+    ----------
+    shards : sequence of Shard
+        All of each bag, in order.
+    engine : Engine
+        Who does the work.
+    directory : Path
+        The output directory; the tiles are in ``map`` inside it.
+    on_done : callable
+        For progress.
+
+    Raises
+    ------
+    MapError
+        If no scan was mapped, or a voxel would hold too many points.
+    BagError, FileFormatError, ClusterError
+        If a bag cannot be read, a file cannot be written, or the workers are lost.
+
+    """
+    with work_directory(directory) as work:
+        run = ShardRun(list(shards), engine, work, on_done)
+        run.all()
+        results = run.ordered()
+        parts = gathered(result.parts for result in results)
+        tiled = merge(parts, engine, directory, shards[0].config.map.min_points, on_done)
+    return Mapped(map=tiled, results=results, repeated=run.repeated)
+
+
+def merge_maps(
+    sources: Sequence[str | Path],
+    engine: Engine,
+    directory: Path,
+    min_points: int,
+    on_done: OnDone = lambda kind, amount: None,
+) -> TiledMap:
+    """Merge finished maps into a dataset of tiles in ``map`` inside a directory; see map_bags."""
+    with work_directory(directory) as work:
+        found: list[dict[Tile, Part]] = []
+        for number, source in enumerate(sources):
+            place = work / str(number)
+            place.mkdir()
+            found += parts_of_map(source, place)
+        return merge(gathered(found), engine, directory, min_points, on_done)
+
+
+@dataclass(slots=True)
+class ShardRun:
+    """Maps shards, again where one began too late, until every one fits the one before it."""
+
+    shards: list[Shard]
+    engine: Engine
+    work: Path
+    on_done: OnDone
+    repeated: int = 0
+    results: dict[int, ShardResult] = field(default_factory=dict)
+
+    def all(self) -> None:
+        """Map all shards."""
+        wanted = list(range(len(self.shards)))
+        while wanted:
+            paths = [str(self.work / f'shard-{number}.parquet') for number in wanted]
+            tasks = [(self.shards[n], path) for n, path in zip(wanted, paths, strict=True)]
+            for done, result in self.engine.run(map_task, tasks):
+                if wanted[done] not in self.results:
+                    self.on_done('map', result.recorded_s)
+                self.results[wanted[done]] = result
+            wanted = self.torn() or self.begun_too_late()
+            self.repeated += len(wanted)
+
+    def ordered(self) -> list[ShardResult]:
+        """Return the results in the order of the shards."""
+        return [self.results[number] for number in sorted(self.results)]
+
+    def begun_too_late(self) -> list[int]:
+        """Return the shards that do not fit the one before; they begin earlier next time."""
+        late = []
+        for number, shard in enumerate(self.shards):
+            if shard.start_ns is None or number not in self.results:
+                continue
+            if self.results[number].before != self.results[number - 1].after:
+                late.append(number)
+                self.shards[number] = replace(shard, lead_s=shard.lead_s * LONGER)
+        return late
+
+    def torn(self) -> list[int]:
+        """Return the first shards of bags in which time was set back: each is all of its bag."""
+        again = []
+        for number, shard in enumerate(self.shards):
+            parts = [n for n, other in enumerate(self.shards) if other.bag == shard.bag]
+            if shard.start_ns is not None or shard.stop_ns is None:
+                continue
+            if any(self.results[n].resets for n in parts if n in self.results):
+                log.warning('%s: time is set back in it; it is mapped in one go', shard.bag)
+                self.shards[number] = replace(shard, stop_ns=None)
+                again.append(number)
+                for other in parts:
+                    if self.shards[other].start_ns is not None:
+                        self.results.pop(other, None)
+        return again
+
+
+def map_task(task: tuple[Shard, str]) -> ShardResult:
+    """Map a shard to a file."""
+    return map_shard(*task)
+
+
+def merge(
+    parts: Parts, engine: Engine, directory: Path, min_points: int, on_done: OnDone
+) -> TiledMap:
+    """Make every tile, take the digest, and give the dataset its name."""
+    if not parts:
+        raise MapError('no scan was mapped')
+    share = min(SAMPLE / sum(part.num_voxels for found in parts.values() for part in found), 1.0)
+    fresh = directory.resolve() / f'.{DATASET}-{secrets.token_hex(8)}.part'
+    tasks = [
+        TileTask(
+            parts=tuple(found), path=str(fresh / tile.path), min_points=min_points, share=share
+        )
+        for tile, found in sorted(parts.items())
+    ]
+    try:
+        done = dict(_done(engine.run(merge_tile, tasks), on_done))
+        tiles = [done[number] for number in range(len(tasks))]
+        ((_, digest),) = engine.run(dataset_digest, [str(fresh)])
+        take_name(fresh, directory / DATASET)
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+    return TiledMap(
+        directory=directory / DATASET,
+        digest=digest,
+        voxels=sum(tile.voxels for tile in tiles),
+        points=sum(tile.points for tile in tiles),
+        surfels=sum(tile.surfels for tile in tiles),
+        tiles=len(tiles),
+        sample=joined([tile.sample for tile in tiles]),
+        peak_bytes=max(tile.peak_bytes for tile in tiles),
+    )
+
+
+def take_name(fresh: Path, wanted: Path) -> None:
+    """Give a finished dataset its name; what had it before is removed."""
+    old = wanted.with_name(f'.{wanted.name}-{secrets.token_hex(8)}.old')
+    try:
+        if wanted.exists():
+            wanted.rename(old)
+        fresh.rename(wanted)
+    except OSError as error:
+        raise FileFormatError(f'{wanted}: cannot be written: {error.strerror}') from error
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def work_directory(directory: Path) -> Iterator[Path]:
+    """Give a directory for parts inside the output directory, and remove it at the end."""
+    wanted = directory / DATASET
+    if wanted.exists() and not (wanted.is_dir() and all(map(is_tiles, wanted.iterdir()))):
+        raise FileFormatError(f'{wanted}: holds something else, expected tiles of a map, or none')
+    work = directory.resolve() / f'.shards-{secrets.token_hex(8)}.part'
+    try:
+        work.mkdir(parents=True)
+    except OSError as error:
+        raise FileFormatError(f'{work}: cannot be made: {error.strerror}') from error
+    try:
+        yield work
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+
+
+def is_tiles(path: Path) -> bool:
+    """Return whether a path in a dataset is one that a dataset has."""
+    return path.is_dir() and path.name.startswith('tile_i=')
+
+
+def joined(parts: Sequence[Surfels]) -> Surfels:
+    """Return the surfels of all parts."""
+    names = [each.name for each in fields(Surfels) if each.name != 'channels']
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    channels = {
+        name: np.concatenate([part.channels[name] for part in parts])
+        for name in parts[0].channels
+    }
+    return Surfels(**columns, channels=channels)
+
+
+def added(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+    """Return counts added up; of the times of stages, the larger."""
+    total = dict(first)
+    for name, value in second.items():
+        if isinstance(value, dict):
+            total[name] = added(total.get(name, {}), value)
+        elif name in ('median', 'p99'):
+            total[name] = max(total.get(name, 0.0), value)
+        else:
+            total[name] = total.get(name, 0) + value
+    return total
+
+
+def _done(results: Iterator[Any], on_done: OnDone) -> Iterator[Any]:
+    for result in results:
+        on_done('merge', 1.0)
+        yield result

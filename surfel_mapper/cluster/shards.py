@@ -1,0 +1,284 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Shards: bags cut by record time, each mapped on its own as if all before it had been seen.
+
+A worker reads a shard from a while before it on, so that poses and stamps are known when it
+begins; what it needs to know there is hashed at both ends (ShardMapper.outlook). Where the end
+of one shard and the beginning of the next disagree, the next is mapped again from earlier on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from copy import deepcopy
+from dataclasses import dataclass, field, replace
+import math
+import resource
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.io.bag import BagMessage, BagReader
+from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.io.parquet_tiles import Part, Tile, write_shard
+from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS, PoseTopics, replay
+from surfel_mapper.offline.span import Span, WHOLE
+from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper
+
+LEAD_S = 3.0
+"""A worker begins to read so long, and ``input.reset_after_s``, before a shard at first."""
+
+LONGER = 8.0
+"""By so much that time grows where it was too short."""
+
+LONGEST_S = 1e9
+"""No recording is longer."""
+
+PLACES = 100
+"""Positions of the sensor that are kept of a shard, for the picture."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shard:
+    """
+    A part of a bag.
+
+    Attributes
+    ----------
+    bag : str
+        Its path, absolute.
+    topics : frozenset of str
+        Its clouds.
+    poses : PoseTopics
+        Its poses.
+    config : Config
+        The settings.
+    span : Span
+        The part of the bag that is to be mapped by all shards together.
+    start_ns, stop_ns : int, optional
+        Record time of its first message, and of the first that is not in it; None at the ends
+        of the span.
+    lead_s : float
+        How long before its start to begin.
+
+    """
+
+    bag: str
+    topics: frozenset[str]
+    poses: PoseTopics
+    config: Config
+    span: Span = WHOLE
+    start_ns: int | None = None
+    stop_ns: int | None = None
+    lead_s: float = 0.0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is all that is to be mapped of its bag."""
+        return self.start_ns is None and self.stop_ns is None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShardResult:
+    """
+    What became of a shard.
+
+    Attributes
+    ----------
+    parts : dict of Tile to Part
+        Where its map is, by tile.
+    before, after : str, optional
+        Outlook at its start and at its stop; None at the ends of the bag.
+    counts : dict
+        ``Counters.summary`` of this part alone.
+    resets : int
+        How often time was set back, in what came before it too.
+    recorded_s, seconds : float
+        Time from its start to its stop, and time that it took.
+    places : (P, 3) float64, m
+        Where the sensor was.
+    peak_bytes : int
+        The most memory that the process had until then.
+
+    """
+
+    parts: dict[Tile, Part]
+    before: str | None
+    after: str | None
+    counts: dict[str, Any]
+    resets: int
+    recorded_s: float
+    seconds: float
+    places: npt.NDArray[np.float64]
+    peak_bytes: int
+
+
+def cut_bag(
+    reader: BagReader,
+    config: Config,
+    topics: Collection[str],
+    poses: PoseTopics,
+    shard_s: float,
+    span: Span = WHOLE,
+) -> list[Shard]:
+    """
+    Return the shards of a bag, of equal length and at most so long.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    config : Config
+        The settings; all scans stay in the map, whatever they say of a window. Where they make
+        a scan depend on all before it, the bag is one shard.
+    topics : collection of str
+        Its clouds.
+    poses : PoseTopics
+        Its poses.
+    shard_s : float
+        The longest that a shard may be.
+    span : Span
+        The part of the bag to map.
+
+    Raises
+    ------
+    ConfigError
+        If the settings ask for something that shards cannot do.
+
+    """
+    if config.map.mode != 'live' or config.map.load:
+        raise ConfigError(
+            f'map.mode {config.map.mode!r}, map.load {config.map.load!r}: several processes '
+            "begin with empty maps; expected 'live' and '', or a single process"
+        )
+    start_ns, stop_ns = span.clipped(reader.start_ns, reader.end_ns)
+    whole = Shard(
+        bag=str(reader.path.resolve()),
+        topics=frozenset(topics),
+        poses=poses,
+        config=config.replace(ALL_SCANS),
+        span=span,
+        lead_s=LEAD_S + config.input.reset_after_s,
+    )
+    by_number = span.every > 1 or (poses.path is not None and not poses.path.has_stamps)
+    number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s), 1)
+    if by_number or not is_divisible(config):
+        number = 1
+    bounds = [start_ns + (stop_ns - start_ns) * part // number for part in range(1, number)]
+    return [
+        replace(whole, start_ns=first, stop_ns=last)
+        for first, last in zip([None, *bounds], [*bounds, None], strict=True)
+    ]
+
+
+def map_shard(shard: Shard, path: str) -> ShardResult:
+    """
+    Map a shard and write its part of the map to a file; runs on a worker.
+
+    Raises
+    ------
+    BagError
+        If the bag cannot be read.
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    began = time.perf_counter()
+    keep_freed_memory()
+    mapper, entry = ShardMapper(shard.config), Entry()
+    with BagReader(shard.bag) as reader:
+        poses = deepcopy(shard.poses)  # those of a file are handed out one after the other
+        if shard.is_whole:
+            updates = replay(reader, mapper, shard.topics, poses, span=shard.span)
+            places = [update.T_fixed_sensor[:3, 3] for update in updates]
+        else:
+            entry, places = map_middle(reader, mapper, replace(shard, poses=poses))
+        first_ns, last_ns = shard.span.clipped(reader.start_ns, reader.end_ns)
+    start_ns = first_ns if shard.start_ns is None else shard.start_ns
+    stop_ns = last_ns if shard.stop_ns is None else shard.stop_ns
+    return ShardResult(
+        parts=write_shard(path, mapper.map),
+        before=entry.outlook,
+        after=None if shard.stop_ns is None else mapper.outlook(),
+        counts=difference(mapper.counters.summary(), entry.counts),
+        resets=mapper.counters.resets,
+        recorded_s=(stop_ns - start_ns) / 1e9,
+        seconds=time.perf_counter() - began,
+        places=np.array(places).reshape(-1, 3)[:: max(len(places) // PLACES, 1)],
+        peak_bytes=peak_bytes(),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What a mapper knew, and had counted, when its shard began."""
+
+    outlook: str | None = None
+    counts: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, mapper: ShardMapper) -> Entry:
+        """Return that of a mapper now."""
+        return cls(mapper.outlook(), mapper.counters.summary())
+
+
+def map_middle(
+    reader: BagReader, mapper: ShardMapper, shard: Shard
+) -> tuple[Entry, list[npt.NDArray[np.float64]]]:
+    """Map a shard after its lead-in; return what was known at its start, and the positions."""
+    entry, places = Entry(), []
+    mapper.passes_over = shard.start_ns is not None
+    for topic, mount in shard.poses.mounts.items():
+        base = mapper.config.frames.base
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    for message in messages_of(reader, shard):
+        if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
+            entry = Entry.of(mapper)
+            mapper.passes_over = False
+        if message.topic not in shard.topics:
+            add_poses(reader, mapper, message, shard.poses)
+        elif shard.span.holds(message.record_ns):
+            add_cloud(reader, mapper, message, shard.poses, 0)
+        places += [update.T_fixed_sensor[:3, 3] for update in mapper.insert_ready()]
+    if mapper.passes_over:  # nothing was recorded since
+        entry = Entry.of(mapper)
+    if shard.stop_ns is None:
+        mapper.finish()
+    return entry, places
+
+
+def messages_of(reader: BagReader, shard: Shard) -> Iterator[BagMessage]:
+    """Yield static transforms from before a shard, then all of it from its lead-in on."""
+    first_ns = shard.span.poses_start_ns
+    if shard.start_ns is not None:
+        earliest_ns = reader.start_ns if first_ns is None else first_ns
+        lead_ns = shard.start_ns - round(min(shard.lead_s, LONGEST_S) * 1e9)
+        first_ns = lead_ns if lead_ns > earliest_ns else first_ns
+    if shard.poses.static and first_ns is not None:
+        yield from reader.messages(shard.poses.static, None, first_ns)
+    names = {*shard.topics, *shard.poses.kinds, *shard.poses.static}
+    last_ns = shard.span.poses_stop_ns if shard.stop_ns is None else shard.stop_ns
+    yield from reader.messages(names, first_ns, last_ns)
+
+
+def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
+    """Return counts less those before; times of stages are all from now."""
+    left: dict[str, Any] = {}
+    for name, value in now.items():
+        if name == 'milliseconds':
+            left[name] = value
+        elif isinstance(value, dict):
+            left[name] = difference(value, before.get(name, {}))
+        else:
+            left[name] = value - before.get(name, 0)
+    return left
+
+
+def peak_bytes() -> int:
+    """Return the most memory that this process has had."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

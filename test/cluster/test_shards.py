@@ -1,0 +1,161 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""However a bag is cut, its shards make the map and the counts that it makes in one go."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+
+from surfel_mapper.cluster.engines import InProcess
+from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.cluster.shards import difference, map_shard
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError, MapError
+from surfel_mapper.io.parquet_tiles import dataset_digest
+from surfel_mapper.offline.span import Span
+from test.cluster.bags import BAGS, counted, in_one_go, RECORDED_S, shards_of, written
+from test.io.recorded import START_NS
+
+
+@pytest.mark.parametrize('name', BAGS)
+@pytest.mark.parametrize('shard_s', [0.7, 2.5])
+def test_shards_make_the_map_and_the_counts_of_one_go(tmp_path, name, shard_s):
+    bag, config = written(tmp_path, name)
+    expected = in_one_go(bag, config)
+    shards = shards_of(bag, config, shard_s)
+
+    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+
+    assert mapped.map.digest == expected.map.digest()
+    assert mapped.map.digest == dataset_digest(tmp_path / 'out' / 'map')
+    assert mapped.map.voxels == expected.map.num_voxels > 100
+    assert mapped.map.points == expected.map.num_points
+    assert mapped.map.surfels == expected.map.num_surfels(config.map.min_points)
+    assert counted(mapped.counts()) == counted(expected.summary())
+
+
+def test_a_bag_is_cut_into_equal_parts_without_gaps(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    shards = shards_of(bag, config, 1.0)
+
+    assert len(shards) == 6
+    assert shards[0].start_ns is shards[-1].stop_ns is None
+    assert all(a.stop_ns == b.start_ns for a, b in pairwise(shards))
+    lengths = [(s.stop_ns - s.start_ns) / 1e9 for s in shards[1:-1]]
+    assert lengths == pytest.approx([RECORDED_S / 6] * 4)
+    assert len(shards_of(bag, config, 100.0)) == 1
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        {'window.gate_distance_m': 1.0},
+        {'align.every_scans': 5, 'window.keep_points': True},
+        {'pose.source': 'registration'},
+    ],
+)
+def test_where_a_scan_depends_on_all_before_it_a_bag_is_not_cut(tmp_path, settings):
+    bag, _ = written(tmp_path, 'plain')
+    assert len(shards_of(bag, Config().replace(settings), 1.0)) == 1
+
+
+def test_a_lead_in_that_is_too_short_is_noticed_and_mended(tmp_path):
+    bag, config = written(tmp_path, 'late poses')
+    expected = in_one_go(bag, config)
+    short = [replace(shard, lead_s=0.01) for shard in shards_of(bag, config, 1.0)]
+
+    mapped = map_bags(short, InProcess(), tmp_path / 'out')
+
+    assert mapped.repeated > 0
+    assert mapped.map.digest == expected.map.digest()
+
+
+def test_the_usual_lead_in_is_long_enough(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    assert map_bags(shards_of(bag, config, 0.5), InProcess(), tmp_path / 'out').repeated == 0
+
+
+@pytest.mark.parametrize('every', [1, 3])
+def test_a_part_of_a_bag_is_mapped_alike(tmp_path, every):
+    bag, config = written(tmp_path, 'plain')
+    start_ns = START_NS + 1_250_000_000
+    span = Span(start_ns=start_ns, stop_ns=start_ns + 3 * 10**9, every=every)
+    expected = in_one_go(bag, config, span)
+
+    shards = shards_of(bag, config, 0.7, span)
+    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+
+    assert len(shards) == (5 if every == 1 else 1)
+    assert mapped.map.digest == expected.map.digest()
+    assert mapped.counts()['scans']['received'] == 30 // every
+
+
+def test_several_bags_make_the_sum_of_their_maps(tmp_path):
+    first, config = written(tmp_path, 'plain')
+    second, _ = written(tmp_path, 'faults')
+    expected = in_one_go(first, config).map
+    expected.merge(in_one_go(second, config).map)
+
+    shards = [*shards_of(first, config, 2.0), *shards_of(second, config, 2.0)]
+
+    assert map_bags(shards, InProcess(), tmp_path / 'out').map.digest == expected.digest()
+
+
+def test_an_earlier_map_is_replaced_and_nothing_is_left_beside_it(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    for shard_s in (1.0, 3.0):
+        mapped = map_bags(shards_of(bag, config, shard_s), InProcess(), tmp_path / 'out')
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['map']
+    assert dataset_digest(tmp_path / 'out' / 'map') == mapped.map.digest
+
+
+def test_a_failure_leaves_an_earlier_map_whole(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    before = map_bags(shards_of(bag, config, 3.0), InProcess(), tmp_path / 'out').map.digest
+    nowhere = config.replace({'frames.fixed': 'nowhere'})
+
+    with pytest.raises(MapError, match='no scan was mapped'):
+        map_bags(shards_of(bag, nowhere, 3.0), InProcess(), tmp_path / 'out')
+
+    assert dataset_digest(tmp_path / 'out' / 'map') == before
+    assert [path.name for path in (tmp_path / 'out').iterdir()] == ['map']
+
+
+def test_a_frozen_map_is_refused(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    with pytest.raises(ConfigError, match='several processes begin with empty maps'):
+        shards_of(bag, config.replace({'map.load': 'old.npz'}), 1.0)
+
+
+def test_progress_adds_up_to_the_recording_and_the_tiles(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    told = []
+
+    mapped = map_bags(
+        shards_of(bag, config, 1.0), InProcess(), tmp_path / 'out', lambda *done: told.append(done)
+    )
+
+    assert sum(s for kind, s in told if kind == 'map') == pytest.approx(RECORDED_S, abs=0.01)
+    assert sum(n for kind, n in told if kind == 'merge') == mapped.map.tiles
+    assert len(mapped.places) >= 60
+    assert len(mapped.map.sample) == mapped.map.surfels
+
+
+def test_a_shard_is_the_same_file_each_time_it_is_mapped(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    shard = shards_of(bag, config, 2.0)[1]
+    contents = []
+    for name in ('a', 'b'):
+        map_shard(shard, str(tmp_path / name))
+        contents.append((tmp_path / name).read_bytes())
+    assert contents[0] == contents[1]
+
+
+def test_counts_are_taken_from_each_other_at_every_depth():
+    now = {'a': 5, 'b': {'c': 2, 'd': 1}, 'milliseconds': {'x': {'median': 1.0}}}
+    assert difference(now, {'a': 2, 'b': {'c': 2}, 'milliseconds': {}}) == {
+        'a': 3,
+        'b': {'c': 0, 'd': 1},
+        'milliseconds': {'x': {'median': 1.0}},
+    }
