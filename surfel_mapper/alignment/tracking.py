@@ -55,6 +55,8 @@ class Tracker:
     ----------
     pose : (4, 4) float64
         T_fixed_body, where it was last.
+    twist : (6,) float64
+        How it moved there, m/s and rad/s, in its own frame.
 
     """
 
@@ -66,20 +68,28 @@ class Tracker:
     def restart(self, T_fixed_body: Transform) -> None:
         """Go on from a pose, with nothing known of the motion."""
         self.pose = T_fixed_body
+        self.twist = np.zeros(6)
         self._stamp_ns: int | None = None
-        self.stop()
+        self._forget()
 
-    def stop(self) -> None:
-        """Go on from where it was last, with nothing known of the motion."""
-        self._twist = np.zeros(6)
+    def begin(self, stamp_ns: int, twist: npt.NDArray[np.float64]) -> None:
+        """Say when and how it moves (6,), m/s and rad/s, where it is to start from."""
+        self._stamp_ns, self.twist = stamp_ns, twist
+
+    def _forget(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
         self._fits: deque[float] = deque(maxlen=REMEMBERED)
+
+    @property
+    def is_new(self) -> bool:
+        """Whether there was no scan yet since the last restart."""
+        return self._stamp_ns is None
 
     def predict(self, stamp_ns: int) -> Transform:
         """Return T_fixed_body at a stamp, if the motion goes on as before."""
         if self._stamp_ns is None:
             return self.pose
-        step = se3_exp(self._twist * ((stamp_ns - self._stamp_ns) / 1e9))
+        step = se3_exp(self.twist * ((stamp_ns - self._stamp_ns) / 1e9))
         return compose(self.pose, step)
 
     @property
@@ -115,7 +125,7 @@ class Tracker:
         Raises
         ------
         AlignmentError
-            If the scan does not fit the map. Nothing is known of the motion any more then.
+            If the scan does not fit the map. The motion is trusted less then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
@@ -127,7 +137,8 @@ class Tracker:
         )
         least = self._registration.config.min_fit_ratio
         if found.fit < (least if found.converged else max(least, EXPECTED_FIT * usual)):
-            self.stop()
+            self._forget()
+            self.twist = 0.5 * self.twist  # it is not what it was; in the end, at rest
             raise AlignmentError(
                 f'{found.fit:.0%} of its {found.num_cells} cells fit the map, expected '
                 f'{max(least, EXPECTED_FIT * usual):.0%} (registration.min_fit_ratio)'
@@ -151,10 +162,10 @@ class Tracker:
             How far away what it sees is, by which a wrong turn counts.
 
         """
-        if self._stamp_ns is not None:
+        if self._stamp_ns is not None and stamp_ns > self._stamp_ns:
             off = compose(inverse(self.predict(stamp_ns)), T_fixed_body)
             turned_m = 2.0 * reach_m * math.sin(0.5 * rotation_angle(off))
             self._deviations.append(math.hypot(*off[:3, 3], turned_m))
             motion = compose(inverse(self.pose), T_fixed_body)
-            self._twist = se3_log(motion) / ((stamp_ns - self._stamp_ns) / 1e9)
+            self.twist = se3_log(motion) / ((stamp_ns - self._stamp_ns) / 1e9)
         self.pose, self._stamp_ns = T_fixed_body, stamp_ns

@@ -411,6 +411,8 @@ class Mapper:
         """Return T_fixed_sensor at the stamp of a scan."""
         if self.config.pose.source == 'identity':
             return np.eye(4)
+        if self.registered is not None:
+            self.registered.learn_motion(scan, self._queue.second)
         pose = self._pose_at(scan.frame_id, scan.stamp_ns)
         if scan.times is not None:  # the poses of all points have to be there
             self._pose_at(scan.frame_id, scan.times.first_ns)
@@ -477,8 +479,9 @@ class Mapper:
         """Deskew, filter and register a scan: deskewed, filtered, its pose; None if it is left."""
         if self.registered is None and self._is_gated(pose):
             return None
-        if scan.times is not None:
-            scan = self._deskewed(scan, scan.times)
+        times = scan.times
+        if times is not None:
+            scan = self._deskewed(scan, times)
             laps.end('deskew')
         filtered: Scan | None = scan
         if len(self.chain):
@@ -487,7 +490,9 @@ class Mapper:
         if filtered is None or self.registered is None:
             return None if filtered is None else (scan, filtered, pose, None)
         try:
-            alignment = self.registered.find(filtered, self.map, self._aligner.T_map_fixed)
+            pose, alignment = self.registered.find(
+                filtered, times, self.map, self._aligner.T_map_fixed
+            )
         except (AlignmentError, PoseError) as error:
             self._drops.scan(scan, 'not_aligned', str(error))
             return None
@@ -499,7 +504,7 @@ class Mapper:
                 f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
                 'of motion open; there the prediction is kept',
             )
-        pose = self._aligner.to_map(self._pose_at(scan.frame_id, scan.stamp_ns))
+        pose = self._aligner.to_map(pose)
         return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
 
     def _is_gated(self, pose: npt.NDArray[np.float64]) -> bool:

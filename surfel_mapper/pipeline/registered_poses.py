@@ -10,19 +10,22 @@ serve one track; else the sensor itself.
 from __future__ import annotations
 
 from collections import deque
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import Alignment, Registration
 from surfel_mapper.alignment.tracking import Tracker
 from surfel_mapper.config import Config
 from surfel_mapper.counters import LATEST
-from surfel_mapper.errors import PoseError
-from surfel_mapper.geometry import compose, pose_matrix, Transform
+from surfel_mapper.errors import AlignmentError, PoseError, PoseNotYetError
+from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
+from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.poses import TransformBuffer
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import PointTimes, Scan
 
 
 class RegisteredPoses:
@@ -73,9 +76,34 @@ class RegisteredPoses:
         """Go on from a pose, or from where the settings say."""
         self._tracker.restart(self._start if T_fixed_body is None else T_fixed_body)
 
+    def learn_motion(self, scan: Scan, following: Scan | None) -> None:
+        """
+        Find out how the robot moves before the first scan is deskewed, from the one after it.
+
+        Both are skewed alike, so the motion between them is right; but were the first one mapped
+        as it is, those deskewed later would not fit it.
+
+        Raises
+        ------
+        PoseNotYetError
+            If the one after it is not there yet.
+
+        """
+        if scan.times is None or not self._tracker.is_new:
+            return
+        if following is None:
+            raise PoseNotYetError('the first scan waits for the next, to be deskewed')
+        surfel_map = SurfelMap(self._config.map.voxel_size_m)
+        surfel_map.insert(self._moments(scan, surfel_map))
+        trial = Tracker(self._registration, np.eye(4))
+        trial.advance(np.eye(4), scan.stamp_ns)
+        with suppress(AlignmentError):  # else it is taken to be at rest
+            trial.track(self._cells(following), following.stamp_ns, surfel_map, np.eye(4))
+        self._tracker.begin(scan.stamp_ns, trial.twist)
+
     def predict(self, frame_id: str, stamp_ns: int) -> Transform:
         """
-        Return T_fixed_sensor at a time; at the stamp of the last scan that is where it was.
+        Return T_fixed_sensor at a time, if the motion goes on as before.
 
         Raises
         ------
@@ -86,19 +114,32 @@ class RegisteredPoses:
         return compose(self._tracker.predict(stamp_ns), self._mount(frame_id, stamp_ns))
 
     def find(
-        self, scan: Scan, surfel_map: SurfelMap, T_map_fixed: Transform
-    ) -> Alignment | None:
+        self,
+        scan: Scan,
+        times: PointTimes | None,
+        surfel_map: SurfelMap,
+        T_map_fixed: Transform,
+    ) -> tuple[Transform, Alignment | None]:
         """
-        Align a scan and go on from there; ``predict`` says then where its sensor was.
+        Align a scan, and go on from there.
 
         Parameters
         ----------
         scan : Scan
             Deskewed and filtered.
+        times : PointTimes, optional
+            When its points were measured, where it was deskewed.
         surfel_map : SurfelMap
-            The map. While it is empty the prediction holds, and None is returned.
+            The map. While it is empty the prediction holds.
         T_map_fixed : (4, 4) float64
             From the frame of the poses to that of the map.
+
+        Returns
+        -------
+        T_fixed_sensor : (4, 4) float64
+            Where the sensor was at the stamp.
+        alignment : Alignment or None
+            How the scan was aligned; None where the prediction holds.
 
         Raises
         ------
@@ -108,20 +149,23 @@ class RegisteredPoses:
             If it is not known how the sensor sits on what is followed.
 
         """
-        if not surfel_map.num_voxels:
-            self._tracker.advance(self._tracker.predict(scan.stamp_ns), scan.stamp_ns)
-            return None
-        limits = self._config.input
-        cells = self._registration.cells(
-            scan.points, limits.min_range_m, limits.max_range_m or np.inf
-        )
-        mount = self._mount(scan.frame_id, scan.stamp_ns)
-        cells = np.ascontiguousarray(cells @ mount[:3, :3].T + mount[:3, 3])
-        found = self._tracker.track(cells, scan.stamp_ns, surfel_map, T_map_fixed)
-        self._num_aligned += 1
-        self._num_degenerate += len(found.degenerate) > 0
-        self._fits.append(found.fit)
-        return found
+        tracker = self._tracker
+        # Deskewed by a velocity that is off, a sweep is right in its middle and off at both
+        # ends: followed at its stamp, which is one of them, pose and velocity would swing.
+        middle_ns = (times.first_ns + times.last_ns) // 2 if times else scan.stamp_ns
+        T_fixed_middle = tracker.predict(middle_ns)
+        T_middle_body = compose(inverse(T_fixed_middle), tracker.predict(scan.stamp_ns))
+        if surfel_map.num_voxels:
+            cells = transformed(T_middle_body, self._cells(scan))
+            alignment = tracker.track(cells, middle_ns, surfel_map, T_map_fixed)
+            self._num_aligned += 1
+            self._num_degenerate += len(alignment.degenerate) > 0
+            self._fits.append(alignment.fit)
+        else:
+            alignment = None
+            tracker.advance(T_fixed_middle, middle_ns)
+        T_fixed_body = compose(tracker.pose, T_middle_body)
+        return compose(T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns)), alignment
 
     def summary(self) -> dict[str, Any]:
         """Return how well scans fitted, for files and reports."""
@@ -132,6 +176,24 @@ class RegisteredPoses:
             'degenerate': self._num_degenerate,
             'fit': {'median': float(np.median(fits)), 'min': float(np.min(fits))},
         }
+
+    def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:
+        """Return the cells of a scan in the frame that is followed."""
+        limits = self._config.input
+        cells = self._registration.cells(
+            scan.points, limits.min_range_m, limits.max_range_m or np.inf
+        )
+        return transformed(self._mount(scan.frame_id, scan.stamp_ns), cells)
+
+    def _moments(self, scan: Scan, surfel_map: SurfelMap) -> ScanMoments:
+        """Return the moments of a scan in a map around what is followed."""
+        limits = self._config.input
+        return surfel_map.reduce(
+            scan.points,
+            self._mount(scan.frame_id, scan.stamp_ns),
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m or np.inf,
+        )
 
     def _mount(self, frame_id: str, stamp_ns: int) -> Transform:
         """Return T_body_sensor; the first scan decides what is followed."""
@@ -144,3 +206,8 @@ class RegisteredPoses:
             self.body = self._config.frames.base
             return mount
         return self._transforms.lookup(self.body, frame_id, stamp_ns)
+
+
+def transformed(T_a_b: Transform, points: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return points (K, 3) in frame a."""
+    return np.ascontiguousarray(points @ T_a_b[:3, :3].T + T_a_b[:3, 3])
