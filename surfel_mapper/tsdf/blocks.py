@@ -182,6 +182,11 @@ class BlockMap:
             return np.empty((0, 2, self.voxels_per_block), np.int64)
         return self._slabs['stamps'].array.reshape(-1, 2, self.voxels_per_block)
 
+    @property
+    def lookup(self) -> tuple[Any, ...]:
+        """What kernels find blocks with: head, table, state; only until the map grows."""
+        return self.head, self._table, self._state
+
     def rows(self) -> Int64:
         """Return the rows in use, ascending."""
         return np.flatnonzero(self._used_head()[:, VERSION] != FREE)

@@ -112,7 +112,8 @@ class Camera:
         rays[:, :, 0] = (np.arange(self.columns) - self.cx) / self.fx
         rays[:, :, 1] = ((np.arange(self.rows) - self.cy) / self.fy)[:, None]
         rays[:, :, 2] = 1.0
-        return (rays / np.linalg.norm(rays, axis=2, keepdims=True)).astype(np.float32)
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        return rays.astype(np.float32)
 
     @cached_property
     def parameters(self) -> Float32:

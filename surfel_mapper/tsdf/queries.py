@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the field says at points: how far the surface is, which way, and whether a place is free.
+
+Distances are those along the rays that were measured, cut at the truncation. Along other ways
+they are too large, by 1 / cos of the angle at which a ray meets the surface; the surface itself is
+where it is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.kernels import tsdf_queries as kernels
+from surfel_mapper.tsdf.blocks import BlockMap
+
+UNKNOWN = kernels.UNKNOWN
+FREE = kernels.FREE
+OCCUPIED = kernels.OCCUPIED
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sampled:
+    """
+    The field at points.
+
+    Attributes
+    ----------
+    distance : (P,) float32
+        Signed distance, m, positive in front of a surface; nan where it is not known.
+    gradient : (P, 3) float32
+        Where it grows, and how fast, in metres a metre; nan likewise.
+
+    """
+
+    distance: npt.NDArray[np.float32]
+    gradient: npt.NDArray[np.float32]
+
+
+def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) -> Sampled:
+    """
+    Return distance and gradient at points, interpolated between voxel centres.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The map.
+    points : (P, 3) float
+        In the map frame, m.
+    min_weight : float
+        Voxels that weigh less count as not observed.
+
+    Raises
+    ------
+    ValueError
+        If points are of another shape.
+
+    """
+    places, bits = in_voxels(blocks, points)
+    head, table, state = blocks.lookup
+    distance = np.empty(len(places), np.float32)
+    gradient = np.empty((len(places), 3), np.float32)
+    kernels.sample(
+        places,
+        1.0 / blocks.config.voxel_size_m,
+        bits,
+        np.float32(min_weight),
+        blocks.field,
+        head,
+        table,
+        state,
+        distance,
+        gradient,
+    )
+    return Sampled(distance=distance, gradient=gradient)
+
+
+def states(
+    blocks: BlockMap,
+    points: npt.ArrayLike,
+    *,
+    min_weight: float = 0.0,
+    occupied_up_to_m: float | None = None,
+) -> npt.NDArray[np.uint8]:
+    """
+    Return whether the voxels that points lie in are UNKNOWN, FREE or OCCUPIED.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The map.
+    points : (P, 3) float
+        In the map frame, m.
+    min_weight : float
+        Voxels that weigh less count as not observed.
+    occupied_up_to_m : float, optional
+        Voxels of this distance or less are occupied, those behind a surface with them; half a
+        voxel where not given.
+
+    Raises
+    ------
+    ValueError
+        If points are of another shape.
+
+    """
+    places, bits = in_voxels(blocks, points)
+    if occupied_up_to_m is None:
+        occupied_up_to_m = 0.5 * blocks.config.voxel_size_m
+    head, table, state = blocks.lookup
+    found = np.empty(len(places), np.uint8)
+    kernels.classify(
+        places,
+        bits,
+        np.float32(min_weight),
+        np.float32(occupied_up_to_m),
+        blocks.field,
+        head,
+        table,
+        state,
+        found,
+    )
+    return found
+
+
+def in_voxels(
+    blocks: BlockMap, points: npt.ArrayLike
+) -> tuple[npt.NDArray[np.float64], int]:
+    """Return points in voxels, and how many bits number the voxels along a block's edge."""
+    places = np.asarray(points, np.float64)
+    if places.ndim != 2 or places.shape[1] != 3:
+        raise ValueError(f'points: {places.shape}, expected (P, 3)')
+    bits = blocks.config.voxels_per_side.bit_length() - 1
+    return places / blocks.config.voxel_size_m, bits
