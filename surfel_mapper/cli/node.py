@@ -9,16 +9,13 @@ SIGINT and SIGTERM end it alike, with exit code 0, at any time from its start on
 from __future__ import annotations
 
 import argparse
-import signal
-from typing import Any
 
 from surfel_mapper.cli.ros import loading_ros
+from surfel_mapper.ros.signals import Signals
 
 SUMMARY = 'Map clouds live from ROS 2 topics.'
 
 EXAMPLE = 'surfel-mapper node --ros-args --params-file my.yaml -r points:=/lidar/points'
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,26 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the node until it is told to end."""
-    before = {number: signal.signal(number, interrupt) for number in SIGNALS}
     try:
-        with loading_ros():
-            from surfel_mapper.ros.running import run_node
-        run_node(args.ros_args)
+        with Signals() as signals:
+            with loading_ros():
+                from surfel_mapper.ros.running import run_node
+            run_node(args.ros_args, signals)
     except KeyboardInterrupt:
         pass
-    finally:
-        for number, handler in before.items():
-            if signal.getsignal(number) is interrupt:  # not interrupted: we go on
-                signal.signal(number, handler)
     return 0
-
-
-def interrupt(*_: Any) -> None:
-    """
-    Raise KeyboardInterrupt, and ignore all signals that follow.
-
-    A terminal and a launch file both send one; the second would cut short what the first began.
-    """
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
-    raise KeyboardInterrupt

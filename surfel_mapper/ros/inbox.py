@@ -47,9 +47,18 @@ class Inbox:
         """Have the main thread raise an error."""
         self._items.put(error)
 
-    def serve(self) -> None:
-        """Do what is asked for until there is an error, and raise it."""
+    def serve(self, check: Callable[[], None]) -> None:
+        """
+        Do what is asked for until there is an error, and raise it.
+
+        Parameters
+        ----------
+        check : callable
+            Called before every wait; raises if there is no point in waiting.
+
+        """
         while True:
+            check()
             item = self._items.get()
             if isinstance(item, BaseException):
                 raise item

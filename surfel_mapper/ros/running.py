@@ -19,9 +19,10 @@ from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.logs import logging_to
 from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.ros.signals import Signals
 
 
-def run_node(ros_args: Sequence[str]) -> None:
+def run_node(ros_args: Sequence[str], signals: Signals) -> None:
     """
     Run the node until KeyboardInterrupt, which is the usual way to end and raised again.
 
@@ -29,6 +30,8 @@ def run_node(ros_args: Sequence[str]) -> None:
     ----------
     ros_args : sequence of str
         What follows --ros-args on the command line, that included.
+    signals : Signals
+        Those that interrupt.
 
     Raises
     ------
@@ -41,19 +44,19 @@ def run_node(ros_args: Sequence[str]) -> None:
         node = MapperNode()
         try:
             with logging_to(node.get_logger()), executing(node):
-                live(node)
+                live(node, signals)
         finally:
             node.destroy_node()
 
 
-def live(node: MapperNode) -> None:
+def live(node: MapperNode, signals: Signals) -> None:
     """Start a node, unless it is to be told when, and make transitions until it has to end."""
     try:
         if node.autostart:
             node.start()
         else:
             node.get_logger().info('autostart is false: waits for the transition configure')
-        node.inbox.serve()
+        node.inbox.serve(signals.check)
     finally:
         node.inbox.close()
         node.end()

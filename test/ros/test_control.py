@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The services of a node over DDS: what they say they did is what a Mapper does when told."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from geometry_msgs.msg import Point32, PolygonStamped
+from nav_msgs.srv import LoadMap
+from rclpy.parameter import Parameter
+from std_srvs.srv import SetBool, Trigger
+
+from surfel_mapper.pipeline.regions import Ball, Box, Prism
+from test.ros.live import NODE, odometry, stamp, START_NS
+from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
+
+pytestmark = pytest.mark.timeout(120)
+
+ANSWERS = LoadMap.Response
+SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))
+"""In the frame base_link, which drive() moves by 0.2 m a scan."""
+
+
+@pytest.fixture
+def node(start, peer, tmp_path):
+    """Give a node that has mapped four scans, and a twin of its Mapper."""
+    node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
+    peer.advertise('/odom', '/points')
+    return node
+
+
+def feed(peer, num_scans):
+    """Have some scans mapped; return a Mapper that has mapped the same."""
+    messages = drive(num_scans)
+    send(peer, messages)
+    peer.diagnosis({'scans.mapped': num_scans})
+    return mapped(messages)[1]
+
+
+def go_on(peer, twin, first, num_scans):
+    """Have more scans mapped, by the twin too, until all that were there before have left."""
+    from surfel_mapper.io.pointcloud2 import to_scan
+    from surfel_mapper.io.pose_messages import poses_in
+
+    for points, pose in drive(first + num_scans)[first:]:
+        send(peer, [(points, pose)])
+        for found in poses_in('odometry', pose, 'base_link'):
+            twin.add_pose(*found)
+        twin.add_scan(to_scan(points))
+        for _ in twin.insert_ready():
+            pass
+    return peer.diagnosis({'scans.mapped': first + num_scans})
+
+
+def digest(peer):
+    """Return the digest of the map of the node, as it says itself."""
+    saved = peer.call('save_map')
+    assert saved.success, saved.message
+    return saved.message.rpartition('digest ')[2]
+
+
+def test_a_box_of_the_parameters_is_cleared_and_what_leaves_later_leaves_exactly(peer, node):
+    twin = feed(peer, 3)
+    refused = peer.call('clear_box')
+    assert not refused.success
+    assert 'expected low below high' in refused.message
+
+    box = [-1.0, -1.0, -2.0, 2.0, 1.5, 0.0]
+    client = peer.parameters()
+    changed = client.set_parameters([Parameter('clear.box', value=box)])
+    assert peer.result(changed).results[0].successful
+    before = twin.map.num_voxels
+    twin.clear_region(Box(tuple(box[:3]), tuple(box[3:])))
+    answer = peer.call('clear_box')
+
+    assert answer.success, answer.message
+    gone = before - twin.map.num_voxels
+    assert gone > 10
+    assert answer.message == (
+        f'cleared {gone} voxels in clear.box from (-1.0, -1.0, -2.0) to (2.0, 1.5, 0.0)'
+    )
+    assert digest(peer) == twin.map.digest()
+    _, values = go_on(peer, twin, 3, 2)  # evicts two scans that have lost voxels
+    assert values['window_scans'] == '3'
+    assert digest(peer) == twin.map.digest()
+    assert 'Traceback' not in node.output
+
+
+def test_all_about_the_sensor_is_cleared(peer, node):
+    nowhere = peer.call('clear_radius')
+    assert not nowhere.success
+    assert 'no scan in the map yet' in nowhere.message
+    twin = feed(peer, 2)
+    center = tuple(twin.window.newest.T_map_sensor[:3, 3].tolist())
+    before = twin.map.num_voxels
+    twin.clear_region(Ball(center, 2.0))
+
+    answer = peer.call('clear_radius')
+
+    gone = before - twin.map.num_voxels
+    assert gone > 10
+    assert answer.message == f'cleared {gone} voxels in 2 m about the sensor at (0.30, 0.00, 0.50)'
+    assert digest(peer) == twin.map.digest()
+
+
+def polygon(corners, frame_id, stamp_ns=0):
+    message = PolygonStamped()
+    message.header.frame_id = frame_id
+    stamp(message, stamp_ns)
+    message.polygon.points = [Point32(x=float(x), y=float(y)) for x, y in corners]
+    return message
+
+
+def test_a_polygon_is_cleared_in_whatever_frame_it_comes(peer, node):
+    polygons = peer.node.create_publisher(PolygonStamped, f'{NODE}/clear_polygon', 10)
+    twin = feed(peer, 3)
+    peer.spin_until(polygons.get_subscription_count)
+    before = twin.map.num_voxels
+    # at the stamp of the second scan the base was 0.2 m along x
+    twin.clear_region(Prism(tuple((x + 0.2, y) for x, y in SQUARE)))
+    twin.clear_region(Prism(SQUARE))
+
+    polygons.publish(polygon(SQUARE[:2], 'odom'))
+    polygons.publish(polygon(SQUARE, 'elsewhere'))
+    polygons.publish(polygon(SQUARE, 'base_link', START_NS + PERIOD_NS))
+    polygons.publish(polygon(SQUARE, 'odom'))
+
+    after = twin.map.num_voxels
+    assert after < before
+    peer.diagnosis({'voxels': after})
+    assert digest(peer) == twin.map.digest()
+    assert "in frame 'odom' ignored: polygon of 2 corners, expected 3 or more" in node.output
+    assert f'voxels in the polygon on {NODE}/clear_polygon in frame base_link' in node.output
+
+
+def test_a_map_that_was_saved_is_loaded_and_goes_on_as_if_it_had_never_stopped(
+    peer, node, tmp_path
+):
+    twin = feed(peer, 3)
+    saved = digest(peer)
+    assert saved == twin.map.digest()
+    assert peer.call('clear').success
+    assert peer.diagnosis({'voxels': 0})
+
+    for url in ('', 'map', 'map.npz', str(tmp_path / 'maps' / 'map.npz')):
+        answer = peer.call('load_map', LoadMap, LoadMap.Request(map_url=url))
+        assert answer.result == ANSWERS.RESULT_SUCCESS, node.output
+        assert (answer.map.header.frame_id, answer.map.info.resolution) == ('odom', 0.5)
+    url = (tmp_path / 'maps' / 'map.npz').as_uri()
+    assert peer.call('load_map', LoadMap, LoadMap.Request(map_url=url)).result == 0
+
+    assert f'surfels of 3 scans, digest {saved}' in node.output
+    assert digest(peer) == saved
+    go_on(peer, twin, 3, 2)
+    assert digest(peer) == twin.map.digest()
+
+
+def test_a_map_that_cannot_be_loaded_is_answered_with_why_and_nothing_changes(
+    peer, node, start, tmp_path
+):
+    twin = feed(peer, 2)
+    (tmp_path / 'secret.npz').write_bytes(b'not for everybody')
+    assert peer.call('save_map').success
+    maps = tmp_path / 'maps'
+    (maps / 'damaged.npz').write_bytes((maps / 'map.npz').read_bytes()[:-100])
+    (maps / 'link.npz').symlink_to(tmp_path / 'secret.npz')
+
+    def load(url):
+        return peer.call('load_map', LoadMap, LoadMap.Request(map_url=url)).result
+
+    assert load('nowhere') == ANSWERS.RESULT_MAP_DOES_NOT_EXIST
+    assert load('damaged') == ANSWERS.RESULT_INVALID_MAP_DATA
+    for url in ('../secret', str(tmp_path / 'secret.npz'), 'link', 'http://there/map.npz', '/'):
+        assert load(url) == ANSWERS.RESULT_UNDEFINED_FAILURE, url
+    assert node.output.count('not inside output.directory') == 3
+    assert digest(peer) == twin.map.digest()
+    node.stop()
+
+    other = start(
+        'node', *ARGUMENTS, '-p', f'output.directory:={maps}', '-p', 'map.voxel_size_m:=0.25'
+    )
+    assert load('map') == ANSWERS.RESULT_INVALID_MAP_METADATA
+    assert 'voxel_size_m 0.5, expected 0.25 as configured' in other.output
+
+
+def test_several_requests_at_a_time_are_answered_and_clouds_taken_meanwhile(peer, node):
+    feed(peer, 1)
+    client = peer.node.create_client(Trigger, f'{NODE}/save_map')
+    peer.spin_until(client.service_is_ready)
+    answers = [client.call_async(Trigger.Request()) for _ in range(8)]
+    for points, pose in drive(4)[1:]:
+        send(peer, [(points, pose)])
+    peer.spin_until(lambda: all(answer.done() for answer in answers))
+
+    assert all(answer.result().success for answer in answers)
+    peer.diagnosis({'scans.mapped': 4})
+
+
+def test_a_pause_drops_clouds_takes_poses_and_says_so(peer, node):
+    feed(peer, 1)
+    assert peer.call('pause', SetBool, SetBool.Request(data=True)).success
+    send(peer, drive(2)[1:])
+    status, values = peer.diagnosis({'scans.dropped.paused': 1})
+    assert values['scans.dropped_by_frame.lidar.paused'] == '1'
+    assert 'paused: clouds are dropped until' in status.message
+    assert status.level == b'\1'
+    assert peer.call('pause', SetBool, SetBool.Request(data=False)).success
+    between = START_NS + 2 * PERIOD_NS
+    peer.publish('/odom', odometry(between, (0.4, 0.0, 0.0)))
+    send(peer, drive(4)[3:])
+    peer.diagnosis({'scans.mapped': 2})

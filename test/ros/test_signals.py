@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Signals end a node wherever they find it; what it is asked for meanwhile is answered."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+
+import pytest
+
+from surfel_mapper.ros.inbox import Inbox
+from surfel_mapper.ros.signals import NUMBERS, Signals
+
+TIMEOUT_S = 20
+
+
+@pytest.fixture(autouse=True)
+def handlers():
+    before = {number: signal.getsignal(number) for number in NUMBERS}
+    yield before
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
+def send(number):
+    os.kill(os.getpid(), number)
+    for _ in range(1000):  # the handler runs between two of these
+        pass
+
+
+@pytest.mark.parametrize('number', NUMBERS)
+def test_a_signal_interrupts_and_those_that_follow_do_not(number):
+    signals = Signals()
+    with pytest.raises(KeyboardInterrupt), signals:
+        send(number)
+    for later in NUMBERS:
+        send(later)
+    with pytest.raises(KeyboardInterrupt):
+        signals.check()
+
+
+@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
+def test_a_signal_that_is_lost_in_a_destructor_is_found_by_check():
+    class Freed:
+        def __del__(self):
+            send(signal.SIGINT)
+
+    with Signals() as signals:
+        signals.check()
+        Freed()
+        with pytest.raises(KeyboardInterrupt):
+            signals.check()
+
+
+def test_without_a_signal_all_is_as_before(handlers):
+    with Signals() as signals:
+        signals.check()
+    assert {number: signal.getsignal(number) for number in NUMBERS} == handlers
+
+
+def nothing():
+    return None
+
+
+def test_a_request_is_answered_by_the_thread_that_serves_and_an_error_ends_it():
+    inbox = Inbox()
+    names = []
+
+    def act():
+        names.append(threading.current_thread().name)
+        return True
+
+    answers = [inbox.ask(act), inbox.ask(lambda: False)]
+    inbox.fail(RuntimeError('the end'))
+    with pytest.raises(RuntimeError, match='the end'):
+        inbox.serve(nothing)
+    assert [answer.result(TIMEOUT_S) for answer in answers] == [True, False]
+    assert names == [threading.current_thread().name]
+
+
+def test_a_request_that_raises_is_answered_and_raises_where_it_is_served():
+    inbox = Inbox()
+    answer = inbox.ask(lambda: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        inbox.serve(nothing)
+    assert answer.result(TIMEOUT_S) is False
+
+
+def test_what_is_asked_for_at_the_end_or_after_it_is_answered_with_no():
+    inbox = Inbox()
+    before = inbox.ask(lambda: True)
+    inbox.fail(RuntimeError('unheard'))
+    inbox.close()
+    assert before.result(TIMEOUT_S) is False
+    assert inbox.ask(lambda: True).result(TIMEOUT_S) is False
+
+
+def test_an_interruption_is_noticed_before_the_next_wait():
+    def check():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        Inbox().serve(check)
