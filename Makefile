@@ -7,6 +7,7 @@
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -22,7 +23,7 @@ VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
 
-.PHONY: demo test boundscheck bench lint settings clean
+.PHONY: demo test boundscheck versions bench lint settings clean
 
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
@@ -37,6 +38,15 @@ boundscheck: $(STAMP)  ## the tests of the kernels, with every index checked
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" \
 	$(BIN)/python -m pytest -q $(wildcard test/kernels test/mapping) $(PYTEST_ARGS)
 
+versions:  ## one bag, one digest, on every Python of PYTHONS that is there
+	@for python in $(PYTHONS); do \
+		"$$python" --version || continue; \
+		directory=$(VENV)-versions/$$("$$python" -c 'import sys; print(sys.version.split()[0])'); \
+		"$$python" -m venv "$$directory" && \
+		"$$directory/bin/python" -m pip install -q --disable-pip-version-check -e '.[test]' && \
+		"$$directory/bin/python" -m pytest -q -p no:cacheprovider test/test_determinism.py || exit 1; \
+	done
+
 bench: $(STAMP)  ## milliseconds a scan
 	$(BIN)/python -m test.bench
 
@@ -49,7 +59,7 @@ settings: $(STAMP)  ## write default.yaml and the table of README.md from config
 	$(BIN)/python -m test.settings
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) build install log dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-versions build install log dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find surfel_mapper test -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMP): setup.py pyproject.toml
