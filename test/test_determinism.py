@@ -62,9 +62,9 @@ def replayed(bag, directory, *, interpreted=False, **settings):
     """Return the digest that replay states, run in a process of its own."""
     config = directory / 'config.yaml'
     config.write_text(json.dumps({**SETTINGS, **settings}))
+    command = [sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', bag, '--window']
     done = subprocess.run(
-        [sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', str(bag), '--window']
-        + ['--config', str(config), '--output', str(directory / 'map')],
+        [*command, '--config', config, '--output', directory / 'map'],
         cwd=Path(__file__).parents[1],
         env={**os.environ, 'NUMBA_DISABLE_JIT': '1' if interpreted else '0'},
         capture_output=True,
@@ -79,7 +79,7 @@ def replayed(bag, directory, *, interpreted=False, **settings):
 
 def test_the_digest_is_that_of_python_integers():
     moments = {}
-    for stamp_ns, xyz, q_xyzw, points in list(drive())[-WINDOW:]:
+    for _, xyz, q_xyzw, points in list(drive())[-WINDOW:]:
         pose = pose_matrix(xyz, q_xyzw)
         ranges_sq = (points.astype(np.float64) ** 2).sum(axis=1)
         points = points[(ranges_sq >= 0.1**2) & (ranges_sq <= 11.0**2)]
