@@ -16,6 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config, load_config
+    from surfel_mapper.io.mirror import MapMirror
     from surfel_mapper.mapping.moments import ScanMoments
     from surfel_mapper.mapping.surfel import Surfel
     from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -28,6 +29,7 @@ __version__ = '0.1.0'
 
 __all__ = [
     'Config',
+    'MapMirror',
     'Mapper',
     'Scan',
     'ScanMoments',
@@ -41,6 +43,7 @@ __all__ = [
 
 _HOMES = {
     'Config': 'config',
+    'MapMirror': 'io.mirror',
     'Mapper': 'pipeline',
     'Scan': 'scan',
     'ScanMoments': 'mapping.moments',

@@ -149,6 +149,6 @@ def added_fields(taken: Iterable[str], offset: int) -> list[Field]:
 
 def cloud_of_scan(scan: Scan, added: npt.NDArray[np.float32]) -> CloudBytes:
     """Return the same for a scan that was no cloud but a depth image."""
-    columns = dict(zip('xyz', scan.points.T, strict=True))
+    columns = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
     columns.update(zip(ADDED[:-1], added.T[:-1], strict=True))
     return from_columns({**columns, ADDED[-1]: added.view(np.uint32)[:, -1]})

@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What clients are told, and a MapMirror that is told it: it equals the map whatever happens to it.
+
+No ROS here: messages are the bytes that the node publishes, in order or late.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surfel_mapper import Mapper, Scan, SurfelMap
+from surfel_mapper.config import Config
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.io.map_cloud import halves, moment_columns, voxel_columns, whole
+from surfel_mapper.io.mirror import MapMirror, MAX_RECENT
+from surfel_mapper.io.pointcloud2 import from_columns, to_scan
+from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.ros.changes import Changes, KnownKeys
+
+SECOND = 10**9
+NO_VOXELS = np.empty((0, 3), np.int32)
+
+
+def config_with(**changes):
+    return Config.from_mapping(
+        {
+            'pose.source': 'identity',
+            'map.min_points': 4,
+            'window.max_scans': 4,
+            'publish.moments': True,
+            **changes,
+        }
+    )
+
+
+class Node:
+    """A mapper, and what a node says of it."""
+
+    def __init__(self, **changes):
+        self.mapper = Mapper(config_with(**changes))
+        self.changes = Changes(self.mapper)
+        self.stamp_ns = 0
+        self._rng = np.random.default_rng(1)
+
+    def message(self, surfels, removed=NO_VOXELS):
+        columns = moment_columns(surfels, self.mapper.map.moments(surfels.voxel_index), removed)
+        content = from_columns(columns)
+        stamp = SimpleNamespace(sec=self.stamp_ns // SECOND, nanosec=self.stamp_ns % SECOND)
+        header = SimpleNamespace(stamp=stamp, frame_id='odom')
+        return SimpleNamespace(
+            header=header, **{name: getattr(content, name) for name in content.__slots__}
+        )
+
+    def full(self):
+        return self.message(self.mapper.map.surfels(1))
+
+    def map_scan(self, stamp_ns, num=300):
+        """Map a random scan somewhere; return what changed, as (Change, message)."""
+        center = self._rng.integers(-3, 3, 3)
+        points = self._rng.normal(scale=0.8, size=(num, 3)) + center
+        colors = self._rng.integers(0, 2**24, num).astype(np.uint32)
+        columns = {'rgb': colors, 'intensity': self._rng.uniform(0, 255, num)}
+        self.mapper.add_scan(
+            Scan(points=points, stamp_ns=stamp_ns, frame_id='odom', columns=columns)
+        )
+        (update,) = self.mapper.insert_ready()
+        self.stamp_ns = stamp_ns
+        change = self.changes.of(update)
+        return change, self.message(change.surfels, change.removed)
+
+    def tell(self):
+        change = self.changes.since_last()
+        return change, self.message(change.surfels, change.removed)
+
+
+def assert_equal(mirror, node):
+    assert mirror.map.digest() == node.mapper.map.digest()
+
+
+@pytest.mark.parametrize('channels', [(), ('intensity',), ('rgb',), ('intensity', 'rgb')])
+def test_a_mirror_follows_scans_that_come_and_go(channels):
+    sums = {'map.intensity': 'intensity' in channels, 'map.color': 'rgb' in channels}
+    node, mirror = Node(**sums), MapMirror(0.5, channels)
+    for number in range(12):
+        _, message = node.map_scan(number * SECOND)
+        mirror.change(message)
+        assert_equal(mirror, node)
+        assert mirror.stamp_ns == number * SECOND
+    assert node.mapper.counters.evicted['max_scans'] == 8
+
+
+def test_a_client_that_comes_late_is_complete_with_the_next_full_map():
+    node, mirror = Node(), MapMirror(0.5)
+    for number in range(3):
+        node.map_scan(number * SECOND)
+    _, message = node.map_scan(3 * SECOND)
+    mirror.change(message)
+    assert not mirror.is_complete
+    mirror.replace(node.full())
+    assert mirror.is_complete
+    assert_equal(mirror, node)
+
+
+def test_a_full_map_that_arrives_after_later_changes_takes_none_of_them_back():
+    node, mirror = Node(), MapMirror(0.5)
+    for number in range(8):
+        _, message = node.map_scan(number * SECOND)
+        mirror.change(message)
+        if number == 4:
+            full = node.full()
+    mirror.replace(full)
+    assert_equal(mirror, node)
+    assert mirror.stamp_ns == 7 * SECOND
+
+
+def test_a_change_that_was_lost_is_mended_by_the_next_full_map():
+    node, mirror = Node(), MapMirror(0.5)
+    for number in range(6):
+        _, message = node.map_scan(number * SECOND)
+        if number != 3:
+            mirror.change(message)
+    assert mirror.map.digest() != node.mapper.map.digest()
+    mirror.replace(node.full())
+    assert_equal(mirror, node)
+
+
+def test_a_map_that_is_cleared_or_changed_otherwise_is_followed():
+    node, mirror = Node(), MapMirror(0.5)
+    for number in range(3):
+        mirror.change(node.map_scan(number * SECOND)[1])
+    node.mapper.clear_region(Ball((0.0, 0.0, 0.0), 1.5))
+    mirror.change(node.tell()[1])
+    assert_equal(mirror, node)
+    mirror.change(node.map_scan(3 * SECOND)[1])
+    assert_equal(mirror, node)
+
+    node.mapper.clear()
+    change, message = node.tell()
+    mirror.change(message)
+    assert len(mirror.map) == 0
+    assert len(change.removed) > 100
+
+    other = SurfelMap(0.5)
+    other.add(np.random.default_rng(5).normal(size=(500, 3)))
+    node.mapper.restore(other, [])
+    mirror.change(node.tell()[1])
+    assert_equal(mirror, node)
+
+
+def test_time_that_is_set_back_is_followed():
+    node, mirror = Node(), MapMirror(0.5)
+    for stamp_s in (100, 101, 102, 5, 6):
+        mirror.change(node.map_scan(stamp_s * SECOND)[1])
+        assert_equal(mirror, node)
+    assert node.mapper.counters.resets == 1
+    mirror.replace(node.full())
+    assert_equal(mirror, node)
+
+
+def test_stamps_of_several_sensors_need_no_order():
+    node, mirror = Node(), MapMirror(0.5)
+    stamps = [5.0, 5.3, 5.2, 5.5, 5.4]
+    for number, stamp_s in enumerate(stamps):
+        node.mapper._queue.forget_stamps()  # as if each were another sensor's
+        _, message = node.map_scan(round(stamp_s * SECOND))
+        mirror.change(message)
+        if number == 1:
+            full = node.full()
+    mirror.replace(full)
+    assert_equal(mirror, node)
+
+
+def test_without_moments_clients_are_told_of_surfels_alone():
+    node = Node(**{'publish.moments': False})
+    known = set()
+    for number in range(10):
+        change, _ = node.map_scan(number * SECOND)
+        assert (change.surfels.num_points >= 4).all()
+        known |= set(pack_keys(change.surfels.voxel_index).tolist())
+        removed = set(pack_keys(change.removed).tolist())
+        assert removed <= known
+        known -= removed
+        now = node.mapper.map.surfels(4)
+        assert known == set(pack_keys(now.voxel_index).tolist())
+    node.mapper.clear()
+    change, _ = node.tell()
+    assert set(pack_keys(change.removed).tolist()) == known
+
+
+def test_whoever_comes_first_gets_what_the_next_scan_changed_only():
+    node = Node()
+    for number in range(3):
+        node.map_scan(number * SECOND)
+        node.changes.forget()
+    before = node.mapper.map.version
+    change, _ = node.map_scan(3 * SECOND, num=50)
+    changed = node.mapper.map.surfels_changed(before, 1)
+    assert len(change.surfels) == len(changed) < len(node.mapper.map)
+
+
+def test_known_keys_are_a_set():
+    rng = np.random.default_rng(3)
+    known, expected = KnownKeys(np.arange(50)), set(range(50))
+    for number in range(40):
+        keys = np.unique(rng.integers(0, 10_000, 8000))
+        (known.add if number % 2 else known.drop)(keys)
+        expected = expected | set(keys.tolist()) if number % 2 else expected - set(keys.tolist())
+        if number % 7 == 0:
+            assert known.keys().tolist() == sorted(expected)
+    assert known.keys().tolist() == sorted(expected)
+
+
+def test_integers_keep_all_their_bits():
+    values = np.array([0, 1, -1, 2**62, -(2**63), 2**63 - 1, 0x0123456789ABCDEF])
+    pairs = halves(values)
+    assert pairs.dtype == np.uint32
+    assert pairs[6].tolist() == [0x89ABCDEF, 0x01234567]  # the low half first
+    np.testing.assert_array_equal(whole(pairs), values)
+
+
+def test_a_voxel_that_is_gone_has_no_points_and_no_place():
+    node = Node()
+    node.map_scan(0)
+    message = node.message(node.mapper.map.surfels(1), np.array([[7, -8, 9]], np.int32))
+    scan = to_scan(message)
+    assert np.isnan(scan.points[-1]).all()
+    assert scan.columns['num_points'][-1] == 0
+    assert [scan.columns[f'voxel_{axis}'][-1] for axis in 'xyz'] == [7, -8, 9]
+
+
+def test_removed_voxels_are_told_by_place_and_index():
+    columns = voxel_columns(np.array([[0, -1, 3]], np.int32), 0.5)
+    assert {name: values.tolist() for name, values in columns.items()} == {
+        'x': [0.25], 'y': [-0.25], 'z': [1.75], 'voxel_x': [0], 'voxel_y': [-1], 'voxel_z': [3],
+    }  # fmt: skip
+
+
+def test_clouds_that_cannot_be_mirrored_are_refused_and_change_nothing():
+    node, mirror = Node(), MapMirror(0.5)
+    mirror.change(node.map_scan(0)[1])
+    digest = mirror.map.digest()
+    full = node.full()
+    plain = to_scan(full)
+    without = {**dict(zip('xyz', plain.points.T, strict=True)), 'num_points': np.zeros(len(plain))}
+    content = from_columns(without)
+    names = content.__slots__
+    message = SimpleNamespace(header=full.header, **{n: getattr(content, n) for n in names})
+    with pytest.raises(CloudFormatError, match=r'no field voxel_x.*publish\.moments'):
+        mirror.replace(message)
+    with pytest.raises(CloudFormatError, match='no field sum_intensity'):
+        MapMirror(0.5, ('intensity',)).replace(full)
+    with pytest.raises(CloudFormatError, match=r'voxels of 0\.4 m'):
+        MapMirror(0.4).change(full)
+    assert mirror.map.digest() == digest
+
+
+def test_an_empty_map_is_mirrored():
+    mirror = MapMirror(0.5)
+    node = Node()
+    mirror.replace(node.full())
+    assert mirror.is_complete
+    assert len(mirror.map) == 0
+
+
+def test_memory_of_changes_is_bounded():
+    node, mirror = Node(), MapMirror(0.5)
+    for number in range(MAX_RECENT + 5):
+        mirror.change(node.map_scan(number * SECOND, num=5)[1])
+    assert len(mirror._recent) == MAX_RECENT
+    assert_equal(mirror, node)
