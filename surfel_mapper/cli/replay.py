@@ -1,113 +1,200 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-``surfel-mapper replay``: a bag into map.ply, map.png and summary.json.
+``surfel-mapper replay``: a bag, or a folder of scans, into a map, its picture and summary.json.
 
-The files are written when the whole bag is mapped, each whole or not at all; summary.json comes
-last, so where it is new the others are. A replay that maps nothing is refused, for an empty map
-looks like a result.
+The files are written when the whole recording is mapped, each whole or not at all; summary.json
+comes last, so where it is new the others are. Ctrl-C ends the recording early: what was mapped is
+written. A replay that maps nothing is refused, for an empty map looks like a result.
+
+Exit code 3: done, but the recording is cut off and --strict was given.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 import json
+import math
 import os
 from pathlib import Path
-import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
+
+from surfel_mapper.cli.progress import progress, stopped_by_interrupt
+from surfel_mapper.cli.replay_files import BAG, FORMATS, Mapped, write_files
+from surfel_mapper.cli.replay_report import causes, report
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
+    from surfel_mapper.config import Config
+    from surfel_mapper.offline.normals_bag import NormalsBag
+    from surfel_mapper.offline.recording import Recording, Request
+    from surfel_mapper.pipeline import Mapper, Update
 
-    from surfel_mapper.io.bag import BagReader
-    from surfel_mapper.offline.replay import PoseTopics
-    from surfel_mapper.pipeline import Mapper
-
-SUMMARY = 'Map the clouds of a bag and write the map, a picture and figures.'
+SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and figures.'
 
 EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
+
+CUT, INTERRUPTED = 3, 130
+"""Exit codes: the recording ends too early and --strict was given; Ctrl-C was pressed."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument(
-        'bag', type=Path, metavar='BAG', help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag'
-    )
-    parser.add_argument('--topic', help='PointCloud2 topic (the only one, if there is one)')
-    parser.add_argument('--pose-topic', help='topic of the poses (/tf, /odom or /pose)')
-    parser.add_argument('--config', type=Path, metavar='FILE', help='YAML file of settings')
-    parser.add_argument(
-        '--filters',
-        metavar='FILE',
+    add = parser.add_argument
+    add(
+        'bag', type=Path, metavar='BAG',
+        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory of .ply, .pcd, .bin scans',
+    )  # fmt: skip
+    add('--config', type=Path, metavar='FILE', help='YAML file of settings')
+    add(
+        '--filters', metavar='FILE',
         help='YAML file of a filter chain, as libpointmatcher has them (see `surfel-mapper '
         'filters`); FILE#key: the list under a key of it',
-    )
-    parser.add_argument(
-        '--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)'
-    )
-    parser.add_argument(
-        '--window',
-        action='store_true',
+    )  # fmt: skip
+    add_input_arguments(parser)
+    add_output_arguments(parser)
+
+
+def add_input_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what is mapped."""
+    add = parser.add_argument_group('what is mapped').add_argument
+    add(
+        '--topic', action='append', default=[],
+        help='PointCloud2 topic (the only one, if there is one); repeatable',
+    )  # fmt: skip
+    add(
+        '--mount', action='append', default=[], type=mount, metavar='TOPIC=X,Y,Z,QX,QY,QZ,QW',
+        help='where the sensor of a topic sits on frames.base, m; repeatable',
+    )  # fmt: skip
+    add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
+    add('--poses', type=Path, metavar='FILE', help='file of poses of frames.base instead')
+    add(
+        '--poses-format', choices=('tum', 'kitti', 'csv'),
+        help='its format (told by its first line)',
+    )  # fmt: skip
+    add('--start', type=float, default=0.0, metavar='S', help='leave out the first seconds')
+    add('--duration', type=float, default=math.inf, metavar='S', help='map so many seconds')
+    add('--every', type=int, default=1, metavar='N', help='map one cloud of every N')
+    add(
+        '--window', action='store_true',
         help="let scans leave the map by the configuration's window, as the node does",
-    )
-    parser.add_argument(
-        '--align',
-        action='store_true',
+    )  # fmt: skip
+    add(
+        '--align', action='store_true',
         help='move the scans in the end to where they agree with each other; keeps all points '
         'in memory until then',
-    )
-    parser.add_argument(
-        '--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text'
-    )
-    parser.add_argument('--json', action='store_true', help='print the summary as JSON')
+    )  # fmt: skip
+
+
+def add_output_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare what is written."""
+    add = parser.add_argument_group('what is written').add_argument
+    add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
+    add(
+        '--formats', type=formats, default=('ply',), metavar='LIST',
+        help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply)',
+    )  # fmt: skip
+    add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
+    add('--json', action='store_true', help='print the summary as JSON')
+    add('--strict', action='store_true', help='exit with 3 where the bag is cut off or damaged')
+
+
+def mount(text: str) -> tuple[str, tuple[float, ...]]:
+    """Return topic and pose of TOPIC=X,Y,Z,QX,QY,QZ,QW."""
+    topic, _, pose = text.partition('=')
+    try:
+        numbers = tuple(float(number) for number in pose.split(','))
+    except ValueError:
+        numbers = ()
+    if not topic or len(numbers) != 7 or abs(math.hypot(*numbers[3:]) - 1.0) > 1e-3:
+        raise argparse.ArgumentTypeError(
+            f'{text!r}, expected TOPIC=X,Y,Z,QX,QY,QZ,QW with a quaternion of norm 1'
+        )
+    return topic, numbers
+
+
+def formats(text: str) -> tuple[str, ...]:
+    """Return the formats of a list."""
+    names = tuple(text.split(','))
+    unknown = [name for name in names if name not in FORMATS]
+    if unknown:
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r}, expected some of {", ".join(FORMATS)}')
+    return names
 
 
 def run(args: argparse.Namespace) -> int:
-    """Map a bag and report."""
-    from surfel_mapper.config import load_config
-    from surfel_mapper.io.bag import BagReader
-    from surfel_mapper.io.bag_topics import CLOUD
+    """Map a recording and report."""
     from surfel_mapper.io.heap import keep_freed_memory
-    from surfel_mapper.io.trajectory import write_tum
-    from surfel_mapper.offline.replay import ALL_SCANS, load_start, pose_topics, poses_now
+    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.replay import load_start, poses_now
     from surfel_mapper.pipeline import Mapper
+
+    keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
+    config = configured(args)
+    output = output_directory(args.bag, args.output)
+    with open_recording(request_of(args), config) as recording, ExitStack() as files:
+        mapper = Mapper(recording.config)
+        load_start(mapper)
+        mapper.warm_up()
+        bag = normals_bag(output, mapper, files) if BAG in args.formats else None
+        start = time.perf_counter()
+        mapped, was_stopped = map_recording(recording, mapper, [bag.add] if bag else [])
+        replay_s = time.perf_counter() - start
+        refuse_empty(recording, mapper, was_stopped)
+        aligned = {'alignment': mapper.align().summary()} if args.align else {}
+        mapped.poses = poses_now(mapper, mapped.stamps_ns, mapped.poses)
+        if bag:
+            bag.finish()
+        summary = {
+            **recording.describe(),
+            'recorded_s': recording.recorded_s,
+            'replay_s': replay_s,
+            'window': args.window,
+            'interrupted': was_stopped,
+            'cut': list(recording.cuts),
+            **aligned,
+            **mapper.summary(),
+            'settings': mapper.config.to_mapping(),
+        }
+    if args.poses_out is not None:
+        mapped.write(args.poses_out)
+    written = write_files(output, args.formats, mapper, mapped, summary)
+    print(json.dumps(summary) if args.json else report(summary, written))
+    if was_stopped:
+        return INTERRUPTED
+    return CUT if args.strict and summary['cut'] else 0
+
+
+def configured(args: argparse.Namespace) -> Config:
+    """Return the configuration that the arguments ask for."""
+    from surfel_mapper.config import load_config
+    from surfel_mapper.offline.replay import ALL_SCANS
 
     config = load_config(args.config)
     if args.filters is not None:
         config = config.replace({'filters': args.filters})
     if args.align:
         config = config.replace({'window.keep_points': True})
-    mapper = Mapper(config if args.window else config.replace(ALL_SCANS))
-    load_start(mapper)
-    output = output_directory(args.bag, args.output)
-    with BagReader(args.bag) as reader:
-        topic = reader.topics.choose(CLOUD, args.topic)
-        poses = pose_topics(reader.topics, mapper.config, args.pose_topic)
-        keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
-        mapper.warm_up()
-        start = time.perf_counter()
-        stamps_ns, trajectory = map_bag(reader, mapper, topic, poses)
-        source = {
-            'bag': str(args.bag),
-            'topic': topic,
-            'pose_topics': [*poses.kinds, *poses.static],
-            'recorded_s': (reader.end_ns - reader.start_ns) / 1e9,
-            'replay_s': time.perf_counter() - start,
-            'window': args.window,
-        }
-    refuse_empty(args.bag, topic, mapper)
-    if args.align:
-        source['alignment'] = mapper.align().summary()
-    trajectory = poses_now(mapper, stamps_ns, trajectory)
-    if args.poses_out is not None:
-        write_tum(args.poses_out, stamps_ns, trajectory)
-    summary = {**source, **mapper.summary(), 'settings': mapper.config.to_mapping()}
-    write(output, args.bag, mapper, trajectory[:, :3, 3], summary)
-    print(json.dumps(summary) if args.json else report(summary, output))
-    return 0
+    return config if args.window else config.replace(ALL_SCANS)
+
+
+def request_of(args: argparse.Namespace) -> Request:
+    """Return what the arguments ask to map."""
+    from surfel_mapper.offline.recording import Request
+
+    return Request(
+        path=args.bag,
+        topics=tuple(args.topic),
+        pose_topic=args.pose_topic,
+        poses=args.poses,
+        poses_format=args.poses_format,
+        mounts=dict(args.mount),
+        start_s=args.start,
+        duration_s=args.duration,
+        every=args.every,
+    )
 
 
 def output_directory(bag: Path, wanted: Path | None) -> Path:
@@ -125,60 +212,44 @@ def output_directory(bag: Path, wanted: Path | None) -> Path:
     return directory
 
 
-def map_bag(
-    reader: BagReader, mapper: Mapper, topic: str, poses: PoseTopics
-) -> tuple[list[int], npt.NDArray[np.float64]]:
-    """Map all clouds of a topic with a progress bar; return stamps and poses, (S, 4, 4)."""
-    import numpy as np
-    from tqdm import tqdm
-    from tqdm.contrib.logging import logging_redirect_tqdm
+def normals_bag(output: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:
+    """Begin the bag of normals; it is whole when the files are closed, or not there."""
+    from surfel_mapper.io.bag_writer import BagWriter
+    from surfel_mapper.offline.normals_bag import NormalsBag
 
-    from surfel_mapper.offline.replay import replay
-
-    stamps_ns, trajectory = [], []
-    total = reader.topics.num_messages([topic])
-    hidden = not sys.stderr.isatty()
-    with logging_redirect_tqdm(), tqdm(total=total, unit='scan', disable=hidden) as bar:
-        for update in replay(reader, mapper, topic, poses):
-            stamps_ns.append(update.stamp_ns)
-            trajectory.append(update.T_fixed_sensor)
-            bar.update(mapper.counters.received - bar.n)
-        bar.update(mapper.counters.received - bar.n)
-    return stamps_ns, np.array(trajectory).reshape(-1, 4, 4)
+    return NormalsBag(files.enter_context(BagWriter(output / BAG, overwrite=True)), mapper)
 
 
-def refuse_empty(bag: Path, topic: str, mapper: Mapper) -> None:
+def map_recording(
+    recording: Recording, mapper: Mapper, listeners: Sequence[Callable[[Update], None]]
+) -> tuple[Mapped, bool]:
+    """Map all scans, showing how far it is; return the poses, and whether Ctrl-C ended it."""
+    mapped = Mapped()
+    with (
+        stopped_by_interrupt() as stopped,
+        progress('replay', recording.num_scans, 'scan') as show,
+    ):
+        for update in recording.replay(mapper, stopped):
+            mapped.add(update)
+            for listen in listeners:
+                listen(update)
+            show(mapper.counters.received)
+        return mapped, stopped()
+
+
+def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> None:
     """Raise if no scan was mapped, with the causes."""
     from surfel_mapper.errors import BagError
 
     counters = mapper.counters
-    if not (counters.mapped or counters.localised):
-        raise BagError(
-            f'{bag}: none of {counters.received} clouds of {topic} was mapped '
-            f'({causes(counters.dropped)}); `surfel-mapper info {bag}` shows what poses it has'
-        )
-
-
-def write(
-    output: Path,
-    bag: Path,
-    mapper: Mapper,
-    trajectory: npt.NDArray[np.float64],
-    summary: dict[str, Any],
-) -> None:
-    """Write the map, its picture and the summary."""
-    from surfel_mapper.io.files import replace_file
-    from surfel_mapper.io.ply import write_surfels
-    from surfel_mapper.viz.picture import draw_map
-
-    output.mkdir(parents=True, exist_ok=True)
-    surfels = mapper.map.surfels(mapper.config.map.min_points)
-    write_surfels(output / 'map.ply', surfels)
-    title = (
-        f'{bag.resolve().name}: {summary["scans"]["mapped"]} scans, '
-        f'{rounded(summary["points"])} points, '
-        f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
+    if counters.mapped or counters.localised:
+        return
+    if was_stopped:
+        raise KeyboardInterrupt
+    found = recording.describe()
+    of = f' of {", ".join(found["topics"])}' if 'topics' in found else ''
+    raise BagError(
+        f'{found["bag"]}: none of {counters.received} clouds{of} was mapped '
+        f'({causes(counters.dropped)}); '
+        f'`surfel-mapper info {found["bag"]}` shows what poses it has'
     )
-    draw_map(surfels, output / 'map.png', title, trajectory=trajectory)
-    with replace_file(output / 'summary.json') as file:
-        file.write((json.dumps(summary, indent=2) + '\n').encode())

@@ -139,8 +139,9 @@ class BagWriter:
             self._writer.write(self._connections[topic], record_ns, raw)
 
     def write_cloud(
-        self, topic: str, record_ns: int, stamp_ns: int, frame_id: str, cloud: CloudBytes
-    ) -> None:
+        self, topic: str, record_ns: int, stamp_ns: int, frame_id: str, cloud: CloudBytes, *,
+        latched: bool = False,
+    ) -> None:  # fmt: skip
         """Append a sensor_msgs/PointCloud2."""
         fields = [
             self._new('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
@@ -151,7 +152,7 @@ class BagWriter:
             cloud.height, cloud.width, fields, cloud.is_bigendian,
             cloud.point_step, cloud.row_step, cloud.data, cloud.is_dense,
         )  # fmt: skip
-        self._write_message(topic, record_ns, message)
+        self._write_message(topic, record_ns, message, latched=latched)
 
     def write_transform(
         self, topic: str, record_ns: int, pose: StampedPose, *, latched: bool = False

@@ -18,7 +18,6 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
-from surfel_mapper.io.map_state import load_map
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.offline.pose_path import PosePath
@@ -143,6 +142,8 @@ def load_start(mapper: Mapper) -> None:
         If it has other columns than are configured.
 
     """
+    from surfel_mapper.io.map_state import load_map  # it brings the compiler
+
     path = mapper.config.map.load
     if path:
         surfel_map, _ = load_map(path, voxel_size_m=mapper.map.voxel_size_m)
@@ -224,8 +225,8 @@ def numbers_before(
 
 
 def poses_now(
-    mapper: Mapper, stamps_ns: Sequence[int], T_map_sensor: npt.NDArray[np.float64]
-) -> npt.NDArray[np.float64]:
+    mapper: Mapper, stamps_ns: Sequence[int], poses: Sequence[npt.NDArray[np.float64]]
+) -> list[npt.NDArray[np.float64]]:
     """
     Return the poses of scans as alignment left them, as far as they are in the window.
 
@@ -235,11 +236,11 @@ def poses_now(
         Which mapped the scans.
     stamps_ns : sequence of int
         Of the scans, in the order in which they were mapped.
-    T_map_sensor : (S, 4, 4) float64
+    poses : sequence of (4, 4) float64
         Where each was when it was mapped.
 
     """
-    result: npt.NDArray[np.float64] = T_map_sensor.copy()
+    result = list(poses)
     for place, scan in enumerate(reversed(list(mapper.window)), start=1):
         if place > len(stamps_ns) or stamps_ns[-place] != scan.stamp_ns:
             break

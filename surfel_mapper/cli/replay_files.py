@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The files that a replay writes, each whole or not at all; summary.json last."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.cli.replay_report import rounded
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surfel_mapper.pipeline import Mapper, Update
+
+BAG = 'bag'
+"""Written while mapping, and so not here: a bag of normals in the directory ``normals``."""
+
+FORMATS = {
+    'ply': 'map.ply',
+    'pcd': 'map.pcd',
+    'parquet': 'map.parquet',
+    'npz': 'map.npz',
+    BAG: 'normals',
+}
+"""What the map is written as, and where: npz and parquet are exact, to be loaded again."""
+
+
+class Mapped:
+    """Stamp and pose of every scan that was mapped."""
+
+    def __init__(self) -> None:
+        """Begin without any."""
+        self.stamps_ns: list[int] = []
+        self.poses: list[npt.NDArray[np.float64]] = []
+
+    def add(self, update: Update) -> None:
+        """Take note of a scan."""
+        self.stamps_ns.append(update.stamp_ns)
+        self.poses.append(update.T_fixed_sensor)
+
+    def write(self, path: Path) -> None:
+        """Write the poses as TUM text."""
+        import numpy as np
+
+        from surfel_mapper.io.trajectory import write_tum
+
+        write_tum(path, self.stamps_ns, np.array(self.poses).reshape(-1, 4, 4))
+
+    @property
+    def positions(self) -> npt.NDArray[np.float64]:
+        """Where the sensor was, (S, 3) m."""
+        import numpy as np
+
+        return np.array([pose[:3, 3] for pose in self.poses]).reshape(-1, 3)
+
+
+def write_files(
+    output: Path,
+    formats: Sequence[str],
+    mapper: Mapper,
+    mapped: Mapped,
+    summary: dict[str, Any],
+) -> list[Path]:
+    """Write the map in some formats, its picture and the summary; return what is there."""
+    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.viz.picture import draw_map
+
+    output.mkdir(parents=True, exist_ok=True)
+    for name in formats:
+        write_map(output / FORMATS[name], name, mapper)
+    picture, figures = output / 'map.png', output / 'summary.json'
+    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    title = (
+        f'{Path(summary["bag"]).resolve().name}: {summary["scans"]["mapped"]} scans, '
+        f'{rounded(summary["points"])} points, '
+        f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
+    )
+    draw_map(surfels, picture, title, trajectory=mapped.positions)
+    with replace_file(figures) as file:
+        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    return [*(output / FORMATS[name] for name in formats), picture, figures]
+
+
+def write_map(path: Path, name: str, mapper: Mapper) -> None:
+    """Write the map in one format."""
+    from surfel_mapper.io import map_state, parquet, pcd, ply
+
+    surfels = mapper.map.surfels(mapper.config.map.min_points)
+    if name == 'ply':
+        ply.write_surfels(path, surfels)
+    elif name == 'pcd':
+        pcd.write_surfels(path, surfels)
+    elif name == 'parquet':
+        parquet.write_map(path, mapper.map)
+    elif name == 'npz':
+        map_state.save_map(path, mapper.map, mapper.window)

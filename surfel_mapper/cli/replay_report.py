@@ -1,0 +1,56 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The summary of a replay in a few lines for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+STAGES = (
+    'decode', 'deskew', 'filter', 'register', 'reduce', 'insert', 'align', 'normals', 'total'
+)  # fmt: skip
+"""Of which the report states the times."""
+
+
+def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
+    """Return the summary in a few lines for people."""
+    scans, times = summary['scans'], summary['milliseconds']
+    out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
+    gated = f' ({scans["gated"]} left out by the motion gate)'
+    localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
+    stages = '   '.join(
+        f'{stage} {times[stage]["median"]:.1f} ms'
+        for stage in STAGES
+        if stage in times
+    )
+    filters = ''.join(
+        f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
+        f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
+        for name, done in summary['filters'].items()
+    )
+    aligned = f'{summary["alignment"]["text"]}\n' if 'alignment' in summary else ''
+    speed = summary['recorded_s'] / summary['replay_s']
+    return (
+        f'scans {scans["received"]}{out if scans["dropped"] else ""}'
+        f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
+        f'surfels {summary["surfels"]}\n'
+        f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
+        f'{filters}{aligned}'
+        f'digest {summary["digest"]}\n'
+        f'{"   ".join(str(path) for path in written)}'
+    )
+
+
+def causes(counts: Mapping[str, int]) -> str:
+    """Return counts by cause for people: no pose 4, no points 1."""
+    return ', '.join(f'{cause.replace("_", " ")} {count}' for cause, count in counts.items())
+
+
+def rounded(number: int) -> str:
+    """Return a number with three digits and k or M."""
+    for factor, letter in ((10**9, 'G'), (10**6, 'M'), (10**3, 'k')):
+        if number >= factor:
+            return f'{number / factor:.3g} {letter}'
+    return str(number)

@@ -1,0 +1,78 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What the node would have published while a recording is mapped, as a bag to play beside it.
+
+Two topics of PointCloud2, named and laid out as those of the node: ``changed`` after every scan,
+and ``normals``, the whole map. Recorded and stamped with the stamp of the scan, so that RViz and
+Foxglove show them in step with the input. The whole map is written at most once a second, and
+only when as many surfels have changed as it holds, so the bag grows with the changes and not with
+the square of the map.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from surfel_mapper.io.bag_writer import BagWriter
+from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
+
+if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfels import Surfels
+    from surfel_mapper.pipeline import Mapper, Update
+
+CHANGED, NORMALS = '/surfel_mapper/changed', '/surfel_mapper/normals'
+
+EVERY_NS = 1_000_000_000
+
+
+class NormalsBag:
+    """
+    Writes the surfels of a map as it grows.
+
+    Parameters
+    ----------
+    bag : BagWriter
+        Entered; whoever made it ends it.
+    mapper : Mapper
+        Whose updates come.
+
+    """
+
+    def __init__(self, bag: BagWriter, mapper: Mapper) -> None:
+        """Begin with nothing written."""
+        self._bag = bag
+        self._mapper = mapper
+        self._newest: Update | None = None
+        self._written_ns: int | None = None
+        self._changed = 0
+
+    def add(self, update: Update) -> None:
+        """Write what a scan changed, and now and then the map."""
+        self._newest = update
+        if len(update.changed):
+            self._write(CHANGED, update, update.changed)
+        self._changed += len(update.changed)
+        num_surfels = self._mapper.map.num_surfels(self._mapper.config.map.min_points)
+        last_ns = self._written_ns
+        is_due = last_ns is None or abs(update.stamp_ns - last_ns) >= EVERY_NS
+        if is_due and self._changed >= num_surfels:
+            self._write_map(update)
+
+    def finish(self) -> None:
+        """Write the map as it is after the last scan."""
+        if self._newest is not None and self._changed:
+            self._write_map(self._newest)
+
+    def _write_map(self, update: Update) -> None:
+        surfels = self._mapper.map.surfels(self._mapper.config.map.min_points)
+        if len(surfels):
+            self._write(NORMALS, update, surfels)
+        self._written_ns, self._changed = update.stamp_ns, 0
+
+    def _write(self, topic: str, update: Update, surfels: Surfels) -> None:
+        cloud = from_columns(surfel_columns(surfels))
+        stamp_ns = update.stamp_ns
+        self._bag.write_cloud(
+            topic, stamp_ns, stamp_ns, update.frame_id, cloud, latched=topic == NORMALS
+        )
