@@ -4,24 +4,29 @@
 Filters by the direction in which a point is seen.
 
 A point on an axis about which an angle is measured has no such angle: neither test can place it.
+Angles are not computed: their cosines, or the side of an edge on which a point is, say as much.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters.base import Filter, Mask
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
+from surfel_mapper.kernels.directions import (
+    ALWAYS,
+    BOTH,
+    EITHER,
+    in_field_of_view,
+    in_wedge,
+    NEVER,
+)
 from surfel_mapper.scan import Scan
-
-Array = npt.NDArray[Any]
 
 
 @register(theirs='AngleLimitDataPointsFilter')
@@ -47,54 +52,34 @@ class AngleLimit(Filter):
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
-        seen = Directions(scan.points)
-        phi_above, theta_above = seen.phi_above, seen.theta_above
-        if self.remove_inside:
-            return (
-                phi_above(self.phi_max_deg)
-                | phi_above(self.phi_min_deg, below=True)
-                | theta_above(self.theta_max_deg)
-                | theta_above(self.theta_min_deg, below=True)
-            )
-        return (
-            phi_above(self.phi_min_deg)
-            & phi_above(self.phi_max_deg, below=True)
-            & theta_above(self.theta_min_deg)
-            & theta_above(self.theta_max_deg, below=True)
-        )
+        phi, theta = [self.phi_min_deg, self.phi_max_deg], [self.theta_min_deg, self.theta_max_deg]
+        if self.remove_inside:  # above the highest or below the lowest
+            phi, theta = phi[::-1], theta[::-1]
+        kinds = [
+            phi_kind(phi[0], below=False),
+            phi_kind(phi[1], below=True),
+            theta_kind(theta[0], below=False),
+            theta_kind(theta[1], below=True),
+        ]
+        cosines = [cosine(limit) if math.isfinite(limit) else 0.0 for limit in (*phi, *theta)]
+        found = np.empty(len(scan), np.bool_)
+        of_type = np.array(cosines, scan.points.dtype)
+        in_wedge(scan.points.T, of_type, np.array(kinds), not self.remove_inside, found)
+        return found
 
 
-class Directions:
-    """
-    The directions of points: phi in (-180, 180] about z and theta in [0, 180] from z, deg.
+def phi_kind(limit_deg: float, *, below: bool) -> int:
+    """Return how phi, in (-180, 180] deg, is found to be above or below a limit."""
+    if not -180.0 <= limit_deg <= 180.0:
+        return ALWAYS if (limit_deg > 180.0) == below else NEVER
+    return BOTH if (limit_deg >= 0.0) != below else EITHER
 
-    Angles are compared by their cosines: 20 times faster than by the angles themselves.
-    """
 
-    def __init__(self, points: Array) -> None:
-        """Measure the points from the axis and from the origin."""
-        self.x, self.y, self.z = points.T
-        planar_sq = self.x * self.x + self.y * self.y
-        self.planar = np.sqrt(planar_sq)
-        self.distance = np.sqrt(planar_sq + self.z * self.z)
-
-    def phi_above(self, limit_deg: float, *, below: bool = False) -> Mask:
-        """Return where phi is above, or below, a limit."""
-        defined = self.planar > 0.0
-        if not -180.0 <= limit_deg <= 180.0:
-            return np.asarray(defined & ((limit_deg > 180.0) == below))
-        edge = self.planar * self.x.dtype.type(cosine(limit_deg))
-        side = self.y < 0.0 if below else self.y >= 0.0
-        if (limit_deg >= 0.0) != below:
-            return np.asarray(defined & side & (self.x < edge))
-        return np.asarray(defined & (side | (self.x > edge)))
-
-    def theta_above(self, limit_deg: float, *, below: bool = False) -> Mask:
-        """Return where theta is above, or below, a limit."""
-        if not 0.0 <= limit_deg <= 180.0:
-            return np.asarray((self.distance > 0.0) & ((limit_deg > 180.0) == below))
-        edge = self.distance * self.z.dtype.type(cosine(limit_deg))
-        return np.asarray(self.z > edge if below else self.z < edge)
+def theta_kind(limit_deg: float, *, below: bool) -> int:
+    """Return how theta, in [0, 180] deg, is found to be above or below a limit."""
+    if not 0.0 <= limit_deg <= 180.0:
+        return ALWAYS if (limit_deg > 180.0) == below else NEVER
+    return BOTH
 
 
 @register
@@ -133,29 +118,20 @@ class FieldOfView(Filter):
         """Return which points stay; one at the origin or not finite does not."""
         if self.sensor and self.sensor != scan.frame_id:
             return np.ones(len(scan), np.bool_)
-        x, y, z = scan.points.T
-        planar = np.sqrt(x * x + y * y)
-        mask = np.asarray((planar > 0.0) | (np.abs(z) > 0.0))
-        mask &= np.isfinite(planar + z)
-        if self.azimuth_max_deg - self.azimuth_min_deg < 360.0:
-            mask &= between(x, y, self.azimuth_min_deg, self.azimuth_max_deg)
-        for limit, above in ((self.elevation_min_deg, True), (self.elevation_max_deg, False)):
-            if abs(limit) < 90.0:
-                edge = planar * planar.dtype.type(sine(limit) / cosine(limit))
-                mask &= z >= edge if above else z <= edge
-        return mask
-
-
-def between(x: Array, y: Array, start_deg: float, end_deg: float) -> Mask:
-    """
-    Return which directions lie from one angle on to another less than a turn further.
-
-    By the side of the two edges on which a point is: 20 times faster than by arctan2.
-    """
-    kind = x.dtype.type
-    after = y * kind(cosine(start_deg)) >= x * kind(sine(start_deg))
-    before = y * kind(cosine(end_deg)) <= x * kind(sine(end_deg))
-    return np.asarray(after | before if end_deg - start_deg > 180.0 else after & before)
+        azimuth = (self.azimuth_min_deg, self.azimuth_max_deg)
+        elevation = (self.elevation_min_deg, self.elevation_max_deg)
+        has_low, has_high = (abs(limit) < 90.0 for limit in elevation)
+        edges = [f(limit) for limit in azimuth for f in (cosine, sine)]
+        edges += [
+            sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation
+        ]
+        extent = azimuth[1] - azimuth[0]
+        seen = np.empty(len(scan), np.bool_)
+        in_field_of_view(
+            scan.points.T, np.array(edges, scan.points.dtype), extent < 360.0, extent > 180.0,
+            has_low, has_high, seen,
+        )
+        return seen
 
 
 def sine(angle_deg: float) -> float:
