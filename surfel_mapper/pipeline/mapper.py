@@ -34,7 +34,7 @@ from surfel_mapper.errors import (
     PoseNotYetError,
 )
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.geometry import compose, inverse, pose_matrix
+from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.mapping.channels import CHANNELS, missing_columns
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import NARROW_COUNT, within
@@ -279,6 +279,11 @@ class Mapper:
             aligned = self._aligner.align(self.window, self.config)
         _log.info('aligned: %s', aligned)
         return aligned
+
+    @property
+    def T_map_fixed(self) -> Transform:
+        """From the fixed frame of the poses that come in to the map: how alignment corrects."""
+        return self._aligner.T_map_fixed
 
     @property
     def map_frame(self) -> str:

@@ -47,7 +47,7 @@ MAX_WAITING = 20
 
 class Control:
     """
-    Services ~/clear, ~/clear_box, ~/clear_radius, ~/save_map, ~/load_map, ~/pause.
+    Services ~/align, ~/clear, ~/clear_box, ~/clear_radius, ~/save_map, ~/load_map, ~/pause.
 
     Parameters
     ----------
@@ -74,6 +74,7 @@ class Control:
         self._polygons: deque[PolygonStamped] = deque(maxlen=MAX_WAITING)
         group = ReentrantCallbackGroup()  # one may wait while the others go on
         for name, action in (
+            ('~/align', self._align),
             ('~/clear', self._clear),
             ('~/clear_box', self._clear_box),
             ('~/clear_radius', self._clear_radius),
@@ -108,7 +109,7 @@ class Control:
             return response
         response.result = LOADED
         config = self._mapper.config
-        response.map.header.frame_id = config.frames.fixed
+        response.map.header.frame_id = self._mapper.map_frame
         response.map.info.resolution = config.map.voxel_size_m
         now_ns = self._node.get_clock().now().nanoseconds
         response.map.header.stamp = response.map.info.map_load_time = time_message(now_ns)
@@ -144,6 +145,12 @@ class Control:
         return said
 
     # What follows is called in the mapping thread.
+
+    def _align(self) -> str:
+        """Move the scans of the window to where they agree; return by how much."""
+        aligned = self._mapper.align()
+        self._outputs.publish_aligned(aligned)
+        return str(aligned)
 
     def _clear(self) -> str:
         """Empty the map; return what was in it."""

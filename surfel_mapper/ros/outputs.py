@@ -26,19 +26,23 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.config import PublishConfig
+from surfel_mapper.config import Config, PublishConfig
 from surfel_mapper.io.cdr import marker_array
 from surfel_mapper.io.map_cloud import moment_columns, voxel_columns
 from surfel_mapper.io.markers import disc_colors, surfel_markers
 from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
 from surfel_mapper.io.scan_normals import scan_with_normals
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.traversability import traversability
-from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.pipeline import Aligned, Mapper, Update
+from surfel_mapper.ros.alignment import AlignmentOutputs
 from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message, grid_message
 from surfel_mapper.ros.waiting import result_of
+from surfel_mapper.scan import Scan
 
 LATCHED = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -73,6 +77,7 @@ class Outputs:
         self._mapper = mapper
         self._thread = thread
         self._changes = Changes(mapper)
+        self._alignment = AlignmentOutputs(node, mapper)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
         self._changed = node.create_publisher(PointCloud2, '~/changed', CHANGES)
         self._removed = node.create_publisher(PointCloud2, '~/removed', CHANGES)
@@ -84,6 +89,7 @@ class Outputs:
         published = (self._normals, self._markers, self._grid)
         self._published: dict[Any, int] = dict.fromkeys(published, mapper.map.version)
         self._timers: list[Timer] = []
+        warm_up(mapper.config)
         group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on
         node.create_service(
             Trigger, '~/publish_normals', self._on_publish_normals, callback_group=group
@@ -92,12 +98,18 @@ class Outputs:
     def publish_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
         self._stamp_ns, self._center = update.stamp_ns, update.T_fixed_sensor[:2, 3]
+        self._alignment.publish(update)
         if self._has_clients():
             self._publish_change(self._changes.of(update))
         else:
             self._changes.forget()
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
+
+    def publish_aligned(self, aligned: Aligned) -> None:
+        """Publish what an alignment changed that was asked for; called in the mapping thread."""
+        self._alignment.publish_path(aligned)
+        self.expire()
 
     def expire(self) -> None:
         """
@@ -209,3 +221,20 @@ class Outputs:
         grid = traversability(surfels, surfel_map.voxel_size_m, self._center, config.grid)
         self._grid.publish(grid_message(grid, self._stamp_ns, self._mapper.map_frame))
         self._published[self._grid] = surfel_map.version
+
+
+def warm_up(config: Config) -> None:
+    """Compile the kernels of what is published, and run the rest once: it loads its libraries."""
+    surfel_map = SurfelMap(config.map.voxel_size_m)
+    scan = Scan(
+        points=np.ones((1, 3), np.float64 if config.deskew.enabled else np.float32),
+        stamp_ns=0,
+        frame_id='',
+    )
+    moments = surfel_map.add(scan.points)
+    surfels = surfel_map.surfels()
+    scan_with_normals(scan, np.eye(4), surfel_map, 1)
+    windowed = WindowedScan(moments=moments, stamp_ns=0, T_map_sensor=np.eye(4))
+    colors = disc_colors('age', surfels, [windowed])
+    surfel_markers(surfels, config.map.voxel_size_m, colors, stamp_ns=0, frame_id='')
+    from_columns(moment_columns(surfels, moments, NO_VOXELS))
