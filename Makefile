@@ -23,7 +23,7 @@ VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
 
-.PHONY: demo test boundscheck versions bench lint settings clean
+.PHONY: demo test boundscheck versions bench soak lint settings clean
 
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
@@ -49,6 +49,9 @@ versions:  ## one bag, one digest, on every Python of PYTHONS that is there
 
 bench: $(STAMP)  ## milliseconds a scan
 	$(BIN)/python -m test.bench
+
+soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map drift?
+	$(BIN)/python -m test.soak
 
 lint: $(STAMP)  ## style, types, layers
 	$(BIN)/ruff check

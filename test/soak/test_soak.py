@@ -1,0 +1,39 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The long drive, cut short: every scan is mapped, and the map is held against another."""
+
+import pytest
+
+from test.bench.options import Options
+from test.soak import core
+
+
+@pytest.fixture
+def options(tmp_path):
+    return Options(scans=5, beams=8, columns=64, cache=tmp_path)
+
+
+def test_the_road_is_driven_up_and_down():
+    places = [(turn, place) for _, turn, place in core.there_and_back(9, 4)]
+    assert places == [(0, p) for p in (0, 1, 2, 3, 2, 1)] + [(1, p) for p in (0, 1, 2)]
+
+
+def test_every_block_gives_a_row(options):
+    rows = list(core.run(250, 100, options))
+    assert [row['scans'] for row in rows] == [100, 200, 250]
+    for row in rows:
+        assert 0.0 < row['median_ms'] <= row['p99_ms'] <= row['slowest_ms']
+        assert row['rss_MB'] > row['map_MB'] > 0.0
+
+
+def test_a_map_that_differs_from_its_window_is_found(options, monkeypatch):
+    evict = core.Mapper.insert_ready
+
+    def losing_a_scan(mapper):
+        yield from evict(mapper)
+        if mapper.counters.mapped == 120:
+            mapper.map.remove(mapper.window.newest.moments)
+
+    monkeypatch.setattr(core.Mapper, 'insert_ready', losing_a_scan)
+    with pytest.raises(RuntimeError, match='not the sum'):
+        list(core.run(130, 100, options))
