@@ -47,7 +47,8 @@ def first_votes(points, ids, sigma, votes):
             if not (length > 0.0 and far < REACH):
                 continue
             x, y, z = x / length, y / length, z / length
-            weight = far * far * (far - REACH) ** 4 / 16.0
+            end = (far - REACH) * (far - REACH)
+            weight = far * far * (end * end) / 16.0
             xx += weight * (1.0 - x * x)
             xy -= weight * x * y
             xz -= weight * x * z
