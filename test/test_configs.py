@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
+from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config, declarations, flatten, load_config
 from test import settings
 
@@ -105,3 +106,10 @@ def test_the_readme_links_to_files_that_are_there():
     assert links
     missing = [link for link in links if '://' not in link and not (root / link).exists()]
     assert missing == []
+
+
+def test_the_command_line_prints_the_table_of_the_readme(capsys):
+    assert main(['info', '--parameters']) == 0
+    assert f'{settings.BEGIN}{capsys.readouterr().out}{settings.END}' in (
+        settings.README.read_text(encoding='utf-8')
+    )

@@ -7,44 +7,63 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from datetime import datetime, timezone
+import itertools
 import json
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.cli.progress import progress
 
 if TYPE_CHECKING:
     from surfel_mapper.io.bag import BagReader
     from surfel_mapper.offline.survey import Offer, Survey
 
-SUMMARY = 'Show the topics, rates and frames of a bag, and which poses its clouds have.'
+SUMMARY = 'Show the topics, rates and poses of a bag, or the settings of node and replay.'
 
 EXAMPLE = 'surfel-mapper info street.mcap'
+
+CUT = 3
+"""Exit code: the bag ends too early and --strict was given."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.add_argument(
-        'bag', type=Path, metavar='BAG', help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag'
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument(
+        'bag',
+        type=Path,
+        metavar='BAG',
+        nargs='?',
+        help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag',
+    )
+    what.add_argument(
+        '--parameters', action='store_true', help='print all settings of node and replay instead'
     )
     parser.add_argument('--json', action='store_true', help='print as JSON')
+    parser.add_argument(
+        '--strict', action='store_true', help='exit with 3 where the bag is cut off or damaged'
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read a bag and report."""
-    from tqdm import tqdm
+    """Read a bag and report, or tell the settings."""
+    if args.parameters:
+        from surfel_mapper.config.table import settings_table
 
+        print(settings_table(), end='')
+        return 0
     from surfel_mapper.io.bag import BagReader
     from surfel_mapper.offline.survey import offers, survey, surveyed_topics
 
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
-        hidden = not sys.stderr.isatty()
-        with tqdm(total=total, unit='message', disable=hidden, leave=False) as bar:
-            found = survey(reader, bar.update)
+        read = itertools.count(1)
+        with progress('info', total, 'message') as show:
+            found = survey(reader, lambda: show(next(read)))
         made = offers(found)
         content = as_mapping(reader, found, made)
     print(json.dumps(content) if args.json else report(content, made))
-    return 0
+    return CUT if args.strict and content['cut'] else 0
 
 
 def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
@@ -65,6 +84,7 @@ def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str,
             for name, seen in found.topics.items()
         ],
         'undecodable': found.undecodable,
+        'cut': list(reader.cuts),
         'poses': [dataclasses.asdict(offer) for offer in made],
     }
 
@@ -78,6 +98,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
         f'{content["seconds"]:.1f} s, {messages} messages',
         *table(content['topics']),
     ]
+    lines += [f'cut off: {cut}' for cut in content['cut']]
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
     for clouds in dict.fromkeys(offer.clouds for offer in made):
