@@ -9,6 +9,10 @@ the points about the plane, and grows with the distance from their mean as the n
 by e0 e1 / (n (e1 - e0)^2). So a surfel of few points, of one ring of a lidar, or of a pole or a
 bush says little without a threshold that would have to be set.
 
+A surface that lies in a face between two voxels is cut in two by its own noise, each half with a
+mean 0.8 standard deviations off; cells would stay on the side they start from. So surfels
+near a face are merged with what continues them behind it.
+
 Source: Kanatani 1996 (Statistical Optimization for Geometric Computation) for the normal.
 """
 
@@ -31,8 +35,15 @@ from surfel_mapper.kernels.registration import (
     sum_equations,
     VARIANCE,
 )
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
+
+SIGMAS = 3.0
+"""So many standard deviations from a face a surface may be cut by it."""
+
+ALIKE = 0.9
+"""Cosine between the normals of two surfels that may be one."""
 
 
 class SurfelPlanes:
@@ -110,6 +121,7 @@ class SurfelPlanes:
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
         """Return surfels as rows of planes; those that say nothing have an infinite variance."""
+        surfels = self._continued(surfels)
         planes = np.empty((len(surfels), PLANE))
         planes[:, MEAN : MEAN + 3] = surfels.position
         planes[:, NORMAL : NORMAL + 3] = surfels.normal
@@ -121,3 +133,57 @@ class SurfelPlanes:
         says_nothing = (count < self._min_points) | np.isnan(surfels.planarity)
         planes[says_nothing, VARIANCE] = math.inf
         return planes
+
+    def _continued(self, surfels: Surfels) -> Surfels:
+        """Merge surfels near a face of their voxels with those behind it, where they are one."""
+        size_m = self._map.voxel_size_m
+        every = np.arange(len(surfels))
+        axis = np.argmax(np.abs(np.nan_to_num(surfels.normal)), axis=1)
+        slope = surfels.normal[every, axis]
+        inside_m = surfels.position[every, axis] - surfels.voxel_index[every, axis] * size_m
+        reach_m = SIGMAS * np.sqrt(surfels.eigenvalues[:, 0] + self._noise_sq)
+        side = np.where(inside_m < 0.5 * size_m, -1, 1)
+        to_face_m = np.minimum(inside_m, size_m - inside_m) * np.abs(slope)
+        near = np.flatnonzero(to_face_m < reach_m)
+        behind = surfels.voxel_index[near]
+        behind[np.arange(len(near)), axis[near]] += side[near]
+        found = self._map.find(pack_keys(behind))
+        near, found = near[found >= 0], found[found >= 0]
+        other = self._map.surfels_of(found)
+        across_m = ((other.position - surfels.position[near]) * surfels.normal[near]).sum(axis=1)
+        alike = np.abs((other.normal * surfels.normal[near]).sum(axis=1)) > ALIKE
+        one = alike & (np.abs(across_m) < 2.0 * reach_m[near])
+        merge(surfels, near[one], other.select(one), across_m[one])
+        return surfels
+
+
+def merge(
+    surfels: Surfels,
+    rows: npt.NDArray[np.int64],
+    other: Surfels,
+    across_m: npt.NDArray[np.float64],
+) -> None:
+    """
+    Merge surfels into some rows of others of about the same normals, in place.
+
+    Parameters
+    ----------
+    surfels : Surfels
+        Those that are changed.
+    rows : (K,) int64
+        Which of them.
+    other : Surfels
+        K more, one for each.
+    across_m : (K,) float64
+        How far these are along the normals of the first.
+
+    """
+    first, second = surfels.num_points[rows], other.num_points
+    share = (second / (first + second))[:, None]
+    turned = np.sign((other.normal * surfels.normal[rows]).sum(axis=1))[:, None] * other.normal
+    normal = (1.0 - share) * surfels.normal[rows] + share * turned
+    surfels.normal[rows] = normal / np.sqrt((normal**2).sum(axis=1))[:, None]
+    surfels.position[rows] += share * (other.position - surfels.position[rows])
+    surfels.eigenvalues[rows] += share * (other.eigenvalues - surfels.eigenvalues[rows])
+    surfels.eigenvalues[rows, 0] += ((1.0 - share) * share)[:, 0] * across_m**2
+    surfels.num_points[rows] = first + second

@@ -29,6 +29,8 @@ class PeerSpec:
         What pip installs for it.
     less : str
         What it does less than we.
+    python : str
+        Version of Python that it needs, where not ours: 3.10.
 
     """
 
@@ -36,6 +38,7 @@ class PeerSpec:
     module: str
     requires: tuple[str, ...]
     less: str | None = None
+    python: str | None = None
 
 
 OPEN3D = ('open3d-cpu==0.19.0',)  # later ones need libusb of the system
@@ -82,3 +85,17 @@ NORMAL_PEERS = (
     ),
 )
 """Those whose normals are compared; a module has ``normals(points, support)``, (N, 3) each."""
+
+ODOMETRY_PEERS = (
+    PeerSpec(
+        name='KISS-ICP',
+        module='test.bench.peers.kiss_icp_odometry',
+        requires=('kiss-icp==1.3.0',),
+    ),
+    PeerSpec(
+        name='small_gicp VGICP',
+        module='test.bench.peers.small_gicp_odometry',
+        requires=SMALL_GICP,
+    ),
+)
+"""Those that find poses; a module has ``Odometry(voxel_size_m)`` with ``register(points)``."""

@@ -4,15 +4,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+import contextlib
 import hashlib
 import json
+import os
 from pathlib import Path
 import re
 import subprocess
 import sys
 import tempfile
 from typing import Any
-import venv
 
 import numpy as np
 import numpy.typing as npt
@@ -83,6 +85,31 @@ def run_normals(
     return normals
 
 
+def run_odometry(
+    python: str | Path, peer: PeerSpec, scans: Sequence[Path], size_m: float
+) -> tuple[list[float], npt.NDArray[np.float64]]:
+    """
+    Return milliseconds and pose of every scan, (S, 4, 4).
+
+    Raises
+    ------
+    PeerError
+        With the last line that the peer said.
+
+    """
+    with tempfile.TemporaryDirectory() as scratch:
+        poses = Path(scratch) / 'poses.npy'
+        job = {
+            'module': peer.module,
+            'scans': [str(path) for path in scans],
+            'voxel_size_m': size_m,
+            'poses': str(poses),
+        }
+        command = [str(python), '-m', 'test.bench.peers.odometry_driver']
+        milliseconds = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
+        return milliseconds, np.load(poses)
+
+
 def environment(peer: PeerSpec, cache: Path) -> Path:
     """
     Return the python of the environment of a peer, made if it is not there yet.
@@ -90,20 +117,41 @@ def environment(peer: PeerSpec, cache: Path) -> Path:
     Raises
     ------
     PeerError
-        With the last line that pip said.
+        With the last line that pip said, or if there is no such Python.
 
     """
-    version = f'{sys.version_info.major}.{sys.version_info.minor}'
+    version = peer.python or f'{sys.version_info.major}.{sys.version_info.minor}'
     name = hashlib.sha256(' '.join([version, *peer.requires]).encode()).hexdigest()[:12]
     directory = cache / f'venv-{name}'
     python = directory / 'bin' / 'python'
     if not (directory / READY).exists():
         print(f'installing {" ".join(peer.requires)} into {directory}', file=sys.stderr)
-        venv.create(directory, clear=True, with_pip=True)
+        output([interpreter(version), '-m', 'venv', '--clear', str(directory)])
         pip = [str(python), '-m', 'pip', 'install', '--quiet', '--disable-pip-version-check']
         output([*pip, *peer.requires])
         (directory / READY).touch()
     return python
+
+
+def interpreter(version: str) -> str:
+    """
+    Return a Python of a version: ours, one on the path, or one that pyenv has.
+
+    Raises
+    ------
+    PeerError
+        If there is none.
+
+    """
+    if sys.executable and version == f'{sys.version_info.major}.{sys.version_info.minor}':
+        return sys.executable
+    root = Path(os.environ.get('PYENV_ROOT') or Path.home() / '.pyenv')
+    candidates = [*sorted(root.glob(f'versions/{version}.*/bin/python')), f'python{version}']
+    for candidate in map(str, candidates):
+        with contextlib.suppress(PeerError, OSError):
+            output([candidate, '--version'])
+            return candidate
+    raise PeerError(f'needs Python {version}, which is neither on the path nor with pyenv')
 
 
 def output(command: list[str], **settings: Any) -> str:

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Registration in rooms whose every surface is known, so that the true pose is as well."""
+
+from __future__ import annotations
+
+from functools import cache
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.alignment.registration import moved, Registration, solve
+from surfel_mapper.alignment.surfel_planes import SurfelPlanes
+from surfel_mapper.config import RegistrationConfig
+from surfel_mapper.geometry import compose, inverse, rotation_angle, se3_exp
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+VOXEL_M = 0.5
+NOISE_M = 0.005
+TRUE = se3_exp(np.array([0.4, -0.7, 1.2, 0.03, -0.02, 0.6]))
+
+# Faces as corner and two edges, m: of a room that no turn but a full one brings onto itself.
+FLOOR = ((-6.0, -4.0, 0.0), (14.0, 0.0, 0.0), (0.0, 9.0, 0.0))
+WALLS = (
+    ((-6.0, -4.0, 0.0), (14.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
+    ((-6.0, 5.0, 0.0), (14.0, 0.0, 0.0), (0.0, 0.0, 3.0)),
+    ((-6.0, -4.0, 0.0), (0.0, 9.0, 0.0), (0.0, 0.0, 3.0)),
+    ((8.0, -4.0, 0.0), (0.0, 9.0, 0.0), (0.0, 0.0, 3.0)),
+)
+CUPBOARD = (
+    ((3.0, 2.0, 0.0), (2.0, 0.7, 0.0), (0.0, 0.0, 2.0)),
+    ((3.0, 2.0, 0.0), (-0.5, 1.5, 0.0), (0.0, 0.0, 2.0)),
+    ((5.0, 2.7, 0.0), (-0.5, 1.5, 0.0), (0.0, 0.0, 2.0)),
+)
+ROOM = (FLOOR, *WALLS, *CUPBOARD)
+CORRIDOR = (
+    ((-60.0, -1.5, 0.0), (120.0, 0.0, 0.0), (0.0, 3.0, 0.0)),
+    ((-60.0, -1.5, 0.0), (120.0, 0.0, 0.0), (0.0, 0.0, 2.5)),
+    ((-60.0, 1.5, 0.0), (120.0, 0.0, 0.0), (0.0, 0.0, 2.5)),
+)
+
+
+def points_on(faces, density, seed, reach_m=math.inf):
+    """Return points on faces with noise, so many a square metre, not far from where TRUE is."""
+    rng = np.random.default_rng(seed)
+    parts = []
+    for corner, first, second in np.array(faces):
+        num = int(density * np.linalg.norm(np.cross(first, second)))
+        u, v = rng.random((2, num, 1))
+        parts.append(corner + u * first + v * second)
+    points = np.concatenate(parts)
+    points += rng.normal(scale=NOISE_M, size=points.shape)
+    return points[np.linalg.norm(points - TRUE[:3, 3], axis=1) < reach_m]
+
+
+@cache
+def map_of(faces):
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(points_on(faces, 200, seed=1, reach_m=40.0), origin=TRUE[:3, 3])
+    return surfel_map
+
+
+def scan_of(faces, reach_m=math.inf):
+    """Return other points, in the frame of a sensor at TRUE."""
+    points = points_on(faces, 150, seed=2, reach_m=reach_m)
+    T_sensor_map = inverse(TRUE)
+    return points @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3]
+
+
+def registration(**settings):
+    return Registration(RegistrationConfig(noise_m=NOISE_M, **settings), VOXEL_M)
+
+
+def align(faces, start, deviation_m, points=None, **settings):
+    aligner = registration(**settings)
+    cells = aligner.cells(scan_of(faces) if points is None else points)
+    return aligner.align(cells, map_of(faces), [start], deviation_m)
+
+
+def off(T_map_sensor):
+    """Return how far a pose is from TRUE: m, deg."""
+    error = compose(inverse(TRUE), T_map_sensor)
+    return np.linalg.norm(error[:3, 3]), math.degrees(rotation_angle(error))
+
+
+def started(x=0.0, y=0.0, z=0.0, turn_deg=(0.0, 0.0, 0.0)):
+    return moved(TRUE, np.array([x, y, z, *np.radians(turn_deg)]))
+
+
+def test_a_scan_is_found_where_it_was_taken():
+    found = align(ROOM, started(0.15, -0.1, 0.05, (0.5, -0.5, 2.0)), 0.3)
+
+    distance_m, angle_deg = off(found.T_map_sensor)
+    assert distance_m < 1e-3  # noise of 5 mm in thousands of cells
+    assert angle_deg < 0.02
+    assert found.converged
+    assert found.fit > 0.9
+    assert len(found.degenerate) == 0
+
+
+@pytest.mark.parametrize('levels', [0, 1, 2, 3])
+def test_a_scan_is_found_from_several_voxels_off(levels):
+    start = started(1.8, 1.5, 0.3, (2.0, -2.0, 15.0))
+
+    found = align(ROOM, start, 1.0, search_deg=0.0, coarse_levels=levels)
+
+    assert off(found.T_map_sensor)[0] < 1e-3
+
+
+def test_a_heading_that_is_far_off_is_searched_for():
+    start = started(0.3, 0.2, 0.0, (0.0, 0.0, 50.0))
+    aligner = registration()
+    cells, surfel_map = aligner.cells(scan_of(ROOM)), map_of(ROOM)
+
+    found = aligner.align(cells, surfel_map, [start], 0.3, expected_fit=0.8)
+
+    assert off(found.T_map_sensor)[0] < 1e-3
+    assert off(found.T_map_sensor)[1] < 0.02
+
+
+def test_a_further_start_is_tried_where_the_first_does_not_fit():
+    wrong, right = started(0.0, 0.0, 0.0, (0.0, 0.0, 90.0)), started(0.1)
+    aligner = registration(search_deg=0.0)
+    cells, surfel_map = aligner.cells(scan_of(ROOM)), map_of(ROOM)
+
+    found = aligner.align(cells, surfel_map, [wrong, right], 0.3, expected_fit=0.8)
+
+    assert off(found.T_map_sensor)[0] < 1e-3
+
+
+def test_what_moved_in_the_scan_hardly_disturbs():
+    points = scan_of(ROOM)
+    rng = np.random.default_rng(5)
+    clutter = rng.uniform([-5.0, -3.0, -1.0], [2.0, 0.0, 1.0], (len(points) // 4, 3))
+
+    found = align(ROOM, started(0.1, 0.1, 0.0), 0.2, points=np.concatenate([points, clutter]))
+
+    assert off(found.T_map_sensor)[0] < 0.01
+
+
+def test_along_a_corridor_the_prediction_stays():
+    start = started(0.2, 0.1, 0.1, (0.0, 0.0, 1.0))
+    points = scan_of(CORRIDOR, reach_m=20.0)
+
+    found = align(CORRIDOR, start, 0.3, points=points)
+
+    error = found.T_map_sensor[:3, 3] - TRUE[:3, 3]
+    assert error[0] == pytest.approx(0.2, abs=0.02)  # nothing is known of x
+    assert abs(error[1:]).max() < 2e-3
+    assert len(found.degenerate) == 1
+    assert abs(found.degenerate[0, 0]) > 0.99
+
+
+def test_on_a_plain_height_and_tilt_alone_are_known():
+    plain = (((-40.0, -40.0, 0.0), (80.0, 0.0, 0.0), (0.0, 80.0, 0.0)),)
+    start = started(0.2, -0.2, 0.1, (0.5, -0.5, 1.0))
+
+    found = align(plain, start, 0.3, points=scan_of(plain, reach_m=15.0))
+
+    assert len(found.degenerate) == 3
+    assert found.T_map_sensor[2, 3] == pytest.approx(TRUE[2, 3], abs=2e-3)
+    np.testing.assert_allclose(found.T_map_sensor[2, :3], TRUE[2, :3], atol=2e-4)
+    assert np.abs(found.T_map_sensor[:2, 3] - start[:2, 3]).max() < 0.02
+
+
+def test_against_an_empty_map_nothing_is_known():
+    aligner = registration()
+    start = started(1.0)
+
+    found = aligner.align(aligner.cells(scan_of(ROOM)), SurfelMap(VOXEL_M), [start], 0.3)
+
+    assert found.fit == 0.0
+    assert len(found.degenerate) == 6
+    np.testing.assert_allclose(found.T_map_sensor, start, atol=1e-12)
+
+
+def test_a_scan_without_points_fits_nothing():
+    found = align(ROOM, TRUE, 0.3, points=np.full((5, 3), np.nan))
+
+    assert (found.num_cells, found.fit) == (0, 0.0)
+
+
+def test_equal_scans_are_found_at_equal_bits_and_leave_the_map_as_it_is():
+    aligner, surfel_map = registration(), map_of(ROOM)
+    digest = surfel_map.digest()
+    start = started(0.9, -0.8, 0.3)
+
+    poses = [
+        aligner.align(aligner.cells(scan_of(ROOM)), surfel_map, [start], 1.0).T_map_sensor
+        for _ in range(2)
+    ]
+
+    np.testing.assert_array_equal(poses[0], poses[1])
+    assert surfel_map.digest() == digest
+
+
+def test_cells_are_means_of_points_within_the_limits_of_range():
+    points = np.array([[1.1, 0.1, 0.1], [1.2, 0.15, 0.2], [3.1, 0.0, 0.1], [0.2, 0.0, 0.1]])
+
+    cells = registration(cell_m=0.25).cells(points, min_range_m=0.5, max_range_m=3.0)
+
+    # the lattice of a cell of 0.25 m is 4 micrometres wide
+    np.testing.assert_allclose(cells, [[1.15, 0.125, 0.15]], atol=4e-6)
+
+
+def test_of_too_many_cells_some_are_taken_evenly():
+    points = np.column_stack([np.arange(1000.0), np.zeros(1000), np.zeros(1000)]) + 0.1
+
+    cells = registration(max_cells=300).cells(points)
+
+    assert len(cells) == 250
+    assert np.diff(np.sort(cells[:, 0])).max() == pytest.approx(4.0, abs=1e-4)
+
+
+def test_the_size_of_cells_can_change_while_running():
+    aligner = registration(cell_m=0.25)
+    points = np.array([[0.1, 0.1, 0.1], [0.6, 0.1, 0.1]])
+    assert len(aligner.cells(points)) == 2
+
+    aligner.config = RegistrationConfig(cell_m=1.0)
+
+    assert len(aligner.cells(points)) == 1
+
+
+def fits_of(points, place):
+    """Return how well one cell fits a map of some points, and the information about it."""
+    surfel_map = SurfelMap(1.0)
+    surfel_map.add(points)
+    planes = SurfelPlanes(surfel_map, min_points=5, noise_m=0.01)
+    hessian, _, fit = planes.equations(np.array([place]), np.eye(4), 1.0)
+    return fit, np.trace(hessian[:3, :3])
+
+
+def test_a_surfel_of_one_ring_says_less_than_one_of_an_area():
+    rng = np.random.default_rng(4)
+    spread = rng.uniform(0.05, 0.95, 200)
+    ring = np.column_stack([spread, np.full(200, 0.5), np.full(200, 0.5)])
+    area = np.column_stack([spread, rng.uniform(0.05, 0.95, 200), np.full(200, 0.5)])
+    noise = rng.normal(scale=0.01, size=(200, 3))
+
+    said_by_ring = fits_of(ring + noise, [0.5, 0.9, 0.5])[1]
+    said_by_area = fits_of(area + noise, [0.5, 0.9, 0.5])[1]
+
+    assert said_by_ring < 0.2 * said_by_area
+
+
+@pytest.mark.parametrize('points', [np.full((4, 3), 0.3), np.full((9, 3), 0.3)])
+def test_a_surfel_of_few_points_or_of_one_place_says_nothing(points):
+    assert fits_of(points, [0.5, 0.5, 0.5]) == (0.0, 0.0)
+
+
+def test_the_step_solves_the_equations_where_all_is_known():
+    rng = np.random.default_rng(6)
+    rows = rng.normal(size=(40, 6)) * [1.0, 1.0, 1.0, 8.0, 8.0, 8.0]
+    hessian, gradient = rows.T @ rows, rng.normal(size=6)
+
+    step, degenerate, radius_m = solve(hessian, gradient, 1e-3)
+
+    np.testing.assert_allclose(step, -np.linalg.solve(hessian, gradient), rtol=1e-9)
+    assert len(degenerate) == 0
+    assert radius_m == pytest.approx(8.0, rel=0.2)

@@ -1,0 +1,37 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Feeds scans to the odometry of one peer and times it; runs in the environment of the peer.
+
+The job comes as JSON on stdin: the module, voxel_size_m, the files of the scans, and where to
+write the poses, (S, 4, 4). The times leave as JSON on stdout.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+import json
+import sys
+from time import perf_counter
+
+import numpy as np
+
+
+def main() -> None:
+    """Do the job."""
+    job = json.load(sys.stdin)
+    odometry = import_module(job['module']).Odometry(job['voxel_size_m'])
+    milliseconds, poses = [], []
+    for path in job['scans']:
+        points = np.load(path)
+        points = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+        start = perf_counter()
+        pose = odometry.register(points)
+        milliseconds.append((perf_counter() - start) * 1e3)
+        poses.append(np.array(pose))
+    np.save(job['poses'], np.array(poses))
+    json.dump(milliseconds, sys.stdout)
+
+
+if __name__ == '__main__':
+    main()
