@@ -142,6 +142,14 @@ def deskewed(
     return replace(scan, points=moved, times=None)
 
 
+def warm_up() -> None:
+    """Compile the kernel for all types that points may have."""
+    times = PointTimes(np.zeros(1, np.int64), 0, 1)
+    for dtype in (np.float32, np.float64):
+        points = np.ones((1, 3), dtype)
+        deskewed(Scan(points=points, stamp_ns=0, frame_id='', times=times), lambda _: np.eye(4))
+
+
 def _measured(points: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     """Return which points are some: finite and not in the origin."""
     x, y, z = points.T

@@ -141,6 +141,13 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
     return Scan(points=points, stamp_ns=stamp_ns, frame_id=str(msg.header.frame_id))
 
 
+def warm_up() -> None:
+    """Compile what makes points of depth, for all types of images."""
+    camera = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
+    for dtype in (np.uint16, np.float32):
+        depth_points(np.ones((1, 1), dtype), camera)
+
+
 def depth_in(msg: Any, topic: str = 'depth') -> npt.NDArray[Any]:
     """
     Return the pixels of a depth image, (H, W) uint16 in mm or float32 in m.

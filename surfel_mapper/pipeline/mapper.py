@@ -24,6 +24,7 @@ from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.deskew import deskewed, point_times
+from surfel_mapper.deskew import warm_up as warm_up_deskewing
 from surfel_mapper.errors import (
     AlignmentError,
     CloudFormatError,
@@ -365,6 +366,8 @@ class Mapper:
             many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
             surfel_map.remove(many)
         surfel_map.digest()
+        if self.config.deskew.enabled:
+            warm_up_deskewing()
         if self.registered is not None:
             self.registered.warm_up()
 

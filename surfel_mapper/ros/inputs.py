@@ -27,7 +27,13 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError
-from surfel_mapper.io.depth_image import camera_info_topic, CameraImage, depth_scan, DepthImages
+from surfel_mapper.io.depth_image import (
+    camera_info_topic,
+    CameraImage,
+    depth_scan,
+    DepthImages,
+    warm_up,
+)
 from surfel_mapper.io.pose_messages import ODOMETRY, POSE, poses_in, TF
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.scan import Scan
@@ -118,6 +124,8 @@ class Inputs:
             self._subscribe(message, '/tf', on_pose, TRANSFORMS)
         if source in (ODOMETRY, POSE) and not self._config.frames.base_to_sensor:
             self._subscribe_static()
+        if self._config.input.kind == 'depth':
+            warm_up()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
 

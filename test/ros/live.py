@@ -104,10 +104,11 @@ class Peer:
         end = time.monotonic() + seconds
         self.spin_until(lambda: time.monotonic() > end)
 
-    def advertise(self, *topics, depth=50):
+    def advertise(self, *topics, depth=50, kinds=None):
         """Publish clouds on topics of points and odometry on others, once they are read."""
         for topic in topics:
             kind = Odometry if topic.endswith('odom') else PointCloud2
+            kind = (kinds or {}).get(topic, kind)
             self._publishers[topic] = self.node.create_publisher(kind, topic, depth)
         self.spin_until(
             lambda: all(self._publishers[t].get_subscription_count() for t in topics)

@@ -1,0 +1,234 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a node takes in, over DDS: several lidars, any QoS, depth images, rolling sweeps."""
+
+from __future__ import annotations
+
+from array import array
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
+
+from surfel_mapper import Mapper
+from surfel_mapper.config import Config
+from surfel_mapper.depth import PinholeCamera
+from surfel_mapper.io.depth_image import CameraImage, depth_scan
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.ros.inputs import Inputs
+from surfel_mapper.simulation import Lidar, Simulation, World
+from test.ros.live import cloud, odometry, RELIABLE, room, stamp, START_NS
+
+pytestmark = pytest.mark.timeout(120)
+
+PERIOD_NS = 100_000_000
+RELIABLE_QOS = QoSProfile(depth=50)
+BEST_EFFORT = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+TURNED = [0.0, 0.0, 0.7071067811865476, 0.7071067811865476]
+OPTICAL = [0.0, 0.0, 1.0, -0.5, 0.5, -0.5, 0.5]
+FRONT, REAR = [1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0], [-1.0, 0.3, 0.6, *TURNED]
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base_to_sensor': FRONT,
+    'publish.diagnostics_rate_hz': 20.0,
+}
+
+
+def arguments(reliable=RELIABLE, **changes):
+    settings = {**SETTINGS, **changes}
+    pairs = [('-p', f'{name}:={value}') for name, value in settings.items()]
+    return ['--ros-args', *(item for pair in pairs for item in pair), *reliable]
+
+
+def digest_of(scans, poses, **changes):
+    """Return the digest of a Mapper fed with scans and poses."""
+    mapper = Mapper(Config.from_mapping({**SETTINGS, **changes}))
+    for pose in poses:
+        for found in poses_in('odometry', pose, 'base_link'):
+            mapper.add_pose(*found)
+    for scan in scans:
+        mapper.add_scan(scan)
+        list(mapper.insert_ready())
+    assert mapper.counters.mapped == len(scans)
+    return mapper.map.digest()
+
+
+def node_digest(node):
+    assert node.stop() == 0, node.output
+    return node.output.rpartition('digest ')[2].split()[0]
+
+
+def test_several_lidars_are_mapped_each_where_it_is_mounted(start, peer):
+    settings = {
+        'input.topics': ['/front/points', '/rear/points'],
+        'frames.sensors': ['front', 'rear'],
+        'frames.base_to_sensor': [*FRONT, *REAR],
+    }
+    reliable = [
+        *('-p', 'qos_overrides./front/points.subscription.reliability:=reliable'),
+        *('-p', 'qos_overrides./rear/points.subscription.reliability:=reliable'),
+        *('-p', 'qos_overrides./odom.subscription.reliability:=reliable'),
+    ]
+    node = start('node', *arguments(reliable, **settings))
+    peer.advertise('/odom', '/front/points', '/rear/points')
+    clouds, poses = [], []
+    for number in range(8):
+        stamp_ns = START_NS + number * PERIOD_NS // 2
+        side = ('front', 'rear')[number % 2]
+        poses.append(odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
+        clouds.append(cloud(stamp_ns, room(seed=number), frame_id=side))
+        peer.spin_for(0.03)
+        peer.publish('/odom', poses[-1])
+        peer.publish(f'/{side}/points', clouds[-1])
+    peer.diagnosis({'scans.mapped': 8})
+
+    expected = digest_of([to_scan(message) for message in clouds], poses, **settings)
+    assert node_digest(node) == expected
+    assert 'reads /odom, /front/points, /rear/points' in node.output
+
+
+def test_reliable_and_best_effort_publishers_are_heard_alike_and_after_a_restart(start, peer):
+    node = start('node', *arguments([]))
+    peer.advertise('/odom')
+    number = 0
+    for qos in (RELIABLE_QOS, BEST_EFFORT, RELIABLE_QOS):
+        publisher = peer.node.create_publisher(PointCloud2, '/points', qos)
+        peer.spin_until(publisher.get_subscription_count)
+        peer.spin_for(0.5)
+        for _ in range(2):
+            stamp_ns = START_NS + number * PERIOD_NS
+            peer.publish('/odom', odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
+            publisher.publish(cloud(stamp_ns, room(seed=number, num=500)))
+            peer.spin_for(0.1)
+            number += 1
+        peer.diagnosis({'scans.mapped': number})
+        peer.node.destroy_publisher(publisher)
+    assert node.is_running()
+
+
+def depth_image(stamp_ns, depth, encoding):
+    message = Image(height=depth.shape[0], width=depth.shape[1], encoding=encoding)
+    message.step = depth.strides[0]
+    message.data = array('B', depth.tobytes())
+    message.header.frame_id = 'camera'
+    stamp(message, stamp_ns)
+    return message
+
+
+def camera_info(camera):
+    K = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+    return CameraInfo(width=camera.width, height=camera.height, k=K)
+
+
+@pytest.mark.parametrize('encoding', ['16UC1', '32FC1'])
+def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
+    settings = {'input.kind': 'depth', 'frames.base_to_sensor': OPTICAL}
+    node = start(
+        'node',
+        *arguments([], **settings),
+        *('-r', 'depth/image:=/camera/depth/image_raw'),
+        *('-p', 'qos_overrides./camera/depth/image_raw.subscription.reliability:=reliable'),
+    )
+    image, info = '/camera/depth/image_raw', '/camera/depth/camera_info'
+    peer.advertise('/odom', image, info, kinds={image: Image, info: CameraInfo})
+    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    dtype = np.uint16 if encoding == '16UC1' else np.float32
+    rng = np.random.default_rng(1)
+    images, poses = [], []
+    for number in range(4):
+        stamp_ns = START_NS + number * PERIOD_NS
+        depth = rng.uniform(2.0, 2.2, (60, 80)) * (1000 if dtype == np.uint16 else 1)
+        depth[:5] = 0
+        images.append(depth_image(stamp_ns, depth.astype(dtype), encoding))
+        poses.append(odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
+        peer.publish('/odom', poses[-1])
+        peer.publish(image, images[-1])
+        if number == 1:  # the first images wait for it
+            peer.spin_for(0.2)
+            peer.publish(info, camera_info(camera))
+            peer.spin_for(0.2)
+    bad = depth_image(START_NS + 4 * PERIOD_NS, np.zeros((60, 80), np.uint8), 'mono8')
+    peer.publish(image, bad)
+    _, values = peer.diagnosis({'scans.mapped': 4, 'scans.dropped.bad_cloud': 1})
+
+    scans = [depth_scan(CameraImage(message, camera)) for message in images]
+    assert node_digest(node) == digest_of(scans, poses, **settings)
+    assert "encoding 'mono8', expected 16UC1 or 32FC1" in node.output
+    assert values['scans.received'] == '5'
+
+
+def rolling_cloud(scan):
+    """Return a simulated sweep as a cloud with the times of its points, as Ouster writes them."""
+    dtype = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('t', '<u4')])
+    points = np.zeros(len(scan), dtype)
+    for axis, name in enumerate('xyz'):
+        points[name] = scan.points[:, axis]
+    points['t'] = np.rint(scan.columns['time'].astype(np.float64) * 1e9)
+    message = cloud(scan.stamp_ns, np.zeros((1, 3)))
+    message.fields.append(PointField(name='t', offset=12, datatype=6, count=1))
+    message.width, message.point_step, message.row_step = len(scan), 16, 16 * len(scan)
+    message.data = array('B', points.tobytes())
+    return message
+
+
+def test_sweeps_are_deskewed_live_as_they_are_offline(start, peer):
+    world = World.street(seed=0, length_m=40.0)
+    simulation = Simulation(world, Lidar(beams=8, columns=256), num_scans=3, rolling=True)
+    settings = {
+        'deskew.enabled': 'true',
+        'frames.base_to_sensor': list(simulation.drive.base_to_sensor),
+    }
+    node = start('node', *arguments(**settings))
+    peer.advertise('/odom', '/points')
+    clouds, poses = [], []
+    for number in range(simulation.num_scans):
+        clouds.append(rolling_cloud(simulation.scan(number)))
+        first = simulation.stamp_ns(number)
+        peer.publish('/points', clouds[-1])  # its poses come after it
+        for stamp_ns in range(first, first + PERIOD_NS, PERIOD_NS // 5):
+            poses.append(moving(simulation, stamp_ns))
+            peer.publish('/odom', poses[-1])
+            peer.spin_for(0.02)
+    poses.append(moving(simulation, first + PERIOD_NS))
+    peer.publish('/odom', poses[-1])
+    peer.diagnosis({'scans.mapped': 3})
+
+    settings['deskew.enabled'] = True
+    scans = [to_scan(message) for message in clouds]
+    deskewed = digest_of(scans, poses, **settings)
+    assert deskewed != digest_of(scans, poses, **{**settings, 'deskew.enabled': False})
+    assert node_digest(node) == deskewed
+
+
+def moving(simulation, stamp_ns):
+    xyz, q_xyzw = simulation.drive.pose(stamp_ns)
+    message = odometry(stamp_ns, xyz)
+    orientation = message.pose.pose.orientation
+    orientation.x, orientation.y, orientation.z, orientation.w = q_xyzw.tolist()
+    return message
+
+
+def inputs_that_lost(size):
+    node = SimpleNamespace(
+        resolve_topic_name=lambda name: f'/{name}',
+        get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
+    )
+    inputs = Inputs(node, Config(), SimpleNamespace(put_cloud=lambda *_: None))
+    inputs._on_cloud('/points', SimpleNamespace(data=bytes(size)))
+    inputs._on_lost('/points', SimpleNamespace(total_count=5))
+    return inputs
+
+
+def test_large_clouds_that_are_lost_point_to_shared_memory_and_small_ones_do_not():
+    large, small = inputs_that_lost(4 << 20), inputs_that_lost(10_000)
+    assert large.clouds_lost == small.clouds_lost == 5
+    assert 'clouds lost on the way (5 of /points)' in large.loss()
+    assert 'fastdds_shm.xml' in large.loss()
+    assert 'overloaded' in small.loss()
+    assert 'fastdds_shm.xml' not in small.loss()

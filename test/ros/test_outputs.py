@@ -1,0 +1,322 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What a node publishes, seen over DDS: changes, mirrors, scans with normals, markers, grids."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from nav_msgs.msg import OccupancyGrid
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from surfel_mapper import Mapper, MapMirror
+from surfel_mapper.config import Config
+from surfel_mapper.io.markers import normal_colors, shades
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.io.scan_normals import ADDED
+from surfel_mapper.mapping.moments import pack_keys
+from test.io.test_scan_normals import cloud as odd_cloud
+from test.ros.live import cloud, LATCHED, odometry, RELIABLE, room, RVIZ, START_NS
+
+pytestmark = pytest.mark.timeout(120)
+
+PERIOD_NS = 100_000_000
+MANY = QoSProfile(depth=200)
+BASE = '/surfel_mapper'
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base_to_sensor': [0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
+    'window.max_scans': 3,
+    'publish.normals_rate_hz': 20.0,
+    'publish.markers_rate_hz': 20.0,
+    'publish.diagnostics_rate_hz': 20.0,
+}
+
+
+def arguments(**changes):
+    settings = {**SETTINGS, **changes}
+    pairs = [('-p', f'{name}:={value}') for name, value in settings.items()]
+    return ['--ros-args', *(item for pair in pairs for item in pair), *RELIABLE]
+
+
+def drive(num_scans, first=0):
+    """Return clouds with their poses: a sensor that moves through a room."""
+    numbers = range(first, first + num_scans)
+    stamps = [START_NS + i * PERIOD_NS for i in numbers]
+    return [
+        (cloud(stamp_ns, room(seed=i)), odometry(stamp_ns, (0.4 * i, 0.0, 0.0)))
+        for i, stamp_ns in zip(numbers, stamps, strict=True)
+    ]
+
+
+def send(peer, messages):
+    for points, pose in messages:
+        peer.spin_for(0.03)  # the queue of a topic holds 20
+        peer.publish('/odom', pose)
+        peer.publish('/points', points)
+
+
+def mapped(messages, **changes):
+    """Return a Mapper fed with the same messages."""
+    mapper = Mapper(Config.from_mapping({**SETTINGS, **changes}))
+    for points, pose in messages:
+        for found in poses_in('odometry', pose, 'base_link'):
+            mapper.add_pose(*found)
+        mapper.add_scan(to_scan(points))
+        list(mapper.insert_ready())
+    return mapper
+
+
+def stamp_of(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+def start_node(start, peer, **changes):
+    node = start('node', *arguments(**changes))
+    peer.advertise('/odom', '/points')
+    return node
+
+
+def digest_of(peer):
+    """Return the digest that the node states of its map, behind all that was sent before."""
+    return peer.call('save_map').message.rpartition('digest ')[2]
+
+
+@pytest.mark.parametrize('columns', [(), ('intensity',)])
+def test_a_mirror_follows_the_node_to_the_bit(start, peer, tmp_path, columns):
+    sums = {'map.intensity': 'true'} if columns else {}
+    node = start_node(
+        start, peer, **sums, **{'publish.moments': 'true', 'output.directory': tmp_path / 'maps'}
+    )
+    mirror = MapMirror(0.5, columns)
+    for topic, take, qos in (
+        ('changed', mirror.change, MANY),
+        ('normals', mirror.replace, LATCHED),
+    ):
+        peer.node.create_subscription(PointCloud2, f'{BASE}/{topic}', take, qos)
+    peer.spin_until(lambda: peer.node.count_publishers(f'{BASE}/changed'))
+    messages = drive(9)
+    if columns:
+        messages = [(with_intensity(points), pose) for points, pose in messages]
+
+    def is_up_to_date():
+        digest = digest_of(peer)
+        peer.spin_for(0.2)
+        return mirror.map.digest() == digest
+
+    send(peer, messages[:6])
+    peer.spin_until(is_up_to_date, what=lambda: f'{mirror.map.digest()}: {node.output}')
+    assert len(mirror.map) > 500
+    peer.call('clear_radius')
+    peer.spin_until(is_up_to_date, what=lambda: node.output)
+    send(peer, messages[6:])
+    peer.spin_until(is_up_to_date, what=lambda: node.output)
+    assert mirror.stamp_ns == START_NS + 8 * PERIOD_NS
+    peer.call('clear')
+    peer.spin_until(is_up_to_date, what=lambda: node.output)
+    assert len(mirror.map) == 0
+
+
+def with_intensity(points):
+    """Return a cloud whose y serves as its intensity too."""
+    field = type(points.fields[1])(name='intensity', offset=4, datatype=7, count=1)
+    points.fields = [*points.fields, field]
+    return points
+
+
+def test_what_changed_less_what_was_removed_is_the_map(start, peer):
+    start_node(start, peer)
+    changed = peer.collect(PointCloud2, f'{BASE}/changed', MANY)
+    removed = peer.collect(PointCloud2, f'{BASE}/removed', MANY)
+    peer.spin_for(0.5)
+    messages = drive(8)
+    send(peer, messages)
+    peer.spin_until(lambda: len(changed) == len(removed) == len(messages))
+
+    def voxels(message, size_m=0.5):
+        return {tuple(index) for index in np.floor(to_scan(message).points / size_m).tolist()}
+
+    known = set()
+    for now, gone in zip(changed, removed, strict=True):
+        assert stamp_of(now) == stamp_of(gone)
+        columns = to_scan(gone).columns
+        if columns:
+            index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
+            assert {tuple(row) for row in index.tolist()} == voxels(gone)
+        known = (known | voxels(now)) - voxels(gone)
+    surfels = mapped(messages).map.surfels(5)
+    expected = {tuple(row) for row in np.floor(surfels.position.astype('f4') / 0.5).tolist()}
+    assert known == expected
+    assert peer.call('clear').success
+    peer.spin_until(lambda: len(removed) > len(messages))
+    assert voxels(removed[-1]) == expected
+
+
+def test_the_full_map_comes_on_request(start, peer):
+    start_node(start, peer, **{'publish.normals_rate_hz': 0.0})
+    late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    messages = drive(2)
+    send(peer, messages)
+    peer.diagnosis({'scans.mapped': 2})
+    normals = peer.collect(PointCloud2, f'{BASE}/normals', late)
+    peer.spin_for(0.5)
+    assert normals == []
+
+    answer = peer.call('publish_normals')
+
+    number = len(mapped(messages).map.surfels(5))
+    assert (answer.success, answer.message) == (True, f'{number} surfels published')
+    peer.spin_until(lambda: normals)
+    assert normals[0].width == number
+    again = peer.collect(PointCloud2, f'{BASE}/normals', late)
+    peer.spin_until(lambda: again)
+    assert again[0].width == number
+
+
+def test_coarser_maps_come_where_they_are_asked_for(start, peer):
+    start_node(start, peer, **{'publish.levels': 2, 'map.min_points': 3})
+    clouds = [peer.collect(PointCloud2, f'{BASE}/level_{n}/normals', LATCHED) for n in (1, 2)]
+    messages = drive(4)
+    send(peer, messages)
+    surfel_map = mapped(messages).map
+    for level, received in enumerate(clouds, 1):
+        expected = surfel_map.coarsen(level).surfels(3)
+        peer.spin_until(lambda r=received, n=len(expected): r and r[-1].width == n)
+        found = to_scan(received[-1])
+        order, wanted = np.lexsort(found.points.T), np.lexsort(expected.position.T)
+        near = np.abs(found.points[order] - expected.position[wanted])
+        assert near.max() <= 1e-5
+        assert found.columns['num_points'][order].tolist() == expected.num_points[wanted].tolist()
+
+
+def test_mean_intensity_comes_with_every_surfel_where_it_is_asked_for(start, peer):
+    start_node(start, peer, **{'map.intensity': 'true'})
+    normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
+    send(peer, [(with_intensity(points), pose) for points, pose in drive(1)])
+    peer.spin_until(lambda: normals and normals[-1].width)
+    scan = to_scan(normals[-1])
+    assert 'intensity' in scan.columns
+    # the intensity of a point is its y, and the sensor is not turned
+    np.testing.assert_allclose(scan.columns['intensity'], scan.points[:, 1], atol=0.01)
+
+
+def test_the_scan_comes_back_with_normals_and_every_field(start, peer):
+    node = start_node(start, peer)
+    messages = drive(4)
+    send(peer, messages[:3])
+    peer.diagnosis({'scans.mapped': 3})
+    found = peer.collect(PointCloud2, f'{BASE}/scan_normals')
+    peer.spin_for(0.5)
+    sent = odd_message(stamp_of(messages[3][0]))
+    send(peer, [(sent, messages[3][1])])
+    peer.spin_until(lambda: found, what=lambda: node.output)
+
+    (message,) = found
+    assert (message.header, message.height) == (sent.header, sent.height)
+    given, again = to_scan(sent), to_scan(message)
+    np.testing.assert_array_equal(again.points, given.points)
+    assert list(again.columns) == [*given.columns, *ADDED]
+    for name, values in given.columns.items():
+        np.testing.assert_array_equal(again.columns[name], values)
+    mapper = mapped([*messages[:3], (sent, messages[3][1])])
+    pose = mapper.window.newest.T_map_sensor
+    surfels = mapper.map.surfels(5)
+    rows = mapper.map.index(5)
+    at = rows.at(given.points.astype(float) + pose[:3, 3])  # not turned
+    known = at >= 0
+    assert 0.3 < known.mean() < 1.0
+    for name, values in (
+        *zip(ADDED[:3], rows.surfels.normal.T, strict=True),
+        ('planarity', rows.surfels.planarity),
+        ('num_points', rows.surfels.num_points),
+    ):
+        np.testing.assert_allclose(again.columns[name][known], values[at[known]], atol=1e-6)
+    assert (again.columns['num_points'][~known] == 0).all()
+    assert len(surfels) == len(rows.surfels)
+
+
+def odd_message(stamp_ns):
+    """Return a real message of a cloud with odd offsets and padded rows."""
+    odd = odd_cloud(padding=5)
+    message = cloud(stamp_ns, np.zeros((1, 3)))
+    kind = type(message.fields[0])
+    message.height, message.width = odd.height, odd.width
+    message.point_step, message.row_step = odd.point_step, odd.row_step
+    message.fields = [
+        kind(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count) for f in odd.fields
+    ]
+    message.data = odd.data
+    return message
+
+
+def colors_of(marker):
+    return np.array([(c.r, c.g, c.b, c.a) for c in marker.colors], np.float32)[:: 3 * 6]
+
+
+def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(start, peer):
+    start_node(start, peer, **{'publish.marker_color': 'normal'})
+    messages = drive(3)
+    send(peer, messages)
+    surfels = mapped(messages).map.surfels(5)
+    markers = peer.collect(MarkerArray, f'{BASE}/markers', RVIZ)
+    peer.spin_until(lambda: markers and len(markers[-1].markers[1].points) == 2 * len(surfels))
+
+    def is_shown(expected):
+        shown = colors_of(markers[-1].markers[0])
+        return len(shown) == len(expected) and np.array_equal(
+            np.unique(shown, axis=0), np.unique(expected, axis=0)
+        )
+
+    assert is_shown(normal_colors(surfels.normal))
+    client = peer.parameters()
+
+    def change(name, value):
+        done = peer.result(client.set_parameters([Parameter(name, value=value)]))
+        assert done.results[0].successful
+
+    change('publish.marker_color', 'planarity')
+    peer.spin_until(lambda: is_shown(shades(surfels.planarity)))
+    change('publish.marker_color', 'age')
+    peer.spin_until(lambda: 1 < len(np.unique(colors_of(markers[-1].markers[0]), axis=0)) <= 3)
+    change('publish.max_markers', 50)
+    peer.spin_until(lambda: len(colors_of(markers[-1].markers[0])) == 50)
+    assert peer.call('clear').success
+    peer.spin_until(lambda: {m.action for m in markers[-1].markers} == {Marker.DELETE})
+
+
+def test_a_grid_comes_to_those_who_ask_for_it_and_to_late_ones(start, peer):
+    start_node(start, peer, **{'grid.rate_hz': 10.0, 'grid.size_m': 20.0})
+    send(peer, drive(3))
+    peer.diagnosis({'scans.mapped': 3})
+    peer.spin_for(0.3)
+    grids = peer.collect(OccupancyGrid, f'{BASE}/grid', LATCHED)
+    peer.spin_until(lambda: grids)
+    grid = grids[-1]
+    assert (grid.header.frame_id, grid.info.resolution) == ('odom', 0.5)
+    assert (grid.info.width, grid.info.height) == (40, 40)
+    cost = np.array(grid.data).reshape(40, 40)
+    origin = grid.info.origin.position
+    # the floor under the sensor is free, the wall at y = 3.3 is not
+    column, row = int((0.9 - origin.x) / 0.5), int((0.0 - origin.y) / 0.5)
+    assert 0 <= cost[row, column] < 50
+    assert cost[int((3.3 - origin.y) / 0.5), column] == 100
+    assert cost[0, 0] == -1
+
+
+def test_keys_of_a_message_are_those_of_the_map(start, peer):
+    start_node(start, peer, **{'publish.moments': 'true'})
+    normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
+    messages = drive(2)
+    send(peer, messages)
+    expected = mapped(messages).map.moments().key
+    peer.spin_until(lambda: normals and normals[-1].width == len(expected))
+    columns = to_scan(normals[-1]).columns
+    index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
+    np.testing.assert_array_equal(pack_keys(index), expected)
