@@ -47,6 +47,9 @@ MAX_BASE_M = 60.0
 FINEST = 0.05
 """In the end a gap across a surface counts half at this part of the voxel size."""
 
+LEEWAY = 10.0
+"""Gaps count half from so many times what the last round moved: less would miss what is right."""
+
 STEPS_A_ROUND = 2
 
 
@@ -120,7 +123,7 @@ def align_scans(
     aligner = _Aligner([scans[key] for key in keys], poses[keys], settings)
     settled, rounds = False, 0
     while rounds < settings.max_rounds and not settled:
-        settled = aligner.round(rounds)
+        settled = aligner.round()
         rounds += 1
     result, T_map_key = aligner.result, aligner.T_map_sensor
     stay = [0, *result.unconnected]
@@ -159,6 +162,7 @@ class _Aligner:
             max_distance_m=settings.max_distance_m, max_angle_deg=settings.max_angle_deg
         )
         self._finest_m = FINEST * settings.voxel_size_m
+        self._scale_m = max(0.5 * settings.max_distance_m, self._finest_m)
         self._ends = _neighbours(T_map_sensor) + loop_candidates(
             T_map_sensor, settings.loop_distance_m
         )
@@ -173,25 +177,26 @@ class _Aligner:
         """Where the scans are now."""
         return np.asarray(self._T_map_first @ transforms(self._lum.graph.poses))
 
-    def round(self, number: int) -> bool:
+    def round(self) -> bool:
         """Match and move; return whether the poses have settled."""
-        scale_m = max(0.5 * self._settings.max_distance_m * 0.5**number, self._finest_m)
         before = self._lum.graph.poses
         T = transforms(before)
         for source, target in self._ends:
-            self._compare(source, target, compose(inverse(T[target]), T[source]), scale_m)
+            self._compare(source, target, compose(inverse(T[target]), T[source]))
         self.result = self._lum.compute()
         moved = np.abs(self._lum.graph.poses - before).max(axis=0)
-        still = moved[:3].max() <= self._settings.settled_m
-        steady = np.degrees(moved[3:].max()) <= self._settings.settled_deg
-        return bool(still and steady and scale_m == self._finest_m)
+        moved_m, turned_deg = moved[:3].max(), np.degrees(moved[3:].max())
+        still = moved_m <= self._settings.settled_m and turned_deg <= self._settings.settled_deg
+        was_finest = self._scale_m == self._finest_m
+        self._scale_m = max(min(0.5 * self._scale_m, LEEWAY * moved_m), self._finest_m)
+        return bool(still and was_finest)
 
-    def _compare(self, source: int, target: int, T_target_source: Floats, scale_m: float) -> None:
+    def _compare(self, source: int, target: int, T_target_source: Floats) -> None:
         scans = self._scans[source], self._scans[target]
         pairs = match(*scans, T_target_source, self._limits)
         if len(pairs) < self._settings.min_overlap * min(map(len, scans)):
             pairs = pairs[:0]
-        weights = surface_weights(*scans, pairs, T_target_source, scale_m)
+        weights = surface_weights(*scans, pairs, T_target_source, self._scale_m)
         self._lum.set_correspondences(source, target, pairs, weights)
 
 
