@@ -1,0 +1,50 @@
+// SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+// SPDX-License-Identifier: Apache-2.0
+//
+// Times pcl::VoxelGrid and pcl::ApproximateVoxelGrid on points that come on stdin, 12 bytes each:
+//
+//   pcl_voxel_grid POINTS SIZE_M REPEATS
+//
+// Prints two lines: the least milliseconds of each, and how many points it leaves.
+
+#include <pcl/filters/approximate_voxel_grid.h>
+#include <pcl/filters/voxel_grid.h>
+#include <pcl/point_types.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include <cstdlib>
+
+using Cloud = pcl::PointCloud<pcl::PointXYZ>;
+
+template <typename Filter>
+void time(const Cloud::ConstPtr& cloud, float size, int repeats) {
+  double least = 1e9;
+  Cloud left;
+  for (int repeat = 0; repeat < repeats; ++repeat) {
+    const auto start = std::chrono::steady_clock::now();
+    Filter filter;
+    filter.setInputCloud(cloud);
+    filter.setLeafSize(size, size, size);
+    filter.filter(left);
+    const std::chrono::duration<double, std::milli> took = std::chrono::steady_clock::now() - start;
+    least = std::min(least, took.count());
+  }
+  std::printf("%.4f %zu\n", least, left.size());
+}
+
+int main(int argc, char** argv) {
+  if (argc != 4) return 2;
+  const size_t number = std::strtoul(argv[1], nullptr, 10);
+  Cloud::Ptr cloud(new Cloud);
+  for (size_t i = 0; i < number; ++i) {
+    float xyz[3];
+    if (std::fread(xyz, sizeof xyz, 1, stdin) != 1) return 2;
+    cloud->push_back(pcl::PointXYZ(xyz[0], xyz[1], xyz[2]));
+  }
+  const float size = std::strtof(argv[2], nullptr);
+  const int repeats = std::atoi(argv[3]);
+  time<pcl::VoxelGrid<pcl::PointXYZ>>(cloud, size, repeats);
+  time<pcl::ApproximateVoxelGrid<pcl::PointXYZ>>(cloud, size, repeats);
+}
