@@ -144,7 +144,7 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
         if scheduler is None:
             with (
                 LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address=None
+                    n_workers=workers, threads_per_worker=1, dashboard_address='127.0.0.1:0'
                 ) as cluster,
                 Client(cluster) as client,
             ):

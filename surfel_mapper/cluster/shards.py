@@ -28,10 +28,10 @@ from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.parquet_tiles import Part, Tile, write_shard
 from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS, PoseTopics, replay
 from surfel_mapper.offline.span import Span, WHOLE
-from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper
+from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
-LEAD_S = 3.0
-"""A worker begins to read so long, and ``input.reset_after_s``, before a shard at first."""
+LEAD_S = 1.0
+"""A worker begins to read so long before the oldest pose that it may need, at first."""
 
 LONGER = 8.0
 """By so much that time grows where it was too short."""
@@ -163,7 +163,7 @@ def cut_bag(
         poses=poses,
         config=config.replace(ALL_SCANS),
         span=span,
-        lead_s=LEAD_S + config.input.reset_after_s,
+        lead_s=LEAD_S + config.input.reset_after_s + sweep_s(config),
     )
     by_number = span.every > 1 or (poses.path is not None and not poses.path.has_stamps)
     number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s), 1)

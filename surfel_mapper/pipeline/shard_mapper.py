@@ -21,8 +21,8 @@ from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.scan import Scan
 
-SWEEP_NS = 1_000_000_000
-"""No point of a scan is further from its stamp than this."""
+SWEEP_S = 1.0
+"""No point of a scan that is put straight is further from its stamp than this."""
 
 
 class ShardMapper(Mapper):
@@ -51,13 +51,18 @@ class ShardMapper(Mapper):
         since_ns = None
         if expected:
             back_ns = round(self.config.input.reset_after_s * 1e9)
-            since_ns = min(*expected, max(expected) - back_ns) - SWEEP_NS
+            since_ns = min(*expected, max(expected) - back_ns) - round(sweep_s(self.config) * 1e9)
         state = [sorted(stamps.items()), waiting, self.transforms.held(since_ns)]
         return hashlib.sha256(repr(state).encode()).hexdigest()
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan, unless scans are passed over."""
         return None if self._passes_over else super()._insert(scan, pose)
+
+
+def sweep_s(config: Config) -> float:
+    """Return how far from its stamp a pose may be needed for a scan, s."""
+    return SWEEP_S if config.deskew.enabled else 0.0
 
 
 def is_divisible(config: Config) -> bool:

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper import __version__
 from surfel_mapper.config import Config
 from surfel_mapper.io.files import replace_file
 from surfel_mapper.mapping.surfels import Surfels
@@ -103,7 +102,7 @@ def page(title: str, body: str) -> str:
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<link rel="icon" href="data:,"><title>{escape(title)}</title>'
         f'<style>{style}</style></head>\n<body>{body}'
-        f'<footer>surfel_mapper {__version__}</footer>\n<script>{script}</script></body></html>\n'
+        f'<footer>made by surfel_mapper</footer>\n<script>{script}</script></body></html>\n'
     )
 
 

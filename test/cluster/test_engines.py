@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Workers that come, go and die change nothing in the map; real Dask clusters of this machine."""
+
+import os
+import signal
+
+import pytest
+
+from surfel_mapper.cluster import engines
+from surfel_mapper.cluster.engines import engine, InProcess
+from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.errors import ClusterError
+from test.cluster.bags import in_one_go, shards_of, written
+
+distributed = pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+
+pytestmark = pytest.mark.timeout(180)
+
+
+def squared(number):
+    return number * number
+
+
+def die(_):
+    os._exit(1)
+
+
+def refuse(_):
+    raise ClusterError('not this one')
+
+
+def kill_one(running):
+    """Kill a worker that is at a task, and return its process."""
+    client = running._client
+    pids = client.run(os.getpid)
+    busy = [address for address, tasks in client.processing().items() if tasks]
+    victim = pids[busy[0] if busy else next(iter(pids))]
+    os.kill(victim, signal.SIGKILL)
+    return victim
+
+
+@pytest.fixture(scope='module')
+def two_workers():
+    with engine(workers=2) as running:
+        yield running
+
+
+@pytest.fixture(scope='module')
+def case(tmp_path_factory):
+    bag, config = written(tmp_path_factory.mktemp('bags'), 'plain')
+    return shards_of(bag, config, 0.5), in_one_go(bag, config).map.digest()
+
+
+def test_every_task_is_answered_under_its_number(two_workers):
+    for running in (two_workers, InProcess()):
+        answers = dict(running.run(squared, range(7)))
+        assert answers == {number: number * number for number in range(7)}
+    assert two_workers.num_workers == 2
+
+
+def test_two_workers_make_the_map_of_one_process(two_workers, case, tmp_path):
+    shards, digest = case
+    mapped = map_bags(shards, two_workers, tmp_path)
+    assert mapped.map.digest == digest
+    assert mapped.counts()['scans']['mapped'] == 60
+
+
+@pytest.mark.parametrize('stage', ['map', 'merge'])
+def test_killing_a_worker_in_the_middle_changes_nothing(two_workers, case, tmp_path, stage):
+    shards, digest = case
+    victims = []
+
+    def kill_once(kind, amount):
+        if kind == stage and not victims:
+            victims.append(kill_one(two_workers))
+
+    mapped = map_bags(shards, two_workers, tmp_path, kill_once)
+
+    assert len(victims) == 1
+    assert victims[0] not in two_workers._client.run(os.getpid).values()
+    assert mapped.map.digest == digest
+    assert mapped.counts()['scans']['mapped'] == 60
+    assert [path.name for path in tmp_path.iterdir()] == ['map']
+
+
+def test_an_error_of_a_task_comes_back_as_it_is(two_workers):
+    with pytest.raises(ClusterError, match='not this one'):
+        list(two_workers.run(refuse, [1]))
+
+
+def test_a_task_that_kills_its_workers_is_given_up(monkeypatch):
+    monkeypatch.setattr(engines, 'LOSSES', 0)
+    with engine(workers=1) as running, pytest.raises(ClusterError, match='workers died'):
+        list(running.run(die, [1]))
+
+
+def test_a_scheduler_elsewhere_is_used(case, tmp_path):
+    shards, digest = case
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0'
+        ) as cluster,
+        engine(scheduler=cluster.scheduler_address) as running,
+    ):
+        assert map_bags(shards, running, tmp_path).map.digest == digest
+
+
+def test_a_scheduler_without_workers_is_refused():
+    with (
+        distributed.LocalCluster(n_workers=0, dashboard_address='127.0.0.1:0') as cluster,
+        pytest.raises(ClusterError, match='no workers'),
+        engine(scheduler=cluster.scheduler_address),
+    ):
+        pass
+
+
+@pytest.mark.parametrize('address', ['tcp://127.0.0.1:1', 'nonsense://x'])
+def test_a_scheduler_that_does_not_answer_is_refused_by_name(monkeypatch, address):
+    monkeypatch.setattr(engines, 'CONNECT_S', 1)
+    with pytest.raises(ClusterError, match=address), engine(scheduler=address):
+        pass
