@@ -1,28 +1,42 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Start the node: ``ros2 launch surfel_mapper mapper.launch.py points:=/lidar/points``.
+Start the node: ``ros2 launch surfel_mapper mapper.launch.py points:=/lidar/points rviz:=true``.
 
-``fixed_frame`` overrides the file of settings only where it is given, so that a file alone says
-what runs.
+Settings come from one file: a preset of this package, or your own with ``config``. An argument
+overrides the file only where it is given, so that a file alone says what runs.
 """
+
+from pathlib import Path
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.substitutions import FindPackageShare
 
-DEFAULT_CONFIG = PathJoinSubstitution(
-    [FindPackageShare('surfel_mapper'), 'launch_configs', 'default.yaml']
-)
+HERE = Path(__file__).resolve().parent
+
+PRESETS = ('default', 'spinning_lidar', 'solid_state_lidar', 'indoor_depth_camera')
+
+BOOLEAN = ['true', 'false']
 
 ARGUMENTS = [
     DeclareLaunchArgument(
-        'config', default_value=DEFAULT_CONFIG, description='YAML file of the settings.'
+        'preset',
+        default_value='default',
+        choices=list(PRESETS),
+        description='Settings to start from, a YAML file of that name beside this one.',
+    ),
+    DeclareLaunchArgument(
+        'config', default_value='', description='YAML file of the settings, instead of a preset.'
     ),
     DeclareLaunchArgument(
         'points', default_value='points', description='Topic of the clouds, PointCloud2.'
+    ),
+    DeclareLaunchArgument(
+        'depth',
+        default_value='depth/image',
+        description='Topic of depth images, for input.kind depth; camera_info is beside it.',
     ),
     DeclareLaunchArgument(
         'odom', default_value='odom', description='Topic of odometry, for pose.source odometry.'
@@ -36,35 +50,75 @@ ARGUMENTS = [
         description='Frame of the map and of all output; empty: frames.fixed of the file.',
     ),
     DeclareLaunchArgument(
+        'namespace', default_value='', description='Namespace of the node and its topics.'
+    ),
+    DeclareLaunchArgument(
+        'autostart',
+        default_value='true',
+        choices=BOOLEAN,
+        description='Map at once; false: wait for the transitions configure and activate.',
+    ),
+    DeclareLaunchArgument(
         'use_sim_time',
         default_value='false',
-        choices=['true', 'false'],
+        choices=BOOLEAN,
         description='Take the time from /clock, as for a bag played with --clock.',
+    ),
+    DeclareLaunchArgument(
+        'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with a view of it.'
+    ),
+    DeclareLaunchArgument(
+        'log_level',
+        default_value='info',
+        choices=['debug', 'info', 'warn', 'error'],
+        description='What the node logs.',
     ),
 ]
 
+TOPICS = {'points': 'points', 'depth': 'depth/image', 'odom': 'odom', 'pose': 'pose'}
+"""What the node reads, by the argument that says where it is."""
 
-def mapper_node(context: LaunchContext) -> list[Node]:
-    """Return the node, once the values of the arguments are known."""
+
+def nodes(context: LaunchContext) -> list[Node]:
+    """Return the nodes, once the values of the arguments are known."""
     values = {
         argument.name: LaunchConfiguration(argument.name).perform(context)
         for argument in ARGUMENTS
     }
-    overrides: dict[str, object] = {'use_sim_time': values['use_sim_time'] == 'true'}
+    use_sim_time = {'use_sim_time': values['use_sim_time'] == 'true'}
+    overrides: dict[str, object] = {**use_sim_time}
     if values['fixed_frame']:
         overrides['frames.fixed'] = values['fixed_frame']
-    return [
+    if values['autostart'] == 'false':
+        overrides['autostart'] = False
+    found = [
         Node(
             package='surfel_mapper',
             executable='node',
             name='surfel_mapper',
+            namespace=values['namespace'],
             output='screen',
-            parameters=[values['config'], overrides],
-            remappings=[(topic, values[topic]) for topic in ('points', 'odom', 'pose')],
+            parameters=[values['config'] or str(HERE / f'{values["preset"]}.yaml'), overrides],
+            remappings=[(topic, values[argument]) for argument, topic in TOPICS.items()],
+            ros_arguments=['--log-level', f'surfel_mapper:={values["log_level"]}'],
         )
     ]
+    if values['rviz'] == 'true':
+        fixed = ['-f', values['fixed_frame']] if values['fixed_frame'] else []
+        found.append(
+            Node(
+                package='rviz2',
+                executable='rviz2',
+                name='surfel_mapper_rviz',
+                namespace=values['namespace'],
+                output='log',
+                arguments=['-d', str(HERE / 'mapper.rviz'), *fixed],
+                parameters=[use_sim_time],
+            )
+        )
+    return found
 
 
 def generate_launch_description() -> LaunchDescription:
     """Return what ``ros2 launch`` runs."""
-    return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=mapper_node)])
+    return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=nodes)])
