@@ -217,7 +217,8 @@ def normals_bag(output: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:
     from surfel_mapper.io.bag_writer import BagWriter
     from surfel_mapper.offline.normals_bag import NormalsBag
 
-    return NormalsBag(files.enter_context(BagWriter(output / BAG, overwrite=True)), mapper)
+    writer = BagWriter(output / FORMATS[BAG], overwrite=True)
+    return NormalsBag(files.enter_context(writer), mapper)
 
 
 def map_recording(

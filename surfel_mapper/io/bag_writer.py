@@ -12,7 +12,7 @@ the final name.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 import shutil
 import tempfile
@@ -79,6 +79,7 @@ class BagWriter:
 
         self._store = get_typestore(Stores.ROS2_JAZZY)
         with self._refusing():
+            self._missing = [p for p in self.path.parents if not p.exists()]
             self.path.parent.mkdir(parents=True, exist_ok=True)
             prefix = f'.{self.path.name}.'
             self._hidden = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
@@ -110,6 +111,14 @@ class BagWriter:
         finally:
             shutil.rmtree(self._hidden, ignore_errors=True)
             self.directory = self.path
+            if not self.path.exists():
+                self._remove_parents()
+
+    def _remove_parents(self) -> None:
+        """Remove the parents that were made for the bag, as far as nothing else is in them."""
+        for directory in self._missing:
+            with suppress(OSError):
+                directory.rmdir()
 
     def write(
         self, topic: str, type_: str, record_ns: int, raw: bytes | memoryview, *,

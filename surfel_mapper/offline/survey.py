@@ -20,7 +20,7 @@ from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import CLOUD, ODOMETRY, POSE, TF, Topic
-from surfel_mapper.io.pose_messages import poses_in, stamp_ns, StampedPose
+from surfel_mapper.io.pose_messages import frame_name, poses_in, stamp_ns, StampedPose
 from surfel_mapper.offline.replay import static_topics
 from surfel_mapper.poses import TransformBuffer
 
@@ -157,7 +157,7 @@ def note_message(found: Survey, reader: BagReader, message: BagMessage) -> list[
     """Add a message to a survey and return the frames that it names."""
     decoded = reader.decode(message)
     if message.type == CLOUD:
-        frame = decoded.header.frame_id
+        frame = frame_name(decoded.header.frame_id)
         found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
         return [frame]
     poses = list(poses_in(SOURCES[message.type], decoded, DEFAULTS.frames.base))

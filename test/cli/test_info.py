@@ -10,6 +10,7 @@ import yaml
 from surfel_mapper.cli.main import main
 from test.io.recorded import (
     CLOUD,
+    cut,
     drive,
     MOUNT_M,
     NUM_SCANS,
@@ -87,3 +88,25 @@ def test_a_mounting_that_is_missing_is_said(tmp_path, capsys):
 def test_no_bag_is_refused(tmp_path, capsys):
     assert main(['info', str(tmp_path / 'none')]) == 1
     assert 'none: no such file or directory' in capsys.readouterr().err
+
+
+def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'a', drive())
+    cut(path / 'a.mcap', 0.5)
+
+    assert main(['info', str(path)]) == 0
+    assert 'cut off: ' in capsys.readouterr().out
+    assert main(['info', str(path), '--strict', '--json']) == 3
+    content = json.loads(capsys.readouterr().out)
+    assert 'a.mcap: the file is cut off or damaged at byte ' in content['cut'][0]
+    assert 0 < sum(row['messages'] for row in content['topics']) < 4 * NUM_SCANS + 1
+
+
+def test_frames_are_shown_without_the_slash_of_ros1(tmp_path, capsys):
+    entries = drive(ROS1)
+    for row in entries:
+        if row[1] == CLOUD:
+            row[3].header.frame_id = '/lidar'
+
+    assert main(['info', str(write_ros1(tmp_path / 'a.bag', entries))]) == 0
+    assert f'  /tf: {NUM_SCANS} of {NUM_SCANS}, in the frame odom' in capsys.readouterr().out

@@ -1,0 +1,138 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Progress is a bar on a terminal, else lines; after Ctrl-C what was mapped is written."""
+
+import fcntl
+import json
+import os
+import pty
+import signal
+import struct
+import subprocess
+import sys
+import termios
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from surfel_mapper.cli import progress as progress_module
+from surfel_mapper.cli.progress import progress, stopped_by_interrupt
+from surfel_mapper.io.parquet import read_map
+from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+
+MANY = 5000
+
+
+def test_lines_say_how_far_it_is_how_fast_and_how_long_it_takes(monkeypatch, capsys):
+    monkeypatch.setattr(progress_module, 'EVERY_S', 0.0)
+
+    with progress('replay', 200, 'scan') as show:
+        show(0)
+        time.sleep(0.01)
+        show(50)
+
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith('surfel-mapper replay: 50 of 200 scans, ')
+    assert line.endswith(' s left')
+
+
+def test_no_line_comes_in_the_first_seconds(capsys):
+    with progress('replay', 200, 'scan') as show:
+        show(50)
+
+    assert capsys.readouterr().err == ''
+
+
+def test_the_first_interrupt_is_told_and_the_second_interrupts():
+    before = signal.getsignal(signal.SIGINT)
+    with stopped_by_interrupt() as stopped:
+        assert not stopped()
+        signal.raise_signal(signal.SIGINT)
+        assert stopped()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_in_another_thread_nothing_is_caught():
+    found = []
+
+    def run():
+        with stopped_by_interrupt() as stopped:
+            found.append(stopped())
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    thread.join()
+
+    assert found == [False]
+
+
+@pytest.fixture(scope='module')
+def long_bag(tmp_path_factory):
+    """Return a bag that takes some seconds to map."""
+    entries = Entries()
+    points = np.random.default_rng(1).uniform(-20.0, 20.0, (500, 3))
+    for i in range(MANY):
+        entries.cloud('/points', START_NS + i * PERIOD_NS, points)
+    return write_rosbag2(tmp_path_factory.mktemp('bags') / 'long', entries)
+
+
+@pytest.fixture
+def command(long_bag, tmp_path):
+    settings = tmp_path / 'settings.yaml'
+    settings.write_text('pose: {source: identity}\n')
+    options = ['--config', str(settings), '--formats', 'parquet,bag', '--json']
+    program = [sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', str(long_bag)]
+    return [*program, *options, '--output', str(tmp_path / 'out')]
+
+
+def interrupt_when_it_maps(process, output):
+    """Send what Ctrl-C sends, once the bag of normals has been begun."""
+    while process.poll() is None and not (output.is_dir() and any(output.iterdir())):
+        time.sleep(0.01)
+    time.sleep(0.3)
+    process.send_signal(signal.SIGINT)
+
+
+def test_ctrl_c_ends_the_replay_and_what_was_mapped_is_written(command, tmp_path):
+    output = tmp_path / 'out'
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+    interrupt_when_it_maps(process, output)
+    printed, errors = process.communicate(timeout=100)
+
+    assert process.returncode == 130, errors
+    summary = json.loads(printed)
+    assert summary['interrupted']
+    assert 0 < summary['scans']['mapped'] < MANY
+    assert read_map(output / 'map.parquet').digest() == summary['digest']
+    assert {path.name for path in output.iterdir()} == {
+        'map.parquet', 'normals', 'map.png', 'summary.json',
+    }  # fmt: skip
+
+
+def test_a_terminal_shows_a_bar_with_rate_and_time_left(command, tmp_path):
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack('HHHH', 24, 100, 0, 0))
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs)
+    os.close(theirs)
+    interrupt_when_it_maps(process, tmp_path / 'out')
+
+    shown = b''
+    while True:
+        try:
+            part = os.read(ours, 4096)
+        except OSError:  # so ends a terminal on Linux
+            break
+        if not part:
+            break
+        shown += part
+    os.close(ours)
+
+    assert process.wait(timeout=100) == 130
+    assert b'%|' in shown
+    assert b'scan/s' in shown
