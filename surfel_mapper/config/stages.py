@@ -242,6 +242,13 @@ class PublishConfig(Stage):
     markers_rate_hz: float = setting(
         1.0, 'Rate of ~/markers, Hz; 0: never.', low=0.0, high=1000.0, live=True
     )
+    levels: int = setting(
+        0,
+        'Publish so many coarser maps too, each with voxels twice as large as the one before, '
+        'on ~/level_1/normals and so on, at the rate of ~/normals.',
+        low=0,
+        high=8,
+    )
     max_markers: int = setting(
         20_000, 'At most this many surfels are drawn in ~/markers.', low=1, high=10**7, live=True
     )

@@ -13,13 +13,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
-from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.mapping.moments import pack_keys, ScanMoments
-
-PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Axes of the products, in the order of ``ScanMoments.product``."""
+from surfel_mapper.kernels.levels import coarsen
+from surfel_mapper.mapping.moments import ScanMoments
 
 
 def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
@@ -34,36 +30,21 @@ def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
         0 or more.
 
     """
-    index = moments.voxel_index.astype(np.int64)
-    fine = 1 << (BITS + moments.level)
-    shift = (index & ((1 << level) - 1)) * fine + fine // 2 - (fine << level) // 2
-    count, total = moments.count.astype(np.int64), moments.total.astype(np.int64)
-    product = np.stack(
-        [
-            moments.product[:, pair]
-            + shift[:, i] * total[:, j]
-            + shift[:, j] * total[:, i]
-            + count * shift[:, i] * shift[:, j]
-            for pair, (i, j) in enumerate(PAIRS)
-        ],
-        axis=1,
-    )
-    key = pack_keys(index >> level)
-    order = np.argsort(key, kind='stable')
-    first = np.flatnonzero(np.diff(key[order], prepend=-1))
-
-    def by_voxel(values: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        sums = np.add.reduceat(values[order], first) if len(first) else values[:0]
-        return np.asarray(sums, np.int64)
-
+    num_fine = len(moments)
+    table = np.full(1 << max(2 * num_fine - 1, 1).bit_length(), -1, np.int32)
+    keys, rows = np.empty(num_fine, np.int64), np.empty(num_fine, np.int64)
+    sums = np.zeros((num_fine, 13), np.int64)
+    num = coarsen(moments.arrays, moments.level, level, table, keys, sums, rows)
+    channels = np.zeros((num, moments.channels.shape[1]), np.int64)
+    np.add.at(channels, rows, moments.channels)
     return replace(
         moments,
         voxel_size_m=moments.voxel_size_m * 2**level,
         level=moments.level + level,
-        key=key[order][first],
-        count=by_voxel(count),
-        total=by_voxel(total + count[:, None] * shift),
-        product=by_voxel(product),
-        view=by_voxel(moments.view.astype(np.int64)),
-        channels=by_voxel(moments.channels) if moments.channel_names else moments.channels,
+        key=keys[:num],
+        count=sums[:num, 0].copy(),
+        total=sums[:num, 1:4].copy(),
+        product=sums[:num, 4:10].copy(),
+        view=sums[:num, 10:13].copy(),
+        channels=channels,
     )

@@ -321,8 +321,11 @@ class SurfelMap:
         coarse = SurfelMap(
             self.voxel_size_m * 2**level, columns=self.columns, level=self.level + level
         )
-        inside = unpack_keys(self._table.keys_in_box(*within)) if within else None
-        coarse.insert(coarse_moments(self.moments(inside), level))
+        if within:
+            fine = self.moments(unpack_keys(self._table.keys_in_box(*within)))
+        else:
+            fine = self._moments_of(self._table.changed_after(-1, 1))
+        coarse.insert(coarse_moments(fine, level))
         return coarse
 
     def copy(self) -> SurfelMap:
@@ -401,7 +404,10 @@ class SurfelMap:
         else:
             chosen = self._table.find(np.unique(pack_keys(voxel_index)))
             chosen = chosen[chosen >= 0]
-        chosen = chosen[np.argsort(self._table.rows[chosen, layout.KEY])]
+        return self._moments_of(chosen[np.argsort(self._table.rows[chosen, layout.KEY])])
+
+    def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
+        """Return the moments of some rows, in their order; a copy."""
         rows = self._table.rows[chosen]
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,

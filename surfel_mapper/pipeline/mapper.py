@@ -40,6 +40,7 @@ from surfel_mapper.mapping.channels import CHANNELS, missing_columns
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import NARROW_COUNT, within
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.motion_gate import stands_still
@@ -291,6 +292,19 @@ class Mapper:
         """The frame of the map: that of the poses, unless alignment gives it its own."""
         return self.config.align.map_frame or self.config.frames.fixed
 
+    def surfels(self, level: int = 0) -> Surfels:
+        """
+        Return the surfels with ``map.min_points`` points.
+
+        Parameters
+        ----------
+        level : int
+            Of the map whose voxels are 2^level times larger.
+
+        """
+        surfel_map = self.map.coarsen(level) if level else self.map
+        return surfel_map.surfels(self.config.map.min_points)
+
     def clear_region(self, region: Region) -> npt.NDArray[np.int32]:
         """
         Empty the voxels whose centres are in a part of space, for good.
@@ -357,6 +371,8 @@ class Mapper:
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
         self.chain.warm_up()
+        if self.config.window.keep_points:
+            self._aligner.warm_up()
         for dtype in (np.float32, np.float64):
             surfel_map = SurfelMap(self.config.map.voxel_size_m, columns=self.config.map.columns)
             one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
@@ -366,6 +382,8 @@ class Mapper:
             many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
             surfel_map.remove(many)
         surfel_map.digest()
+        if self.config.publish.levels:
+            surfel_map.coarsen(1).surfels()
         if self.config.deskew.enabled:
             warm_up_deskewing()
         if self.registered is not None:

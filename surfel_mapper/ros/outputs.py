@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import CancelledError
+from functools import partial
 from typing import Any
 
 from nav_msgs.msg import OccupancyGrid
@@ -79,6 +80,10 @@ class Outputs:
         self._changes = Changes(mapper)
         self._alignment = AlignmentOutputs(node, mapper)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
+        self._levels = [
+            node.create_publisher(PointCloud2, f'~/level_{level}/normals', LATCHED)
+            for level in range(1, mapper.config.publish.levels + 1)
+        ]
         self._changed = node.create_publisher(PointCloud2, '~/changed', CHANGES)
         self._removed = node.create_publisher(PointCloud2, '~/removed', CHANGES)
         self._scan_normals = node.create_publisher(PointCloud2, '~/scan_normals', 10)
@@ -86,7 +91,7 @@ class Outputs:
         self._grid = node.create_publisher(OccupancyGrid, '~/grid', LATCHED)
         self._stamp_ns = 0
         self._center = np.zeros(2)
-        published = (self._normals, self._markers, self._grid)
+        published = (self._normals, self._markers, self._grid, *self._levels)
         self._published: dict[Any, int] = dict.fromkeys(published, mapper.map.version)
         self._timers: list[Timer] = []
         warm_up(mapper.config)
@@ -124,11 +129,16 @@ class Outputs:
     def start_timers(self, rates: PublishConfig) -> None:
         """Publish at these rates from now on; called in the executor's thread."""
         self.stop_timers()
-        for rate_hz, publisher, publish in (
+        published: list[tuple[float, Any, Callable[[], object]]] = [
             (rates.normals_rate_hz, self._normals, self._publish_normals),
             (rates.markers_rate_hz, self._markers, self._publish_markers),
             (self._mapper.config.grid.rate_hz, self._grid, self._publish_grid),
-        ):
+            *(
+                (rates.normals_rate_hz, publisher, partial(self._publish_level, level, publisher))
+                for level, publisher in enumerate(self._levels, 1)
+            ),
+        ]
+        for rate_hz, publisher, publish in published:
             if rate_hz:
                 steady = Clock(clock_type=ClockType.STEADY_TIME)
                 callback = self._poster(publisher, publish)
@@ -201,6 +211,11 @@ class Outputs:
         self._normals.publish(self._surfel_cloud(surfels))
         self._published[self._normals] = self._mapper.map.version
         return len(surfels)
+
+    def _publish_level(self, level: int, publisher: Any) -> None:
+        cloud = from_columns(surfel_columns(self._mapper.surfels(level)))
+        publisher.publish(cloud_message(cloud, self._stamp_ns, self._mapper.map_frame))
+        self._published[publisher] = self._mapper.map.version
 
     def _publish_markers(self) -> None:
         config, surfel_map = self._mapper.config, self._mapper.map
