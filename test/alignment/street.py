@@ -8,13 +8,19 @@ from functools import cache
 from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.geometry import se3_exp, se3_log
+from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
+
+Floats = npt.NDArray[np.float64]
 
 
 @cache
-def street_scans(num_scans: int, step: int = 1, range_noise_m: float = 0.02):
+def street_scans(
+    num_scans: int, step: int = 1, range_noise_m: float = 0.02
+) -> tuple[list[Scan], Floats]:
     """Return scans of the street, 0.5 m times step apart, and their true poses (S, 4, 4)."""
     lidar = Lidar(columns=1024, range_noise_m=range_noise_m)
     world = World.street(seed=1, length_m=60.0)
@@ -24,7 +30,7 @@ def street_scans(num_scans: int, step: int = 1, range_noise_m: float = 0.02):
     return scans, poses
 
 
-def drifted(poses: np.ndarray, share: float = 0.01, deg_m: float = 0.05) -> np.ndarray:
+def drifted(poses: Floats, share: float = 0.01, deg_m: float = 0.05) -> Floats:
     """Return poses as odometry has them that measures ways too long and turns as it goes."""
     result = [poses[0]]
     for before, after in pairwise(poses):
@@ -35,7 +41,7 @@ def drifted(poses: np.ndarray, share: float = 0.01, deg_m: float = 0.05) -> np.n
     return np.array(result)
 
 
-def relative_errors(poses: np.ndarray, true: np.ndarray, apart: int) -> tuple[float, float]:
+def relative_errors(poses: Floats, true: Floats, apart: int) -> tuple[float, float]:
     """Return mean errors, m and rad, of the poses of scans in those so many before."""
     errors = []
     for first in range(len(true) - apart):
@@ -44,4 +50,5 @@ def relative_errors(poses: np.ndarray, true: np.ndarray, apart: int) -> tuple[fl
         expected = np.linalg.inv(true[first]) @ true[last]
         errors.append(se3_log(np.linalg.inv(expected) @ found))
     lengths = np.linalg.norm(np.reshape(errors, (-1, 2, 3)), axis=2)
-    return tuple(lengths.mean(axis=0))
+    distance_m, angle_rad = lengths.mean(axis=0).tolist()
+    return distance_m, angle_rad

@@ -74,7 +74,7 @@ def run(options: Options) -> list[Row]:
     """Return a row for every graph."""
     del options  # nothing here is a scan of the street
     program = compiled()
-    rows = []
+    rows: list[Row] = []
     with one_core():
         for case in CASES:
             clouds = points(case)
