@@ -72,7 +72,8 @@ class Ground(Filter):
         R_up_sensor = self.upright(scan)
         if not len(points):
             return np.zeros(0, np.bool_)
-        points = points @ R_up_sensor.T
+        x, y, z = points.T.copy()
+        points = np.stack([(a * x + b * y) + c * z for a, b, c in R_up_sensor], axis=1)
         grid = Grid.over(points, np.full(3, self.voxel_size_m), 'origin')
         _, _, groups = grid.group(points, True)
         moments = Moments.of_groups(points, groups.rows, len(groups.first))

@@ -68,7 +68,7 @@ class MaxPointCount(Filter):
 @register(theirs='FixStepSamplingDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixStepSampling(Filter):
-    """Keep every so manieth point, from a random one on; the step may change from scan to scan."""
+    """Keep every n-th point, from a random one on; the step n may change from scan to scan."""
 
     start_step: int = parameter(
         10, 'Step at the first scan.', low=1, high=INT32_MAX, theirs='startStep'

@@ -47,12 +47,21 @@ def test_the_example_of_an_own_filter_runs_and_is_checked_like_others(tmp_path, 
         Chain.from_list([{'drop_dim': {'min_intensity': -1}}])
 
 
-def test_the_entry_point_has_the_group_that_is_looked_for():
-    (text,) = blocks('ini')
+def test_a_package_with_the_entry_point_brings_its_filter(tmp_path, monkeypatch):
+    package, info = tmp_path / 'my_package', tmp_path / 'my_package-1.0.dist-info'
+    for folder in (package, info):
+        folder.mkdir()
+    (package / '__init__.py').touch()
+    (package / 'filters.py').write_text(blocks('python')[0])
     content = configparser.ConfigParser()
-    content.read_string(text)
-    assert registry.GROUP in content['options.entry_points']
-    assert 'drop_dim = ' in content['options.entry_points'][registry.GROUP]
+    content.read_string(blocks('ini')[0])
+    ((group, points),) = content['options.entry_points'].items()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: my-package\nVersion: 1.0\n')
+    (info / 'entry_points.txt').write_text(f'[{group}]{points}\n')
+    monkeypatch.syspath_prepend(tmp_path)
+    (found,) = Chain.from_list([{'drop_dim': {'min_intensity': 10}}]).filters
+    assert type(found).__module__ == 'my_package.filters'
+    assert type(found) in all_filters()
 
 
 def test_the_table_has_every_filter_with_its_line():
