@@ -18,7 +18,9 @@ from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
-BENCHES = ('mapping', 'scaling', 'live', 'compare', 'filters', 'lum', 'align', 'accuracy', 'registration')
+BENCHES = (
+    'mapping', 'scaling', 'live', 'compare', 'filters', 'lum', 'align', 'accuracy', 'registration',
+)
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 
