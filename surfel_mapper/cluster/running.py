@@ -202,11 +202,12 @@ class ShardRun:
         """Return the first shards of bags in which time was set back: each is all of its bag."""
         again = []
         for number, shard in enumerate(self.shards):
-            parts = [n for n, other in enumerate(self.shards) if other.bag == shard.bag]
+            parts = [n for n, other in enumerate(self.shards) if other.request is shard.request]
             if shard.start_ns is not None or shard.stop_ns is None:
                 continue
             if any(self.results[n].resets for n in parts if n in self.results):
-                log.warning('%s: time is set back in it; it is mapped in one go', shard.bag)
+                path = shard.request.path
+                log.warning('%s: time is set back in it; it is mapped in one go', path)
                 self.shards[number] = replace(shard, stop_ns=None)
                 again.append(number)
                 for other in parts:

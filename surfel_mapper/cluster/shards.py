@@ -10,8 +10,7 @@ of one shard and the beginning of the next disagree, the next is mapped again fr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
-from copy import deepcopy
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
 import resource
@@ -23,11 +22,11 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.io.bag import BagMessage, BagReader
+from surfel_mapper.io.bag import BagMessage
 from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.parquet_tiles import Part, Tile, write_shard
-from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS, PoseTopics, replay
-from surfel_mapper.offline.span import Span, WHOLE
+from surfel_mapper.offline.recording import BagRecording, open_recording, Request
+from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
 LEAD_S = 1.0
@@ -46,40 +45,31 @@ PLACES = 100
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shard:
     """
-    A part of a bag.
+    A part of a recording, in plain values.
 
     Attributes
     ----------
-    bag : str
-        Its path, absolute.
-    topics : frozenset of str
-        Its clouds.
-    poses : PoseTopics
-        Its poses.
+    request : Request
+        The recording, with absolute paths, and what of it is mapped by all shards together.
     config : Config
         The settings.
-    span : Span
-        The part of the bag that is to be mapped by all shards together.
     start_ns, stop_ns : int, optional
         Record time of its first message, and of the first that is not in it; None at the ends
-        of the span.
+        of what is mapped.
     lead_s : float
         How long before its start to begin.
 
     """
 
-    bag: str
-    topics: frozenset[str]
-    poses: PoseTopics
+    request: Request
     config: Config
-    span: Span = WHOLE
     start_ns: int | None = None
     stop_ns: int | None = None
     lead_s: float = 0.0
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is all that is to be mapped of its bag."""
+        """Whether it is all that is to be mapped of its recording."""
         return self.start_ns is None and self.stop_ns is None
 
 
@@ -118,35 +108,24 @@ class ShardResult:
     peak_bytes: int
 
 
-def cut_bag(
-    reader: BagReader,
-    config: Config,
-    topics: Collection[str],
-    poses: PoseTopics,
-    shard_s: float,
-    span: Span = WHOLE,
-) -> list[Shard]:
+def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
     """
-    Return the shards of a bag, of equal length and at most so long.
+    Return the shards of a recording, of equal length and at most so long.
 
     Parameters
     ----------
-    reader : BagReader
-        The bag.
+    request : Request
+        What is mapped.
     config : Config
         The settings; all scans stay in the map, whatever they say of a window. Where they make
-        a scan depend on all before it, the bag is one shard.
-    topics : collection of str
-        Its clouds.
-    poses : PoseTopics
-        Its poses.
+        a scan depend on all before it, the recording is one shard, and so is a folder of scans.
     shard_s : float
         The longest that a shard may be.
-    span : Span
-        The part of the bag to map.
 
     Raises
     ------
+    BagError, FileFormatError
+        If the recording cannot be read or lacks what is asked of it.
     ConfigError
         If the settings ask for something that shards cannot do.
 
@@ -156,24 +135,36 @@ def cut_bag(
             f'map.mode {config.map.mode!r}, map.load {config.map.load!r}: several processes '
             "begin with empty maps; expected 'live' and '', or a single process"
         )
-    start_ns, stop_ns = span.clipped(reader.start_ns, reader.end_ns)
-    whole = Shard(
-        bag=str(reader.path.resolve()),
-        topics=frozenset(topics),
-        poses=poses,
-        config=config.replace(ALL_SCANS),
-        span=span,
-        lead_s=LEAD_S + config.input.reset_after_s + sweep_s(config),
-    )
-    by_number = span.every > 1 or (poses.path is not None and not poses.path.has_stamps)
+    whole = Shard(request=absolute(request), config=config.replace(ALL_SCANS))
+    with open_recording(request, whole.config) as recording:
+        if not isinstance(recording, BagRecording) or not may_be_cut(recording):
+            return [whole]
+        start_ns, stop_ns = clipped(recording)
     number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s), 1)
-    if by_number or not is_divisible(config):
-        number = 1
     bounds = [start_ns + (stop_ns - start_ns) * part // number for part in range(1, number)]
+    lead_s = LEAD_S + config.input.reset_after_s + sweep_s(config)
     return [
-        replace(whole, start_ns=first, stop_ns=last)
+        replace(whole, start_ns=first, stop_ns=last, lead_s=lead_s)
         for first, last in zip([None, *bounds], [*bounds, None], strict=True)
     ]
+
+
+def absolute(request: Request) -> Request:
+    """Return a request that means the same in another directory."""
+    poses = None if request.poses is None else request.poses.absolute()
+    return replace(request, path=request.path.absolute(), poses=poses)
+
+
+def may_be_cut(recording: BagRecording) -> bool:
+    """Return whether a scan depends on its surroundings alone, not even on its number."""
+    path = recording.poses.path
+    by_number = recording.span.every > 1 or (path is not None and not path.has_stamps)
+    return is_divisible(recording.config) and not by_number
+
+
+def clipped(recording: BagRecording) -> tuple[int, int]:
+    """Return record time of the first and last message of what is mapped."""
+    return recording.span.clipped(recording.reader.start_ns, recording.reader.end_ns)
 
 
 def map_shard(shard: Shard, path: str) -> ShardResult:
@@ -183,31 +174,33 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
     Raises
     ------
     BagError
-        If the bag cannot be read.
+        If the recording cannot be read.
     FileFormatError
-        If the file cannot be written.
+        If a file cannot be read or written.
 
     """
     began = time.perf_counter()
     keep_freed_memory()
-    mapper, entry = ShardMapper(shard.config), Entry()
-    with BagReader(shard.bag) as reader:
-        poses = deepcopy(shard.poses)  # those of a file are handed out one after the other
+    entry = Entry()
+    with open_recording(shard.request, shard.config) as recording:
+        mapper = ShardMapper(recording.config)
+        recorded_s = recording.recorded_s
         if shard.is_whole:
-            updates = replay(reader, mapper, shard.topics, poses, span=shard.span)
-            places = [update.T_fixed_sensor[:3, 3] for update in updates]
+            places = [update.T_fixed_sensor[:3, 3] for update in recording.replay(mapper)]
+        elif isinstance(recording, BagRecording):
+            entry, places = map_middle(recording, mapper, shard)
+            first_ns, last_ns = clipped(recording)
+            start_ns = first_ns if shard.start_ns is None else shard.start_ns
+            recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
         else:
-            entry, places = map_middle(reader, mapper, replace(shard, poses=poses))
-        first_ns, last_ns = shard.span.clipped(reader.start_ns, reader.end_ns)
-    start_ns = first_ns if shard.start_ns is None else shard.start_ns
-    stop_ns = last_ns if shard.stop_ns is None else shard.stop_ns
+            raise TypeError(f'{shard.request.path}: only bags are cut')
     return ShardResult(
         parts=write_shard(path, mapper.map),
         before=entry.outlook,
         after=None if shard.stop_ns is None else mapper.outlook(),
         counts=difference(mapper.counters.summary(), entry.counts),
         resets=mapper.counters.resets,
-        recorded_s=(stop_ns - start_ns) / 1e9,
+        recorded_s=recorded_s,
         seconds=time.perf_counter() - began,
         places=np.array(places).reshape(-1, 3)[:: max(len(places) // PLACES, 1)],
         peak_bytes=peak_bytes(),
@@ -228,22 +221,23 @@ class Entry:
 
 
 def map_middle(
-    reader: BagReader, mapper: ShardMapper, shard: Shard
+    recording: BagRecording, mapper: ShardMapper, shard: Shard
 ) -> tuple[Entry, list[npt.NDArray[np.float64]]]:
     """Map a shard after its lead-in; return what was known at its start, and the positions."""
+    reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     entry, places = Entry(), []
     mapper.passes_over = shard.start_ns is not None
-    for topic, mount in shard.poses.mounts.items():
+    for topic, place in poses.mounts.items():
         base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
-    for message in messages_of(reader, shard):
+        mapper.add_pose(base, topic, 0, place[:3], place[3:], static=True)
+    for message in messages_of(recording, shard):
         if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
             entry = Entry.of(mapper)
             mapper.passes_over = False
-        if message.topic not in shard.topics:
-            add_poses(reader, mapper, message, shard.poses)
-        elif shard.span.holds(message.record_ns):
-            add_cloud(reader, mapper, message, shard.poses, 0)
+        if message.topic not in clouds:
+            add_poses(reader, mapper, message, poses)
+        elif recording.span.holds(message.record_ns):
+            add_cloud(reader, mapper, message, poses, 0)
         places += [update.T_fixed_sensor[:3, 3] for update in mapper.insert_ready()]
     if mapper.passes_over:  # nothing was recorded since
         entry = Entry.of(mapper)
@@ -252,17 +246,18 @@ def map_middle(
     return entry, places
 
 
-def messages_of(reader: BagReader, shard: Shard) -> Iterator[BagMessage]:
+def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
     """Yield static transforms from before a shard, then all of it from its lead-in on."""
-    first_ns = shard.span.poses_start_ns
+    reader, poses, span = recording.reader, recording.poses, recording.span
+    first_ns = span.poses_start_ns
     if shard.start_ns is not None:
         earliest_ns = reader.start_ns if first_ns is None else first_ns
         lead_ns = shard.start_ns - round(min(shard.lead_s, LONGEST_S) * 1e9)
         first_ns = lead_ns if lead_ns > earliest_ns else first_ns
-    if shard.poses.static and first_ns is not None:
-        yield from reader.messages(shard.poses.static, None, first_ns)
-    names = {*shard.topics, *shard.poses.kinds, *shard.poses.static}
-    last_ns = shard.span.poses_stop_ns if shard.stop_ns is None else shard.stop_ns
+    if poses.static and first_ns is not None:
+        yield from reader.messages(poses.static, None, first_ns)
+    names = {*recording.topics, *poses.kinds, *poses.static}
+    last_ns = span.poses_stop_ns if shard.stop_ns is None else shard.stop_ns
     yield from reader.messages(names, first_ns, last_ns)
 
 

@@ -4,11 +4,10 @@
 
 from __future__ import annotations
 
-from surfel_mapper.cluster.shards import cut_bag
+from surfel_mapper.cluster.shards import cut
 from surfel_mapper.config import Config
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.offline.replay import ALL_SCANS, pose_topics, replay
-from surfel_mapper.offline.span import WHOLE
+from surfel_mapper.offline.recording import open_recording, Request
+from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.pipeline import Mapper
 from test.io.recorded import drive, START_NS, write_rosbag2
 
@@ -94,19 +93,22 @@ def written(path, name):
     return write_rosbag2(path / name.replace(' ', '_'), make()), Config().replace(settings)
 
 
-def shards_of(bag, config, shard_s, span=WHOLE):
+def request(bag, config, **part):
+    """Return what is to be mapped of a bag of recorded.py."""
+    pose_topic = '/tf' if config.pose.source == 'tf' else None
+    return Request(path=bag, topics=('/points',), pose_topic=pose_topic, **part)
+
+
+def shards_of(bag, config, shard_s, **part):
     """Return the shards of a bag of recorded.py."""
-    with BagReader(bag) as reader:
-        poses = pose_topics(reader.topics, config, '/tf' if config.pose.source == 'tf' else None)
-        return cut_bag(reader, config, ['/points'], poses, shard_s, span)
+    return cut(request(bag, config, **part), config, shard_s)
 
 
-def in_one_go(bag, config, span=WHOLE):
+def in_one_go(bag, config, **part):
     """Return the mapper that has mapped a whole bag, all scans kept."""
-    mapper = Mapper(config.replace(ALL_SCANS))
-    with BagReader(bag) as reader:
-        poses = pose_topics(reader.topics, config, '/tf' if config.pose.source == 'tf' else None)
-        for _ in replay(reader, mapper, '/points', poses, span=span):
+    with open_recording(request(bag, config, **part), config.replace(ALL_SCANS)) as recording:
+        mapper = Mapper(recording.config)
+        for _ in recording.replay(mapper):
             pass
     return mapper
 

@@ -5,6 +5,7 @@
 from dataclasses import replace
 from itertools import pairwise
 
+import numpy as np
 import pytest
 
 from surfel_mapper.cluster.engines import InProcess
@@ -13,17 +14,14 @@ from surfel_mapper.cluster.shards import difference, map_shard
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, MapError
 from surfel_mapper.io.parquet_tiles import dataset_digest
-from surfel_mapper.offline.span import Span
 from test.cluster.bags import BAGS, counted, in_one_go, RECORDED_S, shards_of, written
-from test.io.recorded import START_NS
 
 
 @pytest.mark.parametrize('name', BAGS)
-@pytest.mark.parametrize('shard_s', [0.7, 2.5])
-def test_shards_make_the_map_and_the_counts_of_one_go(tmp_path, name, shard_s):
+def test_shards_make_the_map_and_the_counts_of_one_go(tmp_path, name):
     bag, config = written(tmp_path, name)
     expected = in_one_go(bag, config)
-    shards = shards_of(bag, config, shard_s)
+    shards = shards_of(bag, config, 0.9)
 
     mapped = map_bags(shards, InProcess(), tmp_path / 'out')
 
@@ -79,16 +77,37 @@ def test_the_usual_lead_in_is_long_enough(tmp_path):
 @pytest.mark.parametrize('every', [1, 3])
 def test_a_part_of_a_bag_is_mapped_alike(tmp_path, every):
     bag, config = written(tmp_path, 'plain')
-    start_ns = START_NS + 1_250_000_000
-    span = Span(start_ns=start_ns, stop_ns=start_ns + 3 * 10**9, every=every)
-    expected = in_one_go(bag, config, span)
+    part = {'start_s': 1.25, 'duration_s': 3.0, 'every': every}
+    expected = in_one_go(bag, config, **part)
 
-    shards = shards_of(bag, config, 0.7, span)
+    shards = shards_of(bag, config, 0.7, **part)
     mapped = map_bags(shards, InProcess(), tmp_path / 'out')
 
     assert len(shards) == (5 if every == 1 else 1)
     assert mapped.map.digest == expected.map.digest()
     assert mapped.counts()['scans']['received'] == 30 // every
+
+
+@pytest.mark.parametrize('has_stamps', [True, False])
+def test_poses_of_a_file_are_known_in_the_middle_too(tmp_path, has_stamps):
+    bag, config = written(tmp_path, 'plain')
+    rows = np.zeros((60, 8))
+    rows[:, 0], rows[:, 1], rows[:, 3], rows[:, 7] = np.arange(60) / 10, np.arange(60), 1.0, 1.0
+    lines = [f'17000000{row[0]:04.1f} ' + ' '.join(map(str, row[1:])) for row in rows]
+    if not has_stamps:
+        lines = [f'1 0 0 {row[1]} 0 1 0 {row[2]} 0 0 1 {row[3]}' for row in rows]
+    poses = tmp_path / 'poses.txt'
+    poses.write_text('\n'.join(lines))
+    config = config.replace({'pose.source': 'odometry'})
+    part = {'poses': poses, 'poses_format': 'tum' if has_stamps else 'kitti'}
+    expected = in_one_go(bag, config, **part)
+
+    shards = shards_of(bag, config, 1.0, **part)
+    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+
+    assert len(shards) == (6 if has_stamps else 1)
+    assert mapped.map.digest == expected.map.digest()
+    assert mapped.counts()['scans']['mapped'] == 60
 
 
 def test_several_bags_make_the_sum_of_their_maps(tmp_path):
