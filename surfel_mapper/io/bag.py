@@ -82,7 +82,7 @@ class BagReader:
     def __init__(self, path: str | Path) -> None:
         """Open the bag and read its index."""
         self.path = Path(path)
-        self.is_ros1 = is_ros1(self.path)
+        self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
         self._decoders: dict[str, tuple[Typestore, str]] = {}
         self._storages: list[tuple[Path, Storage]] = []

@@ -68,6 +68,10 @@ def test_the_only_file_of_a_directory_reads_like_the_directory(tmp_path, storage
     assert_is_the_drive(read(file))
 
 
+def test_a_rosbag2_directory_may_be_called_as_a_ros1_bag(tmp_path):
+    assert_is_the_drive(read(write_rosbag2(tmp_path / 'drive.bag', drive())))
+
+
 @pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
 def test_a_ros1_bag_yields_what_was_written(tmp_path, compression):
     path = write_ros1(tmp_path / 'drive.bag', drive(ROS1), compression)

@@ -1,0 +1,126 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay of a bag of the simulated street, on one core: how many times faster than it was recorded.
+
+The lidar turns at 10 Hz, so 10 ms a scan are ten times real time. ``read`` yields the messages of
+clouds and poses, ``decode`` makes scans and poses of them, ``replay`` maps them at 0.5 m with all
+scans kept, ``command`` is the whole of `surfel-mapper replay`: a process of its own, kernels
+loaded, map, picture and summary written. Each is the fastest of several runs, with the bag in the
+cache of the system. The bag is kept beside the scans of the other benches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+from time import perf_counter
+
+from surfel_mapper.config import load_config
+from surfel_mapper.io.bag import BagReader
+from surfel_mapper.io.bag_topics import CLOUD
+from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.offline.replay import ALL_SCANS, pose_topics
+from surfel_mapper.offline.replay import replay as replay_bag
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.simulation.recording import record
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.report import Row
+from test.bench.street import Street
+
+RUNS = 3
+
+POINTS, ODOMETRY = '/points', '/odom'
+
+BUDGET_TIMES = 10.0
+"""How many times faster than recorded a replay has to be at least."""
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for each part of a replay."""
+    street = Street(options)
+    bag = recorded(street, options)
+    mount = ', '.join(repr(value) for value in street.simulation.drive.base_to_sensor)
+    settings = f'pose: {{source: odometry}}\nframes: {{base_to_sensor: [{mount}]}}\n'
+    with tempfile.TemporaryDirectory() as directory, one_core():
+        config = Path(directory, 'config.yaml')
+        config.write_text(settings, encoding='utf-8')
+        keep_freed_memory()
+        rows = [row(part, options, bag, config) for part in (read, decode, replay, command)]
+    rows[-2] = {**rows[-2], 'budget': BUDGET_TIMES}
+    return rows
+
+
+def recorded(street: Street, options: Options) -> Path:
+    """Return the bag of so many scans, which is recorded at the first call."""
+    path = street.directory.with_name(f'{street.directory.name}-{options.scans}-bag')
+    if not path.exists():
+        print(f'recording {options.scans} scans into {path}', file=sys.stderr)
+        record(replace(street.simulation, num_scans=options.scans), path)
+    return path
+
+
+def row(
+    part: Callable[[Path, Path], None], options: Options, bag: Path, config: Path
+) -> Row:
+    """Return the fastest of some runs."""
+    seconds = []
+    for _ in range(RUNS):
+        start = perf_counter()
+        part(bag, config)
+        seconds.append(perf_counter() - start)
+    with BagReader(bag) as reader:
+        recorded_s = (reader.end_ns - reader.start_ns) / 1e9
+    return {
+        'part': part.__name__,
+        'scans': options.scans,
+        'seconds': min(seconds),
+        'ms_scan': min(seconds) * 1e3 / options.scans,
+        'times_real': recorded_s / min(seconds),
+    }
+
+
+def read(bag: Path, config: Path) -> None:
+    """Read the messages of clouds and poses."""
+    with BagReader(bag) as reader:
+        for _ in reader.messages({POINTS, ODOMETRY}):
+            pass
+
+
+def decode(bag: Path, config: Path) -> None:
+    """Read them and make scans and poses of them."""
+    with BagReader(bag) as reader:
+        for message in reader.messages({POINTS, ODOMETRY}):
+            decoded = reader.decode(message)
+            if message.type == CLOUD:
+                to_scan(decoded)
+            else:
+                for _ in poses_in('odometry', decoded, 'base_link'):
+                    pass
+
+
+def replay(bag: Path, config: Path) -> None:
+    """Map them."""
+    mapper = Mapper(load_config(config).replace(ALL_SCANS))
+    with BagReader(bag) as reader:
+        for _ in replay_bag(reader, mapper, POINTS, pose_topics(reader.topics, mapper.config)):
+            pass
+
+
+def command(bag: Path, config: Path) -> None:
+    """Map them in a process of its own, and write what it writes."""
+    subprocess.run(
+        [
+            *(sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', str(bag)),
+            *('--config', str(config), '--output', str(config.parent / 'out'), '--json'),
+        ],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
