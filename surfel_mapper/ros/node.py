@@ -33,9 +33,10 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 
 from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.filters.chain import Chain
 from surfel_mapper.ros.diagnostics import CountedPublisher, Diagnostics
 from surfel_mapper.ros.inbox import Inbox
-from surfel_mapper.ros.parameters import changed_config, declare_settings
+from surfel_mapper.ros.parameters import as_declared, changed_config, declare_settings, refusal
 from surfel_mapper.ros.session import Session
 from surfel_mapper.ros.waiting import result_of
 
@@ -104,6 +105,12 @@ class MapperNode(LifecycleNodeMixin, Node):
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """Create a publisher whose messages are counted for the diagnostics."""
         return super().create_publisher(*args, publisher_class=CountedPublisher, **kwargs)
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters that someone sends; the reason of a refusal names what is wrong."""
+        if reason := refusal(self, parameter_list):
+            return SetParametersResult(successful=False, reason=reason)
+        return super().set_parameters_atomically([as_declared(p) for p in parameter_list])
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Compile the kernels, then offer topics to read, and services."""
@@ -214,9 +221,11 @@ class MapperNode(LifecycleNodeMixin, Node):
         return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse values that the configuration refuses."""
+        """Refuse values that the configuration refuses, and files that hold no filters."""
         try:
-            changed_config(self._config, parameters)
+            config = changed_config(self._config, parameters)
+            if config.filters and config.filters != self._config.filters:
+                Chain.load(config.filters)
         except ConfigError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

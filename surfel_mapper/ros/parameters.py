@@ -18,7 +18,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from surfel_mapper.config import Config, Declaration, declarations
+from surfel_mapper.config import Config, Declaration, declarations, near
 
 QOS_OVERRIDES = 'qos_overrides.'
 """Parameters of this prefix are declared by rclpy with the topic that they are for."""
@@ -110,3 +110,23 @@ def changed_config(config: Config, parameters: Iterable[Parameter]) -> Config:
     """
     names = {declared.name for declared in declarations()}
     return config.replace({p.name: p.value for p in parameters if p.name in names})
+
+
+def refusal(node: Node, parameters: Iterable[Parameter]) -> str:
+    """Return why parameters cannot be set on a running node, whatever their values; or nothing."""
+    for parameter in parameters:
+        name = parameter.name
+        if not node.has_parameter(name):
+            known = [declared.name for declared in declarations()]
+            return f'{name}: no such setting{near(name, known)}'
+        if node.describe_parameter(name).read_only:
+            return f'{name}: read-only, cannot change while running; set it at the start'
+    return ''
+
+
+def as_declared(parameter: Parameter) -> Parameter:
+    """Return a parameter with a float for a whole number where a float is declared."""
+    floats = {declared.name for declared in declarations() if isinstance(declared.default, float)}
+    if parameter.name in floats and parameter.type_ == Parameter.Type.INTEGER:
+        return Parameter(parameter.name, value=float(parameter.value))
+    return parameter

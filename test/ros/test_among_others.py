@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The node among others: found by name, told new settings, outliving them, in their time."""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import PointCloud2
+
+from test.ros.live import cloud, NODE, odometry, room, stamp, START_NS
+from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
+
+pytestmark = pytest.mark.timeout(120)
+
+TOPICS = {
+    'normals': 'sensor_msgs/msg/PointCloud2',
+    'changed': 'sensor_msgs/msg/PointCloud2',
+    'markers': 'visualization_msgs/msg/MarkerArray',
+    'transition_event': 'lifecycle_msgs/msg/TransitionEvent',
+    'clear_polygon': 'geometry_msgs/msg/PolygonStamped',
+}
+SERVICES = {
+    'clear': 'std_srvs/srv/Trigger',
+    'clear_box': 'std_srvs/srv/Trigger',
+    'clear_radius': 'std_srvs/srv/Trigger',
+    'save_map': 'std_srvs/srv/Trigger',
+    'load_map': 'nav_msgs/srv/LoadMap',
+    'pause': 'std_srvs/srv/SetBool',
+    'change_state': 'lifecycle_msgs/srv/ChangeState',
+    'get_state': 'lifecycle_msgs/srv/GetState',
+    'set_parameters': 'rcl_interfaces/srv/SetParameters',
+}
+
+
+def test_topics_and_services_are_found_under_the_name_of_the_node_with_their_types(start, peer):
+    start('node', *ARGUMENTS, '-r', '__ns:=/robot', '-r', '__node:=map', '-r', 'odom:=/odom')
+    found = {}
+
+    def is_complete():
+        found.update(peer.node.get_topic_names_and_types())
+        found.update(peer.node.get_service_names_and_types())
+        expected = {f'/robot/map/{name}' for name in [*TOPICS, *SERVICES]}
+        return {*expected, '/robot/points', '/odom', '/diagnostics'} <= set(found)
+
+    peer.spin_until(is_complete, what=lambda: str(sorted(found)))
+    for name, kind in {**TOPICS, **SERVICES}.items():
+        assert found[f'/robot/map/{name}'] == [kind], name
+    assert found['/robot/points'] == ['sensor_msgs/msg/PointCloud2']
+    assert found['/odom'] == ['nav_msgs/msg/Odometry']
+    assert found['/diagnostics'] == ['diagnostic_msgs/msg/DiagnosticArray']
+    peer.spin_until(lambda: ('map', '/robot') in peer.node.get_node_names_and_namespaces())
+
+
+def test_a_lidar_that_comes_back_with_another_quality_of_service_is_mapped_on(start, peer):
+    start('node', *ARGUMENTS)
+    peer.advertise('/odom')
+    messages = drive(6)
+    lives = [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE]
+    # the node asks for reliable in ARGUMENTS, so best effort must not come through
+    for number, reliability in enumerate(lives):
+        qos = QoSProfile(depth=10, reliability=reliability)
+        lidar = peer.node.create_publisher(PointCloud2, '/points', qos)
+        if reliability is ReliabilityPolicy.RELIABLE:
+            peer.spin_until(lidar.get_subscription_count)
+        peer.spin_for(0.5)
+        for points, pose in messages[2 * number : 2 * number + 2]:
+            peer.publish('/odom', pose)
+            lidar.publish(points)
+            peer.spin_for(0.05)
+        if reliability is ReliabilityPolicy.RELIABLE:
+            peer.diagnosis({'scans.mapped': 2 if number == 0 else 4})
+        peer.node.destroy_publisher(lidar)
+    _, values = peer.diagnosis()
+    assert values['scans.received'] == '4'
+    assert values['resets'] == '0'
+
+
+def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
+    start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
+    clock = peer.node.create_publisher(Clock, '/clock', 10)
+    peer.spin_until(clock.get_subscription_count)
+    peer.advertise('/odom', '/points')
+    reports = peer.collect(DiagnosticArray, '/diagnostics')
+
+    def set_time(now_ns):
+        message = Clock()
+        message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
+        clock.publish(message)
+        peer.spin_until(
+            lambda: reports and reports[-1].header.stamp == message.clock,
+            what=lambda: f'{reports[-1].header.stamp}, not {message.clock}',
+        )
+
+    set_time(START_NS + 40_000_000)
+    send(peer, drive(1))
+    _, values = peer.diagnosis({'scans.mapped': 1})
+    assert (values['latency_ms.median'], values['latency_ms.p99']) == ('40.0', '40.0')
+
+    set_time(START_NS + PERIOD_NS + 60_000_000)
+    send(peer, drive(2)[1:])
+    _, values = peer.diagnosis({'scans.mapped': 2})
+    assert values['latency_ms.median'] == '50.0'
+
+    long_ago = START_NS - 10**11  # the simulation starts anew
+    set_time(long_ago)
+    send(peer, [(cloud(long_ago, room(seed=5)), odometry(long_ago, (0, 0, 0)))])
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    assert (values['resets'], values['window_scans']) == ('1', '1')
+
+
+def test_filters_change_while_scans_come_and_bad_files_are_refused(start, peer, tmp_path):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    client = peer.parameters()
+    near, wrong = tmp_path / 'near.yaml', tmp_path / 'wrong.yaml'
+    near.write_text('- MaxDistDataPointsFilter:\n    maxDist: 3.0\n', encoding='utf-8')
+    wrong.write_text('- MaxDistDataPointFilter\n', encoding='utf-8')
+
+    def change(path):
+        found = client.set_parameters([Parameter('filters', value=str(path))])
+        return peer.result(found).results[0]
+
+    messages = drive(3)
+    send(peer, messages[:1])
+    peer.diagnosis({'scans.mapped': 1})
+    for path, reason in (
+        (tmp_path / 'nowhere.yaml', 'cannot be read'),
+        (wrong, 'did you mean MaxDistDataPointsFilter?'),
+    ):
+        refused = change(path)
+        assert not refused.successful
+        assert reason in refused.reason
+    assert change(near).successful
+    send(peer, messages[1:2])
+    _, values = peer.diagnosis({'scans.mapped': 2})
+    left_out = int(values['points_left_out.filtered'])
+    assert 1000 < left_out < 4000
+    assert change('').successful
+    send(peer, messages[2:])
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    assert int(values['points_left_out.filtered']) == left_out
+    assert 'Traceback' not in node.output
+
+
+def test_limits_and_rates_change_while_running_and_what_is_wrong_is_refused(start, peer):
+    start('node', *ARGUMENTS, '-p', 'publish.normals_rate_hz:=0.0')
+    peer.advertise('/odom', '/points')
+    normals = peer.collect(PointCloud2, f'{NODE}/normals')
+    client = peer.parameters()
+
+    def change(**values):
+        pairs = [Parameter(k.replace('__', '.'), value=v) for k, v in values.items()]
+        return peer.result(client.set_parameters(pairs)).results
+
+    send(peer, drive(2))
+    peer.diagnosis({'scans.mapped': 2})
+    assert normals == []
+    assert change(publish__normals_rate_hz=20)[0].successful  # a whole number for a float
+    peer.spin_until(lambda: normals)
+
+    (wrong,) = change(clear__box=[1.0, 2.0])
+    assert 'clear.box: 2 values, expected 6' in wrong.reason
+    (read_only,) = change(pose__source='tf')
+    assert read_only.reason.startswith('pose.source: read-only, cannot change while running')
+    (unknown,) = change(window__max_scan=3)
+    assert unknown.reason == 'window.max_scan: no such setting; did you mean window.max_scans?'
+    assert not any(result.successful for result in (wrong, read_only, unknown))
+
+    num = len(normals)
+    assert change(map__min_points=50)[0].successful
+    peer.spin_until(lambda: len(normals) > num)  # other settings make other surfels
+    _, mapper = mapped(drive(2))
+    assert normals[-1].width == len(mapper.map.surfels(50)) < normals[0].width
+
+
+def test_no_pose_in_time_is_counted_by_cause_and_frame_and_the_log_says_what_to_do(start, peer):
+    node = start('node', *ARGUMENTS, '-p', 'pose.max_wait_s:=0.05')
+    peer.advertise('/odom', '/points')
+    (first, pose), (second, _) = drive(2)
+    send(peer, [(first, pose)])
+    other = cloud(START_NS + PERIOD_NS // 2, room(seed=3), 'elsewhere')
+    peer.publish('/points', other)
+    late = START_NS + 5 * PERIOD_NS
+    stamp(second, late)
+    peer.publish('/points', second)
+    later = odometry(late + PERIOD_NS, (1.0, 0.0, 0.0))
+    later.child_frame_id = 'nothing_known'
+    peer.publish('/odom', later)
+
+    _, values = peer.diagnosis({'scans.dropped.no_pose': 2})
+
+    by_frame = {k: v for k, v in values.items() if k.startswith('scans.dropped_by_frame')}
+    assert by_frame == {
+        'scans.dropped_by_frame.elsewhere.no_pose': '1',
+        'scans.dropped_by_frame.lidar.no_pose': '1',
+    }
+    assert "in frame 'elsewhere' dropped: no pose within" in node.output
