@@ -8,7 +8,8 @@ A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_argument
 replay loads no ROS. What the verb prints on stdout is its result; all else goes to stderr. What
 follows --ros-args is ``args.ros_args``.
 
-Exit code 0: done; 1: refused, with a message; 2: usage; 130: interrupted.
+Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
+--strict; 130: interrupted.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from types import ModuleType
 import surfel_mapper
 from surfel_mapper.errors import SurfelMapperError
 
-VERBS = ('node', 'replay', 'play', 'info', 'filters', 'simulate')
+VERBS = ('node', 'replay', 'play', 'info', 'filters', 'simulate', 'merge')
 
 EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
 
