@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Exact moments as columns of a cloud, and back.
+Exact moments as fields of a cloud, and back.
 
 A PointField holds no 64-bit integer. So each integer is a field of two uint32, the low half
 first: its bytes in little-endian order. The number of points is ``num_points``, the voxel three
@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.io.pointcloud2 import surfel_columns
+from surfel_mapper.io.appended import appended
+from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns, surfel_columns, UINT32
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments
 from surfel_mapper.mapping.surfels import Surfels
 
@@ -38,11 +39,11 @@ def voxel_columns(voxel_index: npt.NDArray[np.int32], voxel_size_m: float) -> Co
     return dict(zip((*'xyz', *VOXEL), (*centers.T, *index.T), strict=True))
 
 
-def moment_columns(
+def moment_cloud(
     surfels: Surfels, moments: ScanMoments, removed: npt.NDArray[np.int32]
-) -> Columns:
+) -> CloudBytes:
     """
-    Return the columns of ~/normals and ~/changed where moments are asked for.
+    Return the cloud of ~/normals and ~/changed where moments are asked for.
 
     Parameters
     ----------
@@ -56,20 +57,17 @@ def moment_columns(
     """
     order = np.argsort(pack_keys(surfels.voxel_index))
     index = np.concatenate([moments.voxel_index, removed])
+    columns = {
+        name: extended(values, len(removed))
+        for name, values in surfel_columns(surfels.select(order)).items()
+    }
+    columns.update(zip(VOXEL, index.T, strict=True))
     names = (*TOTAL, *PRODUCT, *VIEW, *(f'sum_{name}' for name in moments.channel_names))
     arrays = (moments.total, moments.product, moments.view, moments.channels)
-    sums = np.concatenate([array.astype(np.int64) for array in arrays], axis=1)
-    return {
-        **{
-            name: extended(values, len(removed))
-            for name, values in surfel_columns(surfels.select(order)).items()
-        },
-        **dict(zip(VOXEL, np.ascontiguousarray(index.T), strict=True)),
-        **{
-            name: extended(halves(sums[:, column]), len(removed))
-            for column, name in enumerate(names)
-        },
-    }
+    sums = np.zeros((len(index), len(names)), np.int64)
+    np.concatenate(arrays, axis=1, out=sums[: len(moments)])
+    fields = [(name, UINT32, 2) for name in names]
+    return appended(from_columns(columns), halves(sums), fields)
 
 
 def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...]) -> ScanMoments:
@@ -133,8 +131,8 @@ def check_size(
 
 
 def halves(values: npt.NDArray[np.int64]) -> npt.NDArray[np.uint32]:
-    """Return integers as pairs, (K, 2) uint32: the low half first."""
-    return np.ascontiguousarray(values, '<i8').view('<u4').reshape(-1, 2).astype(np.uint32)
+    """Return the columns of integers (K, C) as pairs, (K, 2 C) uint32: the low half first."""
+    return np.ascontiguousarray(values, '<i8').view('<u4').astype(np.uint32, copy=False)
 
 
 def whole(pairs: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -145,4 +143,4 @@ def whole(pairs: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 def extended(values: npt.NDArray[Any], number: int) -> npt.NDArray[Any]:
     """Return a column with so many more rows: nan where it has such, else 0."""
     filling = np.nan if values.dtype.kind == 'f' else 0
-    return np.concatenate([values, np.full((number, *values.shape[1:]), filling, values.dtype)])
+    return np.concatenate([values, np.full(number, filling, values.dtype)])

@@ -30,9 +30,9 @@ from surfel_mapper.scan import Scan
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
 
-FLOAT32, FLOAT64 = 7, 8
+UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
-DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', FLOAT32: 'f4', FLOAT64: 'f8'}
+DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', UINT32: 'u4', FLOAT32: 'f4', FLOAT64: 'f8'}
 """Numpy's name of every datatype that a PointField may have."""
 
 DATATYPES = {np.dtype(name): datatype for datatype, name in DTYPES.items()}

@@ -10,14 +10,15 @@ the cloud, as everything else in it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import inverse, Transform
-from surfel_mapper.io.pointcloud2 import CloudBytes, Field, FLOAT32, from_columns
+from surfel_mapper.io.appended import appended
+from surfel_mapper.io.pointcloud2 import CloudBytes, FLOAT32, from_columns, UINT32
 from surfel_mapper.kernels.attach import attach_surfels
 from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.kernels.queries import build_table
@@ -25,8 +26,6 @@ from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.scan import Scan
-
-UINT32 = 6
 
 ADDED = ('normal_x', 'normal_y', 'normal_z', 'planarity', 'num_points')
 """The further fields, four bytes each; uint32 the last, float32 the others."""
@@ -109,42 +108,11 @@ def extended_cloud(msg: Any, added: npt.NDArray[np.float32]) -> CloudBytes:
         From surfels_of_points, one row a point.
 
     """
-    height, width, step = int(msg.height), int(msg.width), int(msg.point_step)
-    rows = np.frombuffer(msg.data, np.uint8)[: int(msg.row_step) * height]
-    points = np.ndarray((height, width), f'V{step}', rows, 0, (int(msg.row_step), step))
-    offset = -(-step // 4) * 4
-    layout = np.dtype(
-        {
-            'names': ['point', 'surfel'],
-            'formats': [f'V{step}', f'V{added.strides[0]}'],
-            'offsets': [0, offset],
-        }
-    )
-    cloud = np.zeros((height, width), layout)
-    cloud['point'] = points
-    order = '>' if msg.is_bigendian else '<'
-    words = added.view(np.uint32).astype(f'{order}u4', copy=False)
-    cloud['surfel'] = words.view(layout['surfel']).reshape(height, width)
-    return CloudBytes(
-        height=height,
-        width=width,
-        fields=(*msg.fields, *added_fields([field.name for field in msg.fields], offset)),
-        is_bigendian=bool(msg.is_bigendian),
-        point_step=layout.itemsize,
-        row_step=layout.itemsize * width,
-        data=cloud.reshape(-1).view(np.uint8),
-        is_dense=False,
-    )
-
-
-def added_fields(taken: Iterable[str], offset: int) -> list[Field]:
-    """Return the new fields behind an offset, none of a name that is taken."""
+    taken = {field.name for field in msg.fields}
     types = [FLOAT32] * (len(ADDED) - 1) + [UINT32]
-    names = [f'surfel_{name}' if name in set(taken) else name for name in ADDED]
-    return [
-        Field(name, offset + 4 * place, type_, 1)
-        for place, (name, type_) in enumerate(zip(names, types, strict=True))
-    ]
+    names = [f'surfel_{name}' if name in taken else name for name in ADDED]
+    fields = [(name, type_, 1) for name, type_ in zip(names, types, strict=True)]
+    return replace(appended(msg, added.view(np.uint32), fields), is_dense=False)
 
 
 def cloud_of_scan(scan: Scan, added: npt.NDArray[np.float32]) -> CloudBytes:

@@ -51,24 +51,3 @@ def attach_surfels(xyz, quantisation, surfels, keys, table, floats, counts):
             else:
                 floats[i, :4] = math.nan
                 counts[i, 4] = 0
-
-
-@njit(cache=True, nogil=True)
-def mark_seen(seen, keys, table, marks, mark):
-    """
-    Mark the surfels whose voxels a scan saw, unless they are marked already; return how many.
-
-    seen    (S,) int64, voxel keys of the scan
-    keys    (K,) int64, of the surfels
-    table   (B,) int32, hash table of the keys, as build_table makes it
-    marks   (K,) int64, in and out: -1 where there is no mark yet
-    mark    int64
-    """
-    shift = hash_shift(len(table))
-    num = 0
-    for key in seen:
-        row = find_key(key, keys, table, shift)
-        if row >= 0 and marks[row] < 0:
-            marks[row] = mark
-            num += 1
-    return num

@@ -9,8 +9,8 @@ from collections.abc import Iterable
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.attach import mark_seen
 from surfel_mapper.kernels.queries import build_table
+from surfel_mapper.kernels.thinning import mark_seen, mix_keys
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.window import WindowedScan
 
@@ -37,10 +37,13 @@ def last_seen_ns(
     keys = pack_keys(voxel_index)
     table = np.empty(1 << max(2 * len(keys) - 1, 1).bit_length(), np.int32)
     build_table(keys, table)
+    mixed = np.zeros(len(keys), np.uint64)
+    mix_keys(keys, mixed)
+    limit = mixed.max(initial=0)
     stamps = np.full(len(keys), -1, np.int64)
     missing = len(keys)
     for scan in sorted(scans, key=lambda scan: scan.stamp_ns, reverse=True):
         if not missing:
             break
-        missing -= mark_seen(scan.moments.key, keys, table, stamps, scan.stamp_ns)
+        missing -= mark_seen(scan.moments.key, limit, keys, table, stamps, scan.stamp_ns)
     return stamps

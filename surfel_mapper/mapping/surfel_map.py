@@ -36,7 +36,6 @@ from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
-from surfel_mapper.mapping.thinning import thinned
 from surfel_mapper.mapping.threads import pool
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
@@ -346,10 +345,9 @@ class SurfelMap:
             If there are more, so many are returned, evenly spread and always the same ones.
 
         """
-        chosen = self._table.changed_after(-1, min_points)
-        if at_most is not None and len(chosen) > at_most:
-            chosen = chosen[thinned(self._table.rows[chosen, layout.KEY], at_most)]
-        return self._derive(chosen)
+        if at_most is None:
+            return self._derive(self._table.changed_after(-1, min_points))
+        return self._derive(self._table.thinned(min_points, at_most))
 
     def num_surfels(self, min_points: int = 1) -> int:
         """Return how many voxels hold at least so many points."""

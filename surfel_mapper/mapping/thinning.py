@@ -7,6 +7,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.thinning import mix_keys
+
 
 def thinned(key: npt.NDArray[np.int64], number: int) -> npt.NDArray[np.int64]:
     """
@@ -23,11 +25,13 @@ def thinned(key: npt.NDArray[np.int64], number: int) -> npt.NDArray[np.int64]:
         How many.
 
     """
-    if len(key) <= number:
-        return np.arange(len(key))
-    mixed = key.astype(np.uint64)
-    for _ in range(2):
-        mixed *= np.uint64(0x9E3779B97F4A7C15)  # 2^64 over the golden ratio, odd
-        mixed ^= mixed >> np.uint64(29)
-    mixed *= np.uint64(0x9E3779B97F4A7C15)
+    mixed = np.empty(len(key), np.uint64)
+    mix_keys(key, mixed)
+    return smallest(mixed, number)
+
+
+def smallest(mixed: npt.NDArray[np.uint64], number: int) -> npt.NDArray[np.int64]:
+    """Return the places of so many smallest hashes, in order; all of fewer."""
+    if len(mixed) <= number:
+        return np.arange(len(mixed))
     return np.sort(np.argpartition(mixed, number - 1)[:number])

@@ -20,6 +20,7 @@ from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.kernels.queries import keys_in_box
 from surfel_mapper.kernels.surfels import rows_changed_after
+from surfel_mapper.kernels.thinning import rows_held
 from surfel_mapper.kernels.voxels import (
     add_moments,
     find_rows,
@@ -28,6 +29,7 @@ from surfel_mapper.kernels.voxels import (
 )
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.slab import Slab
+from surfel_mapper.mapping.thinning import smallest
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
@@ -162,6 +164,13 @@ class VoxelTable:
         """Return the keys of the voxels with indices from low to high, (3,) each."""
         used = int(self._state[hashing.ROWS_USED])
         return np.asarray(keys_in_box(self.rows, used, low, high), np.int64)
+
+    def thinned(self, min_points: int, at_most: int) -> npt.NDArray[np.int32]:
+        """Return the rows with at least so many points, or of more than at_most some; sorted."""
+        used = int(self._state[hashing.ROWS_USED])
+        chosen, mixed = np.empty(used, np.int32), np.empty(used, np.uint64)
+        num = rows_held(self.rows, used, max(min_points, 1), chosen, mixed)
+        return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
     @property
     def _hash_table(self) -> tuple[npt.NDArray[Any], ...]:

@@ -29,7 +29,7 @@ from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import Config, PublishConfig
 from surfel_mapper.io.cdr import marker_array
-from surfel_mapper.io.map_cloud import moment_columns, voxel_columns
+from surfel_mapper.io.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.io.markers import disc_colors, surfel_markers
 from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
 from surfel_mapper.io.scan_normals import scan_with_normals
@@ -194,11 +194,12 @@ class Outputs:
         self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
     ) -> PointCloud2:
         """Return surfels as a cloud; with moments also what is gone, if they are asked for."""
-        columns = surfel_columns(surfels)
         if self._mapper.config.publish.moments:
             moments = self._mapper.map.moments(surfels.voxel_index)
-            columns = moment_columns(surfels, moments, removed)
-        return cloud_message(from_columns(columns), self._stamp_ns, self._mapper.map_frame)
+            content = moment_cloud(surfels, moments, removed)
+        else:
+            content = from_columns(surfel_columns(surfels))
+        return cloud_message(content, self._stamp_ns, self._mapper.map_frame)
 
     def _publish_scan_normals(self, update: Update) -> None:
         scan, surfel_map = update.scan, self._mapper.map
@@ -252,4 +253,4 @@ def warm_up(config: Config) -> None:
     windowed = WindowedScan(moments=moments, stamp_ns=0, T_map_sensor=np.eye(4))
     colors = disc_colors('age', surfels, [windowed])
     surfel_markers(surfels, config.map.voxel_size_m, colors, stamp_ns=0, frame_id='')
-    from_columns(moment_columns(surfels, moments, NO_VOXELS))
+    moment_cloud(surfels, surfel_map.moments(), NO_VOXELS)

@@ -12,8 +12,9 @@ import pytest
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.io.pointcloud2 import Field, to_scan
 from surfel_mapper.io.scan_normals import ADDED, scan_with_normals
-from surfel_mapper.kernels.attach import attach_surfels, mark_seen
+from surfel_mapper.kernels.attach import attach_surfels
 from surfel_mapper.kernels.queries import build_table
+from surfel_mapper.kernels.thinning import mark_seen
 from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.scan import Scan
@@ -186,5 +187,6 @@ def test_the_kernel_attaches_and_leaves_out(call):
 def test_the_first_mark_stays(call):
     keys = np.array([5, 9, 2])
     marks = np.array([-1, 40, -1])
-    assert call(mark_seen, np.array([9, 2, 77]), keys, table_of(keys), marks, 30) == 1
+    limit = np.uint64(2**64 - 1)
+    assert call(mark_seen, np.array([9, 2, 77]), limit, keys, table_of(keys), marks, 30) == 1
     assert marks.tolist() == [-1, 40, 30]

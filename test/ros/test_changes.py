@@ -16,7 +16,7 @@ import pytest
 from surfel_mapper import Mapper, Scan, SurfelMap
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.io.map_cloud import halves, moment_columns, voxel_columns, whole
+from surfel_mapper.io.map_cloud import halves, moment_cloud, voxel_columns, whole
 from surfel_mapper.io.mirror import MapMirror, MAX_RECENT
 from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.mapping.moments import pack_keys
@@ -49,8 +49,8 @@ class Node:
         self._rng = np.random.default_rng(1)
 
     def message(self, surfels, removed=NO_VOXELS):
-        columns = moment_columns(surfels, self.mapper.map.moments(surfels.voxel_index), removed)
-        content = from_columns(columns)
+        moments = self.mapper.map.moments(surfels.voxel_index)
+        content = moment_cloud(surfels, moments, removed)
         stamp = SimpleNamespace(sec=self.stamp_ns // SECOND, nanosec=self.stamp_ns % SECOND)
         header = SimpleNamespace(stamp=stamp, frame_id='odom')
         return SimpleNamespace(
@@ -218,7 +218,7 @@ def test_known_keys_are_a_set():
 
 def test_integers_keep_all_their_bits():
     values = np.array([0, 1, -1, 2**62, -(2**63), 2**63 - 1, 0x0123456789ABCDEF])
-    pairs = halves(values)
+    pairs = halves(values.reshape(-1, 1))
     assert pairs.dtype == np.uint32
     assert pairs[6].tolist() == [0x89ABCDEF, 0x01234567]  # the low half first
     np.testing.assert_array_equal(whole(pairs), values)

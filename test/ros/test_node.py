@@ -285,7 +285,7 @@ def test_markers_come_while_somebody_subscribes(start, peer):
     discs, lines = markers[-1].markers
     surfels = mapper.map.surfels(5)
     assert len(lines.points) == 2 * len(surfels)
-    assert len(discs.points) == 18 * len(surfels)
+    assert len(discs.points) == 12 * len(surfels)
     assert discs.header.frame_id == 'odom'
 
 

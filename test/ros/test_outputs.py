@@ -270,7 +270,8 @@ def odd_message(stamp_ns):
 
 
 def colors_of(marker):
-    return np.array([(c.r, c.g, c.b, c.a) for c in marker.colors], np.float32)[:: 3 * (SEGMENTS - 2)]
+    colors = np.array([(c.r, c.g, c.b, c.a) for c in marker.colors], np.float32)
+    return colors[:: 3 * (SEGMENTS - 2)]
 
 
 def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(start, peer):

@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What goes out of the node beside the map, and what comes in beside clouds, on one core.
+
+Each is timed as the mapping thread does it, from the map to the bytes of the message: markers of
+20,000 discs (choosing them, their surfels, vertices, CDR), changes of one scan with and without
+exact moments, the scan with normals, the grid; and the other way deskewing of a sweep, a depth
+image of 640 x 480, and what a mirror takes to follow one change. Publishing is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from time import perf_counter
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from surfel_mapper.config import Config, GridConfig
+from surfel_mapper.depth import depth_points, PinholeCamera
+from surfel_mapper.deskew import deskewed, point_times
+from surfel_mapper.io.cdr import marker_array
+from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.io.map_cloud import moment_cloud
+from surfel_mapper.io.markers import disc_colors, surfel_markers
+from surfel_mapper.io.mirror import MapMirror
+from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns, to_scan
+from surfel_mapper.io.scan_normals import scan_with_normals
+from surfel_mapper.mapping.traversability import traversability
+from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.report import Row, spread
+from test.bench.street import Street
+
+VOXEL_M = 0.2
+DISCS = 20_000
+MARKERS_BUDGET_MS = 15.0
+MIN_POINTS = 5
+REPEATS = 30
+NOTHING = np.empty((0, 3), np.int32)
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for everything that goes out or comes in."""
+    keep_freed_memory()  # as the node does
+    with one_core():
+        mapper, update = mapped(options)
+        tasks = {**markers(mapper), **clouds(mapper, update), **inputs(mapper, update)}
+        return [row(name, task) for name, task in tasks.items()]
+
+
+def row(name: str, task: Callable[[], Any]) -> Row:
+    """Return the times of a task, after one that does not count."""
+    task()
+    times = []
+    for _ in range(REPEATS):
+        start = perf_counter()
+        task()
+        times.append((perf_counter() - start) * 1e3)
+    budget = MARKERS_BUDGET_MS if name.startswith('markers') else None
+    return {'what': name, **spread(times), 'budget_ms': budget}
+
+
+def mapped(options: Options) -> tuple[Mapper, Update]:
+    """Return a mapper whose window is full, and what the last scan did."""
+    street = Street(options)
+    drive = street.simulation.drive
+    mount = drive.base_to_sensor
+    settings = {
+        'map': {'voxel_size_m': VOXEL_M, 'min_points': MIN_POINTS},
+        'window': {'max_scans': options.window},
+        'pose': {'source': 'odometry'},
+    }
+    mapper = Mapper(Config.from_mapping(settings))
+    mapper.add_pose(BASE, SENSOR, 0, mount[:3], mount[3:], static=True)
+    for number, message, _ in street.drive(options.window, 1):
+        stamp_ns = street.simulation.stamp_ns(number)
+        mapper.add_pose(ODOM, BASE, stamp_ns, *drive.pose(stamp_ns))
+        mapper.add_scan(to_scan(message))
+        (update,) = mapper.insert_ready()
+    end_ns = stamp_ns + 100_000_000
+    mapper.add_pose(ODOM, BASE, end_ns, *drive.pose(end_ns))  # of the last point of the sweep
+    return mapper, update
+
+
+def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
+    """Return what draws, by colour."""
+
+    def draw(kind: str) -> bytes:
+        surfels = mapper.map.surfels(MIN_POINTS, DISCS)
+        colors = disc_colors(kind, surfels, mapper.window)
+        return marker_array(
+            surfel_markers(surfels, VOXEL_M, colors, stamp_ns=0, frame_id='odom')
+        )
+
+    kinds = ('planarity', 'normal', 'age')
+    return {f'markers by {kind}': lambda kind=kind: draw(kind) for kind in kinds}  # type: ignore[misc]
+
+
+def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
+    """Return what makes the clouds of one scan, and the grid."""
+    surfel_map, changed = mapper.map, update.changed
+    center, limits = update.T_fixed_sensor[:2, 3], GridConfig()
+
+    def with_moments() -> Any:
+        moments = surfel_map.moments(changed.voxel_index)
+        return moment_cloud(changed, moments, NOTHING)
+
+    return {
+        f'~/changed, {len(changed)} surfels': lambda: from_columns(surfel_columns(changed)),
+        '~/changed with moments': with_moments,
+        '~/scan_normals': lambda: scan_with_normals(
+            update.scan, update.T_fixed_sensor, surfel_map, MIN_POINTS
+        ),
+        '~/grid': lambda: traversability(
+            surfel_map.surfels(MIN_POINTS), VOXEL_M, center, limits
+        ),
+    }
+
+
+def inputs(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
+    """Return what deskews, turns depth into points, and mirrors."""
+    scan, camera = update.scan, PinholeCamera(640, 480, 600.0, 600.0, 320.0, 240.0)
+    times = np.linspace(0.0, 0.09, len(scan), dtype=np.float32)
+    sweep = replace(scan, columns={'time': times})
+    depth = np.random.default_rng(1).integers(500, 5000, (480, 640)).astype(np.uint16)
+    change, mirror = message(mapper, update), MapMirror(VOXEL_M)
+    mirror.change(change)
+
+    def deskew() -> Any:
+        timed = replace(sweep, times=point_times(sweep))
+        return deskewed(timed, lambda ns: mapper.transforms.lookup(ODOM, SENSOR, ns))
+
+    return {
+        f'deskew, {len(scan)} points': deskew,
+        'depth image of 640 x 480': lambda: depth_points(depth, camera),
+        f'mirror of {len(update.changed)} voxels': lambda: mirror.change(change),
+    }
+
+
+def message(mapper: Mapper, update: Update) -> Any:
+    """Return a change with moments, as a client receives it."""
+    moments = mapper.map.moments(update.changed.voxel_index)
+    content = moment_cloud(update.changed, moments, NOTHING)
+    stamp = SimpleNamespace(sec=1, nanosec=0)
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=stamp, frame_id='odom'),
+        **{name: getattr(content, name) for name in content.__slots__},
+    )
