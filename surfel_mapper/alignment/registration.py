@@ -55,10 +55,12 @@ class Alignment:
     ----------
     T_map_sensor : (4, 4) float64
         Pose of the sensor.
-    fit : float
-        Share of the cells of the scan that fit the map, in [0, 1].
     num_cells : int
-        How many there are.
+        How many cells the scan has.
+    overlap : float
+        Share of them that meet a surfel which says something, in [0, 1].
+    fit : float
+        Share of these that fit it, in [0, 1].
     converged : bool
         Whether the last step was small.
     iterations : int
@@ -74,13 +76,19 @@ class Alignment:
     """
 
     T_map_sensor: Transform
-    fit: float
     num_cells: int
+    overlap: float
+    fit: float
     converged: bool
     iterations: int
     information: npt.NDArray[np.float64]
     degenerate: npt.NDArray[np.float64]
     radius_m: float
+
+    @property
+    def support(self) -> float:
+        """Share of all cells that fit: what is best where the scan belongs."""
+        return self.overlap * self.fit
 
 
 class Registration:
@@ -119,7 +127,7 @@ class Registration:
         surfel_map: SurfelMap,
         starts: Sequence[Transform],
         deviation_m: float,
-        expected_fit: float = 0.0,
+        expected_support: float = 0.0,
     ) -> Alignment:
         """
         Return where a scan belongs on a map.
@@ -136,20 +144,28 @@ class Registration:
         deviation_m : float
             How far cells may be off at the first start; decides where to begin and how much is
             believed.
-        expected_fit : float
-            Other starts and headings are tried where the scan fits less.
+        expected_support : float
+            Other starts and headings are tried where less of the scan fits.
 
         """
         levels = _Levels(self.config, surfel_map, cells, starts)
         found = self._descend(cells, levels, starts[0], deviation_m)
-        if not found.converged or found.fit < max(expected_fit, self.config.min_fit_ratio):
+        if not (found.converged and found.support >= expected_support and self.fits(found)):
             width_m = levels.voxel_size_m(self.config.coarse_levels)
             others = [
                 self._descend(cells, levels, start, width_m)
                 for start in self._headings(cells, levels, starts)
             ]
-            found = max([found, *others], key=lambda other: (other.converged, other.fit))
+            found = max([found, *others], key=lambda other: (other.converged, other.support))
         return found
+
+    def fits(self, alignment: Alignment) -> bool:
+        """Return whether an alignment may be right, by what it says itself."""
+        config = self.config
+        return (
+            alignment.fit >= config.min_fit_ratio
+            and alignment.overlap >= config.min_overlap_ratio
+        )
 
     def _descend(
         self,
@@ -182,7 +198,7 @@ class Registration:
         pose, iteration, moved_m = start, 0, math.inf
         least = self.config.min_information_ratio
         while True:
-            hessian, gradient, fit = planes.equations(cells, pose, width_m)
+            hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m)
             if moved_m < tolerance_m or iteration == self.config.max_iterations:
                 break
             step, degenerate, radius_m = solve(hessian, gradient, least)
@@ -191,8 +207,9 @@ class Registration:
             iteration += 1
         return Alignment(
             T_map_sensor=pose,
-            fit=fit,
             num_cells=len(cells),
+            overlap=overlap,
+            fit=fit,
             converged=moved_m < tolerance_m,
             iterations=iteration,
             information=hessian,
@@ -215,8 +232,9 @@ class Registration:
             for start in starts
             for k in range(-num, num + 1)
         ]
-        fits = [planes.equations(some, pose, width_m)[2] for pose in turned]
-        best = np.argsort(fits, kind='stable')[::-1][:SEARCH_STARTS]
+        found = [planes.equations(some, pose, width_m) for pose in turned]
+        support = [overlap * fit for _, _, overlap, fit in found]
+        best = np.argsort(support, kind='stable')[::-1][:SEARCH_STARTS]
         return [turned[place] for place in best]
 
 

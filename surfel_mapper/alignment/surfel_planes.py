@@ -39,6 +39,12 @@ from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 
+NOISE_IN_PLANE = 3.0
+"""So many variances of a range may lie across a ring of a lidar, along the beam."""
+
+MAX_TILT_SQ = 0.1
+"""The variance of a normal, rad^2, from which on it is none."""
+
 SIGMAS = 3.0
 """So many standard deviations from a face a surface may be cut by it."""
 
@@ -71,7 +77,7 @@ class SurfelPlanes:
 
     def equations(
         self, cells: npt.NDArray[np.float64], T_map_sensor: Transform, width_m: float
-    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float]:
+    ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float, float]:
         """
         Return the normal equations of a step from a pose.
 
@@ -89,17 +95,19 @@ class SurfelPlanes:
         hessian : (6, 6) float64
             Of position and turn about the sensor, along the axes of the map.
         gradient : (6,) float64
+        overlap : float
+            Share of the cells that meet a surfel which says something, in [0, 1].
         fit : float
-            Share of the cells that fit, in [0, 1].
+            Share of these that fit it, in [0, 1].
 
         """
         pose = np.ascontiguousarray(T_map_sensor[:3])
         place = self._place(cells, pose)
         hessian, gradient = np.empty((6, 6)), np.empty(6)
-        fit = sum_equations(
+        met, fit = sum_equations(
             cells, pose, place, self._planes, width_m * width_m, hessian, gradient
         )
-        return hessian, gradient, fit / max(len(cells), 1)
+        return hessian, gradient, met / max(len(cells), 1), fit / max(met, 1)
 
     def _place(
         self, cells: npt.NDArray[np.float64], pose: npt.NDArray[np.float64]
@@ -127,10 +135,15 @@ class SurfelPlanes:
         planes[:, NORMAL : NORMAL + 3] = surfels.normal
         count = surfels.num_points
         low, middle = surfels.eigenvalues[:, 0] + self._noise_sq, surfels.eigenvalues[:, 1]
-        gap = np.maximum(middle - surfels.eigenvalues[:, 0], 1e-9 * low)
+        by_noise = min(NOISE_IN_PLANE * self._noise_sq, self._map.voxel_size_m**2 / 48.0)
+        gap = np.maximum(middle - surfels.eigenvalues[:, 0] - by_noise, 1e-9 * low)
         planes[:, VARIANCE] = low * (1.0 + 1.0 / count)
         planes[:, SPREAD] = low * middle / (count * gap * gap)
-        says_nothing = (count < self._min_points) | np.isnan(surfels.planarity)
+        says_nothing = (
+            (count < self._min_points)
+            | np.isnan(surfels.planarity)
+            | (planes[:, SPREAD] > MAX_TILT_SQ)
+        )
         planes[says_nothing, VARIANCE] = math.inf
         return planes
 

@@ -5,7 +5,7 @@ Tracking: the pose of scan after scan, each predicted from those before.
 
 What carries the sensor is taken to go on as it moved between the last two scans. By how much
 that was wrong lately decides how far the next alignment looks and how much of what is off it
-believes; how well scans fitted lately decides whether the next one is in the right place.
+believes; how much of a scan fitted lately decides whether the next one is in the right place.
 
 Source: Vizzo et al. 2023 (KISS-ICP) for the threshold out of deviations.
 """
@@ -31,10 +31,10 @@ from surfel_mapper.geometry import (
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 REMEMBERED = 10
-"""Deviations and fits of so many scans are remembered."""
+"""Deviations and supports of so many scans are remembered."""
 
-EXPECTED_FIT = 0.85
-"""A scan that fits less than this share of what is usual may be in the wrong place."""
+EXPECTED_SUPPORT = 0.85
+"""A scan of which less than this share of what is usual fits may be in the wrong place."""
 
 FLOOR_NOISES = 3.0
 """No deviation is taken to be less than so many standard deviations of a range."""
@@ -78,7 +78,7 @@ class Tracker:
 
     def _forget(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
-        self._fits: deque[float] = deque(maxlen=REMEMBERED)
+        self._supports: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def is_new(self) -> bool:
@@ -131,19 +131,20 @@ class Tracker:
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
         if self._stamp_ns is not None:
             starts.append(compose(T_map_fixed, self.pose))
-        usual = sorted(self._fits)[len(self._fits) // 2] if self._fits else 0.0
-        found = self._registration.align(
-            cells, surfel_map, starts, self.deviation_m, EXPECTED_FIT * usual
-        )
-        least = self._registration.config.min_fit_ratio
-        if found.fit < (least if found.converged else max(least, EXPECTED_FIT * usual)):
+        usual = sorted(self._supports)[len(self._supports) // 2] if self._supports else 0.0
+        expected = EXPECTED_SUPPORT * usual
+        found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
+        is_steady = found.converged or found.support >= expected > 0.0
+        if not (is_steady and self._registration.fits(found)):
             self._forget()
             self.twist = 0.5 * self.twist  # it is not what it was; in the end, at rest
+            config = self._registration.config
             raise AlignmentError(
-                f'{found.fit:.0%} of its {found.num_cells} cells fit the map, expected '
-                f'{max(least, EXPECTED_FIT * usual):.0%} (registration.min_fit_ratio)'
+                f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
+                f'{found.fit:.0%} of these fit it, expected {config.min_overlap_ratio:.0%} and '
+                f'{config.min_fit_ratio:.0%} (registration.min_overlap_ratio, min_fit_ratio)'
             )
-        self._fits.append(found.fit)
+        self._supports.append(found.support)
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
         return found

@@ -64,9 +64,16 @@ class RegistrationConfig(Stage):
     max_iterations: int = setting(
         30, 'Steps at most, of each level.', low=1, high=10_000, live=True
     )
+    min_overlap_ratio: float = setting(
+        0.05,
+        'A scan is dropped unless this share of its cells meet surfels that say something.',
+        low=0.0,
+        high=1.0,
+        live=True,
+    )
     min_fit_ratio: float = setting(
-        0.25,
-        'A scan of which less than this share fits the map is dropped.',
+        0.6,
+        'A scan is dropped unless this share of these fit.',
         low=0.0,
         high=1.0,
         live=True,

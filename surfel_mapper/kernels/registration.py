@@ -87,13 +87,14 @@ def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
     hessian   (6, 6) float64, out: of position (m) and turn (rad) about the sensor, map axes
     gradient  (6,) float64, out
 
-    Returns how many cells fit: one on its plane counts 1, one three deviations off a half.
+    Returns how many cells met a surfel that says something, and how many of these fit: one on its
+    plane counts 1, one three deviations off a half.
     """
     a00 = a01 = a02 = a11 = a12 = a22 = 0.0
     b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0
     c00 = c01 = c02 = c11 = c12 = c22 = 0.0
     g0 = g1 = g2 = g3 = g4 = g5 = 0.0
-    fit = 0.0
+    met, fit = 0, 0.0
     for i in range(len(cells)):
         row = place[i]
         if row < 0:
@@ -112,6 +113,7 @@ def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
         variance = planes[row, VARIANCE] + along_sq * planes[row, SPREAD]
         if not variance < math.inf:
             continue
+        met += 1
         fit += 1.0 / (1.0 + distance_sq / (SIGMAS_SQ * variance))
         kernel = width_sq / (width_sq + distance_sq)
         weight = kernel * kernel / variance
@@ -158,4 +160,4 @@ def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
         gradient[i] = sums[i]
         for j in range(6):
             hessian[i, j] = upper[i][j]
-    return fit
+    return met, fit

@@ -96,6 +96,8 @@ def test_a_scan_is_found_where_it_was_taken():
     assert angle_deg < 0.02
     assert found.converged
     assert found.fit > 0.9
+    assert found.overlap > 0.9
+    assert found.support == found.overlap * found.fit
     assert len(found.degenerate) == 0
 
 
@@ -113,7 +115,7 @@ def test_a_heading_that_is_far_off_is_searched_for():
     aligner = registration()
     cells, surfel_map = aligner.cells(scan_of(ROOM)), map_of(ROOM)
 
-    found = aligner.align(cells, surfel_map, [start], 0.3, expected_fit=0.8)
+    found = aligner.align(cells, surfel_map, [start], 0.3, expected_support=0.6)
 
     assert off(found.T_map_sensor)[0] < 1e-3
     assert off(found.T_map_sensor)[1] < 0.02
@@ -124,7 +126,7 @@ def test_a_further_start_is_tried_where_the_first_does_not_fit():
     aligner = registration(search_deg=0.0)
     cells, surfel_map = aligner.cells(scan_of(ROOM)), map_of(ROOM)
 
-    found = aligner.align(cells, surfel_map, [wrong, right], 0.3, expected_fit=0.8)
+    found = aligner.align(cells, surfel_map, [wrong, right], 0.3, expected_support=0.6)
 
     assert off(found.T_map_sensor)[0] < 1e-3
 
@@ -170,7 +172,7 @@ def test_against_an_empty_map_nothing_is_known():
 
     found = aligner.align(aligner.cells(scan_of(ROOM)), SurfelMap(VOXEL_M), [start], 0.3)
 
-    assert found.fit == 0.0
+    assert found.overlap == 0.0
     assert len(found.degenerate) == 6
     np.testing.assert_allclose(found.T_map_sensor, start, atol=1e-12)
 
@@ -178,7 +180,7 @@ def test_against_an_empty_map_nothing_is_known():
 def test_a_scan_without_points_fits_nothing():
     found = align(ROOM, TRUE, 0.3, points=np.full((5, 3), np.nan))
 
-    assert (found.num_cells, found.fit) == (0, 0.0)
+    assert (found.num_cells, found.support) == (0, 0.0)
 
 
 def test_equal_scans_are_found_at_equal_bits_and_leave_the_map_as_it_is():
@@ -224,25 +226,32 @@ def test_the_size_of_cells_can_change_while_running():
 
 
 def fits_of(points, place):
-    """Return how well one cell fits a map of some points, and the information about it."""
+    """Return whether one cell meets a map of some points, and the information about it."""
     surfel_map = SurfelMap(1.0)
     surfel_map.add(points)
     planes = SurfelPlanes(surfel_map, min_points=5, noise_m=0.01)
-    hessian, _, fit = planes.equations(np.array([place]), np.eye(4), 1.0)
-    return fit, np.trace(hessian[:3, :3])
+    hessian, _, overlap, _ = planes.equations(np.array([place]), np.eye(4), 1.0)
+    return overlap, np.trace(hessian[:3, :3])
 
 
-def test_a_surfel_of_one_ring_says_less_than_one_of_an_area():
+def test_a_surfel_of_one_ring_says_nothing_as_its_normal_comes_of_noise():
+    # along the ring 0.9 m, along the beam the noise of a range, across both nothing
     rng = np.random.default_rng(4)
-    spread = rng.uniform(0.05, 0.95, 200)
-    ring = np.column_stack([spread, np.full(200, 0.5), np.full(200, 0.5)])
-    area = np.column_stack([spread, rng.uniform(0.05, 0.95, 200), np.full(200, 0.5)])
-    noise = rng.normal(scale=0.01, size=(200, 3))
+    spread, noise = rng.uniform(0.05, 0.95, 200), rng.normal(scale=0.01, size=200)
+    ring = np.column_stack([spread, 0.5 + noise, np.full(200, 0.5)])
 
-    said_by_ring = fits_of(ring + noise, [0.5, 0.9, 0.5])[1]
-    said_by_area = fits_of(area + noise, [0.5, 0.9, 0.5])[1]
+    assert fits_of(ring, [0.5, 0.5, 0.5]) == (0.0, 0.0)
 
-    assert said_by_ring < 0.2 * said_by_area
+
+def test_a_surfel_says_less_away_from_its_mean():
+    rng = np.random.default_rng(4)
+    area = np.column_stack([rng.uniform(0.05, 0.95, (20, 2)), np.full(20, 0.5)])
+    area += rng.normal(scale=0.01, size=(20, 3))
+
+    near, far = (fits_of(area, [x, x, 0.5]) for x in (0.5, 0.99))
+
+    assert near[0] == far[0] == 1.0
+    assert far[1] < 0.8 * near[1]
 
 
 @pytest.mark.parametrize('points', [np.full((4, 3), 0.3), np.full((9, 3), 0.3)])

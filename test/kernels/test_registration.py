@@ -61,7 +61,7 @@ def test_rows_are_numbered_in_the_order_they_are_met(call):
 
 def equations(cells, place, planes, width_sq):
     """Return what sum_equations gives, cell by cell in numpy."""
-    hessian, gradient, fit = np.zeros((6, 6)), np.zeros(6), 0.0
+    hessian, gradient, met, fit = np.zeros((6, 6)), np.zeros(6), 0, 0.0
     for cell, row in zip(cells, place, strict=True):
         if row < 0 or not planes[row, 6] < math.inf:
             continue
@@ -75,8 +75,9 @@ def equations(cells, place, planes, width_sq):
         jacobian = np.concatenate([normal, np.cross(lever, normal)])
         hessian += weight * np.outer(jacobian, jacobian)
         gradient += weight * distance * jacobian
+        met += 1
         fit += 1.0 / (1.0 + distance**2 / (SIGMAS_SQ * variance))
-    return hessian, gradient, fit
+    return hessian, gradient, met, fit
 
 
 @both
@@ -92,12 +93,13 @@ def test_equations_are_those_of_the_twin(call):
     planes[4, 6] = math.inf
     hessian, gradient = np.empty((6, 6)), np.empty(6)
 
-    fit = call(sum_equations, cells, POSE, place, planes, 4.0, hessian, gradient)
+    met, fit = call(sum_equations, cells, POSE, place, planes, 4.0, hessian, gradient)
 
     expected = equations(cells, place, planes, 4.0)
     np.testing.assert_allclose(hessian, expected[0], rtol=1e-10, atol=1e-9)
     np.testing.assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-9)
-    assert math.isclose(fit, expected[2], rel_tol=1e-12)
+    assert met == expected[2]
+    assert math.isclose(fit, expected[3], rel_tol=1e-12)
 
 
 @both

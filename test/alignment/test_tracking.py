@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking through a room, and what is learnt from scan to scan."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.alignment.registration import Registration
+from surfel_mapper.alignment.tracking import Tracker
+from surfel_mapper.config import RegistrationConfig
+from surfel_mapper.errors import AlignmentError
+from surfel_mapper.geometry import compose, inverse, se3_exp
+from test.alignment.test_registration import map_of, NOISE_M, points_on, ROOM, TRUE, VOXEL_M
+
+SECOND = 10**9
+TWIST = np.array([0.8, 0.1, 0.0, 0.0, 0.02, 0.3])
+
+
+def tracker_at(start, **settings):
+    config = RegistrationConfig(noise_m=NOISE_M, **settings)
+    return Tracker(Registration(config, VOXEL_M), start)
+
+
+def cells_at(tracker, pose, seed=7):
+    points = points_on(ROOM, 60, seed=seed)
+    T_sensor_map = inverse(pose)
+    return tracker._registration.cells(points @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3])
+
+
+def pose_at(seconds):
+    return compose(TRUE, se3_exp(TWIST * seconds))
+
+
+def test_before_anything_is_known_the_sensor_stays():
+    tracker = tracker_at(TRUE)
+
+    assert tracker.is_new
+    np.testing.assert_array_equal(tracker.predict(5 * SECOND), TRUE)
+    assert tracker.deviation_m == RegistrationConfig().max_deviation_m
+
+
+def test_the_motion_is_taken_to_go_on():
+    tracker = tracker_at(TRUE)
+    tracker.advance(TRUE, 0)
+    tracker.advance(pose_at(0.5), SECOND // 2)
+
+    np.testing.assert_allclose(tracker.twist, TWIST, atol=1e-12)
+    np.testing.assert_allclose(tracker.predict(2 * SECOND), pose_at(2.0), atol=1e-12)
+    np.testing.assert_allclose(tracker.predict(SECOND // 2), pose_at(0.5), atol=1e-12)
+
+
+def test_deviations_from_the_prediction_say_how_far_to_look():
+    tracker = tracker_at(np.eye(4))
+    tracker.advance(np.eye(4), 0)
+    turned = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))
+
+    tracker.advance(turned, SECOND, reach_m=20.0)
+
+    assert tracker.deviation_m == pytest.approx(2.0 * 20.0 * math.sin(0.05))
+
+
+def test_however_good_predictions_are_noise_is_expected():
+    tracker = tracker_at(TRUE)
+    for k in range(3):
+        tracker.advance(TRUE, k * SECOND)
+
+    assert tracker.deviation_m == pytest.approx(3.0 * NOISE_M)
+
+
+def test_a_sensor_is_followed_through_a_room():
+    tracker = tracker_at(TRUE)
+    for k in range(1, 8):
+        truth = pose_at(0.2 * k)
+        found = tracker.track(cells_at(tracker, truth), k * SECOND // 5, map_of(ROOM), np.eye(4))
+
+        assert found.fit > 0.8
+        np.testing.assert_allclose(tracker.pose, truth, atol=2e-3)
+    assert tracker.deviation_m < 0.2
+
+
+def test_poses_may_be_of_another_frame_than_the_map():
+    T_map_fixed = se3_exp(np.array([30.0, -4.0, 2.0, 0.0, 0.0, 1.0]))
+    tracker = tracker_at(compose(inverse(T_map_fixed), TRUE))
+
+    found = tracker.track(cells_at(tracker, pose_at(0.1)), SECOND, map_of(ROOM), T_map_fixed)
+
+    np.testing.assert_allclose(found.T_map_sensor, pose_at(0.1), atol=2e-3)
+    expected = compose(inverse(T_map_fixed), found.T_map_sensor)
+    np.testing.assert_array_equal(tracker.pose, expected)
+
+
+def test_a_scan_of_another_place_is_refused_and_the_pose_kept():
+    tracker = tracker_at(TRUE)
+    tracker.advance(TRUE, 0)
+    tracker.advance(pose_at(0.2), SECOND // 5)
+    rng = np.random.default_rng(8)
+    elsewhere = rng.uniform(-15.0, 15.0, (3000, 3))
+
+    expected = r'% of its 3000 cells meet a surfel and \d+% of these fit it, expected 5%'
+    with pytest.raises(AlignmentError, match=expected):
+        tracker.track(elsewhere, SECOND, map_of(ROOM), np.eye(4))
+
+    np.testing.assert_array_equal(tracker.pose, pose_at(0.2))
+    np.testing.assert_allclose(tracker.twist, 0.5 * TWIST, atol=1e-12)  # no longer believed
+    assert tracker.deviation_m == RegistrationConfig().max_deviation_m
+
+
+def test_after_a_scan_that_was_refused_the_next_one_is_found():
+    tracker = tracker_at(TRUE)
+    tracker.advance(TRUE, 0)
+    rng = np.random.default_rng(8)
+    with pytest.raises(AlignmentError):
+        tracker.track(rng.uniform(-15.0, 15.0, (3000, 3)), SECOND, map_of(ROOM), np.eye(4))
+
+    tracker.track(cells_at(tracker, pose_at(0.3)), 2 * SECOND, map_of(ROOM), np.eye(4))
+
+    np.testing.assert_allclose(tracker.pose, pose_at(0.3), atol=2e-3)
+
+
+def test_after_a_restart_nothing_is_known_of_the_motion():
+    tracker = tracker_at(TRUE)
+    tracker.advance(TRUE, 0)
+    tracker.advance(pose_at(0.2), SECOND // 5)
+
+    tracker.restart(pose_at(3.0))
+
+    assert tracker.is_new
+    np.testing.assert_array_equal(tracker.predict(9 * SECOND), pose_at(3.0))
+
+
+def test_a_motion_that_is_known_already_holds_from_the_first_scan_on():
+    tracker = tracker_at(TRUE)
+
+    tracker.begin(SECOND, TWIST)
+
+    np.testing.assert_allclose(tracker.predict(2 * SECOND), pose_at(1.0), atol=1e-12)

@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that the mapper finds itself: in a room, on a street, and on a map that is frozen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from surfel_mapper.simulation import Lidar, Simulation, World
+from test.alignment.test_registration import CORRIDOR, map_of, NOISE_M, points_on, ROOM, TRUE
+
+STEP_NS = 10**8
+TWIST = np.array([0.8, 0.1, 0.0, 0.0, 0.02, 0.3])
+MOUNT = (0.3, -0.1, 0.5, 0.0, 0.0, 0.6, 0.8)
+
+
+def mapper_with(**changes):
+    settings = {'pose.source': 'registration', 'registration.noise_m': NOISE_M}
+    changes = {name.replace('__', '.'): value for name, value in changes.items()}
+    return Mapper(Config.from_mapping({**settings, **changes}))
+
+
+def frozen(**changes):
+    """Return a mapper on the frozen map of the room."""
+    mapper = mapper_with(map__mode='frozen', map__load='room.npz', **changes)
+    mapper.restore(map_of(ROOM), [])
+    return mapper
+
+
+def pose_at(number):
+    return compose(TRUE, se3_exp(TWIST * 0.1 * number))
+
+
+def scan_at(number, pose=None, faces=ROOM, frame_id='lidar', reach_m=np.inf):
+    """Return a scan of the room from a pose, by default that of a steady drive."""
+    points = points_on(faces, 100, seed=number, reach_m=reach_m)
+    T_sensor_map = inverse(pose_at(number) if pose is None else pose)
+    return Scan(
+        points=points @ T_sensor_map[:3, :3].T + T_sensor_map[:3, 3],
+        stamp_ns=number * STEP_NS,
+        frame_id=frame_id,
+    )
+
+
+def feed(mapper, scans):
+    updates = []
+    for scan in scans:
+        mapper.add_scan(scan)
+        updates += mapper.insert_ready()
+    return updates
+
+
+def start_of(pose):
+    return (*pose[:3, 3].tolist(), *q_xyzw(pose).tolist())
+
+
+def test_a_sensor_without_any_odometry_is_followed_from_where_it_starts():
+    mapper = mapper_with()
+
+    updates = feed(mapper, [scan_at(number) for number in range(8)])
+
+    for number, update in enumerate(updates):
+        expected = compose(inverse(TRUE), pose_at(number))
+        np.testing.assert_allclose(update.T_fixed_sensor, expected, atol=5e-3)
+    assert updates[0].alignment is None
+    assert all(update.alignment.fit > 0.5 for update in updates[1:])
+    assert mapper.counters.mapped == 8
+    assert mapper.summary()['registration']['aligned'] == 7
+    assert mapper.summary()['registration']['body'] == 'lidar'
+
+
+def test_the_map_is_that_of_the_scans_at_the_poses_found():
+    mapper = mapper_with()
+    scans = [scan_at(number) for number in range(4)]
+
+    updates = feed(mapper, scans)
+
+    expected = Mapper(Config.from_mapping({'pose.source': 'identity'})).map
+    for scan, update in zip(scans, updates, strict=True):
+        pose = update.T_fixed_sensor
+        expected.insert(expected.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1))
+    assert mapper.map.digest() == expected.digest()
+
+
+def test_the_base_is_followed_where_the_sensor_is_mounted_on_it():
+    mount = pose_matrix(MOUNT[:3], MOUNT[3:])
+    start = compose(TRUE, inverse(mount))
+    mapper = mapper_with(frames__base_to_sensor=MOUNT, registration__start=start_of(start))
+
+    updates = feed(mapper, [scan_at(number) for number in range(4)])
+
+    for number, update in enumerate(updates):
+        np.testing.assert_allclose(update.T_fixed_sensor, pose_at(number), atol=5e-3)
+    assert mapper.registered.body == 'base_link'
+
+
+def test_two_sensors_serve_one_track():
+    mount = pose_matrix(MOUNT[:3], MOUNT[3:])
+    mapper = mapper_with(registration__start=start_of(TRUE))
+    mapper.add_pose('base_link', 'front', 0, (0, 0, 0), (0, 0, 0, 1), static=True)
+    mapper.add_pose('base_link', 'back', 0, MOUNT[:3], MOUNT[3:], static=True)
+    scans = []
+    for number in range(6):
+        pose = pose_at(number) if number % 2 == 0 else compose(pose_at(number), mount)
+        scans.append(scan_at(number, pose, frame_id=('front', 'back')[number % 2]))
+
+    updates = feed(mapper, scans)
+
+    np.testing.assert_allclose(updates[4].T_fixed_sensor, pose_at(4), atol=5e-3)
+    np.testing.assert_allclose(
+        updates[5].T_fixed_sensor, compose(pose_at(5), mount), atol=5e-3
+    )
+
+
+def test_a_second_sensor_that_sits_nobody_knows_where_is_dropped():
+    mapper = mapper_with()
+
+    feed(mapper, [scan_at(0), scan_at(1, frame_id='other'), scan_at(20)])
+    mapper.finish()
+
+    assert mapper.counters.mapped == 2
+    assert mapper.counters.dropped == {'no_pose': 1}
+
+
+def test_a_scan_that_does_not_fit_is_dropped_and_the_next_one_mapped():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(4)])
+    digest = mapper.map.digest()
+    rng = np.random.default_rng(0)
+    noise = replace(scan_at(4), points=rng.uniform(-9.0, 9.0, (3000, 3)))
+
+    assert feed(mapper, [noise]) == []
+    assert mapper.counters.dropped == {'not_aligned': 1}
+    assert mapper.map.digest() == digest
+
+    (update,) = feed(mapper, [scan_at(5)])
+    np.testing.assert_allclose(
+        update.T_fixed_sensor, compose(inverse(TRUE), pose_at(5)), atol=5e-3
+    )
+
+
+def test_what_cannot_be_known_is_said(caplog):
+    mapper = mapper_with()
+
+    updates = feed(
+        mapper, [scan_at(n, TRUE, faces=CORRIDOR, reach_m=20.0) for n in range(3)]
+    )
+
+    assert len(updates[2].alignment.degenerate) == 1
+    assert mapper.summary()['registration']['degenerate'] == 2
+    assert 'leaves 1 of 6 directions of motion open' in caplog.text
+
+
+def test_the_motion_gate_looks_at_the_pose_found():
+    mapper = mapper_with(window__gate_distance_m=0.2)
+
+    updates = feed(mapper, [scan_at(number) for number in range(10)])
+
+    assert mapper.counters.gated == 10 - len(updates) == 6  # 0.08 m a scan
+    np.testing.assert_allclose(
+        updates[-1].T_fixed_sensor, compose(inverse(TRUE), pose_at(9)), atol=5e-3
+    )
+
+
+def test_time_that_goes_back_starts_anew():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(20, 24)])
+
+    (update,) = feed(mapper, [scan_at(3)])
+
+    assert mapper.counters.resets == 1
+    np.testing.assert_array_equal(update.T_fixed_sensor, np.eye(4))
+
+
+def rolling(num_scans):
+    world = World.street(seed=2, length_m=40.0)
+    lidar = Lidar(beams=32, columns=512, range_noise_m=0.01)
+    return Simulation(world, lidar, rolling=True, num_scans=num_scans)
+
+
+def test_a_sweep_is_deskewed_by_the_motion_that_was_found():
+    simulation = rolling(12)
+    mapper, skewed = (
+        mapper_with(deskew__enabled=enabled, registration__noise_m=0.01)
+        for enabled in (True, False)
+    )
+
+    updates = feed(mapper, simulation.scans())
+    feed(skewed, simulation.scans())
+
+    drive = simulation.drive
+    start = inverse(drive.T_odom_sensor(simulation.stamp_ns(0)))
+    assert len(updates) == 12
+    for update in updates:
+        truth = compose(start, drive.T_odom_sensor(update.stamp_ns))
+        np.testing.assert_allclose(update.T_fixed_sensor[:3, 3], truth[:3, 3], atol=0.04)
+    fits = [m.summary()['registration']['fit']['median'] for m in (mapper, skewed)]
+    assert fits[0] > fits[1]
+
+
+def test_the_first_sweep_waits_for_the_next_to_be_deskewed():
+    first, second = list(rolling(2).scans())
+    mapper = mapper_with(deskew__enabled=True)
+
+    assert feed(mapper, [first]) == []
+    assert len(feed(mapper, [second])) == 2
+
+
+def test_a_frozen_map_stays_as_it_is():
+    mapper = frozen(registration__start=start_of(TRUE))
+    digest = mapper.map.digest()
+
+    updates = feed(mapper, [scan_at(number) for number in range(5)])
+    mapper.clear()
+
+    for number, update in enumerate(updates):
+        np.testing.assert_allclose(update.T_fixed_sensor, pose_at(number), atol=3e-3)
+        assert (update.num_points, len(update.changed), update.evictions) == (0, 0, ())
+    assert mapper.map.digest() == digest
+    assert (mapper.counters.localised, mapper.counters.mapped) == (5, 0)
+    assert mapper.summary()['scans']['localised'] == 5
+
+
+def test_on_a_frozen_map_somebody_may_say_where_the_robot_is():
+    far_off = (40.0, -30.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    mapper = frozen(registration__start=far_off)
+    assert feed(mapper, [scan_at(0)]) == []
+    near = compose(TRUE, se3_exp(np.array([0.5, -0.4, 0.0, 0.0, 0.0, 0.15])))
+
+    mapper.start_from('odom', near[:3, 3], q_xyzw(near))
+
+    (update,) = feed(mapper, [scan_at(1)])
+    np.testing.assert_allclose(update.T_fixed_sensor, pose_at(1), atol=3e-3)
+
+
+@pytest.mark.parametrize(
+    ('frame_id', 'q', 'reason'),
+    [
+        ('map', (0, 0, 0, 1), "it is in frame 'map', expected 'odom'"),
+        ('odom', (0, 0, 0, 0), 'norm 0'),
+    ],
+)
+def test_an_initial_pose_that_cannot_be_used_changes_nothing(frame_id, q, reason, caplog):
+    mapper = frozen(registration__start=start_of(TRUE))
+
+    mapper.start_from(frame_id, (9.0, 9.0, 9.0), q)
+
+    assert mapper.counters.messages_ignored == {'initial_pose': 1}
+    assert reason in caplog.text
+    assert len(feed(mapper, [scan_at(0)])) == 1
+
+
+def test_an_initial_pose_is_not_used_where_poses_come_in(caplog):
+    mapper = mapper_with(pose__source='odometry')
+
+    mapper.start_from('odom', (0, 0, 0), (0, 0, 0, 1))
+
+    assert 'poses come from pose.source odometry' in caplog.text
+
+
+def test_live_settings_of_the_registration_hold_from_the_next_scan_on():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(0)])
+
+    mapper.reconfigure(mapper.config.replace({'registration.min_fit_ratio': 1.0}))
+
+    assert feed(mapper, [scan_at(1)]) == []
+    assert mapper.counters.dropped == {'not_aligned': 1}
+
+
+@pytest.mark.parametrize(
+    ('settings', 'message'),
+    [
+        ({'map.mode': 'frozen'}, r'map\.load: empty, expected a map to freeze'),
+        ({'registration.start': [1.0, 2.0]}, r'registration\.start: \[1\.0, 2\.0\], expected x'),
+        ({'registration.start': [0.0] * 7}, r'registration\.start: .* a unit quaternion'),
+    ],
+)
+def test_settings_that_make_no_sense_together_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=message):
+        Config.from_mapping(settings)
