@@ -168,9 +168,10 @@ def measure(scan: Scan, axis: int, limit_m: float) -> tuple[npt.NDArray[Any], An
 def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the squared distances from the origin, in the type of the coordinates, m^2."""
     x, y, z = points.T
-    total = x * x
-    square = y * y
-    total += square
-    np.multiply(z, z, out=square)
-    total += square
+    with np.errstate(over='ignore'):  # beyond the range of the type they are infinite
+        total = x * x
+        square = y * y
+        total += square
+        np.multiply(z, z, out=square)
+        total += square
     return np.asarray(total)

@@ -22,6 +22,7 @@ from surfel_mapper.filters.columns import EIGEN_VALUES, EIGEN_VECTORS, NORMALS
 from surfel_mapper.filters.neighbours import Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.kernels.eigen3 import decompose
+from surfel_mapper.kernels.shapes import eigenvectors, neighbour_moments
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Rows of a symmetric matrix as it is stored: xx xy xz yy yz zz."""
@@ -67,23 +68,11 @@ class Moments:
 
     @classmethod
     def of_neighbours(cls, points: Points, ids: Ids) -> Moments:
-        """Return those of neighbours, from their rows (M, K); N where there is none."""
-        present = ids < len(points)
-        count = present.sum(axis=1)
-        around = points[np.where(present, ids, 0)]
-        if not present.all():
-            around[~present] = 0.0
-        mean = around.sum(axis=1) / count[:, None]
-        around -= mean[:, None]
-        if not present.all():
-            around[~present] = 0.0
-        free = np.maximum(count - 1, 1)
-        axes = np.moveaxis(around, 2, 0)
-        covariance = np.stack(
-            [np.einsum('mk,mk->m', axes[i], axes[j]) / free for i, j in PAIRS]
-        )
-        far_sq = np.einsum('mki,mki->mk', around, around).max(axis=1, initial=0.0)
-        return cls(count, mean, covariance, np.sqrt(far_sq))
+        """Return those of neighbours by their rows (M, K); N, after all others, where none is."""
+        count, mean = np.empty(len(ids), np.int64), np.empty((len(ids), 3))
+        covariance, radius = np.empty((6, len(ids))), np.empty(len(ids))
+        neighbour_moments(points, ids, count, mean, covariance, radius)
+        return cls(count, mean, covariance, radius)
 
     @classmethod
     def joined(cls, parts: list[Moments]) -> Moments:
@@ -121,34 +110,13 @@ def eigen(matrices: Points) -> tuple[Points, Points]:
     vectors : (M, 3, 3) float64
         vectors[:, i] are of unit length and belong to values[:, i]; nan where all values are 0.
 
-    Notes
-    -----
-    The kernel gives the values and the vector of the smallest, n. Across n a matrix is 2 by 2,
-    and its larger vector follows from a square root; the third is across both.
-
     """
+    matrices = np.ascontiguousarray(matrices)
     number = matrices.shape[1]
     values, smallest = np.empty((2, 3, number))
-    decompose(np.ascontiguousarray(matrices), number, values, smallest)
-    n = smallest.T
-    # a basis across n: the axis most across it, made orthogonal, and their cross product
-    u = np.zeros((number, 3))
-    u[np.arange(number), np.abs(n).argmin(axis=1)] = 1.0
-    u = unit(u - (u * n).sum(axis=1, keepdims=True) * n)
-    w = np.cross(n, u)
-    full = as_matrices(matrices)
-    uu, uw, ww = (np.einsum('mi,mij,mj->m', a, full, b) for a, b in ((u, u), (u, w), (w, w)))
-    half = 0.5 * (uu - ww)
-    radius = np.hypot(half, uw)
-    equal = radius == 0.0  # every direction across n is as good
-    half, uw = np.divide((half, uw), radius, out=np.zeros((2, number)), where=~equal)
-    first = np.where(half >= 0.0, half + 1.0, uw)
-    second = np.where(half >= 0.0, uw, 1.0 - half)
-    largest = unit(first[:, None] * u + second[:, None] * w)
-    vectors = np.stack([n, np.cross(largest, n), largest], axis=1)
-    leading = np.take_along_axis(vectors, np.abs(vectors).argmax(axis=2)[..., None], axis=2)
-    vectors *= np.where(leading < 0.0, -1.0, 1.0)
-    vectors[values[2] == 0.0] = np.nan
+    vectors = np.empty((number, 3, 3))
+    decompose(matrices, number, values, smallest)
+    eigenvectors(matrices, values, smallest, vectors)
     return values.T.copy(), vectors
 
 

@@ -120,6 +120,24 @@ def test_it_leaves_what_comes_in_as_it_is_and_keeps_the_type(cls, dtype):
     assert all(len(column) == len(found) for column in found.columns.values())
 
 
+MAKE_POINTS = {'voxel_grid', 'remove_sensor_bias'}
+"""Those whose points are not among those of the scan."""
+
+
+@every
+def test_points_keep_their_order_and_their_columns(cls):
+    scan = random_scan()
+    scan = replace(scan, columns={**scan.columns, 'id': np.arange(len(scan))})
+    found = made(cls).apply(scan)
+    rows = found.columns['id']
+    assert (np.diff(rows) > 0).all()
+    if cls.name not in MAKE_POINTS:
+        np.testing.assert_array_equal(found.points, scan.points[rows])
+    if cls.name != 'voxel_grid':
+        for name in ('intensity', 'ring', 'label', 't', 'times', 'rgb'):
+            np.testing.assert_array_equal(found.columns[name], scan.columns[name][rows])
+
+
 @every
 def test_the_same_scan_always_gives_the_same(cls):
     assert bits_of(made(cls).apply(random_scan())) == bits_of(made(cls).apply(random_scan()))
