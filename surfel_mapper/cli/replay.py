@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 import json
 import math
 import os
@@ -22,6 +23,7 @@ from pathlib import Path
 import time
 from typing import TYPE_CHECKING
 
+from surfel_mapper.cli import replay_many
 from surfel_mapper.cli.progress import progress, stopped_by_interrupt
 from surfel_mapper.cli.replay_files import BAG, FORMATS, Mapped, write_files
 from surfel_mapper.cli.replay_report import causes, report
@@ -44,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add(
-        'bag', type=Path, metavar='BAG',
+        'bags', nargs='+', type=Path, metavar='BAG',
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory of .ply, .pcd, .bin scans',
     )  # fmt: skip
     add('--config', type=Path, metavar='FILE', help='YAML file of settings')
@@ -55,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add_input_arguments(parser)
     add_output_arguments(parser)
+    replay_many.add_arguments(parser)
 
 
 def add_input_arguments(parser: argparse.ArgumentParser) -> None:
@@ -93,10 +96,12 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('what is written').add_argument
     add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
     add(
-        '--formats', type=formats, default=('ply',), metavar='LIST',
+        '--formats', type=formats, metavar='LIST',
         help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply)',
     )  # fmt: skip
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
+    add('--view', action='store_true', help='show it in rerun while it happens')
+    add('--rrd', type=Path, metavar='FILE', help='write that to a file, for rerun to open')
     add('--json', action='store_true', help='print the summary as JSON')
     add('--strict', action='store_true', help='exit with 3 where the bag is cut off or damaged')
 
@@ -130,17 +135,25 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.replay import load_start, poses_now
     from surfel_mapper.pipeline import Mapper
+    from surfel_mapper.viz.history import History
 
     keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
     config = configured(args)
-    output = output_directory(args.bag, args.output)
-    with open_recording(request_of(args), config) as recording, ExitStack() as files:
+    output = output_directory(args.bags[0], args.output)
+    requests = [request_of(args, bag) for bag in args.bags]
+    if replay_many.is_wanted(args):
+        return replay_many.run(args, config, requests, output)
+    formats_wanted = args.formats or ('ply',)
+    with open_recording(requests[0], config) as recording, ExitStack() as files:
         mapper = Mapper(recording.config)
         load_start(mapper)
         mapper.warm_up()
-        bag = normals_bag(output, mapper, files) if BAG in args.formats else None
+        bag = normals_bag(output, mapper, files) if BAG in formats_wanted else None
+        history = History()
+        listeners: list[Callable[[Update], None]] = [partial(history.add, mapper)]
+        listeners += [*viewers(args, mapper, files), *([bag.add] if bag else [])]
         start = time.perf_counter()
-        mapped, was_stopped = map_recording(recording, mapper, [bag.add] if bag else [])
+        mapped, was_stopped = map_recording(recording, mapper, listeners)
         replay_s = time.perf_counter() - start
         refuse_empty(recording, mapper, was_stopped)
         aligned = {'alignment': mapper.align().summary()} if args.align else {}
@@ -160,7 +173,7 @@ def run(args: argparse.Namespace) -> int:
         }
     if args.poses_out is not None:
         mapped.write(args.poses_out)
-    written = write_files(output, args.formats, mapper, mapped, summary)
+    written = write_files(output, formats_wanted, mapper, mapped, summary, history)
     print(json.dumps(summary) if args.json else report(summary, written))
     if was_stopped:
         return INTERRUPTED
@@ -180,12 +193,12 @@ def configured(args: argparse.Namespace) -> Config:
     return config if args.window else config.replace(ALL_SCANS)
 
 
-def request_of(args: argparse.Namespace) -> Request:
+def request_of(args: argparse.Namespace, bag: Path) -> Request:
     """Return what the arguments ask to map."""
     from surfel_mapper.offline.recording import Request
 
     return Request(
-        path=args.bag,
+        path=bag,
         topics=tuple(args.topic),
         pose_topic=args.pose_topic,
         poses=args.poses,
@@ -210,6 +223,18 @@ def output_directory(bag: Path, wanted: Path | None) -> Path:
     if not os.access(nearest, os.W_OK):
         raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
+
+
+def viewers(
+    args: argparse.Namespace, mapper: Mapper, files: ExitStack
+) -> list[Callable[[Update], None]]:
+    """Return what shows a replay in rerun, as far as asked for; closed with the files."""
+    paths: list[Path | None] = [*([None] if args.view else []), *([args.rrd] if args.rrd else [])]
+    if not paths:
+        return []
+    from surfel_mapper.viz.viewer import Viewer
+
+    return [files.enter_context(Viewer(mapper, path)).add for path in paths]
 
 
 def normals_bag(output: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:

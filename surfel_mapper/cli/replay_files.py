@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from surfel_mapper.pipeline import Mapper, Update
+    from surfel_mapper.viz.history import History
 
 BAG = 'bag'
 """Written while mapping, and so not here: a bag of normals in the directory ``normals``."""
@@ -65,15 +66,17 @@ def write_files(
     mapper: Mapper,
     mapped: Mapped,
     summary: dict[str, Any],
+    history: History,
 ) -> list[Path]:
-    """Write the map in some formats, its picture and the summary; return what is there."""
+    """Write the map in some formats, picture, report and summary; return what is there."""
     from surfel_mapper.io.files import replace_file
     from surfel_mapper.viz.picture import draw_map
+    from surfel_mapper.viz.report import write_report
 
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper)
-    picture, figures = output / 'map.png', output / 'summary.json'
+    picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (
         f'{Path(summary["bag"]).resolve().name}: {summary["scans"]["mapped"]} scans, '
@@ -81,9 +84,10 @@ def write_files(
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
     draw_map(surfels, picture, title, trajectory=mapped.positions)
+    write_report(page, title, summary, surfels, history, picture)
     with replace_file(figures) as file:
         file.write((json.dumps(summary, indent=2) + '\n').encode())
-    return [*(output / FORMATS[name] for name in formats), picture, figures]
+    return [*(output / FORMATS[name] for name in formats), picture, page, figures]
 
 
 def write_map(path: Path, name: str, mapper: Mapper) -> None:

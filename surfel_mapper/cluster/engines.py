@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+import logging
 from typing import Any, Protocol, TypeVar
 
 from surfel_mapper.errors import ClusterError, DependencyError
@@ -136,6 +137,7 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
             f'dask cannot be loaded ({error}). It runs the workers; install it with '
             '`pip install surfel_mapper[cluster]`'
         ) from error
+    logging.getLogger('distributed').setLevel(logging.WARNING)
     settings = {
         'distributed.scheduler.allowed-failures': LOSSES,
         'distributed.comm.timeouts.connect': f'{CONNECT_S}s',

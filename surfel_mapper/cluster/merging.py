@@ -66,6 +66,7 @@ class TileTask:
 class TileResult:
     """What a tile holds, and some of its surfels."""
 
+    voxel_size_m: float
     voxels: int
     points: int
     surfels: int
@@ -94,6 +95,7 @@ def merge_tile(task: TileTask) -> TileResult:
     wanted = int(np.ceil(len(surfels) * task.share))
     rows = np.linspace(0, len(surfels) - 1, wanted).astype(np.int64)
     return TileResult(
+        voxel_size_m=surfel_map.voxel_size_m,
         voxels=surfel_map.num_voxels,
         points=surfel_map.num_points,
         surfels=len(surfels),

@@ -53,6 +53,7 @@ class TiledMap:
     ----------
     directory : Path
         The dataset.
+    voxel_size_m : float
     digest : str
         Equal to SurfelMap.digest of the same map.
     voxels, points, surfels, tiles : int
@@ -64,6 +65,7 @@ class TiledMap:
     """
 
     directory: Path
+    voxel_size_m: float
     digest: str
     voxels: int
     points: int
@@ -244,6 +246,7 @@ def merge(
         shutil.rmtree(fresh, ignore_errors=True)
     return TiledMap(
         directory=directory / DATASET,
+        voxel_size_m=tiles[0].voxel_size_m,
         digest=digest,
         voxels=sum(tile.voxels for tile in tiles),
         points=sum(tile.points for tile in tiles),

@@ -111,7 +111,7 @@ def test_ctrl_c_ends_the_replay_and_what_was_mapped_is_written(command, tmp_path
     assert 0 < summary['scans']['mapped'] < MANY
     assert read_map(output / 'map.parquet').digest() == summary['digest']
     assert {path.name for path in output.iterdir()} == {
-        'map.parquet', 'normals', 'map.png', 'summary.json',
+        'map.parquet', 'normals', 'map.png', 'report.html', 'summary.json',
     }  # fmt: skip
 
 

@@ -14,7 +14,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from test.io.recorded import cut, drive, NUM_SCANS, write_rosbag2
 
-FILES = {'map.ply', 'map.png', 'summary.json'}
+FILES = {'map.ply', 'map.png', 'report.html', 'summary.json'}
 PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
 
 

@@ -1,0 +1,66 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``surfel-mapper merge``: finished maps into one, tile by tile, exactly.
+
+What comes out has the digest of a map of all their scans. No process holds a whole map.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+import time
+
+from surfel_mapper.cli import replay_many
+from surfel_mapper.cli.replay_report import rounded
+
+SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
+
+EXAMPLE = 'surfel-mapper merge monday_surfels tuesday_surfels --output week'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add(
+        'maps', nargs='+', type=Path, metavar='DIR',
+        help='output of a replay with --formats parquet or --workers, of a merge, or map.parquet',
+    )  # fmt: skip
+    add('--output', type=Path, required=True, metavar='DIR', help='directory to write to')
+    add(
+        '--min-points', type=replay_many.positive, default=5, metavar='N',
+        help='from how many points on a voxel counts as a surfel, for the figures (%(default)s)',
+    )  # fmt: skip
+    add('--json', action='store_true', help='print the summary as JSON')
+    replay_many.add_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Merge and report."""
+    from surfel_mapper.cluster.engines import engine
+    from surfel_mapper.cluster.running import merge_maps
+    from surfel_mapper.io.files import replace_file
+
+    began = time.perf_counter()
+    with engine(args.workers, args.scheduler) as running:
+        tiled = merge_maps(args.maps, running, args.output, args.min_points)
+    summary = {
+        'maps': [str(path) for path in args.maps],
+        'points': tiled.points,
+        **replay_many.described(tiled),
+        'seconds': time.perf_counter() - began,
+        'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
+    }
+    with replace_file(args.output / 'summary.json') as file:
+        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    if args.json:
+        print(json.dumps(summary))
+        return 0
+    print(
+        f'{len(args.maps)} maps   points {rounded(tiled.points)}   '
+        f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
+        f'digest {tiled.digest}\n{tiled.directory}'
+    )
+    return 0

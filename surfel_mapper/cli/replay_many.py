@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``replay`` of several bags, or with several processes: one map of them all, in tiles.
+
+The map is a Parquet dataset, ``map/tile_i=*/tile_j=*/surfels.parquet``; picture and report show
+a part of its surfels. All bags have to be in one fixed frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+import json
+from pathlib import Path
+import time
+from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.cli.progress import progress
+from surfel_mapper.cli.replay_report import report, rounded
+from surfel_mapper.errors import ConfigError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surfel_mapper.cluster.running import Mapped, TiledMap
+    from surfel_mapper.config import Config
+    from surfel_mapper.offline.recording import Request
+
+SHORTEST_S, LONGEST_S = 15.0, 60.0
+"""Bounds of the length of a shard; see docs/many_machines.md."""
+
+ONE_PROCESS = ('window', 'align', 'poses_out', 'view', 'rrd', 'formats')
+"""Options that ask for the whole map, or all scans in order, in one process."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare who does the work."""
+    add = parser.add_argument_group('many bags, many processes').add_argument
+    add('--workers', type=positive, metavar='N', help='map with so many processes')
+    add('--scheduler', metavar='ADDRESS', help='map on the workers of a Dask scheduler, tcp://...')
+
+
+def positive(text: str) -> int:
+    """Return a number of one or more."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected a whole number of 1 or more')
+    return int(text)
+
+
+def is_wanted(args: argparse.Namespace) -> bool:
+    """Return whether the arguments ask for a map in tiles."""
+    return len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
+
+
+def run(
+    args: argparse.Namespace, config: Config, requests: Sequence[Request], output: Path
+) -> int:
+    """Map all recordings and report."""
+    from surfel_mapper.cluster.engines import engine
+    from surfel_mapper.cluster.running import map_bags
+    from surfel_mapper.cluster.shards import cut
+
+    refuse_options(args)
+    began = time.perf_counter()
+    recorded_s = sum(length_s(request, config) for request in requests)
+    with engine(args.workers, args.scheduler) as running:
+        shard_s = recorded_s / (2 * running.num_workers)
+        shard_s = min(max(shard_s, SHORTEST_S), LONGEST_S)
+        shards = [shard for request in requests for shard in cut(request, config, shard_s)]
+        with two_stages('replay', recorded_s, 'recorded second') as on_done:
+            mapped = map_bags(shards, running, output, on_done)
+        workers = running.num_workers
+    summary = {
+        'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
+        'bags': [str(request.path) for request in requests],
+        'recorded_s': recorded_s,
+        'replay_s': time.perf_counter() - began,
+        **mapped.counts(),
+        **described(mapped.map),
+        'workers': workers,
+        'shards': len(mapped.results),
+        'shards_repeated': mapped.repeated,
+        'peak_memory_mb': memory(mapped),
+        'settings': config.to_mapping(),
+    }
+    written = write_overview(output, summary, mapped.map, mapped.places)
+    print(json.dumps(summary) if args.json else report(summary, written))
+    return 0
+
+
+def refuse_options(args: argparse.Namespace) -> None:
+    """Refuse options that only a single process can follow."""
+    given = [name for name in ONE_PROCESS if getattr(args, name)]
+    if given:
+        raise ConfigError(
+            f'--{given[0].replace("_", "-")}: not with several bags, --workers or --scheduler, '
+            'where no process holds the whole map'
+        )
+
+
+def length_s(request: Request, config: Config) -> float:
+    """Return how long a recording is."""
+    from surfel_mapper.offline.recording import open_recording
+
+    with open_recording(request, config) as recording:
+        return recording.recorded_s
+
+
+@contextmanager
+def two_stages(verb: str, total: float, unit: str) -> Iterator[Callable[[str, float], None]]:
+    """Give a function to be told what got done; only mapping is counted, merging is quick."""
+    done = 0.0
+    with progress(verb, round(total), unit) as show:
+
+        def on_done(kind: str, amount: float) -> None:
+            nonlocal done
+            if kind == 'map' or total == 0.0:
+                done += amount
+                show(round(done))
+
+        yield on_done
+
+
+def described(tiled: TiledMap) -> dict[str, Any]:
+    """Return what a map in tiles is, for a summary."""
+    return {
+        'voxels': tiled.voxels,
+        'surfels': tiled.surfels,
+        'tiles': tiled.tiles,
+        'voxel_size_m': tiled.voxel_size_m,
+        'digest': tiled.digest,
+    }
+
+
+def memory(mapped: Mapped) -> dict[str, int]:
+    """Return the most memory that a process had which mapped, and which merged."""
+    return {
+        'mapping': max(result.peak_bytes for result in mapped.results) // 10**6,
+        'merging': mapped.map.peak_bytes // 10**6,
+    }
+
+
+def write_overview(
+    output: Path,
+    summary: dict[str, Any],
+    tiled: TiledMap,
+    places: npt.NDArray[np.float64] | None,
+) -> list[Path]:
+    """Write picture, report and summary of a map in tiles; return what is there."""
+    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.viz.picture import draw_map
+    from surfel_mapper.viz.report import write_report
+
+    picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
+    title = (
+        f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
+        f'{tiled.surfels} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
+    )
+    draw_map(tiled.sample, picture, title)
+    write_report(page, title, summary, tiled.sample, picture=picture)
+    with replace_file(figures) as file:
+        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    return [tiled.directory, picture, page, figures]
+
+
+def requests_of(bags: Sequence[Path], first: Request) -> list[Request]:
+    """Return what to map of every bag."""
+    return [replace(first, path=bag) for bag in bags]

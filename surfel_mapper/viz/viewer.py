@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Viewer: a replay as it happens in rerun, on the screen or in an .rrd file to be opened later.
+
+Logged at every scan are the sensor with its points, the surfels that it changed, and where the
+scans of the window were taken. The whole map is logged when a quarter of it is new since the last
+time, so that a recording holds each surfel some five times, not once a scan.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.viz.picture import sides_m, SPREAD
+
+if TYPE_CHECKING:
+    from surfel_mapper.pipeline import Mapper, Update
+
+NEW = 0.25
+"""The whole map is logged when this share of it came or left since the last time."""
+
+MAX_POINTS = 20_000
+"""Of a scan so many points are logged, evenly picked."""
+
+POINT_RADIUS_M = 0.02
+
+RED, ORANGE = (219, 41, 33), (240, 150, 40)
+
+
+class Viewer:
+    """
+    Shows a replay in rerun; a context manager, closed when all is written.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        What is shown.
+    path : str or Path, optional
+        An .rrd file to write; without it a window opens.
+
+    Raises
+    ------
+    DependencyError
+        If rerun is not installed.
+    FileFormatError
+        If the file cannot be written.
+
+    """
+
+    def __init__(self, mapper: Mapper, path: str | Path | None = None) -> None:
+        """Open the file or the window."""
+        self._mapper = mapper
+        self._rerun = import_rerun()
+        self._positions: list[npt.NDArray[np.float64]] = []
+        self._logged_voxels = self._removed = 0
+        self._stream: Any = self._rerun.RecordingStream('surfel_mapper')
+        if path is None:
+            self._stream.spawn()
+        else:
+            check_writable(Path(path))
+            self._stream.save(str(path))
+        self._stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def __enter__(self) -> Viewer:
+        """Return the viewer, to be closed at the end of the block."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Log the map as it is in the end, and close."""
+        if kind is None and self._positions:
+            self._log_map()
+        self._stream.flush()
+        self._stream.disconnect()
+
+    def add(self, update: Update) -> None:
+        """Show what a scan did."""
+        rerun, pose = self._rerun, update.T_fixed_sensor
+        self._positions.append(pose[:3, 3])
+        self._stream.set_time('stamp', timestamp=np.datetime64(update.stamp_ns, 'ns'))
+        self._stream.log(
+            'map/sensor', rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
+        )
+        self._stream.log(
+            'map/sensor/scan',
+            rerun.Points3D(picked(update.scan.points), radii=POINT_RADIUS_M),
+        )
+        self._stream.log('map/trajectory', rerun.LineStrips3D([self._way()], colors=[RED]))
+        window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
+        self._stream.log(
+            'map/window', rerun.Points3D(window.reshape(-1, 3), radii=0.15, colors=[ORANGE])
+        )
+        self._log_surfels('map/changed', update.changed)
+        self._removed += len(update.removed_voxel_index)
+        num_voxels = self._mapper.map.num_voxels
+        if abs(num_voxels - self._logged_voxels) + self._removed > NEW * num_voxels:
+            self._log_map()
+
+    def _way(self) -> npt.NDArray[np.float64]:
+        """Return where the sensor was, in at most a thousand steps."""
+        step = max(len(self._positions) // 1000, 1)
+        return np.array([*self._positions[::step], self._positions[-1]])
+
+    def _log_map(self) -> None:
+        """Log all surfels."""
+        mapper = self._mapper
+        self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
+        self._logged_voxels, self._removed = mapper.map.num_voxels, 0
+
+    def _log_surfels(self, name: str, surfels: Surfels) -> None:
+        """Log surfels as points as large as their discs, in the colours of planarity."""
+        from matplotlib import colormaps
+
+        valid = surfels.select(np.isfinite(surfels.planarity))
+        colours = np.rint(colormaps['viridis'](valid.planarity)[:, :3] * 255.0).astype(np.uint8)
+        points = self._rerun.Points3D(
+            valid.position, radii=0.5 * SPREAD * sides_m(valid), colors=colours
+        )
+        self._stream.log(name, points)
+
+
+def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Return the finite ones of points, MAX_POINTS of them at most."""
+    finite = points[np.isfinite(points).all(axis=1)]
+    return np.ascontiguousarray(finite[:: max(-(-len(finite) // MAX_POINTS), 1)])
+
+
+def check_writable(path: Path) -> None:
+    """Refuse a file that cannot be written, which rerun would only say in a log."""
+    try:
+        with open(path, 'wb'):
+            pass
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+def import_rerun() -> Any:
+    """Return rerun."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise DependencyError(
+            f'rerun cannot be loaded ({error}). It shows replays; install it with '
+            '`pip install surfel_mapper[viewer]` or `pip install rerun-sdk`'
+        ) from error
+    return rerun

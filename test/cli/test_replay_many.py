@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``replay`` of several bags or with workers, and ``merge``, make the map of one process."""
+
+import json
+
+import pytest
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.io.parquet import read_map
+from surfel_mapper.io.parquet_tiles import dataset_digest
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.cluster.bags import written
+from test.io.recorded import cut
+
+FILES = {'map', 'map.png', 'report.html', 'summary.json'}
+TF = ['--pose-topic', '/tf']
+
+
+@pytest.fixture(scope='module')
+def bags(tmp_path_factory):
+    folder = tmp_path_factory.mktemp('bags')
+    return [str(written(folder, name)[0]) for name in ('plain', 'faults')]
+
+
+@pytest.fixture(scope='module')
+def alone(bags, tmp_path_factory):
+    """Return the output directories of each bag by one process."""
+    outputs = [tmp_path_factory.mktemp('alone') for _ in bags]
+    for bag, output in zip(bags, outputs, strict=True):
+        arguments = ['replay', bag, '--formats', 'parquet', '--output', str(output)]
+        assert main([*arguments, *TF]) == 0
+    return outputs
+
+
+@pytest.fixture(scope='module')
+def both(alone):
+    """Return the digest of the map of both bags."""
+    total = SurfelMap(0.5)
+    for output in alone:
+        total.merge(read_map(output / 'map.parquet'))
+    return total.digest()
+
+
+def summary_of(output):
+    return json.loads((output / 'summary.json').read_text())
+
+
+def test_several_bags_become_one_map_in_tiles(bags, both, alone, tmp_path, capsys):
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 0
+
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+    summary = summary_of(tmp_path)
+    assert summary['digest'] == both == dataset_digest(tmp_path / 'map')
+    assert summary['bags'] == bags
+    received = [summary_of(output)['scans']['received'] for output in alone]
+    assert summary['scans']['received'] == sum(received)
+    printed = capsys.readouterr().out
+    assert f'digest {both}' in printed
+    assert str(tmp_path / 'report.html') in printed
+
+
+def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys):
+    pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+    arguments = ['replay', bags[0], '--workers', '2', '--output', str(tmp_path), '--json']
+    assert main([*arguments, *TF]) == 0
+
+    summary = json.loads(capsys.readouterr().out)
+    assert summary['workers'] == 2
+    assert summary['digest'] == summary_of(alone[0])['digest']
+    assert summary['surfels'] == summary_of(alone[0])['surfels']
+    assert summary['peak_memory_mb']['mapping'] > 50
+
+
+def test_merging_finished_maps_is_mapping_them_together(alone, both, tmp_path, capsys):
+    maps = [str(output) for output in alone]
+    assert main(['merge', *maps, '--output', str(tmp_path / 'sum')]) == 0
+    assert f'digest {both}' in capsys.readouterr().out
+    assert dataset_digest(tmp_path / 'sum' / 'map') == both
+
+    again = [str(tmp_path / 'sum'), str(alone[0] / 'map.parquet')]
+    assert main(['merge', *again, '--output', str(tmp_path / 'more'), '--json']) == 0
+    total = SurfelMap(0.5)
+    for output in (*alone, alone[0]):
+        total.merge(read_map(output / 'map.parquet'))
+    assert json.loads(capsys.readouterr().out)['digest'] == total.digest()
+
+
+def test_maps_that_do_not_fit_are_refused(alone, bags, tmp_path, capsys):
+    config = tmp_path / 'small.yaml'
+    config.write_text('map: {voxel_size_m: 0.2}')
+    arguments = ['replay', bags[0], '--config', str(config), '--formats', 'parquet']
+    assert main([*arguments, '--output', str(tmp_path / 'small'), *TF]) == 0
+
+    maps = [str(alone[0]), str(tmp_path / 'small')]
+    assert main(['merge', *maps, '--output', str(tmp_path / 'sum')]) == 1
+
+    assert '0.2 m' in capsys.readouterr().err
+    assert not (tmp_path / 'sum' / 'map').exists()
+
+
+@pytest.mark.parametrize('place', ['nowhere', 'empty'])
+def test_a_directory_without_a_map_is_refused_by_name(tmp_path, capsys, place):
+    (tmp_path / 'empty').mkdir()
+    assert main(['merge', str(tmp_path / place), '--output', str(tmp_path / 'sum')]) == 1
+    assert f'{place}: no map; expected' in capsys.readouterr().err
+
+
+def test_an_output_that_holds_something_else_is_left_alone(bags, tmp_path, capsys):
+    (tmp_path / 'map').mkdir()
+    (tmp_path / 'map' / 'thesis.txt').write_text('mine')
+
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 1
+
+    assert 'holds something else' in capsys.readouterr().err
+    assert (tmp_path / 'map' / 'thesis.txt').read_text() == 'mine'
+
+
+@pytest.mark.parametrize(
+    'option', [['--window'], ['--align'], ['--poses-out', 'x'], ['--formats', 'ply'], ['--view']]
+)
+def test_what_needs_the_whole_map_in_one_process_is_refused(bags, tmp_path, capsys, option):
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF, *option]) == 1
+    assert f'{option[0]}: not with several bags' in capsys.readouterr().err
+
+
+def test_a_damaged_bag_among_several_is_named(bags, tmp_path, capsys):
+    bag, _ = written(tmp_path, 'plain')
+    cut(bag / 'plain.mcap', 0.0)
+
+    assert main(['replay', bags[0], str(bag), '--output', str(tmp_path / 'out'), *TF]) == 1
+
+    assert 'plain.mcap' in capsys.readouterr().err
+    assert not (tmp_path / 'out' / 'map').exists()
+
+
+@pytest.mark.parametrize('number', ['0', '-1', 'two', '1.5'])
+def test_a_number_of_workers_that_is_none_is_refused(bags, number):
+    with pytest.raises(SystemExit) as exit_info:
+        main(['replay', bags[0], '--workers', number])
+    assert exit_info.value.code == 2
+
+
+def test_a_scheduler_that_does_not_answer_is_refused(bags, tmp_path, capsys, monkeypatch):
+    pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+    from surfel_mapper.cluster import engines
+
+    monkeypatch.setattr(engines, 'CONNECT_S', 1)
+    arguments = ['replay', bags[0], '--scheduler', 'tcp://127.0.0.1:1', '--output', str(tmp_path)]
+    assert main([*arguments, *TF]) == 1
+    assert 'no Dask scheduler answers' in capsys.readouterr().err

@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A recording for rerun holds what was mapped, and can be opened by rerun itself."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
+from test.io.recorded import drive, write_rosbag2
+
+pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+
+ENTITIES = ('/map/surfels', '/map/changed', '/map/trajectory', '/map/window', '/map/sensor/scan')
+
+
+def rerun(*arguments):
+    command = [sys.executable, '-m', 'rerun', 'rrd', *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def test_a_replay_is_recorded_with_scans_surfels_trajectory_and_window(tmp_path):
+    bag = write_rosbag2(tmp_path / 'drive', drive())
+    file = tmp_path / 'drive.rrd'
+
+    arguments = ['replay', str(bag), '--output', str(tmp_path / 'out'), '--rrd', str(file)]
+    assert main(arguments) == 0
+
+    done = rerun('verify', file)
+    assert done.returncode == 0, done.stderr
+    printed = rerun('print', file).stdout
+    for entity in ENTITIES:
+        assert entity in printed
+
+
+def test_points_are_picked_evenly_and_finite():
+    points = np.arange(3.0 * 50_000).reshape(-1, 3)
+    points[7] = np.nan
+    found = picked(points)
+    assert MAX_POINTS / 2 < len(found) <= MAX_POINTS
+    assert np.isfinite(found).all()
+    assert len(picked(points[:10])) == 9
+
+
+def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
+    with pytest.raises(FileFormatError, match='nowhere'):
+        Viewer(Mapper(), tmp_path / 'nowhere' / 'a.rrd')
