@@ -8,6 +8,7 @@ import ast
 import json
 import os
 from pathlib import Path
+import re
 import subprocess
 import sys
 from xml.etree import ElementTree
@@ -113,3 +114,12 @@ def test_the_command_line_prints_the_table_of_the_readme(capsys):
     assert f'{settings.BEGIN}{capsys.readouterr().out}{settings.END}' in (
         settings.README.read_text(encoding='utf-8')
     )
+
+
+def test_the_page_about_the_node_names_settings_that_there_are():
+    page = (settings.ROOT / 'docs' / 'node.md').read_text(encoding='utf-8')
+    names = {declared.name for declared in declarations()}
+    stages = '|'.join(sorted({declared.stage for declared in declarations()} - {''}))
+    named = set(re.findall(rf'`((?:{stages})\.\w+)', page))
+    assert len(named) > 15
+    assert named - names == set()
