@@ -29,9 +29,6 @@ from surfel_mapper.mapping.surfels import Surfels
 Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.int32]
 
-ALONG = 1e-4
-"""What a gap along a surface counts, as part of what it counts across."""
-
 LONG_WAY = 3.0
 """The way to where a loop closes is at least so many times the distance that counts as near."""
 
@@ -197,8 +194,7 @@ def surface_weights(
     along_sq = (gap * gap).sum(axis=1) - across_sq
     variance = source.variance[i] + target.variance[j] + target.tilt_variance[j] * along_sq
     weight = 1.0 / (variance * (1.0 + across_sq / scale_m**2) ** 2)
-    outer = normal[:, :, None] * normal[:, None, :] + ALONG * np.eye(3)
-    return np.asarray(weight[:, None, None] * outer)
+    return np.asarray(weight[:, None, None] * normal[:, :, None] * normal[:, None, :])
 
 
 def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[int, int]]:

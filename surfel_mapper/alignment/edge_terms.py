@@ -121,8 +121,8 @@ class EdgeTerms:
         Zero for edges that are dropped.
     dropped : mapping of int to str
         Row of an edge, and why it does not count.
-    weak : mapping of int to (K, 3) float64
-        Row of an edge, and the axes about which its pairs say nothing of the rotation.
+    weak : mapping of int to (K, 6) float64
+        Row of an edge, and the motions of which its pairs say nothing: these get none.
 
     """
 
@@ -213,7 +213,10 @@ def exact_terms(sums: EdgeSums) -> EdgeTerms:
             sums.num, np.einsum('eij,ej,ekj->eik', axes, inertia, axes), ss, dropped
         ),
         dropped=dropped,
-        weak={int(e): axes[e].T[weak[e]] for e in np.flatnonzero(weak.any(axis=1))},
+        weak={
+            int(e): np.hstack([np.zeros((weak[e].sum(), 3)), axes[e].T[weak[e]]])
+            for e in np.flatnonzero(weak.any(axis=1))
+        },
     )
 
 

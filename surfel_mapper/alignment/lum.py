@@ -56,9 +56,10 @@ class LumResult:
         Edges that did not count in the last step, and why.
     unconnected : tuple of int
         Vertices that no edge that counts connects to vertex 0: they stay where they were.
-    open_axes : mapping of (source, target) to (K, 3) float64
-        Edges whose pairs lie on a line but for their noise, and that line: the rotation about it
-        was left to other edges.
+    open_motions : mapping of (source, target) to (K, 6) float64
+        Edges whose pairs say nothing of some motion, and that motion, translation first, about
+        their middle: it was left to other edges. Pairs on a line leave the rotation about it
+        open, weights across the walls of a tunnel the way along it.
 
     """
 
@@ -67,7 +68,7 @@ class LumResult:
     residuals: Mapping[Ends, float]
     dropped: Mapping[Ends, str]
     unconnected: tuple[int, ...]
-    open_axes: Mapping[Ends, Floats] = field(default_factory=dict)
+    open_motions: Mapping[Ends, Floats] = field(default_factory=dict)
 
 
 class LUM:
@@ -196,7 +197,8 @@ class LUM:
             Row of a point of the source, row of a point of the target.
         weights : (K, 3, 3) float, optional
             By what the gap of each pair counts in which direction, symmetric, in the frame of
-            the target. Only their ratios matter.
+            the target: the inverse of its covariance. Where gaps are larger than that, all of
+            the edge count less.
 
         """
         self.graph.set_edge(source, target, pairs, weights)
@@ -271,5 +273,5 @@ class LUM:
             residuals=dict(zip(names, rms.tolist(), strict=True)),
             dropped={names[e]: terms.dropped[e] for e in sorted(terms.dropped)},
             unconnected=tuple(np.flatnonzero(part != part[0]).tolist()),
-            open_axes={names[e]: axes for e, axes in terms.weak.items()},
+            open_motions={names[e]: axes for e, axes in terms.weak.items()},
         )

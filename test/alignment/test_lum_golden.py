@@ -246,9 +246,11 @@ def test_a_rotation_that_nothing_is_known_of_stays_and_is_reported(golden, cases
 
     result = lum.compute()
 
-    assert set(result.open_axes) == {(1, 2)}
+    assert set(result.open_motions) == {(1, 2)}
     assert result.residuals[1, 2] < 0.03  # sigma is 0.01 m an axis at both ends
-    (axis,) = result.open_axes[1, 2]
+    (motion,) = result.open_motions[1, 2]
+    np.testing.assert_array_equal(motion[:3], 0.0)
+    axis = motion[3:]
     line = lum.transformed_cloud(1)[lum.correspondences(1, 2)[:, 0]]
     along = (line[-1] - line[0]) / np.linalg.norm(line[-1] - line[0])
     assert abs(axis @ along) > 0.999
