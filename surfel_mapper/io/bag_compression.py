@@ -18,6 +18,9 @@ from surfel_mapper.errors import BagError, DependencyError
 
 PIECE_BYTES = 1 << 16
 
+MOST_BYTES = 1 << 30
+"""What claims or turns out to be larger is damaged: chunks and messages have some megabytes."""
+
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """How a zstd frame begins; no CDR message does."""
 
@@ -29,9 +32,11 @@ def unpacked(packed: bytes, compression: str, most: int) -> bytes:
     Raises
     ------
     ValueError
-        If the compression is unknown.
+        If the compression is unknown, or ``most`` beyond all reason.
 
     """
+    if most > MOST_BYTES:
+        raise ValueError(f'{most} bytes of a chunk, expected at most {MOST_BYTES}')
     if not compression or compression == 'none':
         return packed[:most]
     machine = decompressor(compression)
@@ -50,9 +55,9 @@ def unpacked(packed: bytes, compression: str, most: int) -> bytes:
 def unpacked_message(packed: bytes | memoryview) -> bytes:
     """Return a message that the recorder packed with zstd."""
     machine = decompressor('zstd')
-    content: bytes = machine.decompress(bytes(packed))
+    content: bytes = machine.decompress(bytes(packed), MOST_BYTES)
     if not machine.eof:
-        raise ValueError('packed message ends too early')
+        raise ValueError('a packed message that ends too early, or never')
     return content
 
 

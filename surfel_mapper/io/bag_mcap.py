@@ -24,9 +24,6 @@ RECORD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 
-MOST_CHUNK_BYTES = 1 << 32
-"""A chunk that claims more is damaged; recorders make them of some megabytes."""
-
 
 class McapScan(ChunkedFile):
     """The messages of an mcap file, found without its index."""
@@ -67,7 +64,7 @@ class McapScan(ChunkedFile):
         _, _, unpacked_size, checksum = CHUNK_HEAD.unpack_from(head)
         compression, after = text(head, CHUNK_HEAD.size)
         (packed_size,) = struct.unpack_from('<Q', head, after)
-        if unpacked_size > MOST_CHUNK_BYTES or (is_whole and after + 8 + packed_size > size):
+        if is_whole and after + 8 + packed_size > size:
             raise ValueError('sizes of a chunk that do not fit')
         left = min(packed_size, size - after - 8)
         chunk = Chunk(start + after + 8, left, compression, unpacked_size)

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 from surfel_mapper.config import Config
@@ -20,6 +21,7 @@ from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.offline.depth_feed import Decode, DepthFeed
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.span import Span, WHOLE
 
@@ -191,15 +193,20 @@ def replay(
         mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
     first = numbers_before(reader, clouds, poses, span)
     seen: Counter[str] = Counter()
-    for message in messages(reader, clouds, poses, span):
+    add = partial(add_cloud, reader, mapper, poses)
+    images = DepthFeed(clouds, add) if mapper.config.input.kind == 'depth' else None
+    infos = images.info_topics if images else {}
+    for message in messages(reader, {*clouds, *infos}, poses, span):
         if stopped():
             break
-        if message.topic not in clouds:
+        if images and message.topic in infos:
+            add_camera_info(reader, mapper, message, images)
+        elif message.topic not in clouds:
             add_poses(reader, mapper, message, poses)
         elif span.holds(message.record_ns):
             if seen[message.topic] % span.every == 0:
                 number = first[message.topic] + seen[message.topic]
-                add_cloud(reader, mapper, message, poses, number)
+                (images.take_image if images else add)(message, number)
             seen[message.topic] += 1
         yield from mapper.insert_ready()
     mapper.finish()
@@ -249,13 +256,18 @@ def poses_now(
 
 
 def add_cloud(
-    reader: BagReader, mapper: Mapper, message: BagMessage, poses: PoseTopics, number: int
+    reader: BagReader,
+    mapper: Mapper,
+    poses: PoseTopics,
+    message: BagMessage,
+    number: int,
+    decode: Decode = to_scan,
 ) -> None:
-    """Decode a cloud and queue it as a scan, with its pose where a file has it."""
+    """Decode a cloud or an image and queue it as a scan, with its pose where a file has it."""
     try:
         with mapper.counters.timed('decode'):
-            scan = to_scan(reader.decode(message), message.topic)
-    except CloudFormatError as error:
+            scan = decode(reader.decode(message), message.topic)
+    except (CloudFormatError, BagError) as error:
         mapper.refuse_clouds('bad_cloud', message.topic, str(error))
         return
     if message.topic in poses.mounts:
@@ -265,6 +277,16 @@ def add_cloud(
     mapper.add_scan(scan)
 
 
+def add_camera_info(
+    reader: BagReader, mapper: Mapper, message: BagMessage, images: DepthFeed
+) -> None:
+    """Decode a calibration, and map the images that waited for it; a bad one is counted."""
+    try:
+        images.take_info(message.topic, reader.decode(message))
+    except (CloudFormatError, BagError) as error:
+        mapper.ignore_message('bad_message', f'calibration ignored: {error}')
+
+
 def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
     """Decode a message of poses and enter them; a bad one is counted."""
     try:
@@ -272,6 +294,7 @@ def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: Po
     except BagError as error:
         mapper.ignore_message('bad_message', f'pose ignored: {error}')
         return
-    kind = topics.kinds.get(message.topic, 'tf')
-    for pose in poses_in(kind, decoded, mapper.config.frames.base):
-        mapper.add_pose(*pose, static=message.topic in topics.static)
+    kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
+    for pose in poses_in(kind, decoded, base):
+        if topics.path is None or pose.child != base:  # whose pose is in the file
+            mapper.add_pose(*pose, static=message.topic in topics.static)

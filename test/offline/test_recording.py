@@ -229,6 +229,17 @@ def test_between_the_poses_of_a_file_is_interpolated_and_beyond_nothing_is_mappe
     assert dict(mapper.counters.dropped) == {'no_pose': 3}
 
 
+def test_poses_of_the_sensor_do_not_need_the_tree_of_the_bag(tmp_path, bag):
+    sensor = poses()
+    sensor[:, :3, 3] += MOUNT_M
+    write_tum(tmp_path / 'poses.tum', STAMPS, sensor)
+
+    mapper = mapped(bag, {'frames.base': 'lidar'}, poses=tmp_path / 'poses.tum')
+
+    assert mapper.map.digest() == digest_of(range(6))
+    assert dict(mapper.counters.messages_ignored) == {}
+
+
 def test_fewer_poses_without_times_than_clouds_are_refused(tmp_path, bag):
     with pytest.raises(BagError, match=r'kitti: 5 poses, none for scan 6'):
         mapped(bag, poses=pose_file(tmp_path, 'kitti', range(5)))
