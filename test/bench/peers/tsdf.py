@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Others that fuse a signed distance field, and how they are run.
+
+Each has a module here with a class ``Peer(job)``: ``prepared(data, pose)`` gives its input the
+form that it takes, untimed, ``integrate`` fuses it, ``mesh`` returns vertices and triangles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+import os
+from pathlib import Path
+import tempfile
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from test.bench.peers import OPEN3D, PeerSpec
+from test.bench.peers.run import environment, output, ROOT
+
+VDBFUSION = PeerSpec(
+    name='VDBFusion 0.1.6',
+    module='test.bench.peers.tsdf_vdbfusion',
+    requires=('vdbfusion==0.1.6', 'numpy<2'),
+    python='3.10',  # there are no wheels for later ones
+)
+
+OPEN3D_TENSOR = PeerSpec(
+    name='Open3D 0.19 VoxelBlockGrid',
+    module='test.bench.peers.tsdf_open3d_tensor',
+    requires=OPEN3D,
+)
+
+OPEN3D_TENSOR_20 = PeerSpec(
+    name='Open3D 0.20 VoxelBlockGrid',
+    module='test.bench.peers.tsdf_open3d_tensor',
+    requires=('open3d-cpu==0.20.0',),
+)
+
+OPEN3D_LEGACY = PeerSpec(
+    name='Open3D 0.19 ScalableTSDFVolume',
+    module='test.bench.peers.tsdf_open3d_legacy',
+    requires=OPEN3D,
+)
+
+Mesh = tuple[npt.NDArray[Any], npt.NDArray[Any]]
+
+
+def run_tsdf(
+    peer: PeerSpec,
+    cache: Path,
+    scans: Sequence[Path],
+    poses: npt.NDArray[np.float64],
+    settings: dict[str, Any],
+) -> tuple[list[float], Mesh]:
+    """
+    Return milliseconds of every scan, and the mesh: vertices and triangles.
+
+    Raises
+    ------
+    PeerError
+        With the last line that the peer said.
+
+    """
+    python = environment(peer, cache)
+    with tempfile.TemporaryDirectory() as scratch:
+        files = {name: str(Path(scratch) / name) for name in ('poses.npy', 'mesh.npz')}
+        np.save(files['poses.npy'], poses)
+        job = {
+            **settings,
+            'module': peer.module,
+            'scans': [str(path) for path in scans],
+            'poses': files['poses.npy'],
+            'mesh': files['mesh.npz'],
+        }
+        # Threads that wait for each other on one core only lose time.
+        one_thread = {**os.environ, 'OMP_NUM_THREADS': '1'}
+        command = [str(python), '-m', 'test.bench.peers.tsdf_driver']
+        said = output(command, input=json.dumps(job), cwd=ROOT, env=one_thread)
+        mesh = np.load(files['mesh.npz'])
+        times: list[float] = json.loads(said.splitlines()[-1])['milliseconds']
+        return times, (mesh['vertices'], mesh['triangles'])

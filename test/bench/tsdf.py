@@ -1,0 +1,234 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fusing scans and depth images into a signed distance field, beside others, and the meshes' errors.
+
+The street's lidar at 0.2 m with a truncation of 3 voxels, with and without carving, and a depth
+camera that turns in a room at 4 cm and 1 cm with 4 voxels; on one core. Ours begins with points or
+depths in the frame of the sensor; VDBFusion is given points that are in the map already. The
+errors of meshes are taken against the equations of street and room; a mesh that is empty or less
+than half right fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.mesh import Mesher
+from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
+from surfel_mapper.tsdf.sensors import Lidar
+from test.bench import room
+from test.bench.machine import one_core
+from test.bench.mesh_error import mesh_error
+from test.bench.options import Options
+from test.bench.peers import PeerSpec
+from test.bench.peers.run import PeerError
+from test.bench.peers.tsdf import (
+    Mesh,
+    OPEN3D_LEGACY,
+    OPEN3D_TENSOR,
+    OPEN3D_TENSOR_20,
+    run_tsdf,
+    VDBFUSION,
+)
+from test.bench.report import Row, spread
+from test.bench.street import Street
+
+FloatArray = npt.NDArray[np.float64]
+
+WARM = 3
+"""So many scans are not counted."""
+
+LEAST_F_SCORE = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """
+    What is fused, and what the mesh should be.
+
+    Attributes
+    ----------
+    name : str
+        As it stands in the table.
+    voxel_size_m, truncation_m, carve
+        Of the field.
+    files : list of Path
+        Scans or depth images, .npy.
+    poses : (S, 4, 4) float64
+        Of each.
+    image : callable
+        A range image of the content of a file.
+    distance : callable
+        How far points are from the true surface, m.
+    truth : (N, 3) float64, m
+        Points of it that were in view.
+    peers : tuple of PeerSpec
+        Whom to compare with.
+    settings : dict
+        What else those are told.
+
+    """
+
+    name: str
+    voxel_size_m: float
+    truncation_m: float
+    carve: bool
+    files: list[Path]
+    poses: FloatArray
+    image: Callable[[npt.NDArray[Any]], RangeImage]
+    distance: Callable[[FloatArray], FloatArray]
+    truth: FloatArray
+    peers: tuple[PeerSpec, ...]
+    settings: dict[str, Any]
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for everyone in every case; the first of each is ours."""
+    rows: list[Row] = []
+    scans = min(options.scans, 30)
+    for case in [*street_cases(options, scans), *room_cases(options, scans)]:
+        with one_core():
+            rows += case_rows(case, options)
+    return rows
+
+
+def case_rows(case: Case, options: Options) -> list[Row]:
+    """Return the rows of one case."""
+    times, mesh = ours(case)
+    reference_ms = float(np.median(times[WARM:]))
+    rows = [row(case, 'surfel_mapper', times, mesh, reference_ms)]
+    for peer in case.peers if options.peers else ():
+        settings = {
+            **case.settings,
+            'voxel_size_m': case.voxel_size_m,
+            'truncation_m': case.truncation_m,
+            'carve': case.carve,
+        }
+        try:
+            times, mesh = run_tsdf(peer, options.cache, case.files, case.poses, settings)
+            rows.append(row(case, peer.name, times, mesh, reference_ms))
+        except PeerError as error:
+            rows.append({'case': case.name, 'who': f'{peer.name}, not measured: {error}'})
+    return rows
+
+
+def ours(case: Case) -> tuple[list[float], Mesh]:
+    """Return the milliseconds of every scan, and the mesh."""
+    config = TsdfConfig(
+        voxel_size_m=case.voxel_size_m,
+        truncation_m=case.truncation_m,
+        carve=case.carve,
+        max_difference_m=max(0.2, case.voxel_size_m),
+        threads=1,
+    )
+    one, times = Integrator(BlockMap(config)), []
+    for path, pose in zip(case.files, case.poses, strict=True):
+        data = np.load(path)
+        start = perf_counter()
+        one.integrate(case.image(data), pose)
+        times.append((perf_counter() - start) * 1e3)
+    mesher = Mesher(one.blocks)
+    mesher.update()
+    mesh = mesher.mesh()
+    return times, (mesh.vertices, mesh.triangles)
+
+
+def row(case: Case, who: str, times: list[float], mesh: Mesh, reference_ms: float) -> Row:
+    """Return one row; a mesh that is wrong is an error."""
+    error = mesh_error(*mesh, case.distance, case.truth, case.voxel_size_m)
+    if error['f_score'] < LEAST_F_SCORE:
+        raise RuntimeError(f'{case.name}, {who}: the mesh is wrong, {error}')
+    figures = spread(times[WARM:])
+    return {
+        'case': case.name,
+        'who': who,
+        **figures,
+        'x_ours': figures['median_ms'] / reference_ms,
+        'scans': len(times) - WARM,
+        'triangles': len(mesh[1]),
+        **error,
+    }
+
+
+def street_cases(options: Options, scans: int) -> list[Case]:
+    """Return the cases of the lidar, without and with carving."""
+    street, numbers = Street(options), range(WARM + scans)
+    street.prepare(len(numbers))
+    simulated = street.simulation.lidar
+    sensor = Lidar(
+        rows=simulated.beams,
+        columns=simulated.columns,
+        vertical_fov_deg=simulated.elevation_deg[1] - simulated.elevation_deg[0],
+        vertical_fov_top_deg=simulated.elevation_deg[1],
+        first_azimuth_deg=180.0 - 180.0 / simulated.columns,
+        min_range_m=simulated.min_range_m,
+        max_range_m=simulated.max_range_m,
+    )
+    poses = np.array([street.pose(number) for number in numbers])
+    seen = [street.points(n)[::16] @ T[:3, :3].T + T[:3, 3] for n, T in enumerate(poses)]
+    near = np.concatenate(seen)
+    near = near[np.isfinite(near).all(axis=1)]
+    world = street.simulation.world
+    return [
+        Case(
+            name=f'street 0.2 m{", carving" if carve else ""}',
+            voxel_size_m=0.2,
+            truncation_m=0.6,
+            carve=carve,
+            files=[street.path(number) for number in numbers],
+            poses=poses,
+            image=lambda points: from_points(sensor, points),
+            distance=lambda points: world.surface_at(points)[1],
+            truth=near,
+            peers=(VDBFUSION,),
+            settings={},
+        )
+        for carve in (False, True)
+    ]
+
+
+def room_cases(options: Options, scans: int) -> list[Case]:
+    """Return the cases of the depth camera, coarse and fine."""
+    camera, directory = room.CAMERA, options.cache / 'room'
+    directory.mkdir(parents=True, exist_ok=True)
+    poses = np.array([room.pose(number) for number in range(WARM + scans)])
+    files, truth = [], []
+    for number, pose in enumerate(poses):
+        depth = room.depth(pose)
+        files.append(directory / f'{number:05d}.npy')
+        np.save(files[-1], depth)
+        rays = camera.directions * (depth * camera.ray_length)[..., None]
+        truth.append(rays[::8, ::8].reshape(-1, 3) @ pose[:3, :3].T + pose[:3, 3])
+    intrinsic = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+    return [
+        Case(
+            name=f'room {size_m:g} m',
+            voxel_size_m=size_m,
+            truncation_m=4.0 * size_m,
+            carve=False,
+            files=files,
+            poses=poses,
+            image=lambda depth: from_depth(camera, depth),
+            distance=room.distance,
+            truth=np.concatenate(truth),
+            peers=(OPEN3D_TENSOR, OPEN3D_TENSOR_20, OPEN3D_LEGACY),
+            settings={
+                'intrinsic': intrinsic,
+                'columns': camera.columns,
+                'rows': camera.rows,
+                'max_range_m': camera.max_range_m,
+            },
+        )
+        for size_m in (0.04, 0.01)
+    ]
