@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.io.bag import BagMessage
 from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.parquet_tiles import Part, Tile, write_shard
@@ -225,6 +225,8 @@ def map_middle(
 ) -> tuple[Entry, list[npt.NDArray[np.float64]]]:
     """Map a shard after its lead-in; return what was known at its start, and the positions."""
     reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
+    if recording.config.input.kind == 'depth':
+        raise BagError(f'{reader.path}: depth images are mapped by one process alone')
     entry, places = Entry(), []
     mapper.passes_over = shard.start_ns is not None
     for topic, place in poses.mounts.items():

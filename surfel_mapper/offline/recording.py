@@ -19,7 +19,7 @@ from typing import Any, Protocol, TYPE_CHECKING
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_topics import CLOUD
+from surfel_mapper.io.bag_topics import CLOUD, IMAGE
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.replay import pose_topics, PoseTopics, replay, static_topics
 from surfel_mapper.offline.scan_folder import is_scan_folder, ScanFolder
@@ -153,8 +153,11 @@ class BagRecording:
         """Choose topics and poses."""
         self.reader = reader
         self.cuts = reader.cuts
-        names: list[str | None] = [*request.topics] or [*request.mounts] or [None]
-        self.topics = [reader.topics.choose(CLOUD, name) for name in dict.fromkeys(names)]
+        configured = [f'/{name.lstrip("/")}' for name in config.input.topics]
+        named = [*request.topics] or [*request.mounts] or configured
+        names: list[str | None] = [*named] or [None]
+        kind = CLOUD if config.input.kind == 'cloud' else IMAGE
+        self.topics = [reader.topics.choose(kind, name) for name in dict.fromkeys(names)]
         check_mounts(request, self.topics, config)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})
@@ -223,8 +226,10 @@ def check_mounts(request: Request, topics: list[str], config: Config) -> None:
             f'{request.path}: places of sensors for {", ".join(request.mounts)}, expected one '
             f'for each of {", ".join(topics)}'
         )
-    if len(topics) > 1 and not request.mounts and config.frames.base_to_sensor:
+    frames = config.frames
+    if len(topics) > 1 and not (request.mounts or frames.sensors) and frames.base_to_sensor:
         raise BagError(
             f'{request.path}: frames.base_to_sensor is the place of one sensor, not of '
-            f'{len(topics)}; name one for each topic with --mount'
+            f'{len(topics)}; name one for each topic with --mount, or their frames in '
+            'frames.sensors'
         )

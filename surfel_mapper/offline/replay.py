@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from surfel_mapper.config import Config
@@ -193,7 +192,10 @@ def replay(
         mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
     first = numbers_before(reader, clouds, poses, span)
     seen: Counter[str] = Counter()
-    add = partial(add_cloud, reader, mapper, poses)
+
+    def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
+        add_cloud(reader, mapper, message, poses, number, decode)
+
     images = DepthFeed(clouds, add) if mapper.config.input.kind == 'depth' else None
     infos = images.info_topics if images else {}
     for message in messages(reader, {*clouds, *infos}, poses, span):
@@ -258,8 +260,8 @@ def poses_now(
 def add_cloud(
     reader: BagReader,
     mapper: Mapper,
-    poses: PoseTopics,
     message: BagMessage,
+    poses: PoseTopics,
     number: int,
     decode: Decode = to_scan,
 ) -> None:

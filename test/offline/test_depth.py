@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A bag of depth images: each is mapped with the calibration of its camera, as in the node."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper import Config, Mapper
+from surfel_mapper.depth import PinholeCamera
+from surfel_mapper.errors import BagError
+from surfel_mapper.io.depth_image import CameraImage, depth_scan
+from surfel_mapper.offline.recording import open_recording, Request
+from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+
+IMAGE, INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
+TOPIC, INFO_TOPIC = '/camera/depth/image', '/camera/depth/camera_info'
+CAMERA = PinholeCamera(width=40, height=30, fx=35.0, fy=35.0, cx=19.5, cy=14.5)
+SETTINGS = {'input.kind': 'depth', 'pose.source': 'identity', 'map.min_points': 1}
+
+
+def camera_info(entries, record_ns, focal=35.0):
+    K = np.array([focal, 0.0, 19.5, 0.0, focal, 14.5, 0.0, 0.0, 1.0])
+    roi = entries.make(
+        'sensor_msgs/msg/RegionOfInterest',
+        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
+    )  # fmt: skip
+    message = entries.make(
+        INFO,
+        header=entries.header(record_ns, 'optical'),
+        height=30, width=40, distortion_model='plumb_bob', d=np.zeros(5), k=K,
+        r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi,
+    )  # fmt: skip
+    entries.append((INFO_TOPIC, INFO, record_ns, message))
+
+
+def image(entries, number):
+    stamp_ns = START_NS + number * PERIOD_NS
+    depth = np.random.default_rng(number).integers(1000, 1400, (30, 40)).astype('<u2')
+    message = entries.make(
+        IMAGE,
+        header=entries.header(stamp_ns, 'optical'),
+        height=30, width=40, encoding='16UC1', is_bigendian=0, step=80,
+        data=depth.view(np.uint8).ravel(),
+    )  # fmt: skip
+    entries.append((TOPIC, IMAGE, stamp_ns, message))
+    return message
+
+
+def replayed(bag, settings=SETTINGS):
+    config = Config.from_mapping(settings)
+    mapper = Mapper(config)
+    with open_recording(Request(path=bag), config) as recording:
+        list(recording.replay(mapper))
+        return mapper, recording
+
+
+def test_images_wait_for_the_first_calibration_and_are_mapped_with_it(tmp_path):
+    entries = Entries()
+    images = [image(entries, number) for number in range(2)]
+    camera_info(entries, START_NS + PERIOD_NS + 10)
+    images += [image(entries, number) for number in range(2, 4)]
+    mapper, recording = replayed(write_rosbag2(tmp_path / 'bag', entries))
+
+    expected = Mapper(Config.from_mapping(SETTINGS))
+    for message in images:
+        expected.add_scan(depth_scan(CameraImage(message, CAMERA)))
+        list(expected.insert_ready())
+    assert mapper.counters.mapped == 4
+    assert recording.topics == [TOPIC]
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_a_camera_that_is_none_is_counted_and_the_next_one_taken(tmp_path):
+    entries = Entries()
+    camera_info(entries, START_NS - 20, focal=0.0)
+    camera_info(entries, START_NS - 10)
+    image(entries, 0)
+    mapper, _ = replayed(write_rosbag2(tmp_path / 'bag', entries))
+    assert mapper.counters.messages_ignored['bad_message'] == 1
+    assert mapper.counters.mapped == 1
+
+
+def test_without_images_the_topics_are_named(tmp_path):
+    entries = Entries()
+    entries.cloud('/points', START_NS, np.ones((3, 3)))
+    with pytest.raises(BagError, match=r'no topic of type sensor_msgs/msg/Image.*/points'):
+        replayed(write_rosbag2(tmp_path / 'bag', entries))
+
+
+def test_the_topics_of_the_configuration_are_those_of_the_bag(tmp_path):
+    entries = Entries()
+    for number, side in enumerate(('front', 'rear')):
+        stamp_ns = START_NS + number * PERIOD_NS
+        entries.cloud(f'/{side}/points', stamp_ns, np.ones((3, 3)), frame_id=side)
+    entries.cloud('/other', START_NS, np.ones((3, 3)))
+    settings = {
+        'input.topics': ['front/points', '/rear/points'],
+        'pose.source': 'identity',
+        'frames.sensors': ['front', 'rear'],
+        'frames.base_to_sensor': [0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0] * 2,
+    }
+    mapper, recording = replayed(write_rosbag2(tmp_path / 'bag', entries), settings)
+    assert recording.topics == ['/front/points', '/rear/points']
+    assert mapper.counters.mapped == 2
