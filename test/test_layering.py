@@ -40,6 +40,7 @@ LEVELS = {
     'simulation': 5,
     'viz': 5,
     'cluster': 6,
+    'evaluation': 6,
     'cli': 7,
 }
 """Level of every module and folder of the package."""

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``surfel-mapper evaluate``: a map against a world, a cloud or another map; or a trajectory.
+
+Both have to be in one frame; trajectories are moved onto each other first.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.errors import FileFormatError
+
+if TYPE_CHECKING:
+    import numpy as np
+    import numpy.typing as npt
+
+    from surfel_mapper.evaluation.map_files import Discs
+    from surfel_mapper.io.trajectory import Trajectory
+
+SUMMARY = 'Compare a map with the truth or another map, or a trajectory with another.'
+
+EXAMPLE = 'surfel-mapper evaluate street_surfels --truth street'
+
+TRAJECTORIES = ('.tum', '.txt', '.csv', '.kitti')
+"""Files that are taken for trajectories."""
+
+DEFAULT_M = 0.5
+"""For max-distance and radius where no voxel size is known."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add(
+        'map', type=Path, metavar='MAP',
+        help='output of a replay or merge, or a file of it; .tum, .txt, .csv: a trajectory',
+    )  # fmt: skip
+    add(
+        '--truth', type=Path, required=True, metavar='TRUTH',
+        help='a simulated bag, its world.json, a .ply or .pcd of points, or another map; '
+        'for a trajectory another one, or a simulated bag',
+    )  # fmt: skip
+    add(
+        '--max-distance', type=positive, metavar='M',
+        help='surfels farther from the truth are not compared (the voxel size)',
+    )  # fmt: skip
+    add(
+        '--radius', type=positive, metavar='M',
+        help='a place of the truth is found by a surfel this near (the voxel size)',
+    )  # fmt: skip
+    add(
+        '--max-difference', type=positive, default=0.01, metavar='S',
+        help='poses at most so far apart in time are compared (%(default)s)',
+    )  # fmt: skip
+    add(
+        '--min-points', type=int, default=5, metavar='N',
+        help='from how many points on a voxel counts as a surfel (%(default)s)',
+    )  # fmt: skip
+    add('--json', action='store_true', help='print as JSON')
+
+
+def positive(text: str) -> float:
+    """Return a finite positive number."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected a positive number')
+    return value
+
+
+def run(args: argparse.Namespace) -> int:
+    """Compare and report."""
+    if args.map.suffix in TRAJECTORIES:
+        result, lines = trajectories(args)
+    else:
+        result, lines = maps(args)
+    content = {'map': str(args.map), 'truth': str(args.truth), **result}
+    print(json.dumps(content) if args.json else '\n'.join(lines))
+    return 0
+
+
+def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """Return the errors of a map, and lines that state them."""
+    from surfel_mapper.evaluation.comparison import CloudTruth, evaluate, Truth
+    from surfel_mapper.evaluation.map_files import load_discs
+    from surfel_mapper.evaluation.world_truth import is_world, load_truth
+
+    surfels = load_discs(args.map, args.min_points)
+    truth: Truth
+    digests: dict[str, Any] = {}
+    if is_world(args.truth):
+        truth = load_truth(args.truth)
+    else:
+        other = load_discs(args.truth, args.min_points)
+        truth = CloudTruth(other)
+        digests = compared_digests(surfels, other)
+    size_m = surfels.voxel_size_m or DEFAULT_M
+    result = evaluate(
+        surfels,
+        truth,
+        max_distance_m=args.max_distance or size_m,
+        radius_m=args.radius or size_m,
+    )
+    return {**result, **digests}, map_lines({**result, **digests})
+
+
+def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
+    """Return whether two maps are equal to the bit, where both are exact."""
+    if surfels.digest is None or other.digest is None:
+        return {}
+    return {'equal': surfels.digest == other.digest}
+
+
+def map_lines(result: dict[str, Any]) -> list[str]:
+    """Return the errors of a map for people."""
+    lines = [f'surfels {result["surfels"]}   compared {result["compared"]}']
+    for name, unit, factor in (('position_m', 'mm', 1e3), ('normal_deg', 'deg', 1.0)):
+        if name in result:
+            lines.append(f'{name.partition("_")[0]:9} {in_words(result[name], unit, factor)}')
+    if result.get('normals_on_the_other_side') is not None:
+        lines.append(f'normals on the other side {result["normals_on_the_other_side"]}')
+    if result.get('completeness') is not None:
+        radius = result['completeness_radius_m']
+        lines.append(f'completeness {result["completeness"]:.2%} within {radius:g} m')
+    else:
+        lines.append('completeness unknown: of a world it takes the bag with simulation.json')
+    if 'equal' in result:
+        lines.append('equal to the bit' if result['equal'] else 'not equal to the bit')
+    return lines
+
+
+def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) -> str:
+    """Return errors in a line."""
+    return '   '.join(
+        f'{name} {"-" if value is None else f"{value * factor:.3f} {unit}"}'
+        for name, value in errors.items()
+    )
+
+
+def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
+    """Return the errors of a trajectory, and lines that state them."""
+    from surfel_mapper.alignment.trajectory_errors import compare
+    from surfel_mapper.io.trajectory import read_trajectory
+
+    estimated_ns, estimated = poses_of(args.map, read_trajectory(args.map))
+    true_ns, true = true_poses(args.truth, estimated_ns)
+    try:
+        result = compare(
+            estimated_ns, estimated, true_ns, true,
+            max_difference_ns=round(args.max_difference * 1e9),
+        )  # fmt: skip
+    except ValueError as error:
+        raise FileFormatError(f'{args.map}, {args.truth}: {error}') from error
+    lines = [f'poses {result["num_poses"]}']
+    for kind in ('absolute', 'relative'):
+        moved, turned = result[kind]['translation_m'], result[kind]['rotation_deg']
+        lines.append(f'{kind} {in_words(moved, "m")}')
+        lines.append(f'{" " * len(kind)} {in_words(turned, "deg")}')
+    drift_m, drift_deg = result['drift_m_per_100m'], result['drift_deg_per_100m']
+    lines.append(f'drift {drift_m:.3f} m, {drift_deg:.3f} deg in 100 m')
+    return result, lines
+
+
+def true_poses(
+    path: Path, stamps_ns: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return the true poses: of a file, or of the lidar of a simulated bag at given stamps."""
+    import numpy as np
+
+    from surfel_mapper.io.trajectory import read_trajectory
+    from surfel_mapper.simulation import load_simulation
+
+    if not path.is_dir():
+        return poses_of(path, read_trajectory(path))
+    drive = load_simulation(path).drive
+    poses = [drive.T_odom_sensor(int(stamp_ns)) for stamp_ns in stamps_ns]
+    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
+
+
+def poses_of(
+    path: Path, trajectory: Trajectory
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    """Return stamps (S,) and poses (S, 4, 4) of a trajectory; without stamps, by number."""
+    import numpy as np
+
+    from surfel_mapper.geometry import pose_matrix
+
+    poses = [
+        pose_matrix(xyz, q_xyzw)
+        for xyz, q_xyzw in zip(trajectory.xyz, trajectory.q_xyzw, strict=True)
+    ]
+    if trajectory.stamp_ns is None:
+        raise FileFormatError(f'{path}: poses without times, expected a times.txt beside it')
+    return trajectory.stamp_ns, np.array(poses).reshape(-1, 4, 4)

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Maps in files, of whatever format, as discs: where each surfel is, and its normal.
+
+A file or a directory that a replay or a merge wrote, or points of anyone as PLY or PCD. Of the
+exact formats the digest comes along, so that two maps can be found equal to the bit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.io import map_state, parquet, pcd, ply
+from surfel_mapper.io.parquet_tiles import dataset_digest, tiles_in
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+
+Floats = npt.NDArray[np.float64]
+
+IN_DIRECTORY = ('map.parquet', 'map.npz', 'map.ply', 'map.pcd')
+"""Files of a replay that hold its map, the exact ones first."""
+
+NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
+"""What the components of normals are called."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Discs:
+    """
+    Surfels of a map, or points of a cloud.
+
+    Attributes
+    ----------
+    position : (K, 3) float64, m
+    normal : (K, 3) float64, or None
+        Of unit length, or nan; None where the file has none.
+    voxel_size_m : float, optional
+        Of the map, where the file says so.
+    digest : str, optional
+        Of the map, where the file is exact.
+
+    """
+
+    position: Floats
+    normal: Floats | None
+    voxel_size_m: float | None = None
+    digest: str | None = None
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return len(self.position)
+
+
+def load_discs(path: str | Path, min_points: int) -> Discs:
+    """
+    Return the surfels of a map in a file or directory.
+
+    Parameters
+    ----------
+    path : str or Path
+        Output directory of a replay or a merge, a dataset of tiles, or a file: .parquet, .npz,
+        .ply or .pcd.
+    min_points : int
+        From how many points on a voxel counts, where the file has them all.
+
+    Raises
+    ------
+    FileFormatError
+        If there is no map, or it cannot be read.
+
+    """
+    found = Path(path)
+    if not found.is_dir():
+        return load_file(found, min_points)
+    for directory in (found / 'map', found):
+        if tiles_in(directory):
+            return load_tiles(directory, min_points)
+    for name in IN_DIRECTORY:
+        if (found / name).is_file():
+            return load_file(found / name, min_points)
+    raise FileFormatError(
+        f'{path}: no map in this directory; expected map/tile_i=*/tile_j=*/ or one of '
+        f'{", ".join(IN_DIRECTORY)}'
+    )
+
+
+def load_file(path: Path, min_points: int) -> Discs:
+    """Return the surfels in a file."""
+    if path.suffix == '.parquet':
+        return of_map(parquet.read_map(path), min_points)
+    if path.suffix == '.npz':
+        return of_map(map_state.load_map(path)[0], min_points)
+    if path.suffix == '.ply':
+        return of_columns(path, ply.read_points(path))
+    if path.suffix == '.pcd':
+        return of_columns(path, pcd.read_points(path))
+    raise FileFormatError(f'{path}: expected a directory, .parquet, .npz, .ply or .pcd')
+
+
+def load_tiles(directory: Path, min_points: int) -> Discs:
+    """Return the surfels of a dataset, tile by tile."""
+    parts: list[Surfels] = []
+    size_m = 0.0
+    for tile in tiles_in(directory).values():
+        surfel_map = parquet.read_map(tile)
+        parts.append(surfel_map.surfels(min_points))
+        size_m = surfel_map.voxel_size_m
+    return Discs(
+        np.concatenate([part.position for part in parts]),
+        np.concatenate([part.normal for part in parts]),
+        size_m,
+        dataset_digest(directory),
+    )
+
+
+def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
+    """Return the surfels of a map."""
+    surfels = surfel_map.surfels(min_points)
+    return Discs(surfels.position, surfels.normal, surfel_map.voxel_size_m, surfel_map.digest())
+
+
+def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
+    """Return the points of a cloud; normals of other length than 1 are brought to it."""
+    if not {'x', 'y', 'z'} <= set(columns):
+        raise FileFormatError(f'{path}: no x, y, z among {", ".join(columns)}')
+    names = next((names for names in NORMALS if set(names) <= set(columns)), None)
+    normal = None
+    if names is not None:
+        normal = np.stack([columns[name].astype(np.float64) for name in names], axis=1)
+        with np.errstate(invalid='ignore'):
+            normal /= np.sqrt((normal * normal).sum(axis=1, keepdims=True))
+    position = np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1)
+    finite = np.isfinite(position).all(axis=1)
+    return Discs(position[finite], None if normal is None else normal[finite])

@@ -1,0 +1,132 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper evaluate`` compares maps of all formats with the truth, and trajectories."""
+
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.io.ply import write_points
+from surfel_mapper.simulation import load_simulation
+
+FORMATS = 'ply,pcd,parquet,npz'
+
+
+@pytest.fixture(scope='module')
+def street(tmp_path_factory):
+    """Return a simulated bag and the output of its replay in all formats."""
+    folder = tmp_path_factory.mktemp('street')
+    bag, output = folder / 'street', folder / 'out'
+    size = ['--beams', '16', '--columns', '512', '--noise', '0.01', '--scans', '12']
+    assert main(['simulate', 'street', '--output', str(bag), *size]) == 0
+    poses = ['--poses-out', str(folder / 'poses.tum')]
+    arguments = ['replay', str(bag), '--formats', FORMATS, '--output', str(output), *poses]
+    assert main(arguments) == 0
+    return bag, output
+
+
+def evaluated(capsys, *arguments):
+    capsys.readouterr()
+    assert main(['evaluate', *map(str, arguments), '--json']) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def test_a_map_of_a_simulated_street_is_near_its_truth(street, capsys):
+    bag, output = street
+    result = evaluated(capsys, output, '--truth', bag)
+
+    assert result['surfels'] == json.loads((output / 'summary.json').read_text())['surfels']
+    assert result['compared'] == result['surfels'] > 500
+    assert 0.0 < result['position_m']['median'] < 0.005
+    assert 0.0 < result['normal_deg']['median'] < 3.0
+    assert 0.5 < result['completeness'] <= 1.0
+    assert result == {**evaluated(capsys, output, '--truth', bag / 'world.json'),
+                      'truth': str(bag)}  # fmt: skip
+
+
+def test_every_format_has_the_same_errors(street, capsys):
+    bag, output = street
+    found = [
+        evaluated(capsys, output / f'map.{name}', '--truth', bag, '--max-distance', '0.5')
+        for name in FORMATS.split(',')
+    ]
+    for result in found[1:]:
+        for name in ('position_m', 'normal_deg'):
+            for figure in ('mean', 'p95'):
+                assert result[name][figure] == pytest.approx(found[0][name][figure], abs=1e-3)
+        assert result['surfels'] == found[0]['surfels']
+
+
+def test_a_map_against_itself_is_equal_to_the_bit(street, capsys):
+    _, output = street
+    result = evaluated(capsys, output / 'map.npz', '--truth', output / 'map.parquet')
+    assert result['equal'] is True
+    assert result['position_m']['max'] == 0.0
+    assert result['completeness'] == 1.0
+    assert 'equal' not in evaluated(capsys, output / 'map.npz', '--truth', output / 'map.ply')
+
+
+def test_points_without_normals_are_a_truth_too(street, capsys, tmp_path):
+    bag, output = street
+    scan = load_simulation(bag).scan(0)
+    points = scan.points[np.isfinite(scan.points).all(axis=1)]
+    write_points(tmp_path / 'truth.ply', dict(zip('xyz', points.T, strict=True)))
+    result = evaluated(capsys, output, '--truth', tmp_path / 'truth.ply', '--max-distance', '50')
+    assert 'normal_deg' not in result
+    assert result['position_m']['mean'] > 0.0
+
+
+def test_the_poses_of_a_replay_are_those_of_the_simulation(street, capsys):
+    bag, output = street
+    result = evaluated(capsys, output.parent / 'poses.tum', '--truth', bag)
+    assert result['num_poses'] == 12
+    for kind in ('absolute', 'relative'):
+        assert result[kind]['translation_m']['max'] < 1e-6
+        assert result[kind]['rotation_deg']['max'] < 1e-5
+
+
+def test_a_trajectory_that_is_moved_as_a_whole_has_no_error(street, capsys, tmp_path):
+    _, output = street
+    lines = (output.parent / 'poses.tum').read_text().splitlines()
+    moved = [lines[0]]
+    for line in lines[1:]:
+        stamp, x, *rest = line.split()
+        moved.append(' '.join([stamp, repr(float(x) + 100.0), *rest]))
+    (tmp_path / 'moved.tum').write_text('\n'.join(moved))
+
+    result = evaluated(capsys, tmp_path / 'moved.tum', '--truth', output.parent / 'poses.tum')
+
+    assert result['absolute']['translation_m']['max'] < 1e-6
+
+
+def test_the_report_says_it_in_a_few_lines(street, capsys):
+    bag, output = street
+    for arguments in ([output], [output.parent / 'poses.tum']):
+        capsys.readouterr()
+        assert main(['evaluate', *map(str, arguments), '--truth', str(bag)]) == 0
+        assert 2 < len(capsys.readouterr().out.splitlines()) < 9
+
+
+@pytest.mark.parametrize(
+    ('name', 'text'),
+    [('nothing', 'expected a directory'), ('empty', 'no map in this directory'),
+     ('a.json', 'No such file'), ('other.ply', 'No such file')],
+)  # fmt: skip
+def test_what_is_no_map_and_no_truth_is_refused_by_name(street, tmp_path, capsys, name, text):
+    bag, output = street
+    (tmp_path / 'empty').mkdir()
+    assert main(['evaluate', str(output), '--truth', str(tmp_path / name)]) == 1
+    error = capsys.readouterr().err
+    assert name in error
+    assert text in error
+    assert main(['evaluate', str(tmp_path / name), '--truth', str(bag)]) == 1
+
+
+def test_trajectories_without_common_times_are_refused(street, tmp_path, capsys):
+    _, output = street
+    (tmp_path / 'early.tum').write_text('1.0 0 0 0 0 0 0 1\n2.0 1 0 0 0 0 0 1\n')
+    truth = str(output.parent / 'poses.tum')
+    assert main(['evaluate', str(tmp_path / 'early.tum'), '--truth', truth]) == 1
+    assert '0 poses within 0.01 s of one another' in capsys.readouterr().err
