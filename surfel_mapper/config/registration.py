@@ -94,6 +94,10 @@ class RegistrationConfig(Stage):
         live=True,
     )
 
+    publish_tf: bool = setting(
+        True, 'The node publishes the transform from the fixed frame to what it follows.'
+    )
+
     def check(self, stage: str) -> None:
         """Refuse a start that is no pose."""
         if self.start and (

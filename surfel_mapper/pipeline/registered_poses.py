@@ -43,6 +43,8 @@ class RegisteredPoses:
     ----------
     body : str
         The frame that is followed; empty before the first scan.
+    T_fixed_body : (4, 4) float64
+        Where it was at the stamp of the last scan.
 
     """
 
@@ -55,6 +57,7 @@ class RegisteredPoses:
         self._start = pose_matrix(start[:3], start[3:]) if start else np.eye(4)
         self._tracker = Tracker(self._registration, self._start)
         self.body = ''
+        self.T_fixed_body = self._start
         self._num_aligned = self._num_degenerate = 0
         self._fits: deque[float] = deque(maxlen=LATEST)
 
@@ -62,6 +65,11 @@ class RegisteredPoses:
         """Take new settings from the next scan on."""
         self._config = config
         self._registration.config = config.registration
+
+    @property
+    def twist(self) -> npt.NDArray[np.float64]:
+        """How what is followed moves, (6,) m/s and rad/s, in its own frame."""
+        return self._tracker.twist
 
     def warm_up(self) -> None:
         """Compile the kernels, for both types that points may have."""
@@ -164,8 +172,8 @@ class RegisteredPoses:
         else:
             alignment = None
             tracker.advance(T_fixed_middle, middle_ns)
-        T_fixed_body = compose(tracker.pose, T_middle_body)
-        return compose(T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns)), alignment
+        self.T_fixed_body = compose(tracker.pose, T_middle_body)
+        return compose(self.T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns)), alignment
 
     def summary(self) -> dict[str, Any]:
         """Return how well scans fitted, for files and reports."""

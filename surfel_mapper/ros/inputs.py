@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 import copy
 from functools import partial
+import time
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -93,6 +94,7 @@ class Inputs:
         names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
         self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
         self.lost: dict[str, int] = {}
+        self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         self._images = DepthImages()
         self._largest_bytes = 0
         self._node = node
@@ -112,6 +114,7 @@ class Inputs:
             If a package of messages is missing.
 
         """
+        self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         source = self._config.pose.source
         on_pose = partial(self._on_pose, source)
         if source == ODOMETRY:
@@ -122,7 +125,7 @@ class Inputs:
             message = transform_message()
             self._subscribe(message, '/tf_static', self._on_static, STATIC_TRANSFORMS)
             self._subscribe(message, '/tf', on_pose, TRANSFORMS)
-        if source in (ODOMETRY, POSE) and not self._config.frames.base_to_sensor:
+        if source in (ODOMETRY, POSE, 'registration') and not self._config.frames.base_to_sensor:
             self._subscribe_static()
         if self._config.input.kind == 'depth':
             warm_up()
@@ -154,9 +157,9 @@ class Inputs:
         return f'clouds lost on the way ({which}): {remedy}'
 
     @property
-    def cloud_topic(self) -> str:
-        """The first of the topics."""
-        return self.cloud_topics[0]
+    def most_silent(self) -> tuple[str, float]:
+        """The topic that was not heard of for longest, and when it was last, by time.monotonic."""
+        return min(self._heard_s.items(), key=lambda item: item[1])
 
     @property
     def clouds_lost(self) -> int:
@@ -210,11 +213,16 @@ class Inputs:
         self._subscriptions.append(subscription)
 
     def _on_cloud(self, topic: str, msg: PointCloud2) -> None:
-        self._largest_bytes = max(self._largest_bytes, len(msg.data))
+        self._hear(topic, msg)
         self._thread.put_cloud(msg, topic)
 
-    def _on_image(self, topic: str, msg: Image) -> None:
+    def _hear(self, topic: str, msg: Any) -> None:
+        """Remember that a topic lives, and how large its messages are."""
+        self._heard_s[topic] = time.monotonic()
         self._largest_bytes = max(self._largest_bytes, len(msg.data))
+
+    def _on_image(self, topic: str, msg: Image) -> None:
+        self._hear(topic, msg)
         self._put_images(topic, self._images.add_image(topic, msg))
 
     def _on_camera_info(self, topic: str, msg: CameraInfo) -> None:

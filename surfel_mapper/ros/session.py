@@ -13,12 +13,14 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.io.map_state import load_map
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.control import Control
 from surfel_mapper.ros.inbox import Inbox
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
+from surfel_mapper.ros.registration import registration_outputs
 from surfel_mapper.ros.saving import save_map
 
 LATEST = 200
@@ -48,6 +50,8 @@ class Session:
     ------
     ConfigError
         If this version cannot do what the settings ask for.
+    FileFormatError, MapError
+        If the map of ``map.load`` cannot be read, or is not as configured.
 
     """
 
@@ -56,10 +60,14 @@ class Session:
         self._node = node
         self.config = config
         self.mapper = Mapper(config)
+        if config.map.load:
+            surfel_map, _ = load_map(config.map.load, voxel_size_m=config.map.voxel_size_m)
+            self.mapper.restore(surfel_map, [])  # without its window: it stays
         warm_up(self.mapper, node)
         self.thread = MappingThread(self.mapper, inbox.fail)
         self.inputs = Inputs(node, config, self.thread)
         self.outputs = Outputs(node, self.mapper, self.thread)
+        self.registration = registration_outputs(node, self.mapper, self.thread)
         self.control = Control(node, self.mapper, self.thread, self.outputs)
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self.thread.start(self._on_update)
@@ -102,6 +110,8 @@ class Session:
     def _on_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
         self.outputs.publish_update(update)
+        if self.registration is not None:
+            self.registration.publish(update)
         now_ns = self._node.get_clock().now().nanoseconds
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
 

@@ -1,0 +1,128 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The node without any odometry, talked to over DDS: it finds its poses and publishes them."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry, Path
+
+from surfel_mapper.config import Config
+from surfel_mapper.geometry import pose_matrix, q_xyzw
+from surfel_mapper.io.map_state import save_map
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.ros.registration import covariance
+from test.alignment.test_registration import map_of, ROOM
+from test.pipeline.test_registered_poses import pose_at, scan_at
+from test.ros.live import cloud, LATCHED, RVIZ, START_NS
+
+pytestmark = pytest.mark.timeout(120)
+
+PERIOD_NS = 100_000_000
+SETTINGS = {'pose.source': 'registration', 'registration.noise_m': 0.005}
+
+
+def arguments(**more):
+    settings = {**SETTINGS, **{name.replace('__', '.'): value for name, value in more.items()}}
+    parameters = (item for name, value in settings.items() for item in ('-p', f'{name}:={value}'))
+    reliable = 'qos_overrides./points.subscription.reliability:=reliable'
+    return ['--ros-args', *parameters, '-p', reliable]
+
+
+def clouds(numbers):
+    return [cloud(START_NS + n * PERIOD_NS, scan_at(n).points) for n in numbers]
+
+
+def pose_of(message):
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    return pose_matrix((p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+
+
+def send(peer, messages):
+    for message in messages:
+        time.sleep(0.05)
+        peer.publish('/points', message)
+
+
+def test_odometry_and_track_are_those_that_a_mapper_finds(start, peer):
+    node = start('node', *arguments())
+    node.wait_for_output('ready', 60.0)
+    found = peer.collect(Odometry, '/surfel_mapper/odometry', RVIZ)
+    tracks = peer.collect(Path, '/surfel_mapper/track', LATCHED)
+    peer.advertise('/points')
+    messages = clouds(range(6))
+
+    send(peer, messages)
+    peer.spin_until(lambda: len(found) == 6, what=lambda: node.output)
+
+    mapper = Mapper(Config.from_mapping(SETTINGS))
+    for message, odometry in zip(messages, found, strict=True):
+        mapper.add_scan(to_scan(message))
+        list(mapper.insert_ready())
+        np.testing.assert_allclose(
+            pose_of(odometry), mapper.registered.T_fixed_body, rtol=0.0, atol=1e-12
+        )
+        linear = odometry.twist.twist.linear
+        np.testing.assert_allclose(
+            [linear.x, linear.y, linear.z], mapper.registered.twist[:3], atol=1e-12
+        )
+        assert (odometry.header.frame_id, odometry.child_frame_id) == ('odom', 'lidar')
+    assert 0.0 < found[-1].pose.covariance[0] < 1e-3
+    assert tracks[0].header.frame_id == 'odom'
+    assert node.stop() == 0
+    assert mapper.map.digest() in node.output
+
+
+def test_on_a_frozen_map_an_initial_pose_tells_where_to_begin(start, peer, tmp_path):
+    save_map(tmp_path / 'room.npz', map_of(ROOM))
+    far_off = '[40.0, -30.0, 0.0, 0.0, 0.0, 0.0, 1.0]'
+    node = start(
+        'node',
+        *arguments(map__mode='frozen', map__load='room.npz', registration__start=far_off),
+    )
+    node.wait_for_output('ready', 60.0)
+    found = peer.collect(Odometry, '/surfel_mapper/odometry', RVIZ)
+    peer.advertise('/points')
+    peer.advertise('/initialpose', kinds={'/initialpose': PoseWithCovarianceStamped})
+    send(peer, clouds([0]))
+    node.wait_for_output('cells meet a surfel')
+
+    message = PoseWithCovarianceStamped()
+    message.header.frame_id = 'odom'
+    p, q = message.pose.pose.position, message.pose.pose.orientation
+    p.x, p.y, p.z = (pose_at(0)[:3, 3] + [0.4, -0.3, 0.0]).tolist()
+    q.x, q.y, q.z, q.w = q_xyzw(pose_at(0)).tolist()
+    peer.publish('/initialpose', message)
+    peer.spin_for(0.5)
+    send(peer, clouds([1, 2]))
+    peer.spin_until(lambda: len(found) == 2, what=lambda: node.output)
+
+    for number, odometry in enumerate(found, 1):
+        np.testing.assert_allclose(pose_of(odometry), pose_at(number), atol=5e-3)
+    assert node.stop() == 0
+    assert map_of(ROOM).digest() in node.output
+
+
+def test_a_map_that_is_not_there_ends_the_node_with_a_message(start):
+    node = start('node', *arguments(map__load='nowhere.npz'))
+
+    assert node.wait(60.0) == 1
+    assert 'nowhere.npz' in node.output
+    assert 'Traceback' not in node.output
+
+
+def test_where_nothing_is_known_the_covariance_is_huge():
+    information = np.diag([1e4, 0.0, 1e4, 1e6, 1e6, 1e6])
+
+    found = np.diag(covariance(information))
+
+    assert found[0] == pytest.approx(1e-4)
+    assert found[1] == pytest.approx(1e6)
