@@ -8,7 +8,7 @@ marked in a cube of bits about the sensor, so that a block met by a thousand ray
 and is listed once, in the order of its index.
 
 Rays are denser than blocks where they are short. Through the band only so many are walked that
-those next to each other are half a voxel apart. Carving, a ray is walked only from where the
+those next to each other are about half a voxel apart. Carving, a ray is walked only from where the
 coarser ones beside it, with columns and rows of larger powers of two, are an eighth of a block
 away or end: a lidar that sees 100 m walks 6 blocks a ray instead of 40, and what is missed are
 corners of blocks, less than a quarter of a block deep, in free space.
@@ -32,7 +32,7 @@ ROW_FREE = 5
 """Range up to which neighbouring rows are an eighth of a block apart."""
 COLUMN_FREE = 6
 ROW_BAND = 7
-"""Range up to which neighbouring rows are half a voxel apart."""
+"""Range up to which neighbouring rows are too near to each other for each to be walked."""
 COLUMN_BAND = 8
 NUM_REACH = 9
 

@@ -24,6 +24,10 @@ MAX_SIDE = 2048
 """Blocks along the edge of the cube that rays stay in: 1 GiB of bits."""
 
 
+SPACING_VOXELS = 0.7
+"""Rays through the band are at most so far apart; half as much where that is the power of two."""
+
+
 class BlockSelection:
     """
     Chooses blocks; keeps the memory that it needs for it.
@@ -88,7 +92,7 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     """Return what rays reach, as kernels/block_marks.py has it."""
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
-    band = [config.voxel_size_m / 2.0 / pitch for pitch in sensor.pitch_rad]
+    band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
     ends = [config.truncation_m, config.reach_behind_m, sensor.min_range_m, sensor.max_range_m]
     return np.array([*ends, float(config.carve), *free, *band])
 
