@@ -36,7 +36,7 @@ from surfel_mapper.alignment.lum import LUM, LumResult
 from surfel_mapper.alignment.solver import components
 from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.errors import AlignmentError
-from surfel_mapper.geometry import compose, interpolate, inverse, rotation_angle
+from surfel_mapper.geometry import compose, interpolate, inverse, rotation_angle, Transform
 
 Floats = npt.NDArray[np.float64]
 
@@ -60,6 +60,8 @@ LEEWAY = 10.0
 """Gaps count half from so many times what the last round moved: less would miss what is right."""
 
 STEPS_A_ROUND = 2
+
+LITTLE_OVERLAP = 'too few of their surfels belong together (align.min_overlap)'
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -145,9 +147,14 @@ def align_scans(
         settled=settled,
         rounds=rounds,
         residuals={(keys[s], keys[t]): gap for (s, t), gap in by_surfels.items()},
-        dropped={(keys[s], keys[t]): why for (s, t), why in result.dropped.items()},
+        dropped={(keys[s], keys[t]): LITTLE_OVERLAP for s, t in result.dropped},
         unconnected=tuple(keys[v] for v in np.flatnonzero(part != part[0]).tolist()),
     )
+
+
+def extent(motion: Transform) -> tuple[float, float]:
+    """Return how far a motion goes, m, and how far it turns, deg."""
+    return float(np.linalg.norm(motion[:3, 3])), float(np.degrees(rotation_angle(motion)))
 
 
 def key_scans(T_map_sensor: Floats, usable: list[int], distance_m: float) -> list[int]:
@@ -155,8 +162,8 @@ def key_scans(T_map_sensor: Floats, usable: list[int], distance_m: float) -> lis
     keys = usable[:1]
     for number in usable[1:]:
         motion = compose(inverse(T_map_sensor[keys[-1]]), T_map_sensor[number])
-        far = np.linalg.norm(motion[:3, 3]) >= distance_m
-        if far or np.degrees(rotation_angle(motion)) >= KEY_ANGLE_DEG:
+        moved_m, turned_deg = extent(motion)
+        if moved_m >= distance_m or turned_deg >= KEY_ANGLE_DEG:
             keys.append(number)
     if keys[-1] != usable[-1]:
         keys.append(usable[-1])
@@ -179,6 +186,7 @@ class _Aligner:
             T_map_sensor, settings.loop_distance_m
         )
         poses = poses_of(inverse(self._T_map_first) @ T_map_sensor, np.zeros((len(scans), 6)))
+        self._matched: dict[tuple[int, int], tuple[Floats, float]] = {}
         self._lum = LUM(max_iterations=STEPS_A_ROUND)
         self._lum.add_point_cloud(np.concatenate([scans[0].position, ANCHORS]))
         for v in range(1, len(scans)):
@@ -217,6 +225,13 @@ class _Aligner:
         return bool(still and was_finest)
 
     def _compare(self, source: int, target: int, T_target_source: Floats) -> None:
+        """Match the surfels of two scans, unless they were matched where they are still."""
+        known = self._matched.get((source, target))
+        if known is not None and known[1] == self._scale_m:
+            moved_m, turned_deg = extent(compose(inverse(known[0]), T_target_source))
+            if moved_m <= self._settings.settled_m and turned_deg <= self._settings.settled_deg:
+                return
+        self._matched[source, target] = (T_target_source, self._scale_m)
         scans = self._scans[source], self._scans[target]
         pairs = match(*scans, T_target_source, self._limits)
         if len(pairs) < self._settings.min_overlap * min(map(len, scans)):

@@ -20,9 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment import align_scans, Samples, WindowAlignment
+from surfel_mapper.alignment.window import extent
 from surfel_mapper.config import Config
 from surfel_mapper.errors import AlignmentError
-from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
+from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -157,8 +158,7 @@ class WindowAligner:
         moved, changes = {}, [(0.0, 0.0)]
         for place, (scan, pose) in enumerate(zip(scans, alignment.T_map_sensor, strict=True)):
             change = compose(inverse(scan.T_map_sensor), pose)
-            distance_m = float(np.linalg.norm(change[:3, 3]))
-            angle_deg = float(np.degrees(rotation_angle(change)))
+            distance_m, angle_deg = extent(change)
             if distance_m > config.align.move_m or angle_deg > config.align.move_deg:
                 moments = self._moments_at(scan, pose)
                 moved[place] = replace(scan, moments=moments, T_map_sensor=pose)
