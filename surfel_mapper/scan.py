@@ -57,6 +57,9 @@ class Scan:
         not known. Filters that look at the robot or at the vertical need them.
     times : PointTimes, optional
         When the points were measured, for deskewing; None: all at the stamp.
+    camera : tuple of float
+        Of points of a depth image: width and height of the image, focal lengths and centre
+        fx, fy, cx, cy, all in pixels.
     msg : sensor_msgs/PointCloud2, optional
         The cloud that it was read from, whose points are these: as many, in this order.
 
@@ -74,6 +77,7 @@ class Scan:
     T_base_sensor: npt.NDArray[np.float64] | None = None
     T_fixed_sensor: npt.NDArray[np.float64] | None = None
     times: PointTimes | None = None
+    camera: tuple[float, ...] = ()
     msg: Any = None
 
     def __post_init__(self) -> None:
@@ -83,6 +87,8 @@ class Scan:
             raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
+        if getattr(self.columns, 'num_rows', None) == len(points):
+            return  # of filters: to be measured, each would have to be taken
         for name, column in self.columns.items():
             if len(column) != len(points):
                 raise ValueError(

@@ -70,12 +70,16 @@ def write_files(
 ) -> list[Path]:
     """Write the map in some formats, picture, report and summary; return what is there."""
     from surfel_mapper.io.files import replace_file
+    from surfel_mapper.io.ply import write_mesh
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper)
+    if mapper.tsdf is not None:
+        mapper.tsdf.finish(mapper.window)
+        write_mesh(output / 'mesh.ply', mapper.tsdf.mesh())
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (

@@ -17,6 +17,7 @@ from surfel_mapper.config.settings import setting, Stage
 from surfel_mapper.errors import ConfigError
 
 WEIGHT_MODES = ('constant', 'inverse_square', 'ray_density', 'ray_density_inv_sq')
+DISTANCES = ('along_ray', 'to_plane')
 INTERPOLATIONS = ('nearest', 'bilinear', 'adaptive')
 SEMANTICS = ('none', 'majority', 'first_k', 'single', 'binary')
 
@@ -31,6 +32,26 @@ class TsdfConfig(Stage):
     STAGE: ClassVar[str] = 'layers.tsdf'
 
     enabled: bool = setting(False, 'Fuse the scans into a signed distance field too.')
+    when_final: bool = setting(
+        False,
+        'A scan enters when it leaves the window, so that an alignment has moved it before, and '
+        'not at once.',
+    )
+    sensor_rows: int = setting(
+        0,
+        'Beams of the lidar; 0: as its first scan shows. A camera is known from its camera_info.',
+        low=0,
+        high=4096,
+    )
+    sensor_columns: int = setting(
+        0, 'Steps of azimuth of the lidar; 0: as its first scan shows.', low=0, high=65536
+    )
+    min_range_m: float = setting(
+        0.5, 'What the sensor measures nearer than this is ignored, m.', low=0.001, high=1e3
+    )
+    max_range_m: float = setting(
+        50.0, 'Beyond this the sensor only says that there is nothing, m.', low=0.01, high=1e5
+    )
     voxel_size_m: float = setting(0.1, 'Edge of a voxel, m.', low=0.001, high=100.0)
     voxels_per_side: int = setting(
         8, 'Voxels along the edge of a block, a power of two.', low=2, high=32
@@ -61,6 +82,12 @@ class TsdfConfig(Stage):
         choices=('band', 'frustum'),
     )
     carve: bool = setting(True, 'Also visit the blocks between sensor and surface.')
+    distance: str = setting(
+        'along_ray',
+        'How far a voxel is from a surface: along the ray; or to_plane, that times the cosine of '
+        'the angle at which the ray meets the surface, which closes the ground far from a lidar.',
+        choices=DISTANCES,
+    )
     interpolation: str = setting(
         'adaptive', 'How a voxel is looked up in the range image.', choices=INTERPOLATIONS
     )
@@ -141,6 +168,11 @@ class TsdfConfig(Stage):
                 'skip_extra_channels',
                 not (self.skip_extra_channels and self.extra_labels),
                 'false where extra_labels are given',
+            ),
+            (
+                'max_range_m',
+                self.max_range_m > self.min_range_m,
+                f'more than min_range_m = {self.min_range_m}',
             ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
         )

@@ -11,6 +11,7 @@ are read by the names of their attributes alone and checked before a pixel is re
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import astuple
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -138,7 +139,12 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
         points = depth_points(depth, image.camera)
     except ValueError as error:
         raise CloudFormatError(f'{topic}: {error}') from error
-    return Scan(points=points, stamp_ns=stamp_ns, frame_id=str(msg.header.frame_id))
+    return Scan(
+        points=points,
+        stamp_ns=stamp_ns,
+        frame_id=str(msg.header.frame_id),
+        camera=astuple(image.camera),
+    )
 
 
 def warm_up() -> None:

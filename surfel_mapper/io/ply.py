@@ -28,6 +28,7 @@ from surfel_mapper.io.files import replace_file
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
+    from surfel_mapper.tsdf.mesh import Mesh
 
 TYPES = {
     'char': 'i1', 'uchar': 'u1', 'short': 'i2', 'ushort': 'u2', 'int': 'i4', 'uint': 'u4',
@@ -91,6 +92,46 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         If the file cannot be written.
 
     """
+    properties, table = as_table(columns)
+    header = (
+        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        f'element vertex {len(table)}\n{properties}end_header\n'
+    )
+    with replace_file(path) as file:
+        file.write(header.encode('ascii'))
+        file.write(table.view(np.uint8).data)
+
+
+def write_mesh(path: str | Path, mesh: Mesh) -> None:
+    """
+    Write a mesh as a binary PLY, with the colours of the vertices where there are any.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    columns = dict(zip('xyz', mesh.vertices.T, strict=True))
+    if len(mesh.colors):
+        columns.update(zip(('red', 'green', 'blue'), mesh.colors.T, strict=True))
+    layout = np.dtype([('count', 'u1'), ('corners', '<i4', (3,))])
+    faces = np.empty(len(mesh), layout)
+    faces['count'], faces['corners'] = 3, mesh.triangles
+    properties, vertices = as_table(columns)
+    header = (
+        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        f'element vertex {len(vertices)}\n{properties}'
+        f'element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n'
+    )
+    with replace_file(path) as file:
+        file.write(header.encode('ascii'))
+        file.write(vertices.view(np.uint8).data)
+        file.write(faces.view(np.uint8).data)
+
+
+def as_table(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, npt.NDArray[Any]]:
+    """Return columns as the lines of a header and as a structured array."""
     layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
     table = np.empty(len(next(iter(columns.values()))), layout)
     for name, values in columns.items():
@@ -99,13 +140,7 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         f'property {NAMES[values.dtype.newbyteorder("=")]} {name}\n'
         for name, values in columns.items()
     )
-    header = (
-        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
-        f'element vertex {len(table)}\n{properties}end_header\n'
-    )
-    with replace_file(path) as file:
-        file.write(header.encode('ascii'))
-        file.write(table.view(np.uint8).data)
+    return properties, table
 
 
 def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:

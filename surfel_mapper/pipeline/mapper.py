@@ -47,6 +47,7 @@ from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
+from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.pipeline.update import removed_voxels, Update
 from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
 from surfel_mapper.poses import TransformBuffer
@@ -89,6 +90,7 @@ class Mapper:
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._mounted: set[str] = set()
+        self.tsdf = TsdfLayer(self.config.tsdf) if self.config.tsdf.enabled else None
         self.registered: RegisteredPoses | None = None
         if self.config.pose.source == 'registration':
             self.registered = RegisteredPoses(self.config, self.transforms)
@@ -260,6 +262,8 @@ class Mapper:
     def _empty(self) -> None:
         self.window.clear()
         self._aligner.reset()
+        if self.tsdf is not None:
+            self.tsdf.clear()
 
     def align(self) -> Aligned:
         """
@@ -388,6 +392,8 @@ class Mapper:
             warm_up_deskewing()
         if self.registered is not None:
             self.registered.warm_up()
+        if self.tsdf is not None:
+            self.tsdf.warm_up()
 
     def summary(self) -> dict[str, Any]:
         """Return counts and times, and what the map is: for files, reports and diagnostics."""
@@ -400,6 +406,7 @@ class Mapper:
             'voxels': self.map.num_voxels,
             'surfels': len(self.map.surfels(self.config.map.min_points)),
             'digest': self.map.digest(),
+            **({'tsdf': self.tsdf.summary()} if self.tsdf else {}),
         }
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
@@ -484,6 +491,9 @@ class Mapper:
             laps.end('align')
         changed = self.map.surfels_changed(version, self.config.map.min_points)
         laps.end('normals')
+        if self.tsdf is not None:
+            self._follow(self.tsdf, filtered, pose, evictions)
+            laps.end('tsdf')
         self._count(windowed, evictions, laps.milliseconds)
         return Update(
             scan=scan,
@@ -498,6 +508,19 @@ class Mapper:
             aligned=aligned,
             alignment=alignment,
         )
+
+    def _follow(
+        self,
+        layer: TsdfLayer,
+        scan: Scan,
+        pose: npt.NDArray[np.float64],
+        evictions: list[Eviction],
+    ) -> None:
+        """Give a scan to a layer; warn where the layer cannot take it."""
+        try:
+            layer.follow(scan, pose, evictions)
+        except (CloudFormatError, MapError) as error:
+            self._drops.message('tsdf', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
 
     def _prepare(
         self, scan: Scan, pose: npt.NDArray[np.float64], laps: Laps

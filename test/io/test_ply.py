@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.io.ply import read_points, write_points, write_surfels
+from surfel_mapper.io.ply import read_points, write_mesh, write_points, write_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from test.io.examples import make_surfels
 
 NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
@@ -169,3 +170,30 @@ def test_an_ascii_file_of_plyfile_reads_like_its_binary(tmp_path):
     for name in table.dtype.names:
         assert found[0][name].dtype == found[1][name].dtype
         np.testing.assert_array_equal(found[0][name], found[1][name])
+
+
+@pytest.mark.parametrize('colored', [False, True])
+def test_a_mesh_is_read_back_by_plyfile(tmp_path, colored):
+    rng = np.random.default_rng(4)
+    mesh = Mesh(
+        vertices=rng.normal(scale=1e5, size=(30, 3)),
+        triangles=rng.integers(0, 30, (50, 3)).astype(np.int32),
+        colors=rng.integers(0, 256, (30 * colored, 3)).astype(np.uint8),
+    )
+    write_mesh(tmp_path / 'mesh.ply', mesh)
+    plyfile = pytest.importorskip('plyfile')
+    found = plyfile.PlyData.read(tmp_path / 'mesh.ply')
+    for axis, name in enumerate('xyz'):
+        assert found['vertex'][name].tolist() == mesh.vertices[:, axis].tolist()
+    assert np.array_equal(np.stack(found['face']['vertex_indices']), mesh.triangles)
+    names = [p.name for p in found['vertex'].properties]
+    assert names == ['x', 'y', 'z', *(['red', 'green', 'blue'] if colored else [])]
+    if colored:
+        assert found['vertex']['green'].tolist() == mesh.colors[:, 1].tolist()
+
+
+def test_a_mesh_of_nothing_is_a_file_of_nothing(tmp_path):
+    write_mesh(tmp_path / 'mesh.ply', EMPTY)
+    plyfile = pytest.importorskip('plyfile')
+    found = plyfile.PlyData.read(tmp_path / 'mesh.ply')
+    assert len(found['vertex'].data) == len(found['face'].data) == 0

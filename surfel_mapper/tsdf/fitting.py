@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The lidar that a scan came from, as its points show it.
+
+With a ring number a point each beam gets the elevation that its points have; without one the
+beams are taken to be evenly spaced between the lowest and the highest point. There are as many
+columns as the fullest beam has points.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.tsdf.sensors import Lidar
+
+USUAL_ROWS = 64
+"""Beams where nothing tells how many there are."""
+
+MAX_COLUMNS = 4096
+
+SMALLEST_STEP_DEG = 0.01
+"""Rings nearer than this are one beam: no lidar has them, some number their columns."""
+
+NEAR_M = 0.1
+"""Points nearer than this say nothing about an angle; many a driver has zeros for no return."""
+
+
+def fitted_lidar(
+    points: npt.NDArray[Any],
+    ring: npt.NDArray[Any] | None = None,
+    *,
+    rows: int = 0,
+    columns: int = 0,
+    min_range_m: float,
+    max_range_m: float,
+) -> Lidar:
+    """
+    Return a lidar that looks all around and has measured these points.
+
+    Parameters
+    ----------
+    points : (N, 3) float
+        In its frame, m; nan where there was no return.
+    ring : (N,) int, optional
+        Number of the beam of each point.
+    rows, columns : int
+        Beams and steps of azimuth; 0: as the points show.
+    min_range_m, max_range_m : float
+        As in Lidar.
+
+    Raises
+    ------
+    CloudFormatError
+        If the points show no two beams.
+
+    """
+    ranges = np.linalg.norm(points, axis=1)
+    known = np.isfinite(ranges) & (ranges > NEAR_M)
+    elevations = np.degrees(np.arcsin(points[known, 2].astype(np.float64) / ranges[known]))
+    if len(elevations) < 2 or np.ptp(elevations) < 1e-3:
+        raise CloudFormatError(
+            f'{len(elevations)} points between '
+            f'{elevations.min(initial=0.0):.3g} and {elevations.max(initial=0.0):.3g} deg of '
+            'elevation, expected those of a lidar with two beams or more'
+        )
+    if ring is not None and not rows:
+        beams = beam_elevations(elevations, ring[known])
+        fullest = int(np.unique(ring, return_counts=True)[1].max())
+        if len(beams) > 1:
+            return Lidar(
+                rows=len(beams),
+                columns=columns or min(max(fullest, 2), MAX_COLUMNS),
+                beam_elevations_deg=tuple(beams.tolist()),
+                min_range_m=min_range_m,
+                max_range_m=max_range_m,
+            )
+    rows = rows or USUAL_ROWS
+    return Lidar(
+        rows=rows,
+        columns=columns or min(max(-(-len(points) // rows), 2), MAX_COLUMNS),
+        vertical_fov_deg=float(np.ptp(elevations)),
+        vertical_fov_top_deg=float(elevations.max()),
+        min_range_m=min_range_m,
+        max_range_m=max_range_m,
+    )
+
+
+def beam_elevations(
+    elevations: npt.NDArray[np.float64], ring: npt.NDArray[Any]
+) -> npt.NDArray[np.float64]:
+    """Return the median elevation of each ring, descending, deg; nearly equal ones once."""
+    order = np.argsort(ring, kind='stable')
+    _, first = np.unique(ring[order], return_index=True)
+    medians = [float(np.median(part)) for part in np.split(elevations[order], first[1:])]
+    found = np.sort(medians)[::-1]
+    return found[np.diff(found, prepend=np.inf) < -SMALLEST_STEP_DEG]

@@ -1,0 +1,148 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The TSDF of a mapper: what enters, when and where, and what it says of itself.
+
+A lidar stands in a sphere; the mesh has to be that sphere, wherever the poses put it.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from surfel_mapper.tsdf.labels import labels_of
+from surfel_mapper.tsdf.sensors import Camera, Lidar
+
+S = 10**9
+RADIUS_M = 5.0
+LIDAR = Lidar(rows=64, columns=360, vertical_fov_deg=60.0)
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base': 'lidar',
+    'map.min_points': 1,
+    'layers.tsdf.enabled': True,
+    'layers.tsdf.voxel_size_m': 0.2,
+    'layers.tsdf.truncation_m': 0.6,
+    'layers.tsdf.carve': False,
+}
+
+
+def sphere(**columns):
+    points = (RADIUS_M * LIDAR.directions).reshape(-1, 3)
+    return Scan(points=points, stamp_ns=0, frame_id='lidar', columns=columns)
+
+
+RING = np.repeat(np.arange(LIDAR.rows), LIDAR.columns)
+
+
+def mapper_with(**settings):
+    return Mapper(Config.from_mapping({**SETTINGS, **settings}))
+
+
+def insert(mapper, number, xyz=(0.0, 0.0, 0.0), **columns):
+    """Map the sphere about a place; return what became of it."""
+    mapper.add_pose('odom', 'lidar', number * S, xyz, (0.0, 0.0, 0.0, 1.0))
+    mapper.add_scan(replace(sphere(ring=RING, **columns), stamp_ns=number * S))
+    return list(mapper.insert_ready())
+
+
+def radii(mesh, middle=(0.0, 0.0, 0.0)):
+    return np.linalg.norm(mesh.vertices - middle, axis=1)
+
+
+def test_the_mesh_is_what_the_scan_saw_where_it_was_taken():
+    mapper = mapper_with()
+    (update,) = insert(mapper, 1, (10.0, -3.0, 2.0))
+    mesh = mapper.tsdf.mesh()
+    assert len(mesh) > 1000
+    assert np.abs(radii(mesh, (10.0, -3.0, 2.0)) - RADIUS_M).max() <= 0.05
+    assert update.milliseconds['tsdf'] > 0.0
+    summary = mapper.summary()['tsdf']
+    assert (summary['scans'], summary['waiting']) == (1, 0)
+    assert summary['blocks'] == mapper.tsdf.blocks.num_blocks > 0
+
+
+def test_without_the_layer_there_is_none():
+    mapper = mapper_with(**{'layers.tsdf.enabled': False})
+    (update,) = insert(mapper, 1)
+    assert mapper.tsdf is None
+    assert 'tsdf' not in update.milliseconds
+    assert 'tsdf' not in mapper.summary()
+
+
+def test_where_poses_have_to_be_final_scans_enter_as_they_leave_the_window():
+    mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
+    for number in range(1, 4):
+        insert(mapper, number, (20.0 * number, 0.0, 0.0))
+    assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (1, 2)
+    assert np.abs(radii(mapper.tsdf.mesh(), (20.0, 0.0, 0.0)) - RADIUS_M).max() <= 0.05
+    mapper.tsdf.finish(mapper.window)
+    assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (3, 0)
+    assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
+
+
+def test_clearing_the_map_clears_the_field():
+    mapper = mapper_with()
+    insert(mapper, 1)
+    mapper.clear()
+    assert mapper.tsdf.blocks.num_blocks == len(mapper.tsdf.mesh()) == 0
+    insert(mapper, 2)
+    assert len(mapper.tsdf.mesh())
+
+
+def test_blocks_out_of_reach_leave():
+    mapper = mapper_with(**{'layers.tsdf.max_radius_m': 12.0})
+    insert(mapper, 1)
+    insert(mapper, 2, (100.0, 0.0, 0.0))
+    mesh = mapper.tsdf.mesh()
+    assert np.abs(radii(mesh, (100.0, 0.0, 0.0)) - RADIUS_M).max() <= 0.05
+
+
+def test_colours_and_labels_of_points_enter():
+    rgb = np.full(len(RING), (200 << 16) | (100 << 8) | 50, np.uint32)
+    label = np.full(len(RING), 7, np.int32)
+    mapper = mapper_with(**{'layers.tsdf.color': True, 'layers.tsdf.semantics': 'single'})
+    insert(mapper, 1, rgb=rgb, label=label)
+    mesh = mapper.tsdf.mesh()
+    assert set(map(tuple, mesh.colors.tolist())) == {(200, 100, 50)}
+    blocks = mapper.tsdf.blocks
+    labels, _ = labels_of('single', blocks.votes[blocks.rows()].swapaxes(0, 1))
+    assert set(np.unique(labels)) == {-1, 7}
+
+
+def test_a_scan_that_shows_no_lidar_is_counted_and_mapped_all_the_same():
+    mapper = mapper_with()
+    mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    flat = np.array([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
+    mapper.add_scan(Scan(points=flat, stamp_ns=S, frame_id='lidar'))
+    assert len(list(mapper.insert_ready())) == 1
+    assert mapper.counters.messages_ignored == {'tsdf': 1}
+    assert mapper.counters.mapped == 1
+    insert(mapper, 2)
+    assert mapper.tsdf.summary()['scans'] == 1
+
+
+def test_a_depth_image_is_fused_as_its_camera_saw_it():
+    camera = Camera(columns=80, rows=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    depth_m = 2.0
+    points = (camera.directions / camera.directions[..., 2:] * depth_m).reshape(-1, 3)
+    mapper = mapper_with(**{'layers.tsdf.voxel_size_m': 0.05, 'layers.tsdf.truncation_m': 0.15})
+    mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    seen_by = (80, 60, 70.0, 70.0, 39.5, 29.5)
+    mapper.add_scan(Scan(points=points, stamp_ns=S, frame_id='lidar', camera=seen_by))
+    list(mapper.insert_ready())
+    mesh = mapper.tsdf.mesh()
+    assert len(mesh) > 1000
+    assert np.abs(mesh.vertices[:, 2] - depth_m).max() <= 0.1 * 0.05
+
+
+@pytest.mark.parametrize('name', ['max_range_m', 'min_range_m'])
+def test_ranges_that_leave_nothing_are_refused(name):
+    values = {'max_range_m': 0.1, 'min_range_m': 60.0}
+    with pytest.raises(ConfigError, match=r'layers\.tsdf\.max_range_m: .* expected more than'):
+        mapper_with(**{f'layers.tsdf.{name}': values[name]})
