@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Filters that clean and thin scans before they are mapped, and chains of them."""
 
-from surfel_mapper.filters.base import Filter, generator, select, with_columns
+from surfel_mapper.filters.base import Filter, generator, select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain, Step
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
@@ -16,4 +16,5 @@ __all__ = [
     'register',
     'select',
     'with_columns',
+    'with_points',
 ]

@@ -16,6 +16,7 @@ and replay keep the same points and any part of a bag is filtered as the whole i
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.lazy_columns import LazyColumns
 from surfel_mapper.filters.parameters import cast, parameters_of
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.scan import Scan
@@ -109,18 +111,36 @@ def select(scan: Scan, rows: Array) -> Scan:
             return scan
         points = np.empty((number, 3), scan.points.dtype, order='F')
         compact(scan.points.T, rows, points.T)
-        rows = np.flatnonzero(rows) if scan.columns else rows
+        rows = np.flatnonzero(rows) if scan.columns or scan.times else rows
     else:
         points = np.empty((len(rows), 3), scan.points.dtype, order='F')
         for axis in range(3):
             np.take(scan.points[:, axis], rows, out=points[:, axis], mode='raise')
-    columns = {name: np.take(column, rows, axis=0) for name, column in scan.columns.items()}
-    return replace(scan, points=points, columns=columns)
+    columns = LazyColumns(scan.columns, rows, len(points)) if scan.columns else {}
+    times = scan.times and replace(scan.times, offsets=scan.times.offsets[rows])
+    return replace(scan, points=points, columns=columns, times=times, msg=None)
+
+
+def with_points(scan: Scan, points: Array, columns: Mapping[str, Array]) -> Scan:
+    """Return the scan with other points, made of its own, and their columns."""
+    points = points.astype(scan.points.dtype, order='F', copy=False)
+    return replace(scan, points=points, columns=columns, times=None, msg=None)
 
 
 def with_columns(scan: Scan, **columns: Array) -> Scan:
-    """Return the scan with columns added, or put in place of those of the same name."""
-    return replace(scan, columns={**scan.columns, **columns})
+    """
+    Return the scan with columns added, or put in place of those of the same name.
+
+    Raises
+    ------
+    FilterError
+        If a column has not a row for every point.
+
+    """
+    for name, column in columns.items():
+        if len(column) != len(scan):
+            raise FilterError(f'column {name!r}: {len(column)} rows for {len(scan)} points')
+    return replace(scan, columns=LazyColumns(scan.columns, None, len(scan), columns))
 
 
 def generator(scan: Scan, seed: int) -> np.random.Generator:

@@ -14,16 +14,16 @@ line or too few for a normal; here they stay, with a normal as shapes.py says.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import generator, Mask, select, with_columns
+from surfel_mapper.filters.base import generator, Mask, select, with_columns, with_points
 from surfel_mapper.filters.columns import DENSITIES
-from surfel_mapper.filters.merging import Groups, merged_columns
+from surfel_mapper.filters.merging import Groups, MergedColumns
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
@@ -173,11 +173,8 @@ class BoxFilter(ShapeFilter):
         place[chosen] = np.arange(len(chosen))
         inside = select(scan, fit[boxes.rows])
         groups = Groups.of(place[boxes.rows[fit[boxes.rows]]], len(chosen))
-        means = replace(
-            inside,
-            points=boxes.moments.mean[chosen].astype(scan.points.dtype, order='F'),
-            columns=merged_columns(inside, groups, average=self.average_columns),
-        )
+        columns = MergedColumns(inside.columns, groups, average=self.average_columns)
+        means = with_points(inside, boxes.moments.mean[chosen], columns)
         return means, chosen
 
     def fit(self, scan: Scan, boxes: Boxes) -> Mask:

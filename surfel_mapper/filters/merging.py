@@ -9,6 +9,7 @@ in float64, or exactly in integers.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -17,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters.columns import Kind, kind_of
-from surfel_mapper.scan import Scan
 
 Array = npt.NDArray[Any]
 
@@ -50,16 +50,16 @@ class Groups:
         return cls(rows, first, np.bincount(rows, minlength=number))
 
 
-def merged_columns(
-    scan: Scan, groups: Groups, *, average: bool = True, unit: bool = True
-) -> dict[str, Array]:
+class MergedColumns(Mapping[str, Array]):
     """
-    Return the columns of the points that groups of points become, (K,) or (K, C) each.
+    The columns of the points that groups of points become, (K,) or (K, C) each.
+
+    Each is made when it is first asked for: most never are (lazy_columns.py).
 
     Parameters
     ----------
-    scan : Scan
-        The points before.
+    columns : mapping of str to (N, ...) array
+        Of the points before.
     groups : Groups
         Which of them become one.
     average : bool
@@ -69,15 +69,47 @@ def merged_columns(
 
     """
 
-    def kind(name: str, column: Array) -> Kind:
-        if not average:
-            return Kind.FIRST
-        found = kind_of(name, column)
-        return Kind.NUMBER if found is Kind.DIRECTION and not unit else found
+    __slots__ = ('_average', '_columns', '_groups', '_made', '_unit', 'num_rows')
 
-    return {
-        name: merged(kind(name, column), column, groups) for name, column in scan.columns.items()
-    }
+    def __init__(
+        self,
+        columns: Mapping[str, Array],
+        groups: Groups,
+        *,
+        average: bool = True,
+        unit: bool = True,
+    ) -> None:
+        """Make nothing yet."""
+        self._columns = columns
+        self._groups = groups
+        self._average = average
+        self._unit = unit
+        self._made: dict[str, Array] = {}
+        self.num_rows = len(groups.first)
+
+    def __getitem__(self, name: str) -> Array:
+        """Return a column, the same array every time."""
+        if name not in self._made:
+            column = self._columns[name]
+            self._made[name] = merged(self._kind(name, column), column, self._groups)
+        return self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether there is such a column, without making it."""
+        return name in self._columns
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        """Return the number of columns."""
+        return len(self._columns)
+
+    def _kind(self, name: str, column: Array) -> Kind:
+        """Return how a column is merged."""
+        kind = kind_of(name, column) if self._average else Kind.FIRST
+        return Kind.NUMBER if kind is Kind.DIRECTION and not self._unit else kind
 
 
 def merged(kind: Kind, column: Array, groups: Groups) -> Array:

@@ -15,13 +15,13 @@ A 2-D cloud, one whose z are all 0, fills one layer: cubes are squares.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import Filter, generator, select
-from surfel_mapper.filters.merging import Groups, merged_columns
+from surfel_mapper.filters.base import Filter, generator, select, with_points
+from surfel_mapper.filters.merging import Groups, MergedColumns
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
@@ -74,11 +74,7 @@ class OctreeGrid(Filter):
         if self.sampling_method == MEDOID:
             apart_sq = ((points - means[rows]) ** 2).sum(axis=1)
             return select(scan, least_of_each(apart_sq, rows, number))
-        return replace(
-            scan,
-            points=means.astype(scan.points.dtype, order='F'),
-            columns=merged_columns(scan, groups),
-        )
+        return with_points(scan, means, MergedColumns(scan.columns, groups))
 
 
 def leaves(points: Points, max_points: int, max_size_m: float) -> tuple[Ids, int]:

@@ -10,7 +10,7 @@ modelling in a context of 3D mapping, for the bias; constants as in libpointmatc
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from surfel_mapper.filters.base import Filter, Mask, select, with_columns
+from surfel_mapper.filters.base import Filter, Mask, select, with_columns, with_points
 from surfel_mapper.filters.columns import (
     INCIDENCE_ANGLES,
     NORMALS,
@@ -132,7 +132,7 @@ class RemoveSensorBias(Filter):
         towards = scan.columns[OBSERVATION_DIRECTIONS].astype(np.float64)
         shift_m = bias_m(np.sqrt(dot(towards, towards)), angles, *BIASED[self.sensor_type])
         points = scan.points + shift_m[:, None] * unit(towards)
-        return replace(scan, points=points.astype(scan.points.dtype, order='F'))
+        return with_points(scan, points, scan.columns)
 
 
 def bias_m(depth_m: Array, angle: Array, aperture: float, shift: float, bend: float) -> Array:

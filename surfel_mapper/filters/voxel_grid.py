@@ -12,7 +12,7 @@ A 2-D cloud is one whose z are all 0: it is one layer of voxels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -20,8 +20,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
-from surfel_mapper.filters.base import Filter
-from surfel_mapper.filters.merging import Groups, merged_columns
+from surfel_mapper.filters.base import Filter, with_points
+from surfel_mapper.filters.merging import Groups, MergedColumns
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.kernels.voxel_grid import group_points
@@ -88,11 +88,9 @@ class VoxelGrid(Filter):
         with_rows = bool(scan.columns) and self.average_columns
         keys, sums, groups = grid.group(scan.points, with_rows)
         means = sums[:, :3] / sums[:, 3:] if self.use_centroid else grid.centres(keys)
-        return replace(
-            scan,
-            points=means.astype(scan.points.dtype, order='F'),
-            columns=merged_columns(scan, groups, average=with_rows, unit=self.unit_normals),
-        )
+        unit = self.unit_normals
+        columns = MergedColumns(scan.columns, groups, average=with_rows, unit=unit)
+        return with_points(scan, means, columns)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

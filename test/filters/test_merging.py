@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper.filters.base import generator, select, with_columns
 from surfel_mapper.filters.columns import Kind, kind_of
-from surfel_mapper.filters.merging import Groups, merged_columns
+from surfel_mapper.filters.merging import Groups, MergedColumns
 from test.filters.examples import scan_of
 
 GROUPS = Groups.of(np.array([1, 0, 1, 0, 1]), 2)
@@ -17,7 +17,7 @@ GROUPS = Groups.of(np.array([1, 0, 1, 0, 1]), 2)
 
 def merged(column, **settings):
     scan = scan_of(np.zeros((5, 3)), **{settings.pop('name', 'value'): column})
-    (found,) = merged_columns(scan, GROUPS, **settings).values()
+    (found,) = MergedColumns(scan.columns, GROUPS, **settings).values()
     assert found.dtype == np.asarray(column).dtype
     return found
 
@@ -59,7 +59,7 @@ def test_stamps_are_averaged_exactly_and_towards_zero():
 
 def test_seven_stamps_do_not_overflow():
     scan = scan_of(np.zeros((7, 3)), times=np.full(7, 2**62, np.int64))
-    found = merged_columns(scan, Groups.of(np.zeros(7, np.int64), 1))['times']
+    found = MergedColumns(scan.columns, Groups.of(np.zeros(7, np.int64), 1))['times']
     assert found.tolist() == [2**62]
 
 
@@ -86,7 +86,7 @@ def test_the_first_are_kept_where_averages_are_not_wanted():
 
 def test_no_points_leave_no_rows():
     scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
-    found = merged_columns(scan, Groups.of(np.zeros(0, np.int64), 0))
+    found = MergedColumns(scan.columns, Groups.of(np.zeros(0, np.int64), 0))
     assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
 
 
@@ -104,6 +104,15 @@ def test_no_points_leave_no_rows():
 )
 def test_the_kind_of_a_column_follows_its_name_or_its_type(name, dtype, kind):
     assert kind_of(name, np.zeros(1, dtype)) is kind
+
+
+def test_nothing_is_made_before_it_is_asked_for():
+    columns = {'a': np.arange(5.0), 'b': None}  # b could not be averaged
+    found = MergedColumns(columns, GROUPS)
+    assert (list(found), len(found), found.num_rows) == (['a', 'b'], 2, 2)
+    assert 'b' in found
+    assert found['a'].tolist() == [2.0, 2.0]
+    assert found['a'] is found['a']
 
 
 def test_points_can_be_selected_by_mask_or_by_rows():
