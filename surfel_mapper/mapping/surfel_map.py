@@ -353,6 +353,11 @@ class SurfelMap:
         """Return how many voxels hold at least so many points."""
         return len(self._table.changed_after(-1, min_points))
 
+    def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
+        """Return the keys of the voxels with at least so many points, in no stated order."""
+        rows = self._table.changed_after(-1, min_points)
+        return np.asarray(self._table.rows[rows, layout.KEY])
+
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 for none; rows hold until the map changes."""
         return self._table.find(key)

@@ -22,6 +22,9 @@ from surfel_mapper.pipeline import Mapper, Update
 
 Keys = npt.NDArray[np.int64]
 
+LIST_EVERY = 30
+"""Scans between two listings of the voxels of the map."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Change:
@@ -86,8 +89,9 @@ class Changes:
             surfels = self._mapper.map.surfels_changed(self._version, 1)
             change = Change(surfels, self._emptied(update))
         self._version = self._mapper.map.version
-        self._known.add(pack_keys(change.surfels.voxel_index))
-        self._known.drop(pack_keys(change.removed))
+        self._known.note(change)
+        if len(self._known) >= LIST_EVERY:
+            self._known = KnownKeys(self._held())
         return change
 
     def since_last(self) -> Change:
@@ -101,9 +105,8 @@ class Changes:
         return Change(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
 
     def _held(self) -> Keys:
-        """Return the voxels that clients should know of, in ascending order."""
-        held = self._mapper.map.moments()
-        return held.key[held.count >= self.min_points]
+        """Return the voxels that clients should know of."""
+        return self._mapper.map.keys(self.min_points)
 
     def _emptied(self, update: Update) -> npt.NDArray[np.int32]:
         """Return the voxels that hold no point since evictions."""
@@ -116,7 +119,10 @@ class Changes:
 
 class KnownKeys:
     """
-    A set of voxel keys, most of which stay: changes are noted, and worked in now and then.
+    The voxels that clients know of.
+
+    Right after a scan these are the voxels that the map holds. To list them takes milliseconds,
+    so that is done now and then, and what scans change in between is only remembered.
 
     Parameters
     ----------
@@ -126,35 +132,22 @@ class KnownKeys:
     """
 
     def __init__(self, keys: Keys) -> None:
-        """Hold some keys."""
-        self._notes: list[tuple[Keys, bool]] = [(keys, True)]
-        self._num_noted = 0
-        self._num_known = len(keys)
+        """Know of some voxels."""
+        self._keys = keys
+        self._changes: list[Change] = []
 
-    def add(self, keys: Keys) -> None:
-        """Have these too."""
-        self._note(keys, True)
+    def __len__(self) -> int:
+        """Return how many changes are remembered."""
+        return len(self._changes)
 
-    def drop(self, keys: Keys) -> None:
-        """Have these no more."""
-        self._note(keys, False)
+    def note(self, change: Change) -> None:
+        """Remember a change."""
+        self._changes.append(change)
 
     def keys(self) -> Keys:
         """Return all, in ascending order."""
-        noted = np.concatenate([keys for keys, _ in reversed(self._notes)])
-        there = np.repeat(
-            [is_there for _, is_there in reversed(self._notes)],
-            [len(keys) for keys, _ in reversed(self._notes)],
-        )
-        found, first = np.unique(noted, return_index=True)  # the first is the latest word
-        keys: Keys = found[there[first]]
-        self._notes, self._num_noted, self._num_known = [(keys, True)], 0, len(keys)
-        return keys
-
-    def _note(self, keys: Keys, is_there: bool) -> None:
-        if not len(keys):
-            return
-        self._notes.append((keys, is_there))
-        self._num_noted += len(keys)
-        if self._num_noted > 4 * self._num_known + 100_000:
-            self.keys()
+        known = self._keys
+        for change in self._changes:
+            known = np.setdiff1d(known, pack_keys(change.removed))
+            known = np.union1d(known, pack_keys(change.surfels.voxel_index))
+        return np.asarray(known, np.int64)

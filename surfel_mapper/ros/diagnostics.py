@@ -116,7 +116,6 @@ class Totals:
         """Be the totals of the beginning."""
         self.time_s = time.monotonic()
         self.received = 0
-        self.received_s = self.time_s
         self.lost = 0
         self.dropped: Counter[str] = Counter()
         self.published: dict[str, int] = {}
@@ -137,17 +136,14 @@ class Totals:
         return now
 
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
-        """Return what happened since the last; remembers when the last cloud came."""
-        received = self.received - last.received
-        if received <= 0:
-            self.received_s = last.received_s
-        topic = session.inputs.cloud_topic
+        """Return what happened since the last; of several topics the most silent one counts."""
+        topic, heard_s = session.inputs.most_silent
         return Interval(
             topic=topic,
             num_publishers=node.count_publishers(topic),
             ever_received=self.received > 0,
-            received=received,
-            silent_s=self.time_s - self.received_s,
+            received=self.received - last.received,
+            silent_s=max(self.time_s - heard_s, 0.0),
             dropped=self.dropped - last.dropped,
             latency_s=latency(session, 99),
             paused=session.thread.paused,

@@ -21,7 +21,7 @@ from surfel_mapper.io.mirror import MapMirror, MAX_RECENT
 from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.ros.changes import Changes, KnownKeys
+from surfel_mapper.ros.changes import Changes
 
 SECOND = 10**9
 NO_VOXELS = np.empty((0, 3), np.int32)
@@ -204,16 +204,16 @@ def test_whoever_comes_first_gets_what_the_next_scan_changed_only():
     assert len(change.surfels) == len(changed) < len(node.mapper.map)
 
 
-def test_known_keys_are_a_set():
-    rng = np.random.default_rng(3)
-    known, expected = KnownKeys(np.arange(50)), set(range(50))
-    for number in range(40):
-        keys = np.unique(rng.integers(0, 10_000, 8000))
-        (known.add if number % 2 else known.drop)(keys)
-        expected = expected | set(keys.tolist()) if number % 2 else expected - set(keys.tolist())
-        if number % 7 == 0:
-            assert known.keys().tolist() == sorted(expected)
-    assert known.keys().tolist() == sorted(expected)
+def test_what_clients_know_is_listed_anew_now_and_then(monkeypatch):
+    monkeypatch.setattr('surfel_mapper.ros.changes.LIST_EVERY', 3)
+    for moments in (True, False):
+        node = Node(**{'publish.moments': moments})
+        for number in range(8):
+            node.map_scan(number * SECOND)
+            known = node.changes._known
+            assert len(known) < 3
+            expected = np.sort(node.mapper.map.keys(1 if moments else 4))
+            np.testing.assert_array_equal(np.sort(known.keys()), expected)
 
 
 def test_integers_keep_all_their_bits():

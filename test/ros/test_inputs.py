@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -214,12 +215,27 @@ def moving(simulation, stamp_ns):
     return message
 
 
-def inputs_that_lost(size):
+def inputs_of(config):
     node = SimpleNamespace(
         resolve_topic_name=lambda name: f'/{name}',
         get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
     )
-    inputs = Inputs(node, Config(), SimpleNamespace(put_cloud=lambda *_: None))
+    return Inputs(node, config, SimpleNamespace(put_cloud=lambda *_: None))
+
+
+def test_of_several_lidars_the_one_that_is_silent_is_known():
+    inputs = inputs_of(Config.from_mapping({'input.topics': ['front', 'rear']}))
+    before = time.monotonic()
+    inputs._on_cloud('/front', SimpleNamespace(data=b''))
+    topic, heard_s = inputs.most_silent
+    assert topic == '/rear'
+    assert heard_s <= before
+    inputs._on_cloud('/rear', SimpleNamespace(data=b''))
+    assert inputs.most_silent[0] == '/front'
+
+
+def inputs_that_lost(size):
+    inputs = inputs_of(Config())
     inputs._on_cloud('/points', SimpleNamespace(data=bytes(size)))
     inputs._on_lost('/points', SimpleNamespace(total_count=5))
     return inputs
