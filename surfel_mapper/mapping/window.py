@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,41 +20,10 @@ import numpy.typing as npt
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import MapError
-from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-
-
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class WindowedScan:
-    """
-    A scan in the window.
-
-    Attributes
-    ----------
-    moments : ScanMoments
-        What the map holds of it.
-    stamp_ns : int
-        Time of the scan.
-    T_map_sensor : (4, 4) float64
-        The pose it was added at.
-    points : (N, 3) float32 or float64, m, optional
-        Its points in the sensor frame, where they are kept: those that the moments are of.
-    columns : mapping of str to (N,) array
-        What else of them the map sums.
-
-    """
-
-    moments: ScanMoments
-    stamp_ns: int
-    T_map_sensor: npt.NDArray[np.float64]
-    points: npt.NDArray[Any] | None = None
-    columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of moments, points and columns."""
-        kept = [*self.columns.values(), *([] if self.points is None else [self.points])]
-        return self.moments.nbytes + sum(array.nbytes for array in kept)
+from surfel_mapper.mapping.windowed_scan import WindowedScan as WindowedScan  # handed on
+from surfel_mapper.mapping.windowed_scan import without
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -297,23 +266,3 @@ class SlidingWindow:
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')
-
-
-def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
-    """Return a scan without the voxels of some sorted keys."""
-    hit = contains(keys, scan.moments.key)
-    if not hit.any():
-        return scan
-    rest = replace(scan, moments=scan.moments.select(~hit))
-    if scan.points is None:
-        return rest
-    size_m = scan.moments.voxel_size_m
-    stay = ~contains(keys, point_keys(scan.points, scan.T_map_sensor, size_m))
-    columns = {name: column[stay] for name, column in scan.columns.items()}
-    return replace(rest, points=scan.points[stay], columns=columns)
-
-
-def contains(keys: npt.NDArray[np.int64], wanted: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Return which of the wanted keys are among the keys, which are sorted."""
-    at = np.searchsorted(keys, wanted)
-    return np.asarray(keys[np.minimum(at, len(keys) - 1)] == wanted)
