@@ -147,12 +147,13 @@ class Inputs:
         if not self.lost:
             return ''
         which = ', '.join(f'{number} of {topic}' for topic, number in self.lost.items())
-        remedy = 'they come faster than they are taken; is the machine overloaded?'
-        if self._largest_bytes > LARGE_BYTES:
+        if 0 < self._largest_bytes <= LARGE_BYTES:
+            remedy = 'they come faster than they are taken; is the machine overloaded?'
+        else:
             remedy = (
-                f'best-effort messages of {self._largest_bytes} bytes need more shared memory '
-                'than Fast DDS has by default; start their publisher with the profile '
-                'fastdds_shm.xml, see docs/inputs.md'
+                'best-effort messages above 0.5 MB need more shared memory than Fast DDS has by '
+                'default; start their publisher with the profile fastdds_shm.xml, see '
+                'docs/inputs.md'
             )
         return f'clouds lost on the way ({which}): {remedy}'
 

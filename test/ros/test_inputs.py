@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+import os
 import time
 from types import SimpleNamespace
 
@@ -13,6 +14,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
@@ -23,6 +25,7 @@ from surfel_mapper.io.depth_image import CameraImage, depth_scan
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.ros.inputs import Inputs
+from surfel_mapper.ros.shared_memory import OWN_SETTINGS
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.ros.live import cloud, odometry, RELIABLE, room, stamp, START_NS
 
@@ -241,8 +244,31 @@ def inputs_that_lost(size):
     return inputs
 
 
+@pytest.mark.skipif(any(map(os.environ.get, OWN_SETTINGS)), reason='Fast DDS is configured')
+def test_large_clouds_that_get_lost_are_noticed_and_the_remedy_named(start, peer):
+    node = start('node', *arguments([], **{'pose.source': 'identity'}))
+    publisher = peer.node.create_publisher(PointCloud2, '/points', BEST_EFFORT)
+    peer.spin_until(publisher.get_subscription_count)
+    points = np.zeros((350_000, 3), np.float32)  # 4 MiB, of which shared memory holds half of one
+    warned = []
+    peer.node.create_subscription(
+        DiagnosticArray,
+        '/diagnostics',
+        lambda report: warned.append('clouds lost on the way' in report.status[0].message),
+        10,
+    )
+    for number in range(100):
+        publisher.publish(cloud(START_NS + number * PERIOD_NS, points))
+        peer.spin_for(0.05)
+        if any(warned):
+            break
+    assert any(warned), node.output
+    assert 'fastdds_shm.xml' in node.output
+
+
 def test_large_clouds_that_are_lost_point_to_shared_memory_and_small_ones_do_not():
     large, small = inputs_that_lost(4 << 20), inputs_that_lost(10_000)
+    assert inputs_that_lost(0).loss() == large.loss()  # none came at all
     assert large.clouds_lost == small.clouds_lost == 5
     assert 'clouds lost on the way (5 of /points)' in large.loss()
     assert 'fastdds_shm.xml' in large.loss()
