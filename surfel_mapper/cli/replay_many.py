@@ -30,9 +30,6 @@ if TYPE_CHECKING:
     from surfel_mapper.config import Config
     from surfel_mapper.offline.recording import Request
 
-SHORTEST_S, LONGEST_S = 15.0, 60.0
-"""Bounds of the length of a shard; see docs/many_machines.md."""
-
 ONE_PROCESS = ('window', 'align', 'poses_out', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
 
@@ -62,14 +59,13 @@ def run(
     """Map all recordings and report."""
     from surfel_mapper.cluster.engines import engine
     from surfel_mapper.cluster.running import map_bags
-    from surfel_mapper.cluster.shards import cut
+    from surfel_mapper.cluster.shards import cut, shard_length_s
 
     refuse_options(args)
     began = time.perf_counter()
     recorded_s = sum(length_s(request, config) for request in requests)
     with engine(args.workers, args.scheduler) as running:
-        shard_s = recorded_s / (2 * running.num_workers)
-        shard_s = min(max(shard_s, SHORTEST_S), LONGEST_S)
+        shard_s = shard_length_s(recorded_s, running.num_workers)
         shards = [shard for request in requests for shard in cut(request, config, shard_s)]
         with two_stages('replay', recorded_s, 'recorded second') as on_done:
             mapped = map_bags(shards, running, output, on_done)
@@ -85,6 +81,7 @@ def run(
         'shards': len(mapped.results),
         'shards_repeated': mapped.repeated,
         'peak_memory_mb': memory(mapped),
+        'core_s': core_s(mapped),
         'settings': config.to_mapping(),
     }
     written = write_overview(output, summary, mapped.map, mapped.places)
@@ -131,6 +128,7 @@ def described(tiled: TiledMap) -> dict[str, Any]:
         'voxels': tiled.voxels,
         'surfels': tiled.surfels,
         'tiles': tiled.tiles,
+        'bytes': tiled.nbytes,
         'voxel_size_m': tiled.voxel_size_m,
         'digest': tiled.digest,
     }
@@ -142,6 +140,12 @@ def memory(mapped: Mapped) -> dict[str, int]:
         'mapping': max(result.peak_bytes for result in mapped.results) // 10**6,
         'merging': mapped.map.peak_bytes // 10**6,
     }
+
+
+def core_s(mapped: Mapped) -> dict[str, float]:
+    """Return how long processors took to map and to merge, s."""
+    mapping = sum(result.core_s for result in mapped.results)
+    return {'mapping': round(mapping, 1), 'merging': round(mapped.map.core_s, 1)}
 
 
 def write_overview(

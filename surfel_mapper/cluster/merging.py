@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+import time
 
 import numpy as np
 
@@ -70,6 +71,7 @@ class TileResult:
     voxels: int
     points: int
     surfels: int
+    core_s: float
     sample: Surfels
     peak_bytes: int
 
@@ -86,6 +88,7 @@ def merge_tile(task: TileTask) -> TileResult:
         If a file cannot be read or written.
 
     """
+    began_core = time.process_time()
     first, *others = task.parts
     surfel_map = read_part(first)
     for part in others:
@@ -99,6 +102,7 @@ def merge_tile(task: TileTask) -> TileResult:
         voxels=surfel_map.num_voxels,
         points=surfel_map.num_points,
         surfels=len(surfels),
+        core_s=time.process_time() - began_core,
         sample=surfels.select(rows),
         peak_bytes=peak_bytes(),
     )

@@ -32,7 +32,7 @@ from surfel_mapper.cluster.merging import (
 )
 from surfel_mapper.cluster.shards import LONGER, map_shard, Shard, ShardResult
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.io.parquet_tiles import dataset_digest, Part, Tile
+from surfel_mapper.io.parquet_tiles import dataset_digest, Part, Tile, tiles_in
 from surfel_mapper.mapping.surfels import Surfels
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,10 @@ class TiledMap:
     voxel_size_m : float
     digest : str
         Equal to SurfelMap.digest of the same map.
-    voxels, points, surfels, tiles : int
+    voxels, points, surfels, tiles, nbytes : int
+        What it holds; the last are the bytes of its files.
+    core_s : float
+        Time of processors that merging took, without the digest.
     sample : Surfels
         Some of its surfels, for pictures.
     peak_bytes : int
@@ -71,6 +74,8 @@ class TiledMap:
     points: int
     surfels: int
     tiles: int
+    nbytes: int
+    core_s: float
     sample: Surfels
     peak_bytes: int
 
@@ -252,6 +257,8 @@ def merge(
         points=sum(tile.points for tile in tiles),
         surfels=sum(tile.surfels for tile in tiles),
         tiles=len(tiles),
+        nbytes=sum(path.stat().st_size for path in tiles_in(directory / DATASET).values()),
+        core_s=sum(tile.core_s for tile in tiles),
         sample=joined([tile.sample for tile in tiles]),
         peak_bytes=max(tile.peak_bytes for tile in tiles),
     )

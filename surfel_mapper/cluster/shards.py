@@ -29,14 +29,14 @@ from surfel_mapper.offline.recording import BagRecording, open_recording, Reques
 from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
+SHORTEST_S, LONGEST_S = 15.0, 60.0
+"""Bounds of the length of a shard: what comes before each is read twice, what it maps is held."""
+
 LEAD_S = 1.0
 """A worker begins to read so long before the oldest pose that it may need, at first."""
 
 LONGER = 8.0
 """By so much that time grows where it was too short."""
-
-LONGEST_S = 1e9
-"""No recording is longer."""
 
 PLACES = 100
 """Positions of the sensor that are kept of a shard, for the picture."""
@@ -88,8 +88,8 @@ class ShardResult:
         ``Counters.summary`` of this part alone.
     resets : int
         How often time was set back, in what came before it too.
-    recorded_s, seconds : float
-        Time from its start to its stop, and time that it took.
+    recorded_s, seconds, core_s : float
+        Time from its start to its stop, time that it took, and that of the processor.
     places : (P, 3) float64, m
         Where the sensor was.
     peak_bytes : int
@@ -104,8 +104,14 @@ class ShardResult:
     resets: int
     recorded_s: float
     seconds: float
+    core_s: float
     places: npt.NDArray[np.float64]
     peak_bytes: int
+
+
+def shard_length_s(recorded_s: float, num_workers: int) -> float:
+    """Return how long shards should be: two for every worker, within bounds."""
+    return min(max(recorded_s / (2 * num_workers), SHORTEST_S), LONGEST_S)
 
 
 def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
@@ -179,7 +185,7 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
         If a file cannot be read or written.
 
     """
-    began = time.perf_counter()
+    began, began_core = time.perf_counter(), time.process_time()
     keep_freed_memory()
     entry = Entry()
     with open_recording(shard.request, shard.config) as recording:
@@ -194,14 +200,16 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
             recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
         else:
             raise TypeError(f'{shard.request.path}: only bags are cut')
+    parts = write_shard(path, mapper.map)
     return ShardResult(
-        parts=write_shard(path, mapper.map),
+        parts=parts,
         before=entry.outlook,
         after=None if shard.stop_ns is None else mapper.outlook(),
         counts=difference(mapper.counters.summary(), entry.counts),
         resets=mapper.counters.resets,
         recorded_s=recorded_s,
         seconds=time.perf_counter() - began,
+        core_s=time.process_time() - began_core,
         places=np.array(places).reshape(-1, 3)[:: max(len(places) // PLACES, 1)],
         peak_bytes=peak_bytes(),
     )
@@ -254,7 +262,7 @@ def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
     first_ns = span.poses_start_ns
     if shard.start_ns is not None:
         earliest_ns = reader.start_ns if first_ns is None else first_ns
-        lead_ns = shard.start_ns - round(min(shard.lead_s, LONGEST_S) * 1e9)
+        lead_ns = shard.start_ns - round(shard.lead_s * 1e9)
         first_ns = lead_ns if lead_ns > earliest_ns else first_ns
     if poses.static and first_ns is not None:
         yield from reader.messages(poses.static, None, first_ns)

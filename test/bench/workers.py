@@ -1,0 +1,155 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bags with one process, one worker and two: speed, processor time, and memory for more input.
+
+``speed``: four drives from one bag, several times; ``one process`` maps them without writing,
+workers end with a dataset of tiles and its digest. Their start is not counted, the kernels are
+loaded. They take turns and the fastest run of each counts. ``memory``: a quarter, a half and all
+of the drive, with shards of one quarter, in fresh processes; the most that any had. The digests
+of all ways are compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+import multiprocessing
+from pathlib import Path
+import tempfile
+from time import perf_counter
+
+from surfel_mapper.cluster.engines import Engine, engine
+from surfel_mapper.cluster.running import map_bags, Mapped
+from surfel_mapper.cluster.shards import cut, peak_bytes, shard_length_s
+from surfel_mapper.config import Config
+from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.offline.recording import open_recording, Request
+from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.pipeline import Mapper
+from test.bench.offline import recorded
+from test.bench.options import Options
+from test.bench.report import Row
+from test.bench.street import Street
+
+LONGER = 4
+"""The drive has so many times the scans of other benches."""
+
+DRIVES = 4
+"""So many times it is mapped for the speed."""
+
+RUNS = 2
+
+CONFIG = Config()
+
+BUDGET_RATIO = 1.6
+"""Two workers have to be so many times as fast as one process at least."""
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for every way and every amount of input."""
+    options = replace(options, scans=LONGER * options.scans)
+    bag = recorded(Street(options), options)
+    return [*speed_rows(bag), *memory_rows(bag)]
+
+
+def speed_rows(bag: Path) -> list[Row]:
+    """Return how fast each way is."""
+    requests = [Request(path=bag) for _ in range(DRIVES)]
+    seconds: dict[str, list[float]] = {}
+    found: dict[str, tuple[str, float, float]] = {}
+
+    def timed(name: str, way: Callable[[], tuple[str, float, float]]) -> None:
+        start = perf_counter()
+        found[name] = way()
+        seconds.setdefault(name, []).append(perf_counter() - start)
+
+    with engine(workers=1) as one, engine(workers=2) as two:
+        for number in range(RUNS + 1):
+            timed('two workers', lambda: by(two, requests))
+            timed('one process', lambda: in_one_process(requests))
+            timed('one worker', lambda: by(one, requests))
+            if number == 0:
+                seconds.clear()  # the kernels were loaded
+    check_equal({digest for digest, _, _ in found.values()})
+    reference_s = min(seconds['one process'])
+    return [
+        {
+            'what': 'speed',
+            'who': name,
+            'recorded_s': found[name][1],
+            'seconds': min(seconds[name]),
+            'times_real': found[name][1] / min(seconds[name]),
+            'ratio': reference_s / min(seconds[name]),
+            'core_s': found[name][2],
+            **({'budget': BUDGET_RATIO} if name == 'two workers' else {}),
+        }
+        for name in sorted(seconds)
+    ]
+
+
+def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
+    """Map drives one after the other; return digest, seconds recorded, and none of processors."""
+    total, recorded_s = SurfelMap(CONFIG.map.voxel_size_m), 0.0
+    for request in requests:
+        with open_recording(request, CONFIG.replace(ALL_SCANS)) as recording:
+            mapper = Mapper(recording.config)
+            for _ in recording.replay(mapper):
+                pass
+            recorded_s += recording.recorded_s
+        total.merge(mapper.map)
+    return total.digest(), recorded_s, float('nan')
+
+
+def by(running: Engine, requests: list[Request]) -> tuple[str, float, float]:
+    """Map drives with workers; return digest, seconds recorded and seconds of processors."""
+    lengths = []
+    for request in requests:
+        with open_recording(request, CONFIG) as recording:
+            lengths.append(recording.recorded_s)
+    mapped = tiled(running, requests, shard_length_s(sum(lengths), running.num_workers))
+    core_s = sum(result.core_s for result in mapped.results) + mapped.map.core_s
+    return mapped.map.digest, sum(lengths), core_s
+
+
+def tiled(running: Engine, requests: list[Request], shard_s: float) -> Mapped:
+    """Map drives into tiles that are thrown away."""
+    shards = [shard for request in requests for shard in cut(request, CONFIG, shard_s)]
+    with tempfile.TemporaryDirectory() as directory:
+        return map_bags(shards, running, Path(directory))
+
+
+def memory_rows(bag: Path) -> list[Row]:
+    """Return how much memory each way needs for a quarter, a half and all of a drive."""
+    with open_recording(Request(path=bag), CONFIG) as recording:
+        whole_s = recording.recorded_s
+    rows: list[Row] = []
+    for share in (0.25, 0.5, 1.0):
+        requests = [Request(path=bag, duration_s=share * whole_s)]
+        context = multiprocessing.get_context('spawn')
+        with ProcessPoolExecutor(1, mp_context=context) as alone:
+            digest, peak = alone.submit(peak_of_one, requests).result()
+        with engine(workers=2) as running:
+            mapped = tiled(running, requests, 0.25 * whole_s * 1.001)
+        check_equal({digest, mapped.map.digest})
+        common = {'what': 'memory', 'recorded_s': share * whole_s, 'voxels': mapped.map.voxels}
+        rows.append({**common, 'who': 'one process', 'peak_MB': peak / 1e6})
+        largest = max(result.peak_bytes for result in mapped.results)
+        rows.append({**common, 'who': 'a worker that maps', 'peak_MB': largest / 1e6})
+        rows.append({**common, 'who': 'the same, merging', 'peak_MB': mapped.map.peak_bytes / 1e6})
+    return rows
+
+
+def peak_of_one(requests: list[Request]) -> tuple[str, int]:
+    """Map drives; return digest, and the most memory that this process had."""
+    keep_freed_memory()
+    digest, _, _ = in_one_process(requests)
+    return digest, peak_bytes()
+
+
+def check_equal(digests: set[str]) -> None:
+    """Refuse to compare ways that do not make the same map."""
+    if len(digests) > 1:
+        raise RuntimeError(f'the maps differ: {digests}')
