@@ -8,6 +8,9 @@ import os
 
 import pytest
 
+COMPILING_S = 250.0
+"""Half a minute where nothing else runs."""
+
 
 @pytest.fixture(scope='session')
 def domain(tmp_path_factory):
@@ -20,8 +23,22 @@ def domain(tmp_path_factory):
         yield
 
 
+@pytest.fixture(scope='session')
+def compiled(domain, tmp_path_factory):
+    """Run a node until its kernels are compiled, which takes longer than any test waits."""
+    from test.ros.live import Process
+
+    arguments = ['node', '--ros-args', '-p', 'pose.source:=identity']
+    node = Process(arguments, tmp_path_factory.mktemp('compiling'))
+    try:
+        node.wait_for_output('ready:', COMPILING_S)
+        assert node.stop() == 0, node.output
+    finally:
+        node.kill()
+
+
 @pytest.fixture
-def start(domain, tmp_path):
+def start(compiled, tmp_path):
     """Give a function that runs a verb as a process; all are ended after the test."""
     from test.ros.live import Process
 

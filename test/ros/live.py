@@ -23,7 +23,7 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).parents[2]
-TIMEOUT_S = 30.0
+TIMEOUT_S = 60.0
 START_NS = 1_700_000_000_000_000_000
 NODE = '/surfel_mapper'
 

@@ -17,8 +17,6 @@ from sensor_msgs.msg import PointCloud2
 from test.ros.live import cloud, NODE, odometry, room, stamp, START_NS
 from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
 
-pytestmark = pytest.mark.timeout(120)
-
 TOPICS = {
     'normals': 'sensor_msgs/msg/PointCloud2',
     'changed': 'sensor_msgs/msg/PointCloud2',

@@ -17,8 +17,6 @@ from surfel_mapper.pipeline.regions import Ball, Box, Prism
 from test.ros.live import NODE, odometry, stamp, START_NS
 from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
 
-pytestmark = pytest.mark.timeout(120)
-
 ANSWERS = LoadMap.Response
 SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))
 """In the frame base_link, which drive() moves by 0.2 m a scan."""

@@ -20,8 +20,6 @@ from surfel_mapper.io.map_state import load_map
 from test.ros.live import LATCHED, NODE, RVIZ
 from test.ros.test_node import ARGUMENTS, drive, mapped, send
 
-pytestmark = pytest.mark.timeout(120)
-
 STATES = ('unconfigured', 'inactive', 'active', 'finalized')
 WAITING = [*ARGUMENTS, '-p', 'autostart:=false']
 

@@ -36,8 +36,6 @@ from test.ros.live import (
     START_NS,
 )
 
-pytestmark = pytest.mark.timeout(120)
-
 PERIOD_NS = 100_000_000
 SETTINGS = {
     'pose.source': 'odometry',
