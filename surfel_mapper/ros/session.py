@@ -63,12 +63,15 @@ class Session:
         if config.map.load:
             surfel_map, _ = load_map(config.map.load, voxel_size_m=config.map.voxel_size_m)
             self.mapper.restore(surfel_map, [])  # without its window: it stays
-        warm_up(self.mapper, node)
+        log, start = node.get_logger(), time.monotonic()
+        log.info('compiling kernels: a moment, or half a minute the first time')
+        self.mapper.warm_up()
         self.thread = MappingThread(self.mapper, inbox.fail)
         self.inputs = Inputs(node, config, self.thread)
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.control = Control(node, self.mapper, self.thread, self.outputs)
+        log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self.thread.start(self._on_update)
 
@@ -122,15 +125,6 @@ class Session:
         except SurfelMapperError as error:  # the file of filters is not what it was when checked
             self._node.get_logger().error(f'settings not taken: {error}')
         self.outputs.expire()
-
-
-def warm_up(mapper: Mapper, node: Node) -> None:
-    """Compile the kernels of a mapper, and say how long it took."""
-    log = node.get_logger()
-    log.info('compiling kernels: a moment, or half a minute the first time')
-    start = time.monotonic()
-    mapper.warm_up()
-    log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
 
 
 def report(mapper: Mapper) -> str:
