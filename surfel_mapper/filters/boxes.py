@@ -3,9 +3,8 @@
 """
 Boxes: cut the space of a scan until every box holds few points, and see what these are like.
 
-A box is cut at the middle one of its points across its longest edge, so that all boxes of a level
-hold the same number of points but for one, and boxes stay as even as they can. All boxes of a
-level are cut at once: 14 sorts for 131,072 points and boxes of 10.
+A box is cut at the middle one of its points across its longest edge, so that halves hold the same
+number of points but for one, and boxes stay as even as they can.
 
 From each box either points are drawn by chance, which keep their columns and take the shape of
 their box, or one point is made, the mean. libpointmatcher drops boxes whose points are all on one
@@ -28,6 +27,7 @@ from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, Moments, ShapeFilter
+from surfel_mapper.kernels.cutting import cut
 from surfel_mapper.scan import Scan
 
 INT32_MAX = 2**31 - 1
@@ -47,27 +47,10 @@ def cut_into_boxes(points: Points, max_points: int) -> tuple[Ids, int]:
         A box with more is cut.
 
     """
-    total = len(points)
-    if not total:
+    if not len(points):
         return np.empty(0, np.int64), 0
-    ranks = np.argsort(np.argsort(points, axis=0, kind='stable'), axis=0)
-    order, starts = np.arange(total), np.array([0, total])
-    low, high = points.min(axis=0)[None], points.max(axis=0)[None]
-    while (too_many := np.diff(starts) > max_points).any():
-        count = np.diff(starts)
-        box = np.repeat(np.arange(len(count)), count)
-        axis = (high - low).argmax(axis=1)
-        rank = np.where(too_many[box], ranks[order, axis[box]], 0)  # the others stay as they are
-        order = order[np.argsort(box * total + rank, kind='stable')]
-        middle = (starts[:-1] + count - count // 2)[too_many]
-        low, high = np.repeat(low, 1 + too_many, axis=0), np.repeat(high, 1 + too_many, axis=0)
-        lower = np.flatnonzero(too_many) + np.arange(len(middle))
-        axis = axis[too_many]
-        high[lower, axis] = low[lower + 1, axis] = points[order[middle], axis]
-        starts = np.sort(np.append(starts, middle))
-    rows = np.empty(total, np.int64)
-    rows[order] = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-    return rows, len(starts) - 1
+    order, rows = np.arange(len(points)), np.empty(len(points), np.int64)
+    return rows, cut(points, max_points, order, rows)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

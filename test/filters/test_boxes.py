@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.boxes import cut_into_boxes
+from surfel_mapper.kernels.cutting import cut
 from test.filters.examples import filter_of, random_scan, scan_of
 
 SAMPLING, ELLIPSOIDS = 'SamplingSurfaceNormalDataPointsFilter', 'ElipsoidsDataPointsFilter'
@@ -33,6 +34,36 @@ def test_every_box_holds_few_points_and_all_are_in_one(most):
     counts = np.bincount(rows, minlength=number)
     assert counts.max() <= most
     assert counts.min() >= min((most + 1) // 2, 1000)  # half of one that held too many
+
+
+def slow_boxes(points, most):
+    """Return the boxes as sets of rows, each cut with a full sort."""
+    waiting = [(np.arange(len(points)), points.min(axis=0), points.max(axis=0))]
+    found = set()
+    while waiting:
+        rows, low, high = waiting.pop()
+        if len(rows) <= most:
+            found.add(frozenset(rows.tolist()))
+            continue
+        axis = (high - low).argmax()
+        rows = rows[np.lexsort((rows, points[rows, axis]))]
+        middle = len(rows) - len(rows) // 2
+        between = np.where(np.arange(3) == axis, points[rows[middle], axis], np.nan)
+        waiting.append((rows[:middle], low, np.where(np.isnan(between), high, between)))
+        waiting.append((rows[middle:], np.where(np.isnan(between), low, between), high))
+    return found
+
+
+@pytest.mark.parametrize('most', [3, 10, 60])
+@pytest.mark.parametrize('steps', [1e-9, 0.25])  # with ties, and without
+@pytest.mark.parametrize('compiled', [True, False])
+def test_boxes_are_those_of_a_slow_twin(most, steps, compiled):
+    points = np.round(cloud(700) / steps) * steps
+    rows, order = np.empty(700, np.int64), np.arange(700)
+    with np.errstate(over='ignore'):  # chance wraps on purpose
+        number = (cut if compiled else cut.py_func)(points, most, order, rows)
+    found = {frozenset(np.flatnonzero(rows == box).tolist()) for box in range(number)}
+    assert found == slow_boxes(points, most)
 
 
 def test_boxes_do_not_overlap():

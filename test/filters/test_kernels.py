@@ -37,6 +37,7 @@ CHAINS = [
     [{'angle_limit': {'phi_min_deg': 20, 'theta_min_deg': 89, 'remove_inside': 0}}],
     [{'saliency': {'num_neighbours': 12, 'sigma': 1.0}}],
     [{'spectral_decomposition': {'num_neighbours': 12, 'sigma': 1.0}}],
+    ['sampling_surface_normal', {'surface_normal': {'smooth_normals': 1}}],
     [{'covariance_sampling': {'num_points': 50}}, 'ground'],
 ]
 for chain in CHAINS:
@@ -63,7 +64,7 @@ def test_filters_give_the_same_to_the_bit_without_the_compiler():
         assert done.returncode == 0, done.stderr
         printed.append(done.stdout)
     assert printed[0] == printed[1]
-    assert len(printed[0].splitlines()) == 18
+    assert len(printed[0].splitlines()) == 20
 
 
 @both
