@@ -148,6 +148,15 @@ class TsdfConfig(Stage):
         (), 'Labels of what moves: it frees space and leaves no surface.'
     )
     invalid_labels: tuple[float, ...] = setting((), 'Labels treated the same: sky, the robot.')
+    mesh_rate_hz: float = setting(
+        1.0, 'Rate of ~/mesh, Hz, while somebody reads it; 0: never.', low=0.0, high=100.0
+    )
+    slice_rate_hz: float = setting(
+        0.0, 'Rate of ~/tsdf_slice, Hz; 0: never.', low=0.0, high=100.0
+    )
+    slice_height_m: float = setting(
+        0.5, 'Height of ~/tsdf_slice in the fixed frame, m.', low=-1e5, high=1e5
+    )
     mesh_min_weight: float = setting(
         1e-4, 'The mesh uses voxels of at least this weight.', low=0.0, high=1e9
     )

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-visualization_msgs/MarkerArray as bytes, from arrays.
+visualization_msgs/Marker and MarkerArray as bytes, from arrays.
 
 A marker of a surfel map has hundreds of thousands of vertices; as Python objects they take
 seconds, as the bytes of two arrays a millisecond. So the message is never made: its serialised
@@ -138,6 +138,13 @@ def marker_array(markers: Sequence[Marker]) -> bytes:
     writer.numbers('I', len(markers))
     for marker in markers:
         write_marker(writer, marker)
+    return writer.join()
+
+
+def marker_bytes(marker: Marker) -> bytes:
+    """Return the serialised visualization_msgs/Marker; raises as marker_array does."""
+    writer = Writer()
+    write_marker(writer, marker)
     return writer.join()
 
 

@@ -42,6 +42,7 @@ from surfel_mapper.ros.alignment import AlignmentOutputs
 from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message, grid_message
+from surfel_mapper.ros.tsdf_outputs import TsdfOutputs
 from surfel_mapper.ros.waiting import result_of
 from surfel_mapper.scan import Scan
 
@@ -79,6 +80,7 @@ class Outputs:
         self._thread = thread
         self._changes = Changes(mapper)
         self._alignment = AlignmentOutputs(node, mapper)
+        self._tsdf = TsdfOutputs(node, mapper, mapper.tsdf, thread) if mapper.tsdf else None
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
         self._levels = [
             node.create_publisher(PointCloud2, f'~/level_{level}/normals', LATCHED)
@@ -104,6 +106,8 @@ class Outputs:
         """Publish what a scan changed; called in the mapping thread."""
         self._stamp_ns, self._center = update.stamp_ns, update.T_fixed_sensor[:2, 3]
         self._alignment.publish(update)
+        if self._tsdf is not None:
+            self._tsdf.note(update)
         if self._has_clients():
             self._publish_change(self._changes.of(update))
         else:
@@ -145,12 +149,16 @@ class Outputs:
                 self._timers.append(
                     self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
                 )
+        if self._tsdf is not None:
+            self._tsdf.start_timers()
 
     def stop_timers(self) -> None:
         """Publish nothing at a rate any more."""
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers.clear()
+        if self._tsdf is not None:
+            self._tsdf.stop_timers()
 
     def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
         """Return a callback that has the mapping thread publish where there is news to read."""

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What is free and how far the next obstacle is: slices at a height, and distances in a box.
+
+The signed distances of the field are along rays and end at the truncation; a robot that plans
+its way needs the Euclidean distance to the nearest obstacle from anywhere. It is made on request
+from the occupied voxels by the exact transform of scipy (Maurer, Qi and Raghavan 2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import distance_transform_edt
+
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.queries import OCCUPIED, states, UNKNOWN
+
+MAX_VOXELS = 1 << 27
+"""Of a box: its distances take 0.5 GB, and making them four times as much."""
+
+COSTS = np.array([-1, 0, 100], np.int8)
+"""Of unknown, free and occupied voxels in an occupancy grid."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slice:
+    """
+    A horizontal layer of voxels.
+
+    Attributes
+    ----------
+    resolution_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        x and y of the outer corner of the first cell.
+    cost : (rows along y, columns along x) int8
+        0 free, 100 occupied, -1 unknown.
+
+    """
+
+    resolution_m: float
+    origin: npt.NDArray[np.float64]
+    cost: npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True, kw_only=True)
+class DistanceField:
+    """
+    Euclidean distances to the nearest occupied voxel of a box.
+
+    Attributes
+    ----------
+    voxel_size_m : float
+        Edge of a voxel.
+    origin : (3,) float64, m
+        Outer corner of the first voxel.
+    distance_m : (nx, ny, nz) float32
+        Between the centres of voxels; 0 where one is occupied, inf where none in the box is.
+    known : (nx, ny, nz) bool
+        Whether a voxel was observed.
+
+    """
+
+    voxel_size_m: float
+    origin: npt.NDArray[np.float64]
+    distance_m: npt.NDArray[np.float32]
+    known: npt.NDArray[np.bool_]
+
+    def at_height(self, height_m: float) -> npt.NDArray[np.float32]:
+        """
+        Return the distances of the layer at a height, (nx, ny).
+
+        Raises
+        ------
+        ValueError
+            If the box does not reach there.
+
+        """
+        layer = int(np.floor((height_m - self.origin[2]) / self.voxel_size_m))
+        if not 0 <= layer < self.distance_m.shape[2]:
+            top = self.origin[2] + self.distance_m.shape[2] * self.voxel_size_m
+            raise ValueError(
+                f'height {height_m} m, expected one within [{self.origin[2]:g}, {top:g}) m'
+            )
+        return self.distance_m[:, :, layer]
+
+
+def slice_at(blocks: BlockMap, height_m: float) -> Slice:
+    """
+    Return what is free and what is not at a height, over all blocks there.
+
+    Raises
+    ------
+    MapLimitError
+        If the blocks are too far apart for one grid.
+
+    """
+    size_m = blocks.config.voxel_size_m
+    layer = int(np.floor(height_m / size_m))
+    index = blocks.index(blocks.rows())
+    index = index[index[:, 2] == layer // blocks.config.voxels_per_side]
+    if not len(index):
+        return Slice(resolution_m=size_m, origin=np.zeros(2), cost=np.empty((0, 0), np.int8))
+    low, high = extent(blocks, index)
+    low[2], high[2] = layer, layer + 1
+    found = box_states(blocks, low, high)[:, :, 0]
+    origin = np.asarray(low[:2] * size_m, np.float64)
+    return Slice(resolution_m=size_m, origin=origin, cost=COSTS[found.T])
+
+
+def distance_field(
+    blocks: BlockMap,
+    low_m: npt.ArrayLike | None = None,
+    high_m: npt.ArrayLike | None = None,
+) -> DistanceField:
+    """
+    Return how far it is to the nearest occupied voxel.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The field.
+    low_m, high_m : (3,) float, optional
+        Corners of the box; without them it holds all blocks. Obstacles outside do not count.
+
+    Raises
+    ------
+    ValueError
+        If the box is none.
+    MapLimitError
+        If it has too many voxels.
+
+    """
+    size_m = blocks.config.voxel_size_m
+    low, high = extent(blocks, blocks.index(blocks.rows()))
+    if low_m is not None:
+        low = np.floor(np.asarray(low_m, np.float64) / size_m).astype(np.int64)
+    if high_m is not None:
+        high = np.ceil(np.asarray(high_m, np.float64) / size_m).astype(np.int64)
+    if low.shape != (3,) or high.shape != (3,) or (low > high).any():
+        raise ValueError(f'box from {low * size_m} to {high * size_m} m, expected low below high')
+    found = box_states(blocks, low, high)
+    occupied = found == OCCUPIED
+    distance = np.full(found.shape, np.inf, np.float32)
+    if occupied.any():
+        distance = distance_transform_edt(~occupied, sampling=size_m).astype(np.float32)
+    return DistanceField(
+        voxel_size_m=size_m,
+        origin=np.asarray(low * size_m, np.float64),
+        distance_m=distance,
+        known=found != UNKNOWN,
+    )
+
+
+def extent(
+    blocks: BlockMap, index: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Return the first voxel of some blocks along each axis, and the first behind them."""
+    if not len(index):
+        return np.zeros(3, np.int64), np.zeros(3, np.int64)
+    side = blocks.config.voxels_per_side
+    return index.min(axis=0) * side, (index.max(axis=0) + 1) * side
+
+
+def box_states(
+    blocks: BlockMap, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
+) -> npt.NDArray[np.uint8]:
+    """Return the states of the voxels from low up to but without high, (nx, ny, nz)."""
+    shape = tuple((high - low).tolist())
+    num = int(np.prod(shape, dtype=object))
+    if num > MAX_VOXELS:
+        raise MapLimitError(
+            f'a box of {" x ".join(map(str, shape))} voxels; at most {MAX_VOXELS}: take a smaller '
+            'one, or set layers.tsdf.max_radius_m'
+        )
+    found = np.empty(shape, np.uint8)
+    y, z = (np.arange(low[axis], high[axis]) for axis in (1, 2))
+    for plane in range(shape[0]):
+        places = np.stack(np.meshgrid(low[0] + plane, y, z, indexing='ij'), axis=-1)
+        centers = (places.reshape(-1, 3) + 0.5) * blocks.config.voxel_size_m
+        found[plane] = states(blocks, centers).reshape(shape[1:])
+    return found

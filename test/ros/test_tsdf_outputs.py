@@ -1,0 +1,62 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The mesh and the slice of a node's TSDF, seen over DDS."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from nav_msgs.msg import OccupancyGrid
+from visualization_msgs.msg import Marker
+
+from surfel_mapper.tsdf.sensors import Lidar
+from test.ros.live import cloud, LATCHED, odometry, START_NS
+from test.ros.test_outputs import BASE, start_node
+
+pytestmark = pytest.mark.timeout(120)
+
+RADIUS_M = 5.0
+SETTINGS = {
+    'layers.tsdf.enabled': 'true',
+    'layers.tsdf.voxel_size_m': 0.2,
+    'layers.tsdf.truncation_m': 0.6,
+    'layers.tsdf.mesh_rate_hz': 10.0,
+    'layers.tsdf.slice_rate_hz': 10.0,
+    'layers.tsdf.slice_height_m': 0.5,
+    'layers.tsdf.sensor_rows': 32,
+    'layers.tsdf.sensor_columns': 360,
+}
+
+
+def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
+    start_node(start, peer, **SETTINGS)
+    meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
+    slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
+    directions = Lidar(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
+    peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
+
+    peer.spin_until(lambda: meshes and meshes[-1].points)
+    mesh = meshes[-1]
+    corners = np.array([(p.x, p.y, p.z) for p in mesh.points])
+    middle = (0.1, 0.0, 0.5)  # where the sensor is on the robot
+    assert (mesh.type, mesh.action, mesh.header.frame_id) == (Marker.TRIANGLE_LIST, 0, 'odom')
+    assert len(corners) == len(mesh.colors) > 3000
+    assert len(corners) % 3 == 0
+    assert np.abs(np.linalg.norm(corners - middle, axis=1) - RADIUS_M).max() <= 0.1
+
+    peer.spin_until(lambda: slices and slices[-1].data)
+    grid = slices[-1]
+    cost = np.array(grid.data).reshape(grid.info.height, grid.info.width)
+    assert grid.info.resolution == pytest.approx(0.2)
+    y, x = np.nonzero(cost == 100)
+    distance = np.hypot(
+        grid.info.origin.position.x + (x + 0.5) * 0.2 - middle[0],
+        grid.info.origin.position.y + (y + 0.5) * 0.2,
+    )
+    assert len(distance) > 50
+    assert distance.min() > RADIUS_M - 0.4
+    assert (cost == 0).sum() > 500  # what the rays passed through

@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Slices and distance fields of small fields, against brute force over their voxels."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.obstacles import distance_field, slice_at
+from test.tsdf.test_mesh import blocks_of, centers, VOXEL_M
+
+FIRST = (-1, 2, 0)
+SHAPE = (12, 8, 8)
+
+
+@pytest.fixture
+def scene():
+    """Return blocks with a wall and a post, part of which was never observed."""
+    places = centers(SHAPE, FIRST)
+    wall = places[..., 0] - (-0.25)
+    post = np.linalg.norm(places[..., :2] - [0.45, 1.15], axis=-1) - 0.08
+    distance = np.minimum(wall, post).astype(np.float32)
+    weight = np.where(places[..., 1] > 1.45, 0.0, 1.0)
+    return blocks_of(distance, FIRST, weight=weight), distance, weight, places
+
+
+def states_of(distance, weight):
+    """Return -1 unknown, 0 free, 100 occupied."""
+    return np.where(weight == 0.0, -1, np.where(distance <= 0.5 * VOXEL_M, 100, 0))
+
+
+def test_a_slice_shows_what_is_free_occupied_and_unknown(scene):
+    blocks, distance, weight, _ = scene
+    found = slice_at(blocks, 0.37)
+    assert np.array_equal(found.cost.T, states_of(distance, weight)[:, :, 3])
+    assert found.resolution_m == VOXEL_M
+    assert found.origin == pytest.approx([-0.4, 0.8])
+    assert set(np.unique(found.cost)) == {-1, 0, 100}
+
+
+def test_a_slice_where_nothing_was_seen_is_empty(scene):
+    blocks, *_ = scene
+    assert slice_at(blocks, 5.0).cost.shape == (0, 0)
+    assert slice_at(BlockMap(TsdfConfig()), 0.0).cost.shape == (0, 0)
+
+
+def test_distances_are_those_to_the_nearest_obstacle(scene):
+    blocks, distance, weight, places = scene
+    field = distance_field(blocks)
+    occupied = places[states_of(distance, weight) == 100]
+    expected = np.linalg.norm(places.reshape(-1, 1, 3) - occupied, axis=-1).min(axis=1)
+    assert np.abs(field.distance_m.ravel() - expected).max() <= 1e-6
+    assert np.array_equal(field.known, weight > 0.0)
+    assert field.origin == pytest.approx([-0.4, 0.8, 0.0])
+    assert np.array_equal(field.at_height(0.55), field.distance_m[:, :, 5])
+
+
+def test_a_box_counts_the_obstacles_in_it_alone(scene):
+    blocks, *_ = scene
+    free = distance_field(blocks, (0.0, 0.8, 0.0), (0.2, 0.9, 0.3))
+    assert free.distance_m.shape == (2, 1, 3)
+    assert np.isinf(free.distance_m).all()
+    assert free.known.all()
+    beyond = distance_field(blocks, (5.0, 5.0, 5.0), (5.3, 5.3, 5.3))
+    assert not beyond.known.any()
+
+
+def test_an_empty_field_has_no_distances():
+    assert distance_field(BlockMap(TsdfConfig())).distance_m.shape == (0, 0, 0)
+
+
+def test_boxes_that_are_none_or_too_large_are_refused(scene):
+    blocks, *_ = scene
+    with pytest.raises(ValueError, match='expected low below high'):
+        distance_field(blocks, (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))
+    with pytest.raises(MapLimitError, match='voxels; at most'):
+        distance_field(blocks, (-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
+    with pytest.raises(ValueError, match=r'height 9.0 m, expected one within \[0, 0.8\)'):
+        distance_field(blocks).at_height(9.0)
