@@ -1,0 +1,108 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper replay`` of bags without odometry, and on a map that is frozen."""
+
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.alignment.trajectory_errors import compare
+from surfel_mapper.cli.main import main
+from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw
+from surfel_mapper.io.map_state import save_map
+from surfel_mapper.io.trajectory import read_trajectory
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.alignment.test_registration import map_of, ROOM, TRUE
+from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.pipeline.test_registered_poses import pose_at, scan_at
+
+NUM_SCANS = 5
+REGISTRATION = 'pose: {source: registration}\nregistration: {noise_m: 0.005}\n'
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    entries = Entries()
+    for number in range(NUM_SCANS):
+        points = scan_at(number).points
+        entries.cloud('/points', START_NS + number * PERIOD_NS, points)
+    return write_rosbag2(tmp_path_factory.mktemp('bags') / 'room', entries)
+
+
+def settings_file(tmp_path, text):
+    path = tmp_path / 'settings.yaml'
+    path.write_text(text)
+    return str(path)
+
+
+def poses_in(path):
+    found = read_trajectory(path)
+    poses = [pose_matrix(*pose) for pose in zip(found.xyz, found.q_xyzw, strict=True)]
+    return found.stamp_ns, np.array(poses)
+
+
+def test_the_poses_found_are_written(bag, tmp_path):
+    arguments = ['--config', settings_file(tmp_path, REGISTRATION)]
+    arguments += ['--output', str(tmp_path / 'out'), '--poses-out', str(tmp_path / 'found.tum')]
+
+    assert main(['replay', str(bag), *arguments]) == 0
+
+    stamps, poses = poses_in(tmp_path / 'found.tum')
+    assert stamps.tolist() == [START_NS + number * PERIOD_NS for number in range(NUM_SCANS)]
+    for number, pose in enumerate(poses):
+        np.testing.assert_allclose(pose, compose(inverse(TRUE), pose_at(number)), atol=5e-3)
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert summary['registration']['aligned'] == NUM_SCANS - 1
+    assert summary['scans']['mapped'] == NUM_SCANS
+
+
+def test_a_frozen_map_is_loaded_and_only_told_where_scans_were_taken(bag, tmp_path, capsys):
+    save_map(tmp_path / 'room.npz', map_of(ROOM))
+    start = [*TRUE[:3, 3].tolist(), *q_xyzw(TRUE).tolist()]
+    text = (
+        'pose: {source: registration}\n'
+        f'registration: {{noise_m: 0.005, start: {start}}}\n'
+        f'map: {{mode: frozen, load: {tmp_path / "room.npz"}}}\n'
+    )
+    arguments = ['--config', settings_file(tmp_path, text), '--output', str(tmp_path / 'out')]
+    arguments += ['--poses-out', str(tmp_path / 'found.tum')]
+
+    assert main(['replay', str(bag), *arguments]) == 0
+
+    for number, pose in enumerate(poses_in(tmp_path / 'found.tum')[1]):
+        np.testing.assert_allclose(pose, pose_at(number), atol=3e-3)
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert summary['digest'] == map_of(ROOM).digest()
+    assert summary['scans']['localised'] == NUM_SCANS
+
+
+def test_a_map_of_another_voxel_size_is_refused(bag, tmp_path, capsys):
+    save_map(tmp_path / 'other.npz', SurfelMap(0.3))
+    text = f'{REGISTRATION}map: {{load: {tmp_path / "other.npz"}}}\n'
+    arguments = ['--config', settings_file(tmp_path, text), '--output', str(tmp_path / 'out')]
+
+    assert main(['replay', str(bag), *arguments]) == 1
+
+    assert 'voxel size 0.3 m, expected map.voxel_size_m = 0.5 m' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(('name', 'num_scans'), [('hall_os0_full', 22), ('hall_os0_long', 118)])
+def test_real_scans_of_a_hand_that_turns_fast_are_followed(
+    data_folder, tmp_path, name, num_scans
+):
+    # up to 48 deg and 0.8 m between two scans, and no time that would help
+    bag = data_folder / 'data' / 'bags' / name
+    recorded, found = tmp_path / 'recorded.tum', tmp_path / 'found.tum'
+    settings = settings_file(tmp_path, 'pose: {source: registration}\n')
+
+    replay = ['replay', str(bag), '--output', str(tmp_path / 'out'), '--poses-out']
+    assert main([*replay, str(recorded)]) == 0
+    assert main([*replay, str(found), '--config', settings]) == 0
+
+    errors = compare(*poses_in(found), *poses_in(recorded))
+    assert errors['num_poses'] == num_scans
+    # the recorded odometry drifts itself: at all voxel sizes the difference is the same
+    assert errors['relative']['translation_m']['max'] < 0.03
+    assert errors['relative']['rotation_deg']['max'] < 0.5
+    assert errors['absolute']['translation_m']['max'] < 0.1
