@@ -291,6 +291,21 @@ class Mapper:
         """From the fixed frame of the poses that come in to the map: how alignment corrects."""
         return self._aligner.T_map_fixed
 
+    def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
+        """
+        Return where a frame is in the map at a time; 0: the newest there is.
+
+        Raises
+        ------
+        PoseError
+            If there is no transform.
+
+        """
+        if frame_id == self.map_frame:
+            return np.eye(4)
+        fixed, at_ns = self.config.frames.fixed, stamp_ns or self.transforms.newest_ns or 0
+        return self._aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
+
     @property
     def map_frame(self) -> str:
         """The frame of the map: that of the poses, unless alignment gives it its own."""

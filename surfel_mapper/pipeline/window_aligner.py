@@ -151,7 +151,7 @@ class WindowAligner:
         """
         self._num_new = 0
         scans = list(window)
-        self._check(len(window), scans)
+        self._check(len(window), scans, config.map.columns)
         before = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
         samples = self._samples_of(scans, config.align.voxel_size_m)
         alignment = align_scans(samples, before, config.align)
@@ -181,12 +181,16 @@ class WindowAligner:
             removed_voxel_index=fallen,
         )
 
-    def _check(self, num_scans: int, scans: list[WindowedScan]) -> None:
-        num_kept = sum(scan.points is not None for scan in scans)
+    def _check(
+        self, num_scans: int, scans: list[WindowedScan], columns: tuple[str, ...]
+    ) -> None:
+        num_kept = sum(
+            scan.points is not None and scan.columns.keys() >= set(columns) for scan in scans
+        )
         if num_kept < num_scans:
             raise AlignmentError(
-                f'{num_kept} of {num_scans} scans have their points; alignment moves scans by '
-                'their points, so window.keep_points is needed from the start'
+                f'{num_kept} of {num_scans} scans have their points, with what else is mapped of '
+                'them; scans are moved by these, so window.keep_points is needed from the start'
             )
         if num_scans < 2:
             raise AlignmentError(f'{num_scans} scans in the map, expected two or more to align')

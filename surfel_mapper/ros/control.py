@@ -184,7 +184,7 @@ class Control:
         topic, log = self._node.resolve_topic_name('~/clear_polygon'), self._node.get_logger()
         frame_id = msg.header.frame_id
         try:
-            region = prism(msg, self._mapper.transforms, self._mapper.config.frames.fixed)
+            region = prism(msg, self._mapper)
             log.info(self._clear_region(region, f'the polygon on {topic} in frame {frame_id}'))
         except (PoseError, MapError, ValueError) as error:
             log.warning(

@@ -224,3 +224,24 @@ def test_fewer_than_two_scans_are_refused(drive, number):
 def test_aligning_by_itself_needs_points():
     with pytest.raises(ConfigError, match=r'align.every_scans: 5, but window.keep_points'):
         Config.from_mapping({'align.every_scans': 5})
+
+
+def test_frames_are_found_in_the_map_as_it_was_corrected(drive):
+    mapper, _ = mapped(drive, {'align.map_frame': 'map'}, number=6)
+    aligned, newest_ns = mapper.align(), drive[0][5].stamp_ns
+
+    np.testing.assert_array_equal(mapper.T_map_of('map', newest_ns), np.eye(4))
+    np.testing.assert_allclose(mapper.T_map_of('odom', newest_ns), aligned.T_map_fixed)
+    for stamp_ns in (newest_ns, 0):
+        np.testing.assert_allclose(
+            mapper.T_map_of('lidar', stamp_ns), aligned.T_map_sensor[-1], rtol=0, atol=1e-9
+        )
+
+
+def test_scans_whose_columns_were_not_kept_are_refused(drive):
+    mapper, _ = mapped(drive, {'map.intensity': True}, number=3)
+    scans = [replace(scan, columns={}) for scan in mapper.window]
+    mapper.restore(mapper.map.copy(), scans)
+
+    with pytest.raises(AlignmentError, match='0 of 3 scans'):
+        mapper.align()
