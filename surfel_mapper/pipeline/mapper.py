@@ -605,7 +605,7 @@ class Mapper:
 
     def _align_when_due(self) -> Aligned | None:
         """Align the window if so many scans were mapped since; warn where that fails."""
-        if not self._aligner.is_due(self.config.align.every_scans):
+        if not self._aligner.is_due(self.config.align.every_scans) or len(self.window) < 2:
             return None
         try:
             aligned = self._aligner.align(self.window, self.config)

@@ -245,3 +245,10 @@ def test_scans_whose_columns_were_not_kept_are_refused(drive):
 
     with pytest.raises(AlignmentError, match='0 of 3 scans'):
         mapper.align()
+
+
+def test_the_first_scan_alone_is_nothing_to_align_or_to_warn_of(drive, caplog):
+    _, updates = mapped(drive, {'align.every_scans': 1}, number=2)
+
+    assert [update.aligned is not None for update in updates] == [False, True]
+    assert not caplog.records
