@@ -20,6 +20,24 @@ _log = logging.getLogger(__name__)
 WARN_EVERY_S = 1.0
 """A warning of one cause is logged at most this often; all are counted."""
 
+REMEDIES = {
+    'bad_cloud': 'the log says what is wrong with them',
+    'empty_frame_id': 'set the frame in the driver of the sensor',
+    'filter': 'compare the filters with the fields of the clouds',
+    'filtered_out': 'are the limits of the filters too narrow?',
+    'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
+    'missing_column': 'switch map.intensity or map.color off',
+    'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, '
+    'and its stamps with theirs; pose.max_wait_s waits longer',
+    'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
+    'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
+    'faster',
+    'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
+    'stamp_back': 'do two sensors share one frame?',
+    'stamp_repeated': 'does somebody publish the same clouds twice?',
+}
+"""What to do about scans that are dropped, by cause."""
+
 
 class Drops:
     """
@@ -29,6 +47,8 @@ class Drops:
     ----------
     is_silent : bool
         Whether it only counts.
+    topics : dict of str to str
+        Where the scans of a frame come from, for the log.
 
     """
 
@@ -36,6 +56,7 @@ class Drops:
 
     def __init__(self, counters: Counters) -> None:
         """Count into these counters."""
+        self.topics: dict[str, str] = {}
         self._counters = counters
         self._warned_s: dict[str, float] = {}
 
@@ -43,10 +64,13 @@ class Drops:
         """Count a scan as dropped for a cause."""
         counters = self._counters
         counters.drop(cause, scan.frame_id)
+        topic, remedy = self.topics.get(scan.frame_id), REMEDIES.get(cause)
         self.warn(
             cause,
-            f'scan at {scan.stamp_ns / 1e9:.6f} s in frame {scan.frame_id!r} dropped: {reason} '
-            f'({counters.dropped[cause]} dropped for this cause)',
+            f'scan {f"on {topic} " if topic else ""}at {scan.stamp_ns / 1e9:.6f} s '
+            f'in frame {scan.frame_id!r} dropped: {reason} '
+            f'({counters.dropped[cause]} dropped for this cause)'
+            f'{f"; {remedy}" if remedy else ""}',
         )
 
     def message(self, cause: str, reason: str, number: int = 1) -> None:

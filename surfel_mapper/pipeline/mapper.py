@@ -131,15 +131,17 @@ class Mapper:
         except (PoseError, ValueError) as error:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
 
-    def add_scan(self, scan: Scan) -> None:
+    def add_scan(self, scan: Scan, topic: str = '') -> None:
         """
         Queue a scan until its pose is there; ``insert_ready`` maps it.
 
         A scan without points or frame, or with a stamp that is not newer than the last of its
         frame, is dropped and counted. A stamp that goes back by more than
-        ``input.reset_after_s`` clears the map first.
+        ``input.reset_after_s`` clears the map first. The topic it came on is for the log.
         """
         self.counters.received += 1
+        if topic:
+            self._drops.topics[scan.frame_id] = topic
         if not scan.frame_id:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:

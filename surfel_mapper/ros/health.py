@@ -13,21 +13,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from surfel_mapper.config import DiagnosticsConfig
+from surfel_mapper.pipeline.drops import REMEDIES
 
 OK, WARN, ERROR = 0, 1, 2
 """As in diagnostic_msgs/DiagnosticStatus."""
-
-REMEDIES = {
-    'bad_cloud': 'the log says what is wrong with them',
-    'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, and '
-    'its stamps with those of the clouds; pose.max_wait_s waits longer',
-    'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
-    'faster',
-    'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
-    'stamp_back': 'do two sensors share one frame?',
-    'stamp_repeated': 'does somebody publish the same clouds twice?',
-}
-"""What to do about scans that are dropped, by cause."""
 
 OFF_S = 1e5
 """A latency beyond a day means that stamps and clock have nothing to do with each other."""

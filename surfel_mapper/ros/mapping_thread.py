@@ -21,6 +21,7 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.pipeline.drops import REMEDIES
 from surfel_mapper.scan import Scan
 
 MAX_POSES = 10_000
@@ -189,8 +190,8 @@ class MappingThread:
             self._mapper.ignore_message('overload', f'{poses} poses dropped: too many wait', poses)
         for (topic, frame_id), number in clouds.items():
             reason = (
-                f'in frame {frame_id!r}, clouds come faster than they can be mapped; larger '
-                'voxels (map.voxel_size_m) or a shorter range (input.max_range_m) would help'
+                f'in frame {frame_id!r}, clouds come faster than they can be mapped; '
+                f'{REMEDIES["overload"]}'
             )
             self._mapper.refuse_clouds('overload', topic, reason, number, frame_id)
 
@@ -208,7 +209,7 @@ class MappingThread:
             reason = f'in frame {frame_id!r}, {error}'
             self._mapper.refuse_clouds('bad_cloud', cloud.topic, reason, frame_id=frame_id)
             return
-        self._mapper.add_scan(scan)
+        self._mapper.add_scan(scan, cloud.topic)
 
 
 def fulfil(call: Call) -> None:
