@@ -73,7 +73,7 @@ class Ground(Filter):
         if not len(points):
             return np.zeros(0, np.bool_)
         x, y, z = points.T.copy()
-        points = np.stack([(a * x + b * y) + c * z for a, b, c in R_up_sensor], axis=1)
+        points = np.stack([(a * x + b * y) + c * z for a, b, c in R_up_sensor]).T
         grid = Grid.over(points, np.full(3, self.voxel_size_m), 'origin')
         _, _, groups = grid.group(points, True)
         moments = Moments.of_groups(points, groups.rows, len(groups.first))

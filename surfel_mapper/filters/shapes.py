@@ -22,7 +22,7 @@ from surfel_mapper.filters.columns import EIGEN_VALUES, EIGEN_VECTORS, NORMALS
 from surfel_mapper.filters.neighbours import Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.kernels.eigen3 import decompose
-from surfel_mapper.kernels.shapes import eigenvectors, neighbour_moments
+from surfel_mapper.kernels.shapes import eigenvectors, group_moments, neighbour_moments
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Rows of a symmetric matrix as it is stored: xx xy xz yy yz zz."""
@@ -53,18 +53,10 @@ class Moments:
     @classmethod
     def of_groups(cls, points: Points, rows: Ids, number: int) -> Moments:
         """Return those of groups of points, from the group of each; every group has one."""
-
-        def total(values: Points) -> Points:
-            return np.asarray(np.bincount(rows, values, number), np.float64)
-
-        count = np.bincount(rows, minlength=number)
-        mean = np.stack([total(axis) / count for axis in points.T], axis=1)
-        apart = points - mean[rows]
-        free = np.maximum(count - 1, 1)
-        covariance = np.stack([total(apart[:, i] * apart[:, j]) / free for i, j in PAIRS])
-        far_sq = np.zeros(number)
-        np.maximum.at(far_sq, rows, (apart * apart).sum(axis=1))
-        return cls(count, mean, covariance, np.sqrt(far_sq))
+        count, mean = np.zeros(number, np.int64), np.zeros((number, 3))
+        covariance, radius = np.zeros((6, number)), np.zeros(number)
+        group_moments(points, rows, count, mean, covariance, radius)
+        return cls(count, mean, covariance, radius)
 
     @classmethod
     def of_neighbours(cls, points: Points, ids: Ids) -> Moments:
