@@ -20,7 +20,6 @@ from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
-from surfel_mapper.offline.depth_feed import Decode, DepthFeed
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.span import Span, WHOLE
 
@@ -28,6 +27,7 @@ if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not ne
     import numpy as np
     import numpy.typing as npt
 
+    from surfel_mapper.offline.depth_feed import Decode, DepthFeed
     from surfel_mapper.pipeline import Mapper, Update
 
 TYPES = {'tf': TF, 'odometry': ODOMETRY, 'pose': POSE}
@@ -196,7 +196,7 @@ def replay(
     def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
         add_cloud(reader, mapper, message, poses, number, decode)
 
-    images = DepthFeed(clouds, add) if mapper.config.input.kind == 'depth' else None
+    images = depth_feed(clouds, add) if mapper.config.input.kind == 'depth' else None
     infos = images.info_topics if images else {}
     for message in messages(reader, {*clouds, *infos}, poses, span):
         if stopped():
@@ -212,6 +212,15 @@ def replay(
             seen[message.topic] += 1
         yield from mapper.insert_ready()
     mapper.finish()
+
+
+def depth_feed(
+    clouds: Collection[str], add: Callable[[BagMessage, int, Decode], None]
+) -> DepthFeed:
+    """Return what pairs images with calibrations; loaded here, for it brings the compiler."""
+    from surfel_mapper.offline.depth_feed import DepthFeed
+
+    return DepthFeed(clouds, add)
 
 
 def messages(
