@@ -17,13 +17,14 @@ amount, for which every sensor would need a threshold of its own.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 import math
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.plane_levels import PlaneLevels
 from surfel_mapper.alignment.surfel_planes import SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import compose, pose_matrix, q_xyzw, se3_exp, Transform
@@ -148,7 +149,7 @@ class Registration:
             Other starts and headings are tried where less of the scan fits.
 
         """
-        levels = _Levels(self.config, surfel_map, cells, starts)
+        levels = PlaneLevels(self.config, surfel_map, cells, starts)
         found = self._descend(cells, levels, starts[0], deviation_m)
         if not (found.converged and found.support >= expected_support and self.fits(found)):
             width_m = levels.voxel_size_m(self.config.coarse_levels)
@@ -170,7 +171,7 @@ class Registration:
     def _descend(
         self,
         cells: npt.NDArray[np.float64],
-        levels: _Levels,
+        levels: PlaneLevels,
         start: Transform,
         deviation_m: float,
     ) -> Alignment:
@@ -184,7 +185,7 @@ class Registration:
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
             found = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
             pose, iterations = found.T_map_sensor, iterations + found.iterations
-        return found
+        return replace(found, iterations=iterations)
 
     def _converge(
         self,
@@ -218,7 +219,7 @@ class Registration:
         )
 
     def _headings(
-        self, cells: npt.NDArray[np.float64], levels: _Levels, starts: Sequence[Transform]
+        self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]
     ) -> list[Transform]:
         """Return the starts that fit best, turned to all headings searched."""
         num = int(self.config.search_deg / SEARCH_STEP_DEG)
@@ -236,45 +237,6 @@ class Registration:
         support = [overlap * fit for _, _, overlap, fit in found]
         best = np.argsort(support, kind='stable')[::-1][:SEARCH_STARTS]
         return [turned[place] for place in best]
-
-
-class _Levels:
-    """The map and its coarser levels around a scan, made when first asked for."""
-
-    def __init__(
-        self,
-        config: RegistrationConfig,
-        surfel_map: SurfelMap,
-        cells: npt.NDArray[np.float64],
-        starts: Iterable[Transform],
-    ) -> None:
-        self._config = config
-        self._map = surfel_map
-        self._cells = cells
-        self._starts = list(starts)
-        self._planes: dict[int, SurfelPlanes] = {}
-
-    def voxel_size_m(self, level: int) -> float:
-        """Return the edge of a voxel of a level."""
-        return float(self._map.voxel_size_m * 2**level)
-
-    def planes(self, level: int) -> SurfelPlanes:
-        """Return the planes of a level."""
-        if level not in self._planes:
-            target = self._map.coarsen(level, self._box()) if level else self._map
-            self._planes[level] = SurfelPlanes(
-                target, self._config.min_points, self._config.noise_m
-            )
-        return self._planes[level]
-
-    def _box(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Return the voxels that the scan may reach, wherever it turns."""
-        reach_m = math.sqrt(float((self._cells**2).sum(axis=1).max(initial=0.0)))
-        reach_m += self.voxel_size_m(self._config.coarse_levels)
-        at = np.array([start[:3, 3] for start in self._starts])
-        low = np.floor((at.min(axis=0) - reach_m) / self._map.voxel_size_m)
-        high = np.floor((at.max(axis=0) + reach_m) / self._map.voxel_size_m)
-        return low.astype(np.int64), high.astype(np.int64)
 
 
 def means(moments: ScanMoments) -> npt.NDArray[np.float64]:

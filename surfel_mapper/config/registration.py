@@ -58,7 +58,7 @@ class RegistrationConfig(Stage):
         'Where deviations exceed a voxel, alignment begins with voxels up to 2^this times '
         'larger.',
         low=0,
-        high=8,
+        high=3,
         live=True,
     )
     max_iterations: int = setting(

@@ -44,9 +44,11 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
+from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.pipeline.update import removed_voxels, Update
 from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
@@ -90,7 +92,11 @@ class Mapper:
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._mounted: set[str] = set()
-        self.tsdf = TsdfLayer(self.config.tsdf) if self.config.tsdf.enabled else None
+        sensors = SensorModels(self.config.tsdf)
+        self.tsdf = TsdfLayer(self.config.tsdf, sensors) if self.config.tsdf.enabled else None
+        self._moved: MovedAway | None = None
+        if self.config.dynamic.clear:
+            self._moved = MovedAway(self.config.dynamic, self.map.voxel_size_m, sensors)
         self.registered: RegisteredPoses | None = None
         if self.config.pose.source == 'registration':
             self.registered = RegisteredPoses(self.config, self.transforms)
@@ -266,6 +272,8 @@ class Mapper:
         self._aligner.reset()
         if self.tsdf is not None:
             self.tsdf.clear()
+        if self._moved is not None:
+            self._moved.clear()
 
     def align(self) -> Aligned:
         """
@@ -411,6 +419,8 @@ class Mapper:
             self.registered.warm_up()
         if self.tsdf is not None:
             self.tsdf.warm_up()
+        if self._moved is not None:
+            self._moved.warm_up()
 
     def summary(self) -> dict[str, Any]:
         """Return counts and times, and what the map is: for files, reports and diagnostics."""
@@ -502,6 +512,9 @@ class Mapper:
             self._drops.scan(scan, 'map_limit', str(error))
             return None
         laps.end('insert')
+        cleared = self._clear_moved(filtered, pose, windowed.moments.key)
+        if self._moved is not None:
+            laps.end('clear')
         aligned = self._align_when_due()
         if aligned is not None:
             pose = aligned.T_map_sensor[-1]
@@ -519,12 +532,29 @@ class Mapper:
             T_fixed_sensor=pose,
             num_points=windowed.moments.num_points,
             changed=changed,
-            removed_voxel_index=removed_voxels(evictions, aligned, changed),
+            removed_voxel_index=removed_voxels(evictions, cleared, aligned, changed),
             evictions=tuple(evictions),
             milliseconds=laps.milliseconds,
             aligned=aligned,
             alignment=alignment,
         )
+
+    def _clear_moved(
+        self,
+        scan: Scan,
+        pose: npt.NDArray[np.float64],
+        hit: npt.NDArray[np.int64],
+    ) -> npt.NDArray[np.int32]:
+        """Empty the voxels that scans see through by now; return the surfels that are gone."""
+        if self._moved is None:
+            return np.empty((0, 3), np.int32)
+        try:
+            empty = self._moved.look(scan, pose, self.map.keys(), hit)
+        except CloudFormatError as error:
+            self._drops.message('dynamic', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
+            return np.empty((0, 3), np.int32)
+        self.counters.cleared_voxels += len(empty)
+        return self.window.drop_voxels(empty, self.config.map.min_points)
 
     def _follow(
         self,
@@ -559,7 +589,7 @@ class Mapper:
             pose, alignment = self.registered.find(
                 filtered, times, self.map, self._aligner.T_map_fixed
             )
-        except (AlignmentError, PoseError) as error:
+        except (AlignmentError, MapError, PoseError) as error:
             self._drops.scan(scan, 'not_aligned', str(error))
             return None
         laps.end('register')

@@ -105,7 +105,7 @@ class RegisteredPoses:
         surfel_map.insert(self._moments(scan, surfel_map))
         trial = Tracker(self._registration, np.eye(4))
         trial.advance(np.eye(4), scan.stamp_ns)
-        with suppress(AlignmentError):  # else it is taken to be at rest
+        with suppress(AlignmentError, PoseError):  # else it is taken to be at rest
             trial.track(self._cells(following), following.stamp_ns, surfel_map, np.eye(4))
         self._tracker.begin(scan.stamp_ns, trial.twist)
 

@@ -107,6 +107,20 @@ def test_too_many_points_for_a_level_are_refused():
         surfel_map.coarsen(15)
 
 
+def test_a_part_of_a_map_becomes_coarser_alone():
+    surfel_map = map_of(scans_at(0.0))
+    low, high = np.array([-4, -4, -2]), np.array([3, 5, 3])
+    index = surfel_map.moments().voxel_index
+    inside = index[((index >= low) & (index <= high)).all(axis=1)]
+    part = SurfelMap(surfel_map.voxel_size_m)
+    part.insert(surfel_map.moments(inside))
+
+    coarse = surfel_map.coarsen(1, within=(low, high))
+
+    assert 0 < part.num_voxels < surfel_map.num_voxels
+    assert coarse == part.coarsen(1)
+
+
 def test_a_copy_is_equal_and_goes_its_own_way():
     surfel_map = map_of(scans_at(0.0))
     copy = surfel_map.copy()
