@@ -43,6 +43,8 @@ class Counters:
         to a frozen map.
     evicted : Counter of str
         Scans that left the map again, by the limit reached.
+    cleared_voxels : int
+        Voxels emptied because scans see through them.
     resets : int
         How often the map was cleared because time went back.
     dropped : Counter of str
@@ -66,6 +68,7 @@ class Counters:
     mapped: int = 0
     gated: int = 0
     localised: int = 0
+    cleared_voxels: int = 0
     resets: int = 0
     points: int = 0
     evicted: Counter[str] = field(default_factory=Counter)
@@ -123,6 +126,7 @@ class Counters:
                 'dropped': dict(self.dropped),
                 'dropped_by_frame': {k: dict(v) for k, v in self.dropped_by_frame.items()},
             },
+            'cleared_voxels': self.cleared_voxels,
             'resets': self.resets,
             'points': self.points,
             'points_left_out': dict(self.points_left_out),

@@ -13,6 +13,7 @@ a wrong type or a value out of bounds is a ConfigError.
 from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.configuration import Config, declarations, load_config
 from surfel_mapper.config.deskew import DeskewConfig
+from surfel_mapper.config.dynamic import DynamicConfig
 from surfel_mapper.config.grid import GridConfig
 from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
 from surfel_mapper.config.registration import RegistrationConfig
@@ -35,6 +36,7 @@ __all__ = [
     'Declaration',
     'DeskewConfig',
     'DiagnosticsConfig',
+    'DynamicConfig',
     'FramesConfig',
     'GridConfig',
     'InputConfig',

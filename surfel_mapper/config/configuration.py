@@ -12,6 +12,7 @@ from typing import Any
 
 from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.deskew import DeskewConfig
+from surfel_mapper.config.dynamic import DynamicConfig
 from surfel_mapper.config.grid import GridConfig
 from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
 from surfel_mapper.config.registration import RegistrationConfig
@@ -52,6 +53,7 @@ class Config:
     grid: GridConfig = field(default_factory=GridConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
+    dynamic: DynamicConfig = field(default_factory=DynamicConfig)
     clear: ClearConfig = field(default_factory=ClearConfig)
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
     filters: str = setting(

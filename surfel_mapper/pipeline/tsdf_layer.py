@@ -19,13 +19,12 @@ import numpy.typing as npt
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.mapping.window import Eviction, WindowedScan
+from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.fitting import fitted_lidar
 from surfel_mapper.tsdf.integrator import Integrated, Integrator
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.range_image import from_points
-from surfel_mapper.tsdf.sensors import Camera, Lidar
 
 
 class TsdfLayer:
@@ -36,13 +35,15 @@ class TsdfLayer:
     ----------
     config : TsdfConfig
         Its settings.
+    sensors : SensorModels, optional
+        What the scans come from, where others look at them too.
 
     """
 
-    def __init__(self, config: TsdfConfig) -> None:
+    def __init__(self, config: TsdfConfig, sensors: SensorModels | None = None) -> None:
         """Begin with an empty field."""
         self.config = config
-        self._lidars: dict[str, Lidar] = {}
+        self._sensors = sensors or SensorModels(config)
         self.clear()
 
     def clear(self) -> None:
@@ -94,7 +95,7 @@ class TsdfLayer:
         if self.config.color and {'rgb', 'rgba'} & columns.keys():
             colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
         labels = columns.get('label') if self.config.semantics != 'none' else None
-        sensor = self._sensor(scan)
+        sensor = self._sensors.of(scan)
         image = from_points(sensor, scan.points, colors=colors, labels=labels)
         self.blocks.clear_updated()
         done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
@@ -134,22 +135,3 @@ class TsdfLayer:
         scan = self._waiting.pop(windowed.stamp_ns, None)
         if scan is not None:
             self.insert(scan, windowed.T_map_sensor)
-
-    def _sensor(self, scan: Scan) -> Camera | Lidar:
-        """Return the sensor of a scan; a lidar stays as its first scan has shown it."""
-        config = self.config
-        ranges = {'min_range_m': config.min_range_m, 'max_range_m': config.max_range_m}
-        if scan.camera:
-            width, height, fx, fy, cx, cy = scan.camera
-            return Camera(
-                columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **ranges
-            )
-        if scan.frame_id not in self._lidars:
-            self._lidars[scan.frame_id] = fitted_lidar(
-                scan.points,
-                scan.columns.get('ring'),
-                rows=config.sensor_rows,
-                columns=config.sensor_columns,
-                **ranges,
-            )
-        return self._lidars[scan.frame_id]

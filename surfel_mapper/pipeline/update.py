@@ -38,7 +38,8 @@ class Update:
     changed : Surfels
         Every voxel that the scan or an eviction changed and that has ``map.min_points``.
     removed_voxel_index : (K, 3) int32
-        Voxels that were surfels and, after an eviction, have too few points.
+        Voxels that were surfels and, after an eviction, an alignment or because scans see
+        through them, have too few points.
     evictions : tuple of Eviction
         The scans that left, oldest first.
     aligned : Aligned, optional
@@ -65,10 +66,13 @@ class Update:
 
 
 def removed_voxels(
-    evictions: Sequence[Eviction], aligned: Aligned | None, changed: Surfels
+    evictions: Sequence[Eviction],
+    cleared: npt.NDArray[np.int32],
+    aligned: Aligned | None,
+    changed: Surfels,
 ) -> npt.NDArray[np.int32]:
-    """Return the voxels (K, 3) that were surfels before evictions and an alignment, only."""
-    fallen = [np.empty((0, 3), np.int32), *(eviction.fallen for eviction in evictions)]
+    """Return the voxels (K, 3) that were surfels before all these, and are none now."""
+    fallen = [cleared, *(eviction.fallen for eviction in evictions)]
     if aligned is None:
         return np.concatenate(fallen)
     gone = np.unique(np.concatenate([*fallen, aligned.removed_voxel_index]), axis=0)

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Which camera or lidar each scan came from."""
+
+from __future__ import annotations
+
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.scan import Scan
+from surfel_mapper.tsdf.fitting import fitted_lidar
+from surfel_mapper.tsdf.sensors import Camera, Lidar
+
+
+class SensorModels:
+    """
+    The sensors that scans have come from so far.
+
+    Parameters
+    ----------
+    config : TsdfConfig
+        What is known of them beforehand: rows, columns, ranges.
+
+    """
+
+    def __init__(self, config: TsdfConfig) -> None:
+        """Know none."""
+        self._config = config
+        self._lidars: dict[str, Lidar] = {}
+
+    def of(self, scan: Scan) -> Camera | Lidar:
+        """
+        Return the sensor of a scan: its camera, else the lidar that the first of its frame shows.
+
+        Raises
+        ------
+        CloudFormatError
+            If the points of the first show no lidar.
+
+        """
+        config = self._config
+        ranges = {'min_range_m': config.min_range_m, 'max_range_m': config.max_range_m}
+        if scan.camera:
+            width, height, fx, fy, cx, cy = scan.camera
+            return Camera(
+                columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **ranges
+            )
+        if scan.frame_id not in self._lidars:
+            self._lidars[scan.frame_id] = fitted_lidar(
+                scan.points,
+                scan.columns.get('ring'),
+                rows=config.sensor_rows,
+                columns=config.sensor_columns,
+                **ranges,
+            )
+        return self._lidars[scan.frame_id]

@@ -1,0 +1,190 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A box moves through a room: where it was is cleared, the room stays, and nothing drifts.
+
+The room and the box are simulated anew for every scan, so that the truth is known.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config, DynamicConfig, TsdfConfig
+from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.moved_away import MovedAway
+from surfel_mapper.pipeline.sensor_models import SensorModels
+from surfel_mapper.scan import Scan
+from surfel_mapper.tsdf.sensors import Lidar
+
+S = 10**9
+LIDAR = Lidar(rows=64, columns=512, vertical_fov_deg=60.0)
+RING = np.repeat(np.arange(64), 512)
+ROOM_M = np.array([8.0, 6.0, 2.0])
+BOX_M = np.array([0.5, 0.5, 1.0])
+SIZE_M = 0.25
+SCANS = 40
+
+
+def ranges_to_box(origin, directions, middle, half):
+    """Return where rays enter a box, inf where they miss, and where they leave it."""
+    with np.errstate(divide='ignore'):
+        first = (middle - half - origin) / directions
+        second = (middle + half - origin) / directions
+    enters = np.minimum(first, second).max(axis=-1)
+    leaves = np.maximum(first, second).min(axis=-1)
+    return np.where((enters < leaves) & (enters > 0.0), enters, np.inf), leaves
+
+
+def scan_of(number, has_box=True):
+    """Return what a lidar in the middle sees, and where the box is."""
+    origin = np.array([0.02 * number, 0.0, 0.0])
+    box = np.array([-5.0 + 10.0 * number / SCANS, 3.0, -1.0])
+    directions = LIDAR.directions.reshape(-1, 3).astype(np.float64)
+    _, walls = ranges_to_box(origin, directions, np.zeros(3), ROOM_M)
+    nearest, _ = ranges_to_box(origin, directions, box, BOX_M)
+    ranges = np.minimum(walls, nearest) if has_box else walls
+    rng = np.random.default_rng(number)
+    points = directions * (ranges + rng.normal(scale=0.01, size=len(ranges)))[:, None]
+    scan = Scan(
+        points=points.astype(np.float32),
+        stamp_ns=(number + 1) * S,
+        frame_id='lidar',
+        columns={'ring': RING},
+    )
+    return scan, origin, box
+
+
+def driven(**settings):
+    """Return a mapper that has seen the box pass."""
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                'pose.source': 'odometry',
+                'frames.base': 'lidar',
+                'map.voxel_size_m': SIZE_M,
+                'map.min_points': 1,
+                'window.max_scans': 0,
+                **settings,
+            }
+        )
+    )
+    updates = []
+    for number in range(SCANS):
+        scan, origin, _ = scan_of(number)
+        mapper.add_pose('odom', 'lidar', scan.stamp_ns, origin, (0.0, 0.0, 0.0, 1.0))
+        mapper.add_scan(scan)
+        updates += mapper.insert_ready()
+    assert len(updates) == SCANS
+    return mapper, updates
+
+
+def ghosts(mapper, scans=SCANS - 10):
+    """Return the voxels well within the room where the box was up to a scan; keys."""
+    index = mapper.map.moments().voxel_index
+    centers = (index + 0.5) * SIZE_M
+    inner = (np.abs(centers) < ROOM_M - 2 * SIZE_M).all(axis=1)
+    _, _, box = scan_of(scans)
+    return pack_keys(index[inner & (centers[:, 0] < box[0])])
+
+
+def walls(mapper):
+    """Return the voxels of the walls, as a set of keys."""
+    index = mapper.map.moments().voxel_index
+    centers = (index + 0.5) * SIZE_M
+    return set(pack_keys(index[(np.abs(centers) >= ROOM_M - SIZE_M).any(axis=1)]).tolist())
+
+
+@pytest.fixture(scope='module')
+def with_clearing():
+    return driven(**{'dynamic.clear': True})
+
+
+def test_where_the_box_was_is_cleared_and_the_room_stays(with_clearing):
+    mapper, updates = with_clearing
+    without, _ = driven()
+    assert len(ghosts(without)) > 200
+    assert len(ghosts(mapper)) <= 0.02 * len(ghosts(without))
+    assert len(walls(mapper)) >= 0.995 * len(walls(without))
+    assert mapper.summary()['cleared_voxels'] == mapper.counters.cleared_voxels > 200
+    assert without.counters.cleared_voxels == 0
+    assert updates[-1].milliseconds['clear'] > 0.0
+
+
+def test_what_is_cleared_is_said_and_gone(with_clearing):
+    _, updates = with_clearing
+    there = set()
+    for update in updates:
+        there |= set(map(tuple, update.changed.voxel_index.tolist()))
+        removed = set(map(tuple, update.removed_voxel_index.tolist()))
+        assert removed <= there
+        there -= removed
+    mapper, _ = with_clearing
+    assert there == set(map(tuple, mapper.map.surfels().voxel_index.tolist()))
+
+
+def test_scans_leave_exactly_after_voxels_were_cleared():
+    mapper, _ = driven(**{'dynamic.clear': True, 'window.max_scans': 30})
+    alone = SurfelMap(SIZE_M)
+    for scan in mapper.window:
+        alone.insert(scan.moments)
+    assert alone.digest() == mapper.map.digest()
+    mapper.clear()
+    assert mapper.map.num_voxels == 0
+
+
+def look(count, scan, keys, hit=()):
+    """Return which of some voxels are empty after a scan from the origin, as a list."""
+    keys, hit = pack_keys(np.array(keys)), pack_keys(np.reshape(hit, (-1, 3)).astype(int))
+    found = count.look(scan, np.eye(4), np.sort(keys), hit)
+    return sorted(map(tuple, found.tolist()))
+
+
+def counting(**settings):
+    config = DynamicConfig(clear=True, **settings)
+    return MovedAway(config, SIZE_M, SensorModels(TsdfConfig()))
+
+
+EMPTY_ROOM = replace(scan_of(0, has_box=False)[0])
+INSIDE, ON_WALL, OUTSIDE = (12, 4, 1), (31, 0, 0), (60, 0, 0)
+
+
+def test_a_voxel_is_empty_once_enough_scans_in_a_row_saw_through_it():
+    count = counting(min_scans=3)
+    voxels = [INSIDE, ON_WALL, OUTSIDE]
+    assert [look(count, EMPTY_ROOM, voxels) for _ in range(3)] == [[], [], [INSIDE]]
+
+
+def test_a_hit_or_the_loss_of_the_voxel_begins_the_count_anew():
+    count = counting(min_scans=2)
+    assert look(count, EMPTY_ROOM, [INSIDE]) == []
+    assert look(count, EMPTY_ROOM, [INSIDE], hit=[INSIDE]) == []
+    assert look(count, EMPTY_ROOM, [INSIDE]) == []
+    assert look(count, EMPTY_ROOM, [ON_WALL]) == []
+    assert look(count, EMPTY_ROOM, [INSIDE]) == []
+    assert look(count, EMPTY_ROOM, [INSIDE]) == [INSIDE]
+
+
+def test_what_no_ray_says_anything_about_stays():
+    count = counting(min_scans=1)
+    nothing = replace(EMPTY_ROOM, points=np.full_like(EMPTY_ROOM.points, np.nan))
+    look(count, EMPTY_ROOM, [ON_WALL])  # shows the lidar
+    assert look(count, nothing, [INSIDE]) == []
+    above = (0, 1, 30)  # out of view
+    assert look(count, EMPTY_ROOM, [above]) == []
+
+
+def test_the_margin_bounds_what_counts_as_behind():
+    assert look(counting(min_scans=1, margin_m=20.0), EMPTY_ROOM, [INSIDE]) == []
+    assert look(counting(min_scans=1, margin_m=0.5), EMPTY_ROOM, [INSIDE]) == [INSIDE]
+
+
+def test_a_scan_that_shows_no_sensor_is_counted_and_mapped_all_the_same():
+    mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'dynamic.clear': True}))
+    flat = np.array([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
+    mapper.add_scan(Scan(points=flat, stamp_ns=S, frame_id='lidar'))
+    assert len(list(mapper.insert_ready())) == 1
+    assert mapper.counters.messages_ignored == {'dynamic': 1}
