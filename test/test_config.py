@@ -17,12 +17,15 @@ DECLARATIONS = {declared.name: declared for declared in declarations()}
 BOUNDED = [declared for declared in declarations() if declared.low is not None]
 QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
-UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio'}
+UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
 
 # A stage may refuse together what each bound accepts alone; these companions keep them apart.
 LEVEL = {'layers.tsdf.weight_dropoff': False}
 COMPANIONS = {
+    'align.every_scans': {'window.keep_points': True},
     'input.min_range_m': {'input.max_range_m': 0.0},
+    'layers.tsdf.min_range_m': {'layers.tsdf.max_range_m': 1e5},
+    'layers.tsdf.max_range_m': {'layers.tsdf.min_range_m': 0.001},
     'layers.tsdf.voxel_size_m': LEVEL,
     'layers.tsdf.truncation_m': LEVEL,
     'layers.tsdf.dropoff_m': LEVEL,
