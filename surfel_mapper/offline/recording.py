@@ -21,7 +21,8 @@ from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
 from surfel_mapper.io.bag_topics import CLOUD, IMAGE
 from surfel_mapper.offline.pose_path import PosePath
-from surfel_mapper.offline.replay import pose_topics, PoseTopics, replay, static_topics
+from surfel_mapper.offline.pose_topics import pose_topics, PoseTopics, static_topics
+from surfel_mapper.offline.replay import replay
 from surfel_mapper.offline.scan_folder import is_scan_folder, ScanFolder
 from surfel_mapper.offline.span import part
 

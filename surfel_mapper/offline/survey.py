@@ -21,7 +21,7 @@ from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import CLOUD, ODOMETRY, POSE, TF, Topic
 from surfel_mapper.io.pose_messages import frame_name, poses_in, stamp_ns, StampedPose
-from surfel_mapper.offline.replay import static_topics
+from surfel_mapper.offline.pose_topics import static_topics
 from surfel_mapper.poses import TransformBuffer
 
 SOURCES = {TF: 'tf', ODOMETRY: 'odometry', POSE: 'pose'}

@@ -10,7 +10,8 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.io.bag import BagReader
-from surfel_mapper.offline.replay import pose_topics, replay
+from surfel_mapper.offline.pose_topics import pose_topics
+from surfel_mapper.offline.replay import replay
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, relative_errors

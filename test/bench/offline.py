@@ -26,7 +26,8 @@ from surfel_mapper.io.bag_topics import CLOUD
 from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
-from surfel_mapper.offline.replay import ALL_SCANS, pose_topics
+from surfel_mapper.offline.pose_topics import pose_topics
+from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.replay import replay as replay_bag
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation.recording import record

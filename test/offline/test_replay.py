@@ -10,7 +10,8 @@ import pytest
 from surfel_mapper import Config, Mapper, SurfelMap
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
-from surfel_mapper.offline.replay import ALL_SCANS, pose_topics, replay
+from surfel_mapper.offline.pose_topics import pose_topics
+from surfel_mapper.offline.replay import ALL_SCANS, replay
 from test.io.recorded import (
     CLOUD,
     drive,
