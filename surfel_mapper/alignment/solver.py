@@ -16,6 +16,8 @@ that one pair of scans with exact pairs meets in a single step whatever the angl
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_array
@@ -28,6 +30,30 @@ from surfel_mapper.errors import AlignmentError
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+
+
+class Entries(NamedTuple):
+    """
+    Which edges enter the rows of which vertices: line c is one edge in one row.
+
+    Attributes
+    ----------
+    edges : (C,) int64
+        The edge.
+    ij : (C, 2) int64
+        The vertex of the row, and the other end of the edge.
+    sign : (C,) float64
+        1 in the row of the source, -1 in that of the target.
+
+    """
+
+    edges: Ints
+    ij: Ints
+    sign: Floats
+
+    def chosen(self, lines: npt.NDArray[np.bool_]) -> Entries:
+        """Return some of the lines."""
+        return Entries(self.edges[lines], self.ij[lines], self.sign[lines])
 
 
 def components(num_vertices: int, ends: Ints) -> Ints:
@@ -60,11 +86,13 @@ def exact_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     part = components(len(poses), ends[used])
     free = part == part[0]
     free[0] = False
-    rows = np.concatenate([used, used])
-    ij = np.concatenate([ends[used], ends[used][:, ::-1]])
-    sign = np.repeat([1.0, -1.0], len(used))
+    entries = Entries(
+        edges=np.concatenate([used, used]),
+        ij=np.concatenate([ends[used], ends[used][:, ::-1]]),
+        sign=np.repeat([1.0, -1.0], len(used)),
+    )
     pivots = _pivots(len(poses), ends[used], terms.center[used])
-    motion = _solve(free, ij, rows, sign, pivots, terms, symmetric=True)
+    motion = _solve(free, entries, pivots, terms, symmetric=True)
     moved = poses_of(_cayley(transforms(poses), pivots, motion), near=poses)
     return np.where(free[:, None], moved, poses)
 
@@ -88,18 +116,19 @@ def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     edges = np.arange(len(ends))
     leaving = {tuple(pair) for pair in ends.tolist()}
     answered = np.array([(t, s) in leaving for s, t in ends.tolist()], bool)
-    rows = np.concatenate([edges, edges[~answered]])
-    ij = np.concatenate([ends, ends[~answered][:, ::-1]])
-    sign = np.repeat([1.0, -1.0], [len(edges), int((~answered).sum())])
-    keep = counts[rows]
-    rows, ij, sign = rows[keep], ij[keep], sign[keep]
+    entries = Entries(
+        edges=np.concatenate([edges, edges[~answered]]),
+        ij=np.concatenate([ends, ends[~answered][:, ::-1]]),
+        sign=np.repeat([1.0, -1.0], [len(edges), int((~answered).sum())]),
+    )
+    entries = entries.chosen(counts[entries.edges])
     free = np.zeros(len(poses), bool)
-    free[ij[:, 0]] = True
-    part = components(len(poses), ij)
+    free[entries.ij[:, 0]] = True
+    part = components(len(poses), entries.ij)
     last = {int(number): vertex for vertex, number in enumerate(part)}
     free[[0 if number == part[0] else vertex for number, vertex in last.items()]] = False
-    pivots = _pivots(len(poses), ij, terms.center[rows])
-    motion = _solve(free, ij, rows, sign, pivots, terms, symmetric=False)
+    pivots = _pivots(len(poses), entries.ij, terms.center[entries.edges])
+    motion = _solve(free, entries, pivots, terms, symmetric=False)
     motion[:, :3] -= np.cross(motion[:, 3:], pivots)  # about the origin of the map
     try:
         change = np.linalg.solve(pcl_incidence(poses), motion[:, :, None])[:, :, 0]
@@ -128,23 +157,15 @@ def _pivots(num_vertices: int, ends: Ints, centers: Floats) -> Floats:
 
 def _solve(
     free: npt.NDArray[np.bool_],
-    ij: Ints,
-    edges: Ints,
-    sign: Floats,
+    entries: Entries,
     pivots: Floats,
     terms: EdgeTerms,
     *,
     symmetric: bool,
 ) -> Floats:
-    """
-    Return the motions (V, 6) of all vertices about their pivots, zero where they are not free.
-
-    Line c says that edge ``edges[c]`` enters the row of vertex ``ij[c, 0]``, with vertex
-    ``ij[c, 1]`` at its other end and the sign that its observation has there.
-    """
+    """Return the motions (V, 6) of all vertices about their pivots, zero where not free."""
     motion = np.zeros((len(free), 6))
-    own = free[ij[:, 0]]
-    ij, edges, sign = ij[own], edges[own], sign[own]
+    edges, ij, sign = entries.chosen(free[entries.ij[:, 0]])
     if not len(edges):
         return motion
     place = np.cumsum(free) - 1

@@ -155,35 +155,36 @@ class WindowAligner:
         before = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
         samples = self._samples_of(scans, config.align.voxel_size_m)
         alignment = align_scans(samples, before, config.align)
-        moved, changes = {}, [(0.0, 0.0)]
-        for place, (scan, pose) in enumerate(zip(scans, alignment.T_map_sensor, strict=True)):
-            change = compose(inverse(scan.T_map_sensor), pose)
-            distance_m, angle_deg = extent(change)
-            if distance_m > config.align.move_m or angle_deg > config.align.move_deg:
-                moments = self._moments_at(scan, pose)
-                moved[place] = replace(scan, moments=moments, T_map_sensor=pose)
-                changes.append((distance_m, angle_deg))
+        extents = [
+            extent(compose(inverse(old), new))
+            for old, new in zip(before, alignment.T_map_sensor, strict=True)
+        ]
+        moved = {
+            place: self._moved(scans[place], alignment.T_map_sensor[place])
+            for place, (way_m, turn_deg) in enumerate(extents)
+            if way_m > config.align.move_m or turn_deg > config.align.move_deg
+        }
         fallen = window.move(moved, config.map.min_points)
         after = np.array([scan.T_map_sensor for scan in window])
-        # what the newest scan was moved by, in the map
-        correction = compose(after[-1], inverse(before[-1]))
         if len(scans) - 1 in moved:
+            correction = compose(after[-1], inverse(before[-1]))  # in the map
             self.T_map_fixed = compose(correction, self.T_map_fixed)
-        largest = np.max(changes, axis=0).tolist()
         return Aligned(
             alignment=alignment,
             stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
             T_map_sensor=after,
             T_map_fixed=self.T_map_fixed,
             num_moved=len(moved),
-            largest_m=largest[0],
-            largest_deg=largest[1],
+            largest_m=max((extents[place][0] for place in moved), default=0.0),
+            largest_deg=max((extents[place][1] for place in moved), default=0.0),
             removed_voxel_index=fallen,
         )
 
-    def _check(
-        self, num_scans: int, scans: list[WindowedScan], columns: tuple[str, ...]
-    ) -> None:
+    def _moved(self, scan: WindowedScan, pose: Transform) -> WindowedScan:
+        """Return a scan as it is at another pose."""
+        return replace(scan, moments=self._moments_at(scan, pose), T_map_sensor=pose)
+
+    def _check(self, num_scans: int, scans: list[WindowedScan], columns: tuple[str, ...]) -> None:
         num_kept = sum(
             scan.points is not None and scan.columns.keys() >= set(columns) for scan in scans
         )
