@@ -87,9 +87,9 @@ def run_normals(
 
 def run_odometry(
     python: str | Path, peer: PeerSpec, scans: Sequence[Path], size_m: float
-) -> tuple[list[float], npt.NDArray[np.float64]]:
+) -> tuple[dict[str, list[float]], npt.NDArray[np.float64]]:
     """
-    Return milliseconds and pose of every scan, (S, 4, 4).
+    Return times (milliseconds, cpu_ms) and pose of every scan, (S, 4, 4).
 
     Raises
     ------
@@ -106,8 +106,8 @@ def run_odometry(
             'poses': str(poses),
         }
         command = [str(python), '-m', 'test.bench.peers.odometry_driver']
-        milliseconds = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
-        return milliseconds, np.load(poses)
+        times = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
+        return times, np.load(poses)
 
 
 def environment(peer: PeerSpec, cache: Path) -> Path:
