@@ -145,7 +145,7 @@ class Totals:
             received=self.received - last.received,
             silent_s=max(self.time_s - heard_s, 0.0),
             dropped=self.dropped - last.dropped,
-            latency_s=latency(session, 99),
+            latency_s=latency(session, 99) if self.received > last.received else None,
             paused=session.thread.paused,
             loss=session.inputs.loss() if self.lost > last.lost else '',
         )
