@@ -51,18 +51,22 @@ def covered(image, row, column, down, across, reach):
     """Return up to where coarser rays are so near to a ray that it need not be walked, m."""
     beside = above = 0.0
     if column > 0:
-        beside = min(reach[COLUMN_FREE] / across, np.float64(image[row, column - np.int64(across)]))
+        coarser = np.float64(image[row, column - np.int64(across)])
+        beside = min(reach[COLUMN_FREE] / across, coarser)
     if row > 0:
-        above = min(reach[ROW_FREE] / down, np.float64(image[row - np.int64(down), column]))
+        coarser = np.float64(image[row - np.int64(down), column])
+        above = min(reach[ROW_FREE] / down, coarser)
     return max(beside, above)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mark_rays(image, directions, pose, reach, side, marks):
+def mark_rays(image, cosine, directions, pose, reach, side, marks):
     """
     Mark the blocks that rays touch.
 
     image       (rows, columns or more) float32 m
+    cosine      likewise, 1 where distances are along rays; the band is longer by 1 / cosine; or
+                no rows
     directions  (rows, columns, 3) float32, unit vectors in the frame of the sensor
     pose        (3, 4) float64: sensor to the cube, blocks from metres; 0 is the cube's corner
     reach       (NUM_REACH,) float64
@@ -83,8 +87,9 @@ def mark_rays(image, directions, pose, reach, side, marks):
                 continue
             range_m = np.float64(measured)
             clears = range_m > max_range
-            start = range_m - reach[BEFORE]
-            end = range_m + reach[BEHIND] if in_band else start
+            longer = 1.0 / cosine[row, column] if cosine.shape[0] > 0 else 1.0
+            start = range_m - reach[BEFORE] * longer
+            end = range_m + reach[BEHIND] * longer if in_band else start
             if clears:
                 start, end = max_range, max_range
             if carve:

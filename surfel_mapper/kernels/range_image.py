@@ -13,6 +13,18 @@ import numpy as np
 
 from surfel_mapper.kernels.projection import project
 
+LEAST_COSINE = np.float32(0.35)
+"""Rays that meet a surface at less than 20 deg are taken as if they met it so."""
+
+GENTLE = 0.4
+"""Slopes up to this are believed from one neighbour."""
+
+STRAIGHT = 0.1
+"""Steeper ones where the other neighbour is off by at most this share of the rise."""
+
+MOST_PIXELS = 16.0
+"""Slopes are taken between pixels at most so far apart."""
+
 CHUNK = 1024
 """Points projected at once; their numbers stay in the first cache."""
 
@@ -99,3 +111,105 @@ def from_points(points, sensor, limits, image, index):
         for row in range(rows):
             image[row, columns] = image[row, 0]
     return min(largest, limits[1]), used
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def cosines(image, directions, pitch, reach_m, max_range, cosine):
+    """
+    Find the cosine of the angle between each ray and the normal of the surface it meets.
+
+    image       (rows, columns or one more) float32 m; all around with one more
+    directions  (rows, columns, 3) float32
+    pitch       (row, column) float64 rad, between neighbours
+    reach_m     float64, slopes are taken between points about so far apart
+    max_range   float32 m, of the sensor
+    cosine      (rows, columns or one more) float32, out: in [LEAST_COSINE, 1]; 1 if not known
+    """
+    rows, columns = np.int64(directions.shape[0]), np.int64(directions.shape[1])
+    around = image.shape[1] > columns
+    farthest_row, farthest_column = reach_m / pitch[0], reach_m / pitch[1]
+    for row in range(rows):
+        for column in range(columns):
+            cosine[row, column] = np.float32(1.0)
+            range_m = np.float64(image[row, column])
+            if range_m <= 0.0 or range_m > max_range:
+                continue
+            inverse = 1.0 / range_m
+            across, down = steps(farthest_column * inverse), steps(farthest_row * inverse)
+            left, right = column - across, column + across
+            if around:
+                left = left + columns if left < 0 else left
+                right = right - columns if right >= columns else right
+            gap_m = across * pitch[1] * range_m
+            first = known(image, row, left, columns, max_range)
+            second = known(image, row, right, columns, max_range)
+            beside = slope(first, range_m, second, gap_m)
+            gap_m = down * pitch[0] * range_m
+            first = known(image, row - down, column, columns, max_range)
+            second = known(image, row + down, column, columns, max_range)
+            above = slope(first, range_m, second, gap_m)
+            if beside == 0 or above == 0:
+                continue
+            column1, row1 = left if beside < 0 else right, row + above * down
+            ux, uy, uz = unit(directions, row, column)
+            ax, ay, az = unit(directions, row, column1)
+            bx, by, bz = unit(directions, row1, column)
+            # To the two neighbours, in units of the range.
+            ra, rb = image[row, column1] * inverse, image[row1, column] * inverse
+            ax, ay, az = ra * ax - ux, ra * ay - uy, ra * az - uz
+            bx, by, bz = rb * bx - ux, rb * by - uy, rb * bz - uz
+            x, y, z = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+            length_sq = x * x + y * y + z * z
+            if length_sq > 0.0:
+                along = abs(x * ux + y * uy + z * uz) / np.sqrt(length_sq)
+                cosine[row, column] = max(np.float32(along), LEAST_COSINE)
+        if around:
+            cosine[row, columns] = cosine[row, 0]
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def steps(pixels):
+    """Return a number of pixels, whole and within bounds."""
+    return np.int64(min(max(pixels + 0.5, 1.0), MOST_PIXELS))
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def unit(directions, row, column):
+    """Return the unit vector of a pixel."""
+    return (
+        np.float64(directions[row, column, 0]),
+        np.float64(directions[row, column, 1]),
+        np.float64(directions[row, column, 2]),
+    )
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def known(image, row, column, columns, max_range):
+    """Return the range of a pixel, 0 if it has none or lies beyond the image."""
+    if row < 0 or column < 0 or row >= image.shape[0] or column >= columns:
+        return 0.0
+    range_m = np.float64(image[row, column])
+    return range_m if range_m <= max_range else 0.0
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def slope(first, middle, second, gap_m):
+    """
+    Return which of two neighbours is on a plane with a pixel, -1 or 1; 0 for neither.
+
+    first, middle, second  float64 m, ranges; 0 where there is none
+    gap_m                  how far apart they are across the ray
+
+    The one of the more similar range counts, so that the edge of a thing does not pass for its
+    slope; a steep slope only if the other goes on with it. Along a plane the inverse of the range
+    is linear.
+    """
+    before = abs(first - middle) if first > 0.0 else np.inf
+    after = abs(second - middle) if second > 0.0 else np.inf
+    side = -1 if before <= after else 1
+    if min(before, after) <= GENTLE * gap_m:
+        return side
+    if first <= 0.0 or second <= 0.0:
+        return 0
+    bend = abs(1.0 / first + 1.0 / second - 2.0 / middle)
+    return side if bend <= STRAIGHT * abs(1.0 / first - 1.0 / second) else 0

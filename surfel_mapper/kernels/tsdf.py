@@ -64,8 +64,8 @@ def integrate_blocks(rows, corners, offsets, field, sensor, images, settings, mo
     offsets   (3, N) float32 m, from there to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations), see kernels/projection.py
-    images    (range_m, color, label, mask): see measure, fuse_color, vote_labels, apply_mask;
-              those that are missing have no rows
+    images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
+              subtract, fuse_color, vote_labels, apply_mask; those that are missing have no rows
     settings  (NUM_SETTINGS,) float32
     modes     (interpolation, power): weights fall by depth^-(2 power)
     channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
@@ -81,7 +81,7 @@ def integrate_blocks(rows, corners, offsets, field, sensor, images, settings, mo
     place = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
     kind, parameters, elevations = sensor
-    image, color_image, label_image, mask = images
+    image, cosine, color_image, label_image, mask = images
     color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
     tau, overflow = settings[TAU], 0
     for b in range(len(rows)):
@@ -96,7 +96,8 @@ def integrate_blocks(rows, corners, offsets, field, sensor, images, settings, mo
         if settings[MAX_OFFSET] > _ZERO:
             row_gaps(kind, parameters, elevations, v, weight)
             drop_far(x, y, u, v, distance, weight, settings, value)
-        subtract(value, distance, settings, signed)
+        slant(cosine, image.shape[1], place, u, v, weight)
+        subtract(value, distance, weight, settings, signed)
         count = count_observed(signed)
         if count > 0 and mask.shape[0] > 0:
             flag_mixed(value, mixed)
@@ -214,12 +215,36 @@ def drop_far(x, y, u, v, distance, gap, settings, value):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def subtract(value, distance, settings, signed):
+def slant(cosine, stride, place, u, v, factor):
+    """
+    Find what to multiply distances along the ray with: 1, or the cosine at the nearest pixel.
+
+    place   (N,) int32, number of the pixel above and left; in their stead, out, of the nearest
+    cosine  (rows, columns) float32 with its border, or no rows
+    factor  (N,) float32, out
+    """
+    if cosine.shape[0] == 0:
+        for n in range(len(factor)):
+            factor[n] = _ONE
+        return
+    step = np.int32(stride)
+    for n in range(len(factor)):
+        right, below = u[n] + _ONE, v[n] + _ONE
+        aside = np.int32(right - np.float32(np.int32(right)) >= _HALF)
+        down = step if below - np.float32(np.int32(below)) >= _HALF else np.int32(0)
+        place[n] = place[n] + aside + down
+    flat = cosine.ravel()
+    for n in range(len(factor)):
+        factor[n] = flat[np.int64(place[n])]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def subtract(value, distance, factor, settings, signed):
     """Find the signed distance of every voxel, (N,) float32 m; SKIP if it is not observed."""
     tau, extra, reach = settings[TAU], settings[EXTRA], settings[MAX_RANGE]
     for n in range(len(value)):
         range_m, d = abs(value[n]), distance[n]
-        s = range_m - d
+        s = (range_m - d) * factor[n]
         # A pixel that clears knows nothing beyond the reach of the sensor.
         seen = (range_m > _ZERO) & (s >= -tau - extra) & ((range_m <= reach) | (d <= reach))
         signed[n] = min(max(s, -tau), tau) if seen else SKIP

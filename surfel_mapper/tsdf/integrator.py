@@ -24,7 +24,7 @@ from surfel_mapper.kernels import tsdf as kernels
 from surfel_mapper.mapping.threads import pool, split
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.range_image import RangeImage
-from surfel_mapper.tsdf.selection import BlockSelection
+from surfel_mapper.tsdf.selection import BlockSelection, NO_COSINE, reach_behind_m
 from surfel_mapper.tsdf.sensors import Lidar
 
 logger = logging.getLogger(__name__)
@@ -133,6 +133,8 @@ class Integrator:
 
         """
         T = checked_pose(T_map_sensor)
+        if self.blocks.config.distance == 'to_plane' and image.cosine is None:
+            image = image.with_cosines(self.blocks.config.voxel_size_m)
         index = self._selection.blocks(image, T)
         blocks = self.blocks
         before = blocks.num_blocks
@@ -193,6 +195,7 @@ class Integrator:
         edges = [rows, (left, right - image.sensor.wraps)]
         return (
             np.pad(image.range_m, edges),
+            NO_COSINE if image.cosine is None else np.pad(image.cosine, edges),
             NO_COLOR if image.color is None else image.color,
             NO_LABEL if image.label is None else image.label,
             NO_MASK if mask is None else mask,
@@ -224,7 +227,7 @@ def settings(config: TsdfConfig, image: RangeImage) -> Float32:
     found[kernels.EXTRA] = config.extra_distance_m
     found[kernels.MIN_RANGE] = sensor.min_range_m
     found[kernels.MAX_RANGE] = sensor.max_range_m
-    found[kernels.LIMIT] = image.largest_m + config.reach_behind_m
+    found[kernels.LIMIT] = image.largest_m + reach_behind_m(config, image)
     found[kernels.MAX_DIFFERENCE] = config.max_difference_m
     found[kernels.MAX_DIFFERENCE_RATIO] = config.max_difference_ratio
     found[kernels.MAX_OFFSET] = config.max_ray_offset_voxels * config.voxel_size_m * is_lidar

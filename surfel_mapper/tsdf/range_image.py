@@ -25,6 +25,8 @@ MAX_LABEL = (1 << 24) - 1
 """Labels are kept as float32, which holds whole numbers up to here."""
 
 
+LEAST_COSINE = float(kernels.LEAST_COSINE)
+
 CLEARING_M = 2e3
 """A pixel that clears holds a range so far beyond max_range_m: more than any truncation."""
 
@@ -50,6 +52,8 @@ class RangeImage:
         -1: unknown.
     mask : (rows, columns or one more) uint8, optional
         1 where something moves or must not leave a surface.
+    cosine : (rows, columns or one more) float32, optional
+        Cosine of the angle between each ray and the normal of the surface that it meets.
 
     """
 
@@ -60,6 +64,7 @@ class RangeImage:
     color: npt.NDArray[np.uint8] | None = None
     label: npt.NDArray[np.int32] | None = None
     mask: npt.NDArray[np.uint8] | None = None
+    cosine: Float32 | None = None
 
     def with_images(
         self,
@@ -102,6 +107,20 @@ class RangeImage:
         if mask is not None:
             more['mask'] = (self._fitted('mask', np.asarray(mask), ()) != 0).astype(np.uint8)
         return replace(self, **more)
+
+    def with_cosines(self, reach_m: float) -> RangeImage:
+        """Return this range image with cosines, from slopes between points so far apart, m."""
+        cosine = np.empty_like(self.range_m)
+        sensor = self.sensor
+        kernels.cosines(
+            self.range_m,
+            sensor.directions,
+            sensor.pitch_rad,
+            reach_m,
+            np.float32(sensor.max_range_m),
+            cosine,
+        )
+        return replace(self, cosine=cosine)
 
     def _fitted(
         self, name: str, image: npt.NDArray[Any], channels: tuple[int, ...]

@@ -15,10 +15,12 @@ import numpy.typing as npt
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.block_marks import count_marks, list_marks, mark_rays
-from surfel_mapper.tsdf.range_image import RangeImage
+from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
+
+NO_COSINE = np.empty((0, 0), np.float32)
 
 MAX_SIDE = 2048
 """Blocks along the edge of the cube that rays stay in: 1 GiB of bits."""
@@ -75,17 +77,25 @@ class BlockSelection:
         pose = T_map_sensor[:3] / config.block_size_m
         low = np.floor(pose[:, 3]).astype(np.int64) - half
         pose[:, 3] -= low
-        mark_rays(image.range_m, image.sensor.directions, pose, reach(config, image), side, marks)
+        cosine = NO_COSINE if image.cosine is None else image.cosine
+        directions = image.sensor.directions
+        mark_rays(image.range_m, cosine, directions, pose, reach(config, image), side, marks)
         index = np.empty((count_marks(marks), 3), np.int64)
         list_marks(marks, side, low, index)
         return index
+
+
+def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:
+    """Return how far behind the farthest surface voxels may change, along a ray."""
+    longer = 1.0 if image.cosine is None else 1.0 / LEAST_COSINE
+    return config.reach_behind_m * longer
 
 
 def half_side(config: TsdfConfig, image: RangeImage) -> int:
     """Return how many blocks from the sensor's the farthest one is; 0 if nothing is measured."""
     if image.largest_m == 0.0:
         return 0
-    return int((image.largest_m + config.reach_behind_m) / config.block_size_m) + 2
+    return int((image.largest_m + reach_behind_m(config, image)) / config.block_size_m) + 2
 
 
 def reach(config: TsdfConfig, image: RangeImage) -> Float64:
@@ -112,6 +122,6 @@ def in_view(
         centres = ((index + 0.5) * size_m - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
         distance = np.linalg.norm(centres, axis=1)
         near = distance >= sensor.min_range_m - radius_m
-        far = distance <= image.largest_m + config.reach_behind_m + radius_m
+        far = distance <= image.largest_m + reach_behind_m(config, image) + radius_m
         found.append(index[near & far & sensor.sees(centres, radius_m)])
     return np.concatenate(found)

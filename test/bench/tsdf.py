@@ -77,6 +77,8 @@ class Case:
         Whom to compare with.
     settings : dict
         What else those are told.
+    ours : dict
+        Settings of ours beside the defaults.
 
     """
 
@@ -91,6 +93,7 @@ class Case:
     truth: FloatArray
     peers: tuple[PeerSpec, ...]
     settings: dict[str, Any]
+    ours: dict[str, Any]
 
 
 def run(options: Options) -> list[Row]:
@@ -129,8 +132,8 @@ def ours(case: Case) -> tuple[list[float], Mesh]:
         voxel_size_m=case.voxel_size_m,
         truncation_m=case.truncation_m,
         carve=case.carve,
-        max_difference_m=max(0.2, case.voxel_size_m),
         threads=1,
+        **case.ours,
     )
     one, times = Integrator(BlockMap(config)), []
     for path, pose in zip(case.files, case.poses, strict=True):
@@ -193,6 +196,7 @@ def street_cases(options: Options, scans: int) -> list[Case]:
             truth=near,
             peers=(VDBFUSION,),
             settings={},
+            ours=dict(distance='to_plane', weight_mode='constant', mesh_min_weight=0.2),
         )
         for carve in (False, True)
     ]
@@ -229,6 +233,7 @@ def room_cases(options: Options, scans: int) -> list[Case]:
                 'rows': camera.rows,
                 'max_range_m': camera.max_range_m,
             },
+            ours={},
         )
         for size_m in (0.04, 0.01)
     ]

@@ -34,6 +34,7 @@ SETTINGS = [
     dict(extra_distance_m=0.6, extra_labels=[2.0], weight_dropoff=False),
     dict(dynamic_labels=[1.0], invalid_labels=[3.0], dropoff_m=0.1, max_weight=0.5),
     dict(max_ray_offset_voxels=0.0, voxels_per_side=4, min_measurement_weight=0.0),
+    dict(distance='to_plane', carve=False),
 ]
 
 
@@ -63,6 +64,8 @@ def test_the_kernel_equals_its_numpy_twin(sensor, settings):
     expected = {}
     for number in range(2):
         image = random_image(SENSORS[sensor], rng)
+        if config.distance == 'to_plane':
+            image = image.with_cosines(0.25)
         T = POSE.copy()
         T[0, 3] += 0.3 * number
         index = BlockSelection(config).blocks(image, T)

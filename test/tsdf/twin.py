@@ -109,13 +109,14 @@ def measurements(config, image, T_map_sensor, block):
     masked = {*config.dynamic_labels, *config.invalid_labels}
     for n, p in enumerate(points):
         d = np.linalg.norm(p)
-        farthest = image.largest_m + config.reach_behind_m
+        longer = 1.0 if image.cosine is None else 1.0 / 0.35
+        farthest = image.largest_m + config.reach_behind_m * longer
         if np.isnan(u[n]) or not sensor.min_range_m <= d <= farthest:
             continue
         value, pixels = look_up(config, sensor, image.range_m, p, u[n], v[n])
         if value <= 0 or (value > sensor.max_range_m and d > sensor.max_range_m):
             continue
-        s = value - d
+        s = (value - d) * slant(image, u[n], v[n])
         if s < -tau - config.extra_distance_m:
             continue
         s = min(max(s, -tau), tau)
@@ -126,6 +127,13 @@ def measurements(config, image, T_map_sensor, block):
             continue
         depth = p[2] if hasattr(sensor, 'fx') else d
         yield n, s, weight(config, sensor, depth, s), pixels
+
+
+def slant(image, u, v):
+    """Return the cosine at the nearest pixel, 1 where there are none."""
+    if image.cosine is None:
+        return 1.0
+    return float(image.cosine[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
 
 
 def share_of(pixels, image, masked):
