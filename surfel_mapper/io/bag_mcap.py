@@ -16,6 +16,7 @@ from collections.abc import Iterator
 import struct
 from zlib import crc32
 
+from surfel_mapper.io.bag_profiles import profiles_in
 from surfel_mapper.io.bag_scan import Chunk, ChunkedFile, Entry, Place
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
@@ -103,7 +104,7 @@ class McapScan(ChunkedFile):
             yield Entry(record_ns, channel, place)
 
     def _note_channel(self, content: bytes) -> None:
-        """Keep a channel as rosbags states it, but for its quality of service."""
+        """Keep a channel as rosbags states it."""
         from rosbags.interfaces import (
             Connection,
             ConnectionExtRosbag2,
@@ -113,11 +114,11 @@ class McapScan(ChunkedFile):
 
         key, schema = struct.unpack_from('<HH', content)
         topic, at = text(content, 4)
-        encoding, _ = text(content, at)
+        encoding, at = text(content, at)
         name, kind, definition = self._schemas.get(schema, ('', '', ''))
         formats = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
         stated = MessageDefinition(formats.get(kind, MessageDefinitionFormat.NONE), definition)
-        ext = ConnectionExtRosbag2(encoding, [])
+        ext = ConnectionExtRosbag2(encoding, profiles_in(content[at:].decode(errors='replace')))
         self._found.setdefault(key, Connection(key, topic, name, stated, '', 0, ext, self))
 
 

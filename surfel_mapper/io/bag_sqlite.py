@@ -19,6 +19,7 @@ from pathlib import Path
 import struct
 from typing import NamedTuple
 
+from surfel_mapper.io.bag_profiles import profiles_in
 from surfel_mapper.io.bag_scan import Entry, ScannedFile
 
 HEADER_BYTES = 100
@@ -122,14 +123,14 @@ class SqliteScan(ScannedFile):
         )
 
         at, texts = row.data_at, []
-        for kind in row.types[1:4]:
+        for kind in row.types[1:]:
             length = (kind - 13) // 2
             texts.append(content[at : at + length].decode())
             at += length
-        topic, type_, encoding = texts
+        topic, type_, encoding, *further = texts
         if topic.startswith('/') and '/' in type_:
             nothing = MessageDefinition(MessageDefinitionFormat.NONE, '')
-            ext = ConnectionExtRosbag2(encoding, [])
+            ext = ConnectionExtRosbag2(encoding, profiles_in(' '.join(further[:1])))
             self._found[rowid] = Connection(rowid, topic, type_, nothing, '', 0, ext, self)
 
     def _check_chain(self, place: tuple[int, int, int, int]) -> None:

@@ -22,11 +22,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from surfel_mapper.errors import BagError
+from surfel_mapper.io.bag_profiles import latched_profile
 from surfel_mapper.io.pointcloud2 import CloudBytes
 from surfel_mapper.io.pose_messages import StampedPose
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection, Qos
+    from rosbags.interfaces import Connection
 
 STORAGES = ('mcap', 'sqlite3')
 
@@ -141,7 +142,7 @@ class BagWriter:
         """
         with self._refusing():
             if topic not in self._connections:
-                profiles = [_latched()] if latched else []
+                profiles = [latched_profile()] if latched else []
                 self._connections[topic] = self._writer.add_connection(
                     topic, type_, typestore=self._store, offered_qos_profiles=profiles
                 )
@@ -252,28 +253,3 @@ class BagWriter:
         except OSError as error:
             reason = error.strerror or error
             raise BagError(f'{self.path}: cannot be written: {reason}') from error
-
-
-def _latched() -> Qos:
-    """Return the quality of service of a publisher that keeps its last message for latecomers."""
-    from rosbags.interfaces import (
-        Qos,
-        QosDurability,
-        QosHistory,
-        QosLiveliness,
-        QosReliability,
-        QosTime,
-    )
-
-    never = QosTime(sec=9223372036, nsec=854775807)
-    return Qos(
-        history=QosHistory.KEEP_LAST,
-        depth=1,
-        reliability=QosReliability.RELIABLE,
-        durability=QosDurability.TRANSIENT_LOCAL,
-        deadline=never,
-        lifespan=never,
-        liveliness=QosLiveliness.AUTOMATIC,
-        liveliness_lease_duration=never,
-        avoid_ros_namespace_conventions=False,
-    )

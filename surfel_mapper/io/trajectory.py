@@ -132,8 +132,7 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     if format_ == 'kitti':
         return kitti_poses(path, lines)
     rows = csv_rows(path, lines) if format_ == 'csv' else tum_rows(path, lines)
-    stamps: list[int] = []
-    numbers: list[list[float]] = []
+    stamps, numbers = list[int](), list[list[float]]()
     for where, stamp_ns, values in rows:
         if stamps and stamp_ns <= stamps[-1]:
             raise FileFormatError(f'{where}: stamp is not after that of the pose before')
@@ -241,8 +240,8 @@ def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
     """Return whether a (3, 3) matrix is a rotation, to the few digits that such files have."""
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 2.0:
         return False
-    is_orthogonal = np.abs(matrix @ matrix.T - np.eye(3)).max() < 1e-3
-    return bool(is_orthogonal and np.linalg.det(matrix) > 0.0)
+    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(skew < 1e-3 and np.linalg.det(matrix) > 0.0)
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:

@@ -13,6 +13,8 @@ import pytest
 
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
+from surfel_mapper.io.bag_writer import BagWriter
+from surfel_mapper.io.pose_messages import StampedPose
 from test.io.recorded import (
     cut,
     drive,
@@ -219,6 +221,22 @@ def test_mcap_of_every_layout_reads_up_to_the_cut(tmp_path, options, keep):
     assert found == raws(drive())[: len(found)]
     assert len(found) >= 0.4 * keep * len(raws(drive()))
     assert cuts
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+@pytest.mark.parametrize('keep', [1.0, 0.9])
+def test_latched_topics_are_known_with_and_without_index(tmp_path, storage, keep):
+    pose = StampedPose('base_link', 'lidar', START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    with BagWriter(tmp_path / 'a', storage) as bag:
+        bag.write_transform('/tf_static', START_NS, pose, latched=True)
+        for i in range(200):
+            bag.write_transform('/tf', START_NS + i, pose)
+    cut(file_of(tmp_path / 'a'), keep)
+
+    with BagReader(tmp_path / 'a') as reader:
+        assert bool(reader.cuts) == (keep < 1.0)
+        assert reader.is_latched('/tf_static')
+        assert not reader.is_latched('/tf')
 
 
 def test_messages_out_of_order_without_an_index_come_sorted(tmp_path):
