@@ -6,7 +6,7 @@ Parts of a map as Parquet: those of one shard, and the tiles of a map that no pr
 A tile is a square of 256 voxels a side in i and j, with everything above and below: 128 m at
 0.5 m. Its file is one that write_map writes, so read_map reads it, and all tiles together are a
 dataset partitioned by tile: ``tile_i=3/tile_j=-2/surfels.parquet``. Within it a row group holds
-16 voxels in i. Side by side the tiles of one tile_i are then sorted by voxel 16 voxels at a time,
+32 voxels in i. Side by side the tiles of one tile_i are then sorted by voxel 32 voxels at a time,
 and that is how the digest of the whole map is taken with little memory.
 
 The file of a shard has a row group for every tile that it touches, of the moments alone.
@@ -51,8 +51,8 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 TILE_BITS = 8
 """A tile is 2^8 voxels wide."""
 
-BLOCK_BITS = 4
-"""A row group of a tile holds 2^4 voxels in i."""
+BLOCK_BITS = 5
+"""A row group of a tile holds 2^5 voxels in i."""
 
 FILE = 'surfels.parquet'
 
@@ -99,7 +99,7 @@ def write_shard(path: str | Path, surfel_map: SurfelMap) -> dict[Tile, Part]:
     order = np.lexsort((tile[:, 1], tile[:, 0]))
     bounds = np.flatnonzero(np.diff(tile[order], axis=0, prepend=tile[order[:1]] - 1).any(axis=1))
     rows = np.split(order, bounds[1:]) if len(order) else []
-    _write(path, surfel_map, columns, rows)
+    _write(path, surfel_map, columns, rows, 'lz4')  # to be read once, and thrown away
     return {
         Tile(*(int(value) for value in tile[part[0]])): Part(str(path), (group,), len(part))
         for group, part in enumerate(rows)
@@ -111,7 +111,7 @@ def write_tile(path: str | Path, surfel_map: SurfelMap) -> None:
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     columns = map_columns(surfel_map)
     block = columns['i'] >> BLOCK_BITS
-    _write(path, surfel_map, columns, np.split(np.arange(len(block)), _starts(block)[1:]))
+    _write(path, surfel_map, columns, np.split(np.arange(len(block)), _starts(block)[1:]), 'zstd')
 
 
 def read_part(part: Part) -> SurfelMap:
@@ -191,7 +191,12 @@ def dataset_digest(directory: str | Path) -> str:
 
 
 def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArray[np.int64]]:
-    """Yield columns of tiles that lie side by side, sorted by voxel; without names, the keys."""
+    """
+    Yield columns of tiles that lie side by side, sorted by voxel; without names, the keys.
+
+    Each tile is sorted, and all of them have their places in j in order, so that of several
+    tiles only i is to be looked at.
+    """
     blocks: dict[int, list[tuple[Path, int]]] = {}
     for path in paths:
         with _opened(path) as (content, _):
@@ -199,11 +204,11 @@ def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArr
                 first = content.metadata.row_group(group).column(0).statistics.min
                 blocks.setdefault(first >> BLOCK_BITS, []).append((path, group))
     for block in sorted(blocks):
-        read = [_columns(path, group, (*INDEX, *names)) for path, group in blocks[block]]
-        stacked = np.concatenate(read)
-        key = pack_keys(stacked[:, :3])
-        order = np.argsort(key)
-        yield key[order] if not names else stacked[order, 3:]
+        wanted = ('i', *names) if names else INDEX
+        stacked = np.concatenate([_columns(*place, wanted) for place in blocks[block]])
+        if len(blocks[block]) > 1:
+            stacked = stacked[np.argsort(stacked[:, 0], kind='stable')]
+        yield stacked[:, 1:] if names else pack_keys(stacked)
 
 
 def _columns(path: Path, group: int, names: tuple[str, ...]) -> npt.NDArray[np.int64]:
@@ -218,6 +223,7 @@ def _write(
     surfel_map: SurfelMap,
     columns: Columns,
     groups: Sequence[npt.NDArray[np.int64]],
+    compression: str,
 ) -> None:
     """Write a file with row groups of the given rows."""
     arrow, parquet = import_pyarrow()
@@ -226,7 +232,9 @@ def _write(
     schema = table.schema.with_metadata(metadata)
     with (
         replace_file(path) as file,
-        parquet.ParquetWriter(file, schema, compression='zstd') as writer,
+        parquet.ParquetWriter(
+            file, schema, compression=compression, use_dictionary=False, write_statistics=['i']
+        ) as writer,
     ):
         for rows in groups:
             writer.write_table(table.take(rows), row_group_size=max(len(rows), 1))

@@ -519,7 +519,7 @@ class Mapper:
         if aligned is not None:
             pose = aligned.T_map_sensor[-1]
             laps.end('align')
-        changed = self.map.surfels_changed(version, self.config.map.min_points)
+        changed = self._changed_since(version)
         laps.end('normals')
         if self.tsdf is not None:
             self._follow(self.tsdf, filtered, pose, evictions)
@@ -568,6 +568,10 @@ class Mapper:
             layer.follow(scan, pose, evictions)
         except (CloudFormatError, MapError) as error:
             self._drops.message('tsdf', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
+
+    def _changed_since(self, version: int) -> Surfels:
+        """Return the surfels of the voxels that changed after a version of the map."""
+        return self.map.surfels_changed(version, self.config.map.min_points)
 
     def _prepare(
         self, scan: Scan, pose: npt.NDArray[np.float64], laps: Laps
