@@ -91,10 +91,9 @@ def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
             table[:] = -1
             return -1
         num_rows = find_run_rows(chunk_keys, starts, num_runs, scratch, num_rows, run_rows)
+        add_runs(places, starts, num_runs, run_rows, sums)
         for run in range(num_runs):
-            if run_rows[run] >= 0:
-                add_run(places, starts[run], starts[run + 1], sums, run_rows[run])
-            else:
+            if run_rows[run] < 0:
                 for i in range(starts[run], starts[run + 1]):
                     left_out[reason(x[i], y[i], z[i], range_sq)] += 1
     return num_rows
@@ -236,30 +235,40 @@ def find_run_rows(chunk_keys, starts, num_runs, scratch, num_rows, run_rows):
 
 
 @njit(cache=True, nogil=True)
-def add_run(places, start, end, sums, row):
-    """Add count, sums and products of the places of points start to end to a row of sums."""
-    sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-    for i in range(start, end):
-        qx, qy, qz = places[0, i], places[1, i], places[2, i]
-        sx += qx
-        sy += qy
-        sz += qz
-        xx += qx * qx
-        xy += qx * qy
-        xz += qx * qz
-        yy += qy * qy
-        yz += qy * qz
-        zz += qz * qz
-    sums[row, 0] += np.float64(end - start)
-    sums[row, 1] += sx
-    sums[row, 2] += sy
-    sums[row, 3] += sz
-    sums[row, 4] += xx
-    sums[row, 5] += xy
-    sums[row, 6] += xz
-    sums[row, 7] += yy
-    sums[row, 8] += yz
-    sums[row, 9] += zz
+def add_runs(places, starts, num_runs, run_rows, sums):
+    """
+    Add count, sums and products of the places of each run to the sums of its voxel.
+
+    All runs in one call, with indices that cannot be negative: half the time of a call a run.
+    """
+    all_x, all_y, all_z = places[0], places[1], places[2]
+    for run in range(np.uint32(num_runs)):
+        if run_rows[run] < 0:
+            continue
+        begin, end = np.uint32(starts[run]), np.uint32(starts[run + np.uint32(1)])
+        sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+        for i in range(begin, end):
+            qx, qy, qz = all_x[i], all_y[i], all_z[i]
+            sx += qx
+            sy += qy
+            sz += qz
+            xx += qx * qx
+            xy += qx * qy
+            xz += qx * qz
+            yy += qy * qy
+            yz += qy * qz
+            zz += qz * qz
+        row = np.uint32(run_rows[run])
+        sums[row, 0] += np.float64(end - begin)
+        sums[row, 1] += sx
+        sums[row, 2] += sy
+        sums[row, 3] += sz
+        sums[row, 4] += xx
+        sums[row, 5] += xy
+        sums[row, 6] += xz
+        sums[row, 7] += yy
+        sums[row, 8] += yz
+        sums[row, 9] += zz
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ import pytest
 
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.kernels.moments import (
-    add_run,
+    add_runs,
     BEYOND,
     CHUNK,
     find_runs,
@@ -99,16 +99,19 @@ def test_runs_are_those_of_groupby(call, keys):
 
 
 @both
-def test_a_run_adds_count_sums_and_products(call):
+def test_runs_add_count_sums_and_products_to_their_voxels(call):
     places = np.random.default_rng(1).integers(-32768, 32768, (3, 20)).astype(np.float64)
-    sums = np.zeros((3, 10))
+    sums = np.zeros((4, 10))
     sums[1] = 5.0
-    call(add_run, places, 4, 9, sums, 1)
-    x, y, z = places[:, 4:9].astype(int).tolist()
-    products = [sum(a * b for a, b in zip(*p, strict=True))
-                for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]]  # fmt: skip
-    assert sums[1].tolist() == [v + 5 for v in [5, sum(x), sum(y), sum(z), *products]]
-    assert not sums[[0, 2]].any()
+    starts = np.array([4, 9, 10, 17, 99], np.int32)  # of which three runs count
+    call(add_runs, places, starts, 3, np.array([1, -1, 2, 0], np.int32), sums)
+    for row, first, last, before in ((1, 4, 9, 5), (2, 10, 17, 0)):
+        x, y, z = places[:, first:last].astype(int).tolist()
+        products = [sum(a * b for a, b in zip(*p, strict=True))
+                    for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]]  # fmt: skip
+        found = [last - first, sum(x), sum(y), sum(z), *products]
+        assert sums[row].tolist() == [value + before for value in found]
+    assert not sums[[0, 3]].any()
 
 
 @both
