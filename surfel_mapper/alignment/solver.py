@@ -32,6 +32,10 @@ Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
+HUGE = 1e12
+"""Motions of so many m or rad are no solution but a system that is singular."""
+
+
 class Entries(NamedTuple):
     """
     Which edges enter the rows of which vertices: line c is one edge in one row.
@@ -206,7 +210,7 @@ def _solve_blocks(
         solution = np.asarray(factors.solve(right.ravel()))
     except RuntimeError as error:
         raise AlignmentError(f'the edges do not determine the poses: {error}') from error
-    if not np.isfinite(solution).all():
+    if not (np.abs(solution) < HUGE).all():
         raise AlignmentError('the edges do not determine the poses: no finite solution')
     return solution.reshape(-1, 6)
 
@@ -225,9 +229,11 @@ def _cayley(T: Floats, pivots: Floats, motion: Floats) -> Floats:
 
     A point u about the pivot goes to v with v - u = -(t + w x (u + v) / 2).
     """
-    half = 0.5 * skew(motion[:, 3:])
-    inverse = np.linalg.inv(np.eye(3) + half)
-    R = inverse @ (np.eye(3) - half)
+    half = 0.5 * motion[:, 3:]
+    # the inverse of 1 + [half]x, written out: never singular, however large a turn
+    inverse = np.eye(3) + half[:, :, None] * half[:, None] - skew(half)
+    inverse /= 1.0 + (half * half).sum(axis=1)[:, None, None]
+    R = inverse @ (np.eye(3) - skew(half))
     moved = T.copy()
     moved[:, :3, :3] = R @ T[:, :3, :3]
     arm = R @ (T[:, :3, 3] - pivots)[:, :, None] - inverse @ motion[:, :3, None]

@@ -398,3 +398,45 @@ def test_an_empty_graph_has_no_edges():
 
     assert graph.ends.shape == (0, 2)
     assert graph.poses.shape == (0, 6)
+
+
+def odd_points(rng):
+    """Return points on a line, in one point, in a plane, with nan, far away, or none of these."""
+    points = rng.normal(size=(rng.integers(1, 30), 3)) * 10.0 ** rng.integers(-8, 6)
+    kind = rng.integers(0, 6)
+    if kind == 0:
+        points[:, 1:] = 0.0
+    elif kind == 1:
+        points[:] = points[0]
+    elif kind == 2:
+        points[:, 2] = 0.0
+    elif kind == 3:
+        points[rng.random(len(points)) < 0.3] = np.nan
+    elif kind == 4:
+        points += 1e7
+    return points
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('jacobian', ['exact', 'pcl'])
+def test_any_graph_ends_with_finite_poses_or_an_error_that_changes_nothing(jacobian):
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        lum = LUM(max_iterations=4, jacobian=jacobian)
+        num = int(rng.integers(2, 7))
+        for v in range(num):
+            lum.add_point_cloud(odd_points(rng), rng.normal(size=6) if v else None)
+        for s, t in rng.integers(0, num, (rng.integers(0, 10), 2)).tolist():
+            if s == t:
+                continue
+            rows = [rng.integers(0, len(lum.point_cloud(v)), 12) for v in (s, t)]
+            weights = rng.normal(size=(12, 3, 1)) * 10.0 ** rng.integers(-6, 8)
+            planes = weights @ weights.swapaxes(1, 2)
+            some = planes if jacobian == 'exact' and rng.random() < 0.5 else None
+            lum.set_correspondences(s, t, np.stack(rows, axis=1), some)
+        before = lum.graph.poses
+        try:
+            lum.compute()
+        except AlignmentError:
+            np.testing.assert_array_equal(lum.graph.poses, before)
+        assert np.isfinite(lum.graph.poses).all()
