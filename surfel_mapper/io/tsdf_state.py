@@ -19,7 +19,8 @@ import numpy.typing as npt
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.io.state import load_state, save_state
-from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
+from surfel_mapper.tsdf.block_content import block_keys, Blocks
+from surfel_mapper.tsdf.blocks import BlockMap
 
 KIND = 'tsdf'
 SHAPE = (

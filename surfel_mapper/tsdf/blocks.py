@@ -25,7 +25,6 @@ flagged updated, and stays when the window moves on.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -44,8 +43,9 @@ from surfel_mapper.kernels.blocks import (
     STAMP,
     VERSION,
 )
-from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
+from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
 from surfel_mapper.mapping.slab import Slab
+from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks, some
 
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]
@@ -58,34 +58,6 @@ MAX_DEPTH = 24
 
 UPPER = np.array([(n & 1, n >> 1 & 1, n >> 2) for n in range(8)])
 """The block itself and the seven beside and above it that hold the far corners of its cubes."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Blocks:
-    """
-    Content of some blocks, taken out of a map or about to be put into one.
-
-    Attributes
-    ----------
-    index : (K, 3) int64
-        Which blocks.
-    stamp_ns : (K,) int64
-        Stamp of the last change of each.
-    field, color, votes, stamps
-        As in BlockMap, one row a block.
-
-    """
-
-    index: Int64
-    stamp_ns: Int64
-    field: Float32
-    color: Float32
-    votes: Float32
-    stamps: Int64
-
-    def __len__(self) -> int:
-        """Return how many blocks."""
-        return len(self.index)
 
 
 class BlockMap:
@@ -376,24 +348,3 @@ class BlockMap:
             self._state[hashing.DEPTH] += 1
         else:
             raise MapLimitError(f'{self.num_blocks} blocks: the hash table is full')
-
-
-def some(array: npt.NDArray[Any], rows: Int64) -> Any:
-    """Return a copy of some rows, or of none where the channel is not kept."""
-    return array[rows] if len(array) else array.copy()
-
-
-def block_keys(index: npt.NDArray[Any]) -> Int64:
-    """Return the keys of blocks, (...,) int64; -1 for an index beyond 20 bits."""
-    place = index.astype(np.int64) + INDEX_OFFSET
-    within = ((place >= 0) & (place <= INDEX_MASK)).all(axis=-1)
-    x, y, z = (place[..., axis] for axis in range(3))
-    keys: Int64 = np.where(within, x << 2 * INDEX_BITS | y << INDEX_BITS | z, -1)
-    return keys
-
-
-def block_index(keys: Int64) -> Int64:
-    """Return the blocks that keys stand for, (..., 3) int64."""
-    shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
-    index: Int64 = (keys[..., None] >> shifts & INDEX_MASK) - INDEX_OFFSET
-    return index

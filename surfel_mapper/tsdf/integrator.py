@@ -20,7 +20,8 @@ import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import INTERPOLATIONS, SEMANTICS, TsdfConfig
 from surfel_mapper.errors import PoseError
-from surfel_mapper.kernels import tsdf as kernels
+from surfel_mapper.kernels import tsdf_lookup as kernels
+from surfel_mapper.kernels.tsdf import integrate_blocks
 from surfel_mapper.mapping.threads import pool, split
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.range_image import RangeImage
@@ -175,7 +176,7 @@ class Integrator:
 
         def fuse(part: slice) -> int:
             return int(
-                kernels.integrate_blocks(
+                integrate_blocks(
                     rows[part], corners[part], offsets, *common, observed[part]
                 )
             )

@@ -1,0 +1,155 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Look voxels up in a range image.
+
+The four pixels about a voxel are fetched one by one; all else is plain loops that the compiler
+turns into vector instructions: each writes one array and reads few, and chooses without branches.
+A border of zeros, which say nothing, stands in for every test of bounds.
+"""
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.projection import LIDAR_TABLE
+
+# Settings of an integration, float32.
+TAU = 0
+EXTRA = 1
+MIN_RANGE = 2
+MAX_RANGE = 3
+LIMIT = 4
+"""No voxel farther than this is observed, m."""
+MAX_DIFFERENCE = 5
+MAX_DIFFERENCE_RATIO = 6
+MAX_OFFSET = 7
+"""Largest distance from the ray of the nearest pixel, m; 0: any."""
+COLUMN_RAD = 8
+WEIGHT = 9
+DROPOFF = 10
+"""How far behind the surface weights begin to fall, m; not less than TAU: never."""
+MIN_WEIGHT = 11
+MAX_WEIGHT = 12
+NUM_SETTINGS = 13
+
+NEAREST = 0
+BILINEAR = 1
+ADAPTIVE = 2
+
+BORDER = ((2, 2), (1, 2))
+"""Rows above and below the image, and columns left and right of it, that hold 0."""
+
+_ZERO = np.float32(0.0)
+_HALF = np.float32(0.5)
+_ONE = np.float32(1.0)
+_TWO = np.float32(2.0)
+_LARGE = np.float32(1e30)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def locate(distance, u, v, stride, settings, place):
+    """
+    Find the pixel above and left of every voxel in the image with its border.
+
+    u, v    (N,) float32, from -1 on, or u is OUTSIDE
+    stride  columns of the image, border included
+    place   (N,) int32, out: number of the pixel; 0, in the border, if there is none in reach
+    """
+    near, limit = settings[MIN_RANGE], settings[LIMIT]
+    stride = np.int32(stride)
+    for n in range(len(place)):
+        found = np.int32(v[n] + _TWO) * stride + np.int32(u[n] + _ONE)
+        seen = (u[n] >= -_ONE) & (distance[n] >= near) & (distance[n] <= limit)
+        place[n] = found if seen else np.int32(0)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gather(image, stride, place, pixels):
+    """
+    Fetch the four pixels about every voxel.
+
+    image   (P,) float32
+    pixels  (4, N) float32, out: upper left and right, lower left and right
+    """
+    for n in range(len(place)):
+        first = np.int64(place[n])
+        pixels[0, n], pixels[1, n] = image[first], image[first + 1]
+        pixels[2, n], pixels[3, n] = image[first + stride], image[first + stride + 1]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def mix(q00, q10, q01, q11, u, v, method, settings, value):
+    """
+    Find the range at every voxel's place in the image: mixed, or that of the nearest pixel.
+
+    value  (N,) float32, out: range if four pixels were mixed; -range if one was taken; 0 if there
+           is none
+    """
+    reach, ratio = settings[MAX_RANGE], settings[MAX_DIFFERENCE_RATIO]
+    allowed = _LARGE if method == BILINEAR else settings[MAX_DIFFERENCE]
+    allowed = -_ONE if method == NEAREST else allowed
+    ratio = -_ONE if method == NEAREST else ratio
+    for n in range(len(value)):
+        right, below = u[n] + _ONE, v[n] + _ONE
+        du, dv = right - np.float32(np.int32(right)), below - np.float32(np.int32(below))
+        low = min(min(q00[n], q10[n]), min(q01[n], q11[n]))
+        high = max(max(q00[n], q10[n]), max(q01[n], q11[n]))
+        upper = q00[n] + du * (q10[n] - q00[n])
+        lower = q01[n] + du * (q11[n] - q01[n])
+        upper_near = q00[n] if du < _HALF else q10[n]
+        lower_near = q01[n] if du < _HALF else q11[n]
+        nearest = upper_near if dv < _HALF else lower_near
+        alike = (high - low <= allowed) | (high - low <= ratio * low)
+        # A pixel that clears is not mixed with one that measured something.
+        alike = alike & (low > _ZERO) & ((high <= reach) | (low > reach))
+        value[n] = upper + dv * (lower - upper) if alike else -nearest
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def row_gaps(kind, parameters, elevations, v, gap):
+    """Find the angle between the rows about every voxel, (N,) float32 rad, out."""
+    for n in range(len(v)):
+        gap[n] = parameters[3]
+    if kind == LIDAR_TABLE:
+        last = len(elevations) - 2
+        for n in range(len(v)):
+            above = min(max(np.int64(v[n]), 0), last)
+            gap[n] = elevations[above] - elevations[above + 1]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def drop_far(x, y, u, v, distance, gap, settings, value):
+    """Leave out voxels that took the range of one pixel too far from its ray."""
+    column_rad, most = settings[COLUMN_RAD], settings[MAX_OFFSET] * settings[MAX_OFFSET]
+    for n in range(len(value)):
+        right, below = u[n] + _ONE, v[n] + _ONE
+        du, dv = right - np.float32(np.int32(right)), below - np.float32(np.int32(below))
+        du, dv = min(du, _ONE - du), min(dv, _ONE - dv)
+        across = du * column_rad
+        down = distance[n] * dv * gap[n]
+        far = (x[n] * x[n] + y[n] * y[n]) * (across * across) + down * down > most
+        value[n] = _ZERO if far & (value[n] < _ZERO) else value[n]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def slant(cosine, stride, place, u, v, factor):
+    """
+    Find what to multiply distances along the ray with: 1, or the cosine at the nearest pixel.
+
+    place   (N,) int32, number of the pixel above and left; in their stead, out, of the nearest
+    cosine  (rows, columns) float32 with its border, or no rows
+    factor  (N,) float32, out
+    """
+    if cosine.shape[0] == 0:
+        for n in range(len(factor)):
+            factor[n] = _ONE
+        return
+    step = np.int32(stride)
+    for n in range(len(factor)):
+        right, below = u[n] + _ONE, v[n] + _ONE
+        aside = np.int32(right - np.float32(np.int32(right)) >= _HALF)
+        down = step if below - np.float32(np.int32(below)) >= _HALF else np.int32(0)
+        place[n] = place[n] + aside + down
+    flat = cosine.ravel()
+    for n in range(len(factor)):
+        factor[n] = flat[np.int64(place[n])]
