@@ -27,7 +27,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.config import Config, PublishConfig
+from surfel_mapper.config import Config
 from surfel_mapper.io.cdr import marker_array
 from surfel_mapper.io.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.io.markers import disc_colors, surfel_markers
@@ -94,7 +94,7 @@ class Outputs:
         self._stamp_ns = 0
         self._center = np.zeros(2)
         published = (self._normals, self._markers, self._grid, *self._levels)
-        self._published: dict[Any, int] = dict.fromkeys(published, mapper.map.version)
+        self._published: dict[Any, int] = dict.fromkeys(published, 0)  # of an empty map
         self._timers: list[Timer] = []
         warm_up(mapper.config)
         group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on
@@ -130,13 +130,14 @@ class Outputs:
         if self._has_clients():
             self._publish_change(self._changes.since_last())
 
-    def start_timers(self, rates: PublishConfig) -> None:
-        """Publish at these rates from now on; called in the executor's thread."""
+    def start_timers(self, config: Config) -> None:
+        """Publish at the rates of these settings from now on; called in the executor's thread."""
         self.stop_timers()
+        rates = config.publish
         published: list[tuple[float, Any, Callable[[], object]]] = [
             (rates.normals_rate_hz, self._normals, self._publish_normals),
             (rates.markers_rate_hz, self._markers, self._publish_markers),
-            (self._mapper.config.grid.rate_hz, self._grid, self._publish_grid),
+            (config.grid.rate_hz, self._grid, self._publish_grid),
             *(
                 (rates.normals_rate_hz, publisher, partial(self._publish_level, level, publisher))
                 for level, publisher in enumerate(self._levels, 1)

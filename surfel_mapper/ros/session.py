@@ -82,7 +82,7 @@ class Session:
         except SurfelMapperError:
             self.inputs.unsubscribe()
             raise
-        self.outputs.start_timers(self.config.publish)
+        self.outputs.start_timers(self.config)
 
     def deactivate(self) -> None:
         """Take no more messages and, when those that came are mapped, publish no more."""
@@ -95,7 +95,7 @@ class Session:
         """Put new settings to work, from the next scan on."""
         self.config = config
         if is_active:
-            self.outputs.start_timers(config.publish)
+            self.outputs.start_timers(config)
         self.thread.post(self._reconfigure)
 
     def close(self, *, save: bool) -> None:

@@ -306,9 +306,12 @@ def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(
 
 
 def test_a_grid_comes_to_those_who_ask_for_it_and_to_late_ones(start, peer):
-    start_node(start, peer, **{'grid.rate_hz': 10.0, 'grid.size_m': 20.0})
+    start_node(start, peer, **{'grid.size_m': 20.0})
     send(peer, drive(3))
     peer.diagnosis({'scans.mapped': 3})
+    client = peer.parameters()
+    done = peer.result(client.set_parameters([Parameter('grid.rate_hz', value=10.0)]))
+    assert done.results[0].successful
     peer.spin_for(0.3)
     grids = peer.collect(OccupancyGrid, f'{BASE}/grid', LATCHED)
     peer.spin_until(lambda: grids)
