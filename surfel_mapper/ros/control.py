@@ -41,8 +41,12 @@ UNLOADED: tuple[tuple[type[Exception], int], ...] = (
 )
 """What the answer to ~/load_map is, by the error that loading ended with; the first that fits."""
 
-MAX_WAITING = 20
-"""Requests that may wait; more are refused. Polygons likewise; the oldest gives way."""
+MAX_WAITING = 10
+"""
+Requests that may wait, as many as a client holds answers to; more are refused.
+
+Polygons likewise; the oldest gives way.
+"""
 
 
 class Control:

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+from threading import Event
+from types import SimpleNamespace
+
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
@@ -13,7 +16,11 @@ from nav_msgs.srv import LoadMap
 from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
+from surfel_mapper.config import Config
+from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
+from surfel_mapper.ros.control import Control, MAX_WAITING
+from surfel_mapper.ros.mapping_thread import MappingThread
 from test.ros.live import NODE, odometry, stamp, START_NS
 from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
 
@@ -210,3 +217,28 @@ def test_a_pause_drops_clouds_takes_poses_and_says_so(peer, node):
     peer.publish('/odom', odometry(between, (0.4, 0.0, 0.0)))
     send(peer, drive(4)[3:])
     peer.diagnosis({'scans.mapped': 2})
+
+
+def test_of_too_many_requests_that_wait_the_last_are_refused_at_once(peer):
+    mapper = Mapper(Config())
+    thread, busy, released = MappingThread(mapper, pytest.fail), Event(), Event()
+    thread.start(lambda update: None)
+    thread.call(lambda: (busy.set(), released.wait(60)))
+    assert busy.wait(60)
+    Control(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
+    client = peer.node.create_client(Trigger, '/peer/clear')
+    peer.spin_until(client.service_is_ready)
+    answers = []
+    for _ in range(MAX_WAITING):
+        answers.append(client.call_async(Trigger.Request()))
+        peer.spin_for(0.02)
+
+    refused = peer.result(client.call_async(Trigger.Request()))
+
+    assert not refused.success
+    assert refused.message == f'{MAX_WAITING} requests wait already; try again'
+    assert not any(answer.done() for answer in answers)
+    released.set()
+    peer.spin_until(lambda: all(answer.done() for answer in answers))
+    assert all(answer.result().success for answer in answers)
+    thread.stop()
