@@ -289,7 +289,7 @@ def test_markers_come_while_somebody_subscribes(start, peer):
 
 def test_without_clouds_the_diagnostics_say_so(start, peer):
     start('node', *ARGUMENTS)
-    status, values = peer.diagnosis()
+    status, values = peer.diagnosis({'state': 'active'})
     assert status.level == b'\1'
     assert status.message.startswith('no cloud on /points yet: nobody publishes there')
     assert values['scans.received'] == '0'
