@@ -108,8 +108,8 @@ def page(title: str, body: str) -> str:
 
 def about(summary: Mapping[str, Any]) -> str:
     """Return in a line where the map came from."""
-    topics = [summary.get('topic'), *summary.get('pose_topics', [])]
-    source = ', '.join(str(topic) for topic in topics if topic)
+    names = [*summary.get('topics', []), *summary.get('pose_topics', []), summary.get('poses')]
+    source = ', '.join(str(name) for name in names if name)
     return ' \u00b7 '.join(filter(None, [source, f'digest {summary.get("digest", "unknown")}']))
 
 

@@ -101,8 +101,9 @@ def test_names_of_a_bag_are_text_and_nothing_else(tmp_path):
     parsed = report(
         tmp_path,
         title=NASTY,
-        topic=NASTY,
+        topics=[NASTY],
         pose_topics=[NASTY],
+        poses=NASTY,
         points_left_out={NASTY: 3},
         settings={NASTY: NASTY, 'frames.fixed': NASTY},
         milliseconds={NASTY: {'median': 1.0, 'p99': 2.0}},
