@@ -178,13 +178,18 @@ class Registration:
         """Align from the level that a deviation asks for down to the map itself."""
         reach = max(3.0 * deviation_m / levels.voxel_size_m(0), 1.0)
         coarsest = min(self.config.coarse_levels, math.ceil(math.log2(reach)))
-        pose, iterations = start, 0
+        found, iterations = None, 0
         for level in range(coarsest, -1, -1):
+            pose = start if found is None else found.T_map_sensor
             size_m = levels.voxel_size_m(level)
             width_m = min(deviation_m, 0.5 * size_m)
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
-            found = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
-            pose, iterations = found.T_map_sensor, iterations + found.iterations
+            finer = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
+            iterations += finer.iterations
+            # the first scans of few beams may fill larger voxels only: they are better than none
+            if found is None or finer.overlap >= self.config.min_overlap_ratio:
+                found = finer
+        assert found is not None, 'there is always level 0'
         return replace(found, iterations=iterations)
 
     def _converge(

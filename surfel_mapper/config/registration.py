@@ -65,7 +65,7 @@ class RegistrationConfig(Stage):
         30, 'Steps at most, of each level.', low=1, high=10_000, live=True
     )
     min_overlap_ratio: float = setting(
-        0.05,
+        0.03,
         'A scan is dropped unless this share of its cells meet surfels that say something.',
         low=0.0,
         high=1.0,

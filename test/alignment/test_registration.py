@@ -269,3 +269,16 @@ def test_the_step_solves_the_equations_where_all_is_known():
     np.testing.assert_allclose(step, -np.linalg.solve(hessian, gradient), rtol=1e-9)
     assert len(degenerate) == 0
     assert radius_m == pytest.approx(8.0, rel=0.2)
+
+
+def test_a_map_too_sparse_for_its_voxels_is_met_in_larger_ones():
+    # 3 points in a voxel of 0.5 m, less than make a surfel, and 12 in one of 1 m
+    sparse = SurfelMap(VOXEL_M)
+    sparse.add(points_on(ROOM, 6, seed=1), origin=TRUE[:3, 3])
+    aligner = registration(min_points=8)
+    cells = aligner.cells(scan_of(ROOM))
+
+    found = aligner.align(cells, sparse, [started(0.2, -0.2, 0.1)], 1.0)
+
+    assert aligner.fits(found)
+    assert off(found.T_map_sensor)[0] < 0.05
