@@ -12,48 +12,37 @@ at any speed does alike.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import astuple, replace
-from functools import partial
+from dataclasses import replace
 import logging
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.config import Config, declarations
-from surfel_mapper.counters import Counters, Laps
-from surfel_mapper.deskew import deskewed, point_times
-from surfel_mapper.deskew import warm_up as warm_up_deskewing
+from surfel_mapper.counters import Counters
+from surfel_mapper.deskew import point_times
 from surfel_mapper.errors import (
-    AlignmentError,
     CloudFormatError,
     ConfigError,
-    FilterError,
     MapError,
     PoseError,
     PoseNotYetError,
 )
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
-from surfel_mapper.mapping.channels import CHANNELS, missing_columns
-from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.reducer import NARROW_COUNT, within
+from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.motion_gate import stands_still
-from surfel_mapper.pipeline.moved_away import MovedAway
+from surfel_mapper.pipeline.inserter import Inserter
 from surfel_mapper.pipeline.regions import Region
-from surfel_mapper.pipeline.registered_poses import RegisteredPoses
+from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
-from surfel_mapper.pipeline.sensor_models import SensorModels
-from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
-from surfel_mapper.pipeline.update import removed_voxels, Update
-from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
-from surfel_mapper.poses import TransformBuffer
-from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.pipeline.update import Update
+from surfel_mapper.pipeline.window_aligner import Aligned
+from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
 
@@ -78,28 +67,20 @@ class Mapper:
         """Make an empty map with the settings of a configuration."""
         self.config = config or Config()
         self.counters = Counters()
-        self.chain = Chain.load(self.config.filters) if self.config.filters else Chain()
-        self.map = SurfelMap(
-            self.config.map.voxel_size_m,
-            columns=self.config.map.columns,
-            threads=self.config.map.threads,
-        )
-        self.window = SlidingWindow(
-            self.map, self.config.window, max_voxels=self.config.map.max_voxels
-        )
-        self.transforms = TransformBuffer(reset_after_s=self.config.input.reset_after_s)
-        self._aligner = WindowAligner(self._moments_at)
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
-        self._mounted: set[str] = set()
-        sensors = SensorModels(self.config.tsdf)
-        self.tsdf = TsdfLayer(self.config.tsdf, sensors) if self.config.tsdf.enabled else None
-        self._moved: MovedAway | None = None
-        if self.config.dynamic.clear:
-            self._moved = MovedAway(self.config.dynamic, self.map.voxel_size_m, sensors)
-        self.registered: RegisteredPoses | None = None
-        if self.config.pose.source == 'registration':
-            self.registered = RegisteredPoses(self.config, self.transforms)
+        self._poses = ScanPoses(self.config, self._drops)
+        self._inserter = Inserter(self.config, self._poses, self.counters, self._drops)
+        self.transforms = self._poses.transforms
+        self.registered = self._poses.registered
+        self.map = self._inserter.map
+        self.window = self._inserter.window
+        self.tsdf = self._inserter.tsdf
+
+    @property
+    def chain(self) -> Chain:
+        """The filters that scans pass."""
+        return self._inserter.chain
 
     def add_pose(
         self,
@@ -128,14 +109,7 @@ class Mapper:
             Whether it holds for all time.
 
         """
-        try:
-            transform = pose_matrix(xyz, q_xyzw)
-            if static:
-                self.transforms.add_static(parent, child, transform)
-            else:
-                self.transforms.add(parent, child, stamp_ns, transform)
-        except (PoseError, ValueError) as error:
-            self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+        self._poses.add(parent, child, stamp_ns, xyz, q_xyzw, static=static)
 
     def add_scan(self, scan: Scan, topic: str = '') -> None:
         """
@@ -158,7 +132,7 @@ class Mapper:
         elif (timed := self._timed(scan)) is not None:
             if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
                 self._start_anew(scan, back_s)
-            self._mount(scan.frame_id)
+            self._poses.mount(scan.frame_id)
             self._queue.push(timed)
 
     def _timed(self, scan: Scan) -> Scan | None:
@@ -212,7 +186,7 @@ class Mapper:
         """
         while (scan := self._queue.first) is not None:
             try:
-                pose = self._lookup(scan)
+                pose = self._poses.of(scan, self._queue.second)
             except PoseNotYetError as error:
                 waited_s = (self._now_ns() - scan.end_ns) / 1e9
                 if waited_s <= self.config.pose.max_wait_s:
@@ -253,7 +227,7 @@ class Mapper:
             except ValueError as error:
                 reason = str(error)
             else:
-                self.registered.restart(compose(inverse(self._aligner.T_map_fixed), T_map_body))
+                self.registered.restart(compose(inverse(self.T_map_fixed), T_map_body))
                 return
         self._drops.message('initial_pose', f'initial pose ignored: {reason}')
 
@@ -265,15 +239,7 @@ class Mapper:
         """Forget all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
         self._queue.drop_all('cleared', 'the map was cleared')
         if self.config.map.mode != 'frozen':
-            self._empty()
-
-    def _empty(self) -> None:
-        self.window.clear()
-        self._aligner.reset()
-        if self.tsdf is not None:
-            self.tsdf.clear()
-        if self._moved is not None:
-            self._moved.clear()
+            self._inserter.clear()
 
     def align(self) -> Aligned:
         """
@@ -291,15 +257,14 @@ class Mapper:
             If a scan cannot be where it belongs. Nothing has changed then.
 
         """
-        with self.counters.timed('align'):
-            aligned = self._aligner.align(self.window, self.config)
+        aligned = self._inserter.align()
         _log.info('aligned: %s', aligned)
         return aligned
 
     @property
     def T_map_fixed(self) -> Transform:
         """From the fixed frame of the poses that come in to the map: how alignment corrects."""
-        return self._aligner.T_map_fixed
+        return self._inserter.aligner.T_map_fixed
 
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
         """
@@ -314,12 +279,12 @@ class Mapper:
         if frame_id == self.map_frame:
             return np.eye(4)
         fixed, at_ns = self.config.frames.fixed, stamp_ns or self.transforms.newest_ns or 0
-        return self._aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
+        return self._inserter.aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
 
     @property
     def map_frame(self) -> str:
         """The frame of the map: that of the poses, unless alignment gives it its own."""
-        return self.config.align.map_frame or self.config.frames.fixed
+        return self._inserter.map_frame
 
     def surfels(self, level: int = 0) -> Surfels:
         """
@@ -366,7 +331,7 @@ class Mapper:
             if found != expected:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
         self.clear()
-        self._empty()
+        self._inserter.clear()
         self.map.insert(surfel_map.moments())
         self.window.restore(scans)
 
@@ -387,40 +352,13 @@ class Mapper:
                 raise ConfigError(
                     f'{declared.name}: cannot change while running; set it at the start'
                 )
-        if config.filters != self.config.filters:
-            chain = Chain.load(config.filters) if config.filters else Chain()
-            chain.warm_up()
-            self.chain = chain
+        self._inserter.reconfigure(config)
+        self._poses.reconfigure(config)
         self.config = config
-        if self.registered is not None:
-            self.registered.reconfigure(config)
-        self.window.config = config.window
-        self.window.max_voxels = config.map.max_voxels
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
-        self.chain.warm_up()
-        if self.config.window.keep_points:
-            self._aligner.warm_up()
-        for dtype in (np.float32, np.float64):
-            surfel_map = SurfelMap(self.config.map.voxel_size_m, columns=self.config.map.columns)
-            one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
-            moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
-            surfel_map.surfels_changed(since=0)
-            surfel_map.remove(moments)
-            many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
-            surfel_map.remove(many)
-        surfel_map.digest()
-        if self.config.publish.levels:
-            surfel_map.coarsen(1).surfels()
-        if self.config.deskew.enabled:
-            warm_up_deskewing()
-        if self.registered is not None:
-            self.registered.warm_up()
-        if self.tsdf is not None:
-            self.tsdf.warm_up()
-        if self._moved is not None:
-            self._moved.warm_up()
+        self._inserter.warm_up()
 
     def summary(self) -> dict[str, Any]:
         """Return counts and times, and what the map is: for files, reports and diagnostics."""
@@ -460,255 +398,6 @@ class Mapper:
         stamps = (self._queue.newest_ns, self.transforms.newest_ns)
         return max(stamp for stamp in stamps if stamp is not None)
 
-    def _mount(self, frame_id: str) -> None:
-        """Enter the configured extrinsics of a sensor when its frame is first seen."""
-        values, base = self.config.frames.mount_of(frame_id), self.config.frames.base
-        if values and frame_id != base and frame_id not in self._mounted:
-            self._mounted.add(frame_id)
-            self.add_pose(base, frame_id, 0, values[:3], values[3:], static=True)
-
-    def _lookup(self, scan: Scan) -> npt.NDArray[np.float64]:
-        """Return T_fixed_sensor at the stamp of a scan."""
-        if self.config.pose.source == 'identity':
-            return np.eye(4)
-        if self.registered is not None:
-            self.registered.learn_motion(scan, self._queue.second)
-        pose = self._pose_at(scan.frame_id, scan.stamp_ns)
-        if scan.times is not None:  # the poses of all points have to be there
-            self._pose_at(scan.frame_id, scan.times.first_ns)
-            self._pose_at(scan.frame_id, scan.times.last_ns)
-        return pose
-
-    def _pose_at(self, frame_id: str, stamp_ns: int) -> npt.NDArray[np.float64]:
-        """Return T_fixed_sensor at a time."""
-        if self.registered is not None:
-            return self.registered.predict(frame_id, stamp_ns)
-        return self.transforms.lookup(self.config.frames.fixed, frame_id, stamp_ns)
-
-    def _deskewed(self, scan: Scan, times: PointTimes) -> Scan:
-        """Return a scan as seen from one place, where the sensor was at its stamp."""
-        fixed, sensor = self.config.frames.fixed, scan.frame_id
-        stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
-        min_range_m = self.config.input.min_range_m
-        return deskewed(scan, partial(self._pose_at, sensor), stamps, min_range_m)
-
-    def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
-        """Map a scan; None where the motion gate or the map leaves it out."""
-        laps, version = Laps(), self.map.version
-        prepared = self._prepare(scan, self._aligner.to_map(pose), laps)
-        if prepared is None:
-            return None
-        scan, filtered, pose, alignment = prepared
-        if self.config.map.mode == 'frozen':
-            return self._only_posed(scan, pose, alignment, laps)
-        try:
-            windowed = self._reduce(filtered, pose)
-            laps.end('reduce')
-            if not len(windowed.moments):
-                self._drops.scan(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
-                return None
-            evictions = self.window.insert(windowed, self.config.map.min_points)
-        except MapError as error:
-            self._drops.scan(scan, 'map_limit', str(error))
-            return None
-        laps.end('insert')
-        cleared = self._clear_moved(filtered, pose, windowed.moments.key)
-        if self._moved is not None:
-            laps.end('clear')
-        aligned = self._align_when_due()
-        if aligned is not None:
-            pose = aligned.T_map_sensor[-1]
-            laps.end('align')
-        changed = self._changed_since(version)
-        laps.end('normals')
-        if self.tsdf is not None:
-            self._follow(self.tsdf, filtered, pose, evictions)
-            laps.end('tsdf')
-        self._count(windowed, evictions, laps.milliseconds)
-        return Update(
-            scan=scan,
-            stamp_ns=scan.stamp_ns,
-            frame_id=self.map_frame,
-            T_fixed_sensor=pose,
-            num_points=windowed.moments.num_points,
-            changed=changed,
-            removed_voxel_index=removed_voxels(evictions, cleared, aligned, changed),
-            evictions=tuple(evictions),
-            milliseconds=laps.milliseconds,
-            aligned=aligned,
-            alignment=alignment,
-        )
-
-    def _clear_moved(
-        self,
-        scan: Scan,
-        pose: npt.NDArray[np.float64],
-        hit: npt.NDArray[np.int64],
-    ) -> npt.NDArray[np.int32]:
-        """Empty the voxels that scans see through by now; return the surfels that are gone."""
-        if self._moved is None:
-            return np.empty((0, 3), np.int32)
-        try:
-            empty = self._moved.look(scan, pose, self.map.keys(), hit)
-        except CloudFormatError as error:
-            self._drops.message('dynamic', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
-            return np.empty((0, 3), np.int32)
-        self.counters.cleared_voxels += len(empty)
-        return self.window.drop_voxels(empty, self.config.map.min_points)
-
-    def _follow(
-        self,
-        layer: TsdfLayer,
-        scan: Scan,
-        pose: npt.NDArray[np.float64],
-        evictions: list[Eviction],
-    ) -> None:
-        """Give a scan to a layer; warn where the layer cannot take it."""
-        try:
-            layer.follow(scan, pose, evictions)
-        except (CloudFormatError, MapError) as error:
-            self._drops.message('tsdf', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
-
-    def _changed_since(self, version: int) -> Surfels:
-        """Return the surfels of the voxels that changed after a version of the map."""
-        return self.map.surfels_changed(version, self.config.map.min_points)
-
-    def _prepare(
-        self, scan: Scan, pose: npt.NDArray[np.float64], laps: Laps
-    ) -> tuple[Scan, Scan, npt.NDArray[np.float64], Alignment | None] | None:
-        """Deskew, filter and register a scan: deskewed, filtered, its pose; None if it is left."""
-        if self.registered is None and self._is_gated(pose):
-            return None
-        times = scan.times
-        if times is not None:
-            scan = self._deskewed(scan, times)
-            laps.end('deskew')
-        filtered: Scan | None = scan
-        if len(self.chain):
-            filtered = self._filter(scan, pose)
-            laps.end('filter')
-        if filtered is None or self.registered is None:
-            return None if filtered is None else (scan, filtered, pose, None)
-        try:
-            pose, alignment = self.registered.find(
-                filtered, times, self.map, self._aligner.T_map_fixed
-            )
-        except (AlignmentError, MapError, PoseError) as error:
-            self._drops.scan(scan, 'not_aligned', str(error))
-            return None
-        laps.end('register')
-        if alignment is not None and len(alignment.degenerate):
-            num = len(alignment.degenerate)
-            self._drops.warn(
-                'degenerate',
-                f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
-                'of motion open; there the prediction is kept',
-            )
-        pose = self._aligner.to_map(pose)
-        return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
-
-    def _is_gated(self, pose: npt.NDArray[np.float64]) -> bool:
-        """Return whether the motion gate leaves out a scan at a pose, and count it."""
-        last = self.window.newest
-        if last is None or not stands_still(last.T_map_sensor, pose, self.config.window):
-            return False
-        self.counters.gated += 1
-        return True
-
-    def _only_posed(
-        self,
-        scan: Scan,
-        pose: npt.NDArray[np.float64],
-        alignment: Alignment | None,
-        laps: Laps,
-    ) -> Update:
-        """Say where a scan was taken; a frozen map takes none."""
-        self.counters.localised += 1
-        for stage, milliseconds in laps.milliseconds.items():
-            self.counters.add_time(stage, milliseconds)
-        return Update(
-            scan=scan,
-            stamp_ns=scan.stamp_ns,
-            frame_id=self.map_frame,
-            T_fixed_sensor=pose,
-            num_points=0,
-            changed=self.map.surfels_changed(self.map.version),
-            removed_voxel_index=np.empty((0, 3), np.int32),
-            evictions=(),
-            milliseconds=laps.milliseconds,
-            alignment=alignment,
-        )
-
-    def _align_when_due(self) -> Aligned | None:
-        """Align the window if so many scans were mapped since; warn where that fails."""
-        if not self._aligner.is_due(self.config.align.every_scans) or len(self.window) < 2:
-            return None
-        try:
-            aligned = self._aligner.align(self.window, self.config)
-        except (AlignmentError, MapError) as error:
-            self._drops.warn('alignment', f'the window is not aligned: {error}')
-            return None
-        _log.debug('aligned: %s', aligned)
-        return aligned
-
-    def _filter(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Scan | None:
-        """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
-        try:
-            T_base_sensor = self.transforms.lookup(
-                self.config.frames.base, scan.frame_id, scan.stamp_ns
-            )
-        except PoseError:
-            T_base_sensor = None  # the filters that need it will say so
-        try:
-            filtered, steps = self.chain.run(
-                replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
-            )
-        except FilterError as error:
-            self._drops.scan(scan, 'filter', str(error))
-            return None
-        for step in steps:
-            self.counters.add_filter(*astuple(step))
-        self.counters.points_left_out['filtered'] += len(scan) - len(filtered)
-        if not len(filtered):
-            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
-            return None
-        return filtered
-
-    def _reduce(self, scan: Scan, pose: npt.NDArray[np.float64]) -> WindowedScan:
-        """Reduce a scan to its moments."""
-        limits = self.config.input
-        moments = self.map.reduce(
-            scan.points,
-            pose,
-            origin=self._origin(pose),
-            min_range_m=limits.min_range_m,
-            max_range_m=limits.max_range_m or np.inf,
-            columns=scan.columns,
-        )
-        self.counters.points_left_out.update(moments.left_out)
-        windowed = WindowedScan(moments=moments, stamp_ns=scan.stamp_ns, T_map_sensor=pose)
-        if not self.config.window.keep_points:
-            return windowed
-        entered = scan.select(within(scan.points, limits.min_range_m, limits.max_range_m))
-        columns = {name: entered.columns[name] for name in self.map.columns}
-        return replace(windowed, points=entered.points, columns=columns)
-
-    def _moments_at(self, scan: WindowedScan, pose: npt.NDArray[np.float64]) -> ScanMoments:
-        """Return the moments of a scan of the window at another pose."""
-        assert scan.points is not None, 'only scans with points are moved'
-        return self.map.reduce(
-            scan.points, pose, origin=self._origin(pose), columns=scan.columns
-        )
-
-    def _origin(self, pose: npt.NDArray[np.float64]) -> npt.NDArray[np.float64] | None:
-        """Return where the sensor is; None where that is unknown, and normals stay unturned."""
-        return None if self.config.pose.source == 'identity' else pose[:3, 3]
-
-    def _count(
-        self, scan: WindowedScan, evictions: list[Eviction], times: dict[str, float]
-    ) -> None:
-        self.counters.mapped += 1
-        self.counters.points += scan.moments.num_points
-        self.counters.evicted.update(eviction.limit for eviction in evictions)
-        for stage, milliseconds in times.items():
-            self.counters.add_time(stage, milliseconds)
+    def _insert(self, scan: Scan, pose: Transform) -> Update | None:
+        """Map a scan whose pose is there; None where it is left out."""
+        return self._inserter.insert(scan, pose)

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.scan import Scan
@@ -30,6 +29,11 @@ class ShardMapper(Mapper):
     """Maps a part of a recording."""
 
     _passes_over = False
+
+    def __init__(self, config: Config | None = None) -> None:
+        """Make an empty map; nobody looks at its surfels until all parts are together."""
+        super().__init__(config)
+        self._inserter.derives = False
 
     @property
     def passes_over(self) -> bool:
@@ -59,10 +63,6 @@ class ShardMapper(Mapper):
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
         """Map a scan, unless scans are passed over."""
         return None if self._passes_over else super()._insert(scan, pose)
-
-    def _changed_since(self, version: int) -> Surfels:
-        """Return none: nobody looks at the surfels of a part until all parts are together."""
-        return self.map.surfels_changed(self.map.version)
 
 
 def sweep_s(config: Config) -> float:

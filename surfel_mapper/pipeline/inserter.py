@@ -1,0 +1,347 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Inserter: one scan with its pose, all the way into the map, the window and the layers.
+
+Deskewed, filtered, aligned to the map where poses come from there, reduced to moments, added;
+then what its coming changes: scans that leave, what has moved away, the alignment of the window,
+the TSDF.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, replace
+import logging
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.alignment.registration import Alignment
+from surfel_mapper.config import Config
+from surfel_mapper.counters import Counters, Laps
+from surfel_mapper.deskew import warm_up as warm_up_deskewing
+from surfel_mapper.errors import (
+    AlignmentError,
+    CloudFormatError,
+    FilterError,
+    MapError,
+    PoseError,
+)
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.geometry import Transform
+from surfel_mapper.mapping.channels import CHANNELS
+from surfel_mapper.mapping.reducer import NARROW_COUNT
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
+from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.moved_away import MovedAway
+from surfel_mapper.pipeline.reduction import moments_at, reduced
+from surfel_mapper.pipeline.scan_poses import ScanPoses
+from surfel_mapper.pipeline.sensor_models import SensorModels
+from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
+from surfel_mapper.pipeline.update import removed_voxels, Update
+from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
+from surfel_mapper.scan import Scan
+
+_log = logging.getLogger(__name__)
+
+
+class Inserter:
+    """
+    Owns the map and its window, and puts scans into them.
+
+    Parameters
+    ----------
+    config : Config
+        All settings; may be replaced by ``reconfigure``.
+    poses : ScanPoses
+        Of the sensors.
+    counters : Counters
+        What was done.
+    drops : Drops
+        What was not.
+
+    Attributes
+    ----------
+    map, window, chain, tsdf
+        See Mapper.
+    derives : bool
+        Whether updates hold the surfels that changed; they are none where nobody looks at them.
+
+    """
+
+    def __init__(
+        self, config: Config, poses: ScanPoses, counters: Counters, drops: Drops
+    ) -> None:
+        """Make an empty map with the settings of a configuration."""
+        self._config = config
+        self._poses = poses
+        self._counters = counters
+        self._drops = drops
+        self.derives = True
+        self.chain = Chain.load(config.filters) if config.filters else Chain()
+        self.map = SurfelMap(
+            config.map.voxel_size_m, columns=config.map.columns, threads=config.map.threads
+        )
+        self.window = SlidingWindow(self.map, config.window, max_voxels=config.map.max_voxels)
+        self.aligner = WindowAligner(
+            lambda scan, pose: moments_at(scan, pose, self.map, self._config)
+        )
+        sensors = SensorModels(config.tsdf)
+        self.tsdf = TsdfLayer(config.tsdf, sensors) if config.tsdf.enabled else None
+        self._moved: MovedAway | None = None
+        if config.dynamic.clear:
+            self._moved = MovedAway(config.dynamic, self.map.voxel_size_m, sensors)
+
+    @property
+    def map_frame(self) -> str:
+        """The frame of the map: that of the poses, unless alignment gives it its own."""
+        return self._config.align.map_frame or self._config.frames.fixed
+
+    def reconfigure(self, config: Config) -> None:
+        """
+        Take new settings.
+
+        Raises
+        ------
+        ConfigError
+            If ``filters`` names a file that holds no chain; nothing has changed then.
+
+        """
+        if config.filters != self._config.filters:
+            chain = Chain.load(config.filters) if config.filters else Chain()
+            chain.warm_up()
+            self.chain = chain
+        self._config = config
+        self.window.config = config.window
+        self.window.max_voxels = config.map.max_voxels
+
+    def clear(self) -> None:
+        """Empty map, window and layers."""
+        self.window.clear()
+        self.aligner.reset()
+        if self.tsdf is not None:
+            self.tsdf.clear()
+        if self._moved is not None:
+            self._moved.clear()
+
+    def align(self) -> Aligned:
+        """Move the scans of the window to where they agree; see Mapper.align."""
+        with self._counters.timed('align'):
+            return self.aligner.align(self.window, self._config)
+
+    def warm_up(self) -> None:
+        """Compile every kernel that mapping needs, for all types that scans may have."""
+        self.chain.warm_up()
+        if self._config.window.keep_points:
+            self.aligner.warm_up()
+        for dtype in (np.float32, np.float64):
+            surfel_map = SurfelMap(self._config.map.voxel_size_m, columns=self._config.map.columns)
+            one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
+            moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
+            surfel_map.surfels_changed(since=0)
+            surfel_map.remove(moments)
+            many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
+            surfel_map.remove(many)
+        surfel_map.digest()
+        if self._config.publish.levels:
+            surfel_map.coarsen(1).surfels()
+        if self._config.deskew.enabled:
+            warm_up_deskewing()
+        if self._poses.registered is not None:
+            self._poses.registered.warm_up()
+        if self.tsdf is not None:
+            self.tsdf.warm_up()
+        if self._moved is not None:
+            self._moved.warm_up()
+
+    def insert(self, scan: Scan, pose: Transform) -> Update | None:
+        """Map a scan; None where the motion gate or the map leaves it out."""
+        laps, version = Laps(), self.map.version
+        prepared = self._prepare(scan, self.aligner.to_map(pose), laps)
+        if prepared is None:
+            return None
+        scan, filtered, pose, alignment = prepared
+        if self._config.map.mode == 'frozen':
+            return self._only_posed(scan, pose, alignment, laps)
+        try:
+            windowed = reduced(filtered, pose, self.map, self._config)
+            laps.end('reduce')
+            self._counters.points_left_out.update(windowed.moments.left_out)
+            if not len(windowed.moments):
+                self._drops.scan(scan, 'no_valid_points', f'left out: {windowed.moments.left_out}')
+                return None
+            evictions = self.window.insert(windowed, self._config.map.min_points)
+        except MapError as error:
+            self._drops.scan(scan, 'map_limit', str(error))
+            return None
+        laps.end('insert')
+        cleared = self._clear_moved(filtered, pose, windowed.moments.key)
+        if self._moved is not None:
+            laps.end('clear')
+        aligned = self._align_when_due()
+        if aligned is not None:
+            pose = aligned.T_map_sensor[-1]
+            laps.end('align')
+        changed = self._changed_since(version)
+        laps.end('normals')
+        if self.tsdf is not None:
+            self._follow(self.tsdf, filtered, pose, evictions)
+            laps.end('tsdf')
+        self._count(windowed, evictions, laps.milliseconds)
+        return Update(
+            scan=scan,
+            stamp_ns=scan.stamp_ns,
+            frame_id=self.map_frame,
+            T_fixed_sensor=pose,
+            num_points=windowed.moments.num_points,
+            changed=changed,
+            removed_voxel_index=removed_voxels(evictions, cleared, aligned, changed),
+            evictions=tuple(evictions),
+            milliseconds=laps.milliseconds,
+            aligned=aligned,
+            alignment=alignment,
+        )
+
+    def _prepare(
+        self, scan: Scan, pose: Transform, laps: Laps
+    ) -> tuple[Scan, Scan, Transform, Alignment | None] | None:
+        """Deskew, filter and register a scan: deskewed, filtered, its pose; None if it is left."""
+        if self._poses.registered is None and self._is_gated(pose):
+            return None
+        times = scan.times
+        if times is not None:
+            scan = self._poses.deskewed(scan, times)
+            laps.end('deskew')
+        filtered: Scan | None = scan
+        if len(self.chain):
+            filtered = self._filter(scan, pose)
+            laps.end('filter')
+        if filtered is None or self._poses.registered is None:
+            return None if filtered is None else (scan, filtered, pose, None)
+        try:
+            pose, alignment = self._poses.registered.find(
+                filtered, times, self.map, self.aligner.T_map_fixed
+            )
+        except (AlignmentError, MapError, PoseError) as error:
+            self._drops.scan(scan, 'not_aligned', str(error))
+            return None
+        laps.end('register')
+        if alignment is not None and len(alignment.degenerate):
+            num = len(alignment.degenerate)
+            self._drops.warn(
+                'degenerate',
+                f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
+                'of motion open; there the prediction is kept',
+            )
+        pose = self.aligner.to_map(pose)
+        return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
+
+    def _is_gated(self, pose: Transform) -> bool:
+        """Return whether the motion gate leaves out a scan at a pose, and count it."""
+        last = self.window.newest
+        if last is None or not stands_still(last.T_map_sensor, pose, self._config.window):
+            return False
+        self._counters.gated += 1
+        return True
+
+    def _filter(self, scan: Scan, pose: Transform) -> Scan | None:
+        """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
+        T_base_sensor = self._poses.of_base(scan)  # the filters that need it say if it lacks
+        try:
+            filtered, steps = self.chain.run(
+                replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
+            )
+        except FilterError as error:
+            self._drops.scan(scan, 'filter', str(error))
+            return None
+        for step in steps:
+            self._counters.add_filter(*astuple(step))
+        self._counters.points_left_out['filtered'] += len(scan) - len(filtered)
+        if not len(filtered):
+            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
+            return None
+        return filtered
+
+    def _only_posed(
+        self,
+        scan: Scan,
+        pose: Transform,
+        alignment: Alignment | None,
+        laps: Laps,
+    ) -> Update:
+        """Say where a scan was taken; a frozen map takes none."""
+        self._counters.localised += 1
+        for stage, milliseconds in laps.milliseconds.items():
+            self._counters.add_time(stage, milliseconds)
+        return Update(
+            scan=scan,
+            stamp_ns=scan.stamp_ns,
+            frame_id=self.map_frame,
+            T_fixed_sensor=pose,
+            num_points=0,
+            changed=self.map.surfels_changed(self.map.version),
+            removed_voxel_index=np.empty((0, 3), np.int32),
+            evictions=(),
+            milliseconds=laps.milliseconds,
+            alignment=alignment,
+        )
+
+    def _clear_moved(
+        self,
+        scan: Scan,
+        pose: Transform,
+        hit: npt.NDArray[np.int64],
+    ) -> npt.NDArray[np.int32]:
+        """Empty the voxels that scans see through by now; return the surfels that are gone."""
+        if self._moved is None:
+            return np.empty((0, 3), np.int32)
+        try:
+            empty = self._moved.look(scan, pose, self.map.keys(), hit)
+        except CloudFormatError as error:
+            self._drops.message('dynamic', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
+            return np.empty((0, 3), np.int32)
+        self._counters.cleared_voxels += len(empty)
+        return self.window.drop_voxels(empty, self._config.map.min_points)
+
+    def _align_when_due(self) -> Aligned | None:
+        """Align the window if so many scans were mapped since; warn where that fails."""
+        if not self.aligner.is_due(self._config.align.every_scans) or len(self.window) < 2:
+            return None
+        try:
+            aligned = self.aligner.align(self.window, self._config)
+        except (AlignmentError, MapError) as error:
+            self._drops.warn('alignment', f'the window is not aligned: {error}')
+            return None
+        _log.debug('aligned: %s', aligned)
+        return aligned
+
+    def _follow(
+        self,
+        layer: TsdfLayer,
+        scan: Scan,
+        pose: Transform,
+        evictions: list[Eviction],
+    ) -> None:
+        """Give a scan to a layer; warn where the layer cannot take it."""
+        try:
+            layer.follow(scan, pose, evictions)
+        except (CloudFormatError, MapError) as error:
+            self._drops.message('tsdf', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
+
+    def _changed_since(self, version: int) -> Surfels:
+        """Return the surfels of the voxels that changed after a version of the map."""
+        if not self.derives:
+            return self.map.surfels_changed(self.map.version)
+        return self.map.surfels_changed(version, self._config.map.min_points)
+
+    def _count(
+        self, scan: WindowedScan, evictions: list[Eviction], times: dict[str, float]
+    ) -> None:
+        self._counters.mapped += 1
+        self._counters.points += scan.moments.num_points
+        self._counters.evicted.update(eviction.limit for eviction in evictions)
+        for stage, milliseconds in times.items():
+            self._counters.add_time(stage, milliseconds)

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where the sensor was at the times of a scan, in the fixed frame: looked up, or registered.
+
+Extrinsics that the configuration states become static transforms as soon as a frame is seen, so
+that all further work has one tree of frames to ask.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from surfel_mapper.config import Config
+from surfel_mapper.deskew import deskewed
+from surfel_mapper.errors import PoseError
+from surfel_mapper.geometry import pose_matrix, Transform
+from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.registered_poses import RegisteredPoses
+from surfel_mapper.poses import TransformBuffer
+from surfel_mapper.scan import PointTimes, Scan
+
+
+class ScanPoses:
+    """
+    The poses of the sensors of a pipeline.
+
+    Parameters
+    ----------
+    config : Config
+        Where poses come from, and how sensors sit on the robot.
+    drops : Drops
+        Counts poses that are none.
+
+    Attributes
+    ----------
+    transforms : TransformBuffer
+        The tree of frames.
+    registered : RegisteredPoses, optional
+        What finds poses, where ``pose.source`` is registration.
+
+    """
+
+    def __init__(self, config: Config, drops: Drops) -> None:
+        """Know none."""
+        self._config = config
+        self._drops = drops
+        self._mounted: set[str] = set()
+        self.transforms = TransformBuffer(reset_after_s=config.input.reset_after_s)
+        self.registered: RegisteredPoses | None = None
+        if config.pose.source == 'registration':
+            self.registered = RegisteredPoses(config, self.transforms)
+
+    def reconfigure(self, config: Config) -> None:
+        """Take new settings."""
+        self._config = config
+        if self.registered is not None:
+            self.registered.reconfigure(config)
+
+    def add(
+        self, parent: str, child: str, stamp_ns: int, xyz: Any, q_xyzw: Any, *, static: bool
+    ) -> None:
+        """Add the pose of one frame in another; a bad one is counted and warned about."""
+        try:
+            transform = pose_matrix(xyz, q_xyzw)
+            if static:
+                self.transforms.add_static(parent, child, transform)
+            else:
+                self.transforms.add(parent, child, stamp_ns, transform)
+        except (PoseError, ValueError) as error:
+            self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+
+    def mount(self, frame_id: str) -> None:
+        """Enter the configured extrinsics of a sensor when its frame is first seen."""
+        values, base = self._config.frames.mount_of(frame_id), self._config.frames.base
+        if values and frame_id != base and frame_id not in self._mounted:
+            self._mounted.add(frame_id)
+            self.add(base, frame_id, 0, values[:3], values[3:], static=True)
+
+    def of(self, scan: Scan, following: Scan | None = None) -> Transform:
+        """
+        Return T_fixed_sensor at the stamp of a scan.
+
+        Parameters
+        ----------
+        scan : Scan
+            Whose pose is wanted.
+        following : Scan, optional
+            The next one, from which registration learns how the sensor moves at first.
+
+        Raises
+        ------
+        PoseNotYetError
+            If it may still come.
+        PoseError
+            If it cannot come any more.
+
+        """
+        if self._config.pose.source == 'identity':
+            return np.eye(4)
+        if self.registered is not None:
+            self.registered.learn_motion(scan, following)
+        pose = self._at(scan.frame_id, scan.stamp_ns)
+        if scan.times is not None:  # the poses of all points have to be there
+            self._at(scan.frame_id, scan.times.first_ns)
+            self._at(scan.frame_id, scan.times.last_ns)
+        return pose
+
+    def deskewed(self, scan: Scan, times: PointTimes) -> Scan:
+        """Return a scan as seen from one place, where the sensor was at its stamp."""
+        fixed, sensor = self._config.frames.fixed, scan.frame_id
+        stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
+        min_range_m = self._config.input.min_range_m
+        return deskewed(scan, partial(self._at, sensor), stamps, min_range_m)
+
+    def of_base(self, scan: Scan) -> Transform | None:
+        """Return T_base_sensor at the stamp of a scan; None where it is not known."""
+        try:
+            return self.transforms.lookup(self._config.frames.base, scan.frame_id, scan.stamp_ns)
+        except PoseError:
+            return None
+
+    def _at(self, frame_id: str, stamp_ns: int) -> Transform:
+        """Return T_fixed_sensor at a time."""
+        if self.registered is not None:
+            return self.registered.predict(frame_id, stamp_ns)
+        return self.transforms.lookup(self._config.frames.fixed, frame_id, stamp_ns)
