@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from surfel_mapper.config import Config
     from surfel_mapper.offline.recording import Request
 
+CUT = 3
+"""Exit code: a recording ends too early and --strict was given."""
+
 ONE_PROCESS = ('window', 'align', 'poses_out', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
 
@@ -63,7 +66,8 @@ def run(
 
     refuse_options(args)
     began = time.perf_counter()
-    recorded_s = sum(length_s(request, config) for request in requests)
+    lengths_s, cuts = surveyed(requests, config)
+    recorded_s = sum(lengths_s)
     with engine(args.workers, args.scheduler) as running:
         shard_s = shard_length_s(recorded_s, running.num_workers)
         shards = [shard for request in requests for shard in cut(request, config, shard_s)]
@@ -75,6 +79,7 @@ def run(
         'bags': [str(request.path) for request in requests],
         'recorded_s': recorded_s,
         'replay_s': time.perf_counter() - began,
+        'cut': cuts,
         **mapped.counts(),
         **described(mapped.map),
         'workers': workers,
@@ -86,7 +91,7 @@ def run(
     }
     written = write_overview(output, summary, mapped.map, mapped.places)
     print(json.dumps(summary) if args.json else report(summary, written))
-    return 0
+    return CUT if args.strict and cuts else 0
 
 
 def refuse_options(args: argparse.Namespace) -> None:
@@ -99,12 +104,17 @@ def refuse_options(args: argparse.Namespace) -> None:
         )
 
 
-def length_s(request: Request, config: Config) -> float:
-    """Return how long a recording is."""
+def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], list[str]]:
+    """Return how long recordings are, s, and what of them ends too early."""
     from surfel_mapper.offline.recording import open_recording
 
-    with open_recording(request, config) as recording:
-        return recording.recorded_s
+    lengths_s: list[float] = []
+    cuts: list[str] = []
+    for request in requests:
+        with open_recording(request, config) as recording:
+            lengths_s.append(recording.recorded_s)
+            cuts += recording.cuts
+    return lengths_s, cuts
 
 
 @contextmanager

@@ -134,6 +134,19 @@ def test_a_damaged_bag_among_several_is_named(bags, tmp_path, capsys):
     assert not (tmp_path / 'out' / 'map').exists()
 
 
+def test_a_bag_that_ends_too_early_is_mapped_as_far_as_it_goes(bags, tmp_path, capsys):
+    bag, _ = written(tmp_path, 'plain')
+    cut(bag / 'plain.mcap', 0.7)
+    arguments = ['replay', str(bag), str(bag), '--output', str(tmp_path / 'out'), *TF]
+
+    assert main(arguments) == 0
+    assert main([*arguments, '--strict']) == 3
+
+    summary = summary_of(tmp_path / 'out')
+    assert 20 < summary['scans']['mapped'] < 2 * 60
+    assert 'cut off' in summary['cut'][0]
+
+
 @pytest.mark.parametrize('number', ['0', '-1', 'two', '1.5'])
 def test_a_number_of_workers_that_is_none_is_refused(bags, number):
     with pytest.raises(SystemExit) as exit_info:
