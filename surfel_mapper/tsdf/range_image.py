@@ -132,7 +132,11 @@ class RangeImage:
 
 
 def from_depth(
-    sensor: Camera, depth: npt.NDArray[Any], *, scale: float | None = None
+    sensor: Camera,
+    depth: npt.NDArray[Any],
+    *,
+    scale: float | None = None,
+    unknown: float | None = None,
 ) -> RangeImage:
     """
     Return the range image of a depth image.
@@ -146,6 +150,8 @@ def from_depth(
         in millimetres if uint16, 0: unknown.
     scale : float, optional
         Metres of one unit, where it is not those.
+    unknown : float, optional
+        A further value that says nothing: 65535 with some cameras.
 
     Raises
     ------
@@ -167,6 +173,8 @@ def from_depth(
         raise CloudFormatError(f'depth scale: {scale}, expected positive and finite')
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     native = np.ascontiguousarray(depth, native_type)
+    if unknown is not None:
+        native = np.where(native == unknown, 0, native).astype(native_type)
     largest, used = kernels.from_depth(
         native, np.float32(scale), sensor.ray_length, limits(sensor), image
     )

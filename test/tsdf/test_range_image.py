@@ -129,6 +129,10 @@ def test_whole_numbers_are_millimetres_unless_told():
     assert image.range_m[30, 40] == pytest.approx(2.0)
     assert scaled.range_m[30, 40] == pytest.approx(0.4)
     assert image.range_m[0, 0] == 0.0
+    depth[1, 1] = 65535
+    assert from_depth(SMALL, depth).range_m[1, 1] > SMALL.max_range_m
+    assert from_depth(SMALL, depth, unknown=65535).range_m[1, 1] == 0.0
+    depth[1, 1] = 2000
     swapped = from_depth(SMALL, depth.astype('>u2'))
     assert np.array_equal(swapped.range_m, image.range_m)
 

@@ -56,9 +56,9 @@ def run_tsdf(
     scans: Sequence[Path],
     poses: npt.NDArray[np.float64],
     settings: dict[str, Any],
-) -> tuple[list[float], Mesh]:
+) -> tuple[npt.NDArray[np.float64], Mesh]:
     """
-    Return milliseconds of every scan, and the mesh: vertices and triangles.
+    Return the times of every scan, (S, 2) ms of the clock and of the processor, and the mesh.
 
     Raises
     ------
@@ -82,5 +82,4 @@ def run_tsdf(
         command = [str(python), '-m', 'test.bench.peers.tsdf_driver']
         said = output(command, input=json.dumps(job), cwd=ROOT, env=one_thread)
         mesh = np.load(files['mesh.npz'])
-        times: list[float] = json.loads(said.splitlines()[-1])['milliseconds']
-        return times, (mesh['vertices'], mesh['triangles'])
+        return np.array(json.loads(said.splitlines()[-1])), (mesh['vertices'], mesh['triangles'])
