@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import logging
+import math
 import os
 from typing import Any
 
@@ -26,7 +27,7 @@ from surfel_mapper.mapping.threads import pool, split
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.range_image import RangeImage
 from surfel_mapper.tsdf.selection import BlockSelection, NO_COSINE, reach_behind_m
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import Lidar, Sensor
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +91,7 @@ class Integrator:
                 config.voxel_size_m,
             )
         self._selection = BlockSelection(config)
+        self._has_warned = False
         self._threads = config.threads or os.cpu_count() or 1
         side = np.arange(config.voxels_per_side) * config.voxel_size_m
         z, y, x = np.meshgrid(side, side, side, indexing='ij')
@@ -134,6 +136,7 @@ class Integrator:
 
         """
         T = checked_pose(T_map_sensor)
+        self._warn_of_radius(image.sensor)
         if self.blocks.config.distance == 'to_plane' and image.cosine is None:
             image = image.with_cosines(self.blocks.config.voxel_size_m)
         index = self._selection.blocks(image, T)
@@ -141,11 +144,13 @@ class Integrator:
         before = blocks.num_blocks
         rows = blocks.place(index) if allocate_blocks else blocks.find(index)
         there = rows >= 0
-        observed, num_lost = self._fuse(image, T, stamp_ns, index[there], rows[there])
-        updated = rows[there][observed > 0]
-        if len(updated):
-            blocks.touch(updated, stamp_ns)
-        blocks.drop_new(rows)
+        try:
+            observed, num_lost = self._fuse(image, T, stamp_ns, index[there], rows[there])
+            updated = rows[there][observed > 0]
+            if len(updated):
+                blocks.touch(updated, stamp_ns)
+        finally:
+            blocks.drop_new(rows)
         return Integrated(
             num_blocks=len(index),
             num_updated=len(updated),
@@ -175,16 +180,26 @@ class Integrator:
         )
 
         def fuse(part: slice) -> int:
-            return int(
-                integrate_blocks(
-                    rows[part], corners[part], offsets, *common, observed[part]
-                )
-            )
+            where = rows[part], corners[part], offsets
+            return int(integrate_blocks(*where, *common, observed[part]))
 
         helpers = pool(self._threads)
         parts = split(len(rows), self._threads)
         lost = [helpers.submit(fuse, part) for part in parts[1:]] if helpers else []
         return observed, fuse(parts[0]) + sum(one.result() for one in lost)
+
+    def _warn_of_radius(self, sensor: Sensor) -> None:
+        """Say once if blocks will come and go with every scan."""
+        config = self.blocks.config
+        needed_m = sensor.max_range_m + math.sqrt(0.75) * config.block_size_m
+        if 0.0 < config.max_radius_m < needed_m and not self._has_warned:
+            self._has_warned = True
+            logger.warning(
+                'layers.tsdf.max_radius_m: %g m is less than the range of the sensor and the half '
+                'diagonal of a block, %.4g m; blocks beyond it are made anew with every scan',
+                config.max_radius_m,
+                needed_m,
+            )
 
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
         """Return ranges, colours, labels and mask; without rows what there is not."""

@@ -78,10 +78,14 @@ def drive(max_radius_m):
     return added, removed
 
 
-def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen():
+def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen(caplog):
     assert drive(3.0 + HALF_DIAGONAL_M * 0.8) == (0, 0)
+    assert not caplog.records
     added, removed = drive(2.0)
     assert added == removed > 0
+    assert [record.message.split(':')[0] for record in caplog.records] == [
+        'layers.tsdf.max_radius_m'
+    ]
 
 
 def test_what_left_and_comes_back_is_as_it_was():
