@@ -18,10 +18,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-import hashlib
 from itertools import takewhile
 import math
-import struct
 from typing import Any
 
 import numpy as np
@@ -31,6 +29,7 @@ from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.kernels.surfels import rows_changed_at
 from surfel_mapper.mapping.channels import channel_names, means
+from surfel_mapper.mapping.digest import digest_of
 from surfel_mapper.mapping.levels import coarse_moments
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
@@ -433,23 +432,17 @@ class SurfelMap:
 
         Notes
         -----
-        Of the text ``surfel map 1``, the voxel size as float64, level and number of voxels; then
-        of all voxels the keys, the counts, the sums (x y z), the products (xx xy xz yy yz zz)
-        and the sums of the views (x y z), array by array and sorted by key; where the map has
-        columns, their names, a comma between each, and the sums of the channels. All numbers
-        but the first are int64, all are little-endian. The key of voxel (i, j, k) is
-        ((i + 2^20) 2^21 + (j + 2^20)) 2^21 + (k + 2^20).
+        What is hashed, and in which order, stands in mapping/digest.py.
 
         """
         moments = self.moments()
-        state = hashlib.sha256(b'surfel map 1')
-        state.update(struct.pack('<dqq', self.voxel_size_m, self.level, len(moments)))
-        for array in moments.arrays:
-            state.update(np.ascontiguousarray(array, dtype='<i8').data)
-        if self.columns:
-            state.update(','.join(self.columns).encode())
-            state.update(np.ascontiguousarray(moments.channels, dtype='<i8').data)
-        return state.hexdigest()
+        return digest_of(
+            self.voxel_size_m,
+            self.level,
+            len(moments),
+            self.columns,
+            lambda name: [getattr(moments, name)],
+        )
 
     def clear(self) -> None:
         """Remove everything."""
