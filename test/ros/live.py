@@ -24,6 +24,9 @@ from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 60.0
+SETTLE_S = 0.3
+"""A server answers nobody whom it has not discovered yet, though he knows it."""
+
 START_NS = 1_700_000_000_000_000_000
 NODE = '/surfel_mapper'
 
@@ -133,6 +136,7 @@ class Peer:
     def call(self, service, kind=Trigger, request=None):
         client = self.node.create_client(kind, f'{NODE}/{service}')
         self.spin_until(client.service_is_ready)
+        self.spin_for(SETTLE_S)
         future = client.call_async(request or kind.Request())
         self.spin_until(future.done)
         self.node.destroy_client(client)
@@ -141,6 +145,7 @@ class Peer:
     def parameters(self):
         client = AsyncParameterClient(self.node, NODE)
         self.spin_until(client.services_are_ready)
+        self.spin_for(SETTLE_S)
         return client
 
     def result(self, future):
