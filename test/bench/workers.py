@@ -18,7 +18,7 @@ from dataclasses import replace
 import multiprocessing
 from pathlib import Path
 import tempfile
-from time import perf_counter
+from time import perf_counter, process_time
 
 from surfel_mapper.cluster.engines import Engine, engine
 from surfel_mapper.cluster.running import map_bags, Mapped
@@ -91,8 +91,8 @@ def speed_rows(bag: Path) -> list[Row]:
 
 
 def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
-    """Map drives one after the other; return digest, seconds recorded, and none of processors."""
-    total, recorded_s = SurfelMap(CONFIG.map.voxel_size_m), 0.0
+    """Map drives one after the other; return digest, seconds recorded and of the processor."""
+    total, recorded_s, start = SurfelMap(CONFIG.map.voxel_size_m), 0.0, process_time()
     for request in requests:
         with open_recording(request, CONFIG.replace(ALL_SCANS)) as recording:
             mapper = Mapper(recording.config)
@@ -100,7 +100,7 @@ def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
                 pass
             recorded_s += recording.recorded_s
         total.merge(mapper.map)
-    return total.digest(), recorded_s, float('nan')
+    return total.digest(), recorded_s, process_time() - start
 
 
 def by(running: Engine, requests: list[Request]) -> tuple[str, float, float]:

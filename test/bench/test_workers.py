@@ -1,0 +1,28 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The ways that the bench of workers compares make the same map; here without workers."""
+
+import pytest
+
+from surfel_mapper.cluster.engines import InProcess
+from surfel_mapper.offline.recording import Request
+from test.bench.offline import recorded
+from test.bench.options import Options
+from test.bench.street import Street
+from test.bench.workers import by, check_equal, in_one_process
+
+
+def test_one_process_and_tiles_make_the_same_map(tmp_path):
+    options = Options(scans=4, beams=8, columns=64, cache=tmp_path)
+    requests = [Request(path=recorded(Street(options), options))] * 2
+
+    ways = [in_one_process(requests), by(InProcess(), requests)]
+
+    check_equal({digest for digest, _, _ in ways})
+    assert ways[0][1] == ways[1][1] > 0.5
+    assert all(core_s > 0.0 for _, _, core_s in ways)
+
+
+def test_maps_that_differ_are_not_compared():
+    with pytest.raises(RuntimeError, match='the maps differ'):
+        check_equal({'a', 'b'})
