@@ -7,6 +7,7 @@
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+FUZZ_SECONDS ?= 60
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
@@ -22,8 +23,9 @@ EXTRAS := test,lint
 VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
+DOCS_STAMP := $(VENV)/.docs-$(KIND)
 
-.PHONY: demo test boundscheck versions bench soak lint settings clean
+.PHONY: demo test boundscheck versions bench soak fuzz lint docs dist settings clean
 
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
@@ -53,16 +55,34 @@ bench: $(STAMP)  ## milliseconds a scan
 soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map drift?
 	$(BIN)/python -m test.soak
 
+fuzz: $(STAMP)  ## search for inputs that break readers, a minute of each; FUZZ_SECONDS=600
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
+	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
+
 lint: $(STAMP)  ## style, types, layers
 	$(BIN)/ruff check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q test/test_layering.py
 
+docs: $(DOCS_STAMP)  ## build site/ from docs/ and the docstrings, without a warning, links checked
+	$(BIN)/python -m pytest -q test/docs/test_pages.py
+	$(BIN)/python -m mkdocs build --quiet --strict
+	@echo 'site/index.html'
+
+dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/, and install the wheel into an empty environment
+	rm -rf dist build
+	$(BIN)/python -m build --outdir dist
+	@check=$$(mktemp -d) && trap 'rm -rf "$$check"' EXIT && \
+	$(PYTHON) -m venv "$$check/venv" && \
+	"$$check/venv/bin/python" -m pip install -q --disable-pip-version-check dist/*.whl && \
+	cd "$$check" && venv/bin/surfel-mapper simulate street --output street --scans 3 --columns 256 && \
+	venv/bin/surfel-mapper replay street --output mapped
+
 settings: $(STAMP)  ## write default.yaml and the table of README.md from config.py
 	$(BIN)/python -m test.settings
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) $(VENV)-versions build install log dist demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(VENV)-versions build install log dist site demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find surfel_mapper test -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMP): setup.py pyproject.toml
@@ -70,4 +90,8 @@ $(STAMP): setup.py pyproject.toml
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
+	touch $@
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[docs]'
 	touch $@

@@ -71,6 +71,19 @@ LINT = [
     'mypy>=1.11',  # types; configured in setup.cfg
 ]
 
+FUZZ = [
+    # searches for inputs that break readers, led by the branches they take; has wheels for some
+    # Pythons only, which is why the tests do without it
+    'atheris>=2.3',
+]
+
+DOCS = [
+    'mkdocs>=1.6,<2',  # builds the site; its configuration is mkdocs.yml
+    'mkdocs-material>=9.5',  # its theme
+    'mkdocstrings[python]>=0.26',  # the reference, from docstrings
+    'build>=1.2',  # wheel and sdist, for `make dist`
+]
+
 # colcon build --symlink-install runs a link to this file, beside which there is no README.md.
 README = Path(__file__).resolve().with_name('README.md')
 
@@ -101,6 +114,8 @@ setup(
         'ros': ROS,
         'test': TEST,
         'lint': LINT,
+        'docs': DOCS,
+        'fuzz': FUZZ,
     },
     entry_points={'console_scripts': [f'surfel-mapper = {NAME}.cli.main:main']},
     data_files=[

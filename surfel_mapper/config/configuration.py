@@ -34,6 +34,7 @@ from surfel_mapper.config.stages import (
     WindowConfig,
 )
 from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import ConfigError
 
 
@@ -164,15 +165,13 @@ def load_config(path: str | Path | None = None) -> Config:
         If the file cannot be read, is not YAML, or holds something that is no setting.
 
     """
-    import yaml
-
     if path is None:
         return Config()
     try:
-        content = yaml.safe_load(Path(path).read_text(encoding='utf-8'))
+        content = read_yaml(path)
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f'{path}: not YAML: {error}') from error
     if content is None:
         return Config()

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import Filter
 from surfel_mapper.filters.columns import (
@@ -217,13 +218,11 @@ def jsonable(value: Any) -> Any:
 
 def read(path: str) -> Any:
     """Return the content of a YAML file, every scalar as text."""
-    import yaml
-
     try:
-        return yaml.load(Path(path).read_text(encoding='utf-8'), yaml.BaseLoader)
+        return read_yaml(path, as_text=True)
     except OSError as error:
         raise ConfigError(f'{path}: cannot be read: {error.strerror}') from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigError(f'{path}: not YAML: {error}') from error
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import re
 from typing import Any
 
+from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import BagError
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
@@ -83,17 +84,15 @@ def stated_counts(path: Path) -> dict[str, int]:
 
 def metadata(directory: Path) -> Mapping[str, Any] | None:
     """Return the content of metadata.yaml in a directory, or nothing where there is none."""
-    import yaml
-
     path = directory / METADATA
     if not path.is_file():
         return None
     try:
-        content = yaml.safe_load(path.read_text(encoding='utf-8'))
+        content = read_yaml(path)
         information = content['rosbag2_bagfile_information']
         if not isinstance(information, Mapping):
             raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
-    except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise damaged_metadata(path, error) from error
     return information
 

@@ -10,6 +10,7 @@ of mcap of which no index says what they hold; those files are scanned too.
 
 from __future__ import annotations
 
+import bz2
 from collections import Counter
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ import struct
 from typing import Any, Protocol, TYPE_CHECKING
 
 from surfel_mapper.errors import BagError, DependencyError
+from surfel_mapper.io.bag_compression import bunzip2, check_zstd
 from surfel_mapper.io.bag_files import is_ros1, unpacked_name
 from surfel_mapper.io.bag_mcap import McapScan
 from surfel_mapper.io.bag_ros1 import Ros1Scan
@@ -33,6 +35,9 @@ SCANS: dict[str, type[ScannedFile]] = {
     '.bag': Ros1Scan,
 }
 """What reads a file without its index."""
+
+CHUNK_RECORD_BYTES = 9 + 40
+"""What stands before the packed records of a chunk in mcap, but for the name of the packing."""
 
 REPAIR = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
 """The tool that may help with a file that does not read."""
@@ -114,8 +119,36 @@ def open_indexed(path: Path) -> Storage:
         ) from error
     reader: Any = rosbag1.Reader(path) if is_ros1(path) else rosbag2.Reader(path)
     reader.open()
+    try:
+        bound_chunks(reader, path)
+    except BaseException:
+        reader.close()
+        raise
     opened: Storage = reader
     return opened
+
+
+def bound_chunks(reader: Any, path: Path) -> None:
+    """
+    Refuse packed chunks that get larger than plausible: rosbags unpacks whatever there is.
+
+    lz4 packs 255 times at most and needs no check.
+    """
+    if is_ros1(path):
+        for place, chunk in reader.chunks.items():
+            if chunk.decompressor is bz2.decompress:
+                reader.chunks[place] = chunk._replace(decompressor=bunzip2)
+        return
+    chunks = [c for c in getattr(reader.storage, 'chunks', ()) if c.compression == 'zstd']
+    with open(path, 'rb') as file:
+
+        def read(start: int, size: int) -> bytes:
+            file.seek(start)
+            return file.read(size)
+
+        for chunk in chunks:
+            head = CHUNK_RECORD_BYTES + len(chunk.compression)
+            check_zstd(read, chunk.chunk_start_offset + head, chunk.compressed_size)
 
 
 def is_fully_indexed(storage: Any, path: Path) -> bool:

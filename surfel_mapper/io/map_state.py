@@ -127,9 +127,9 @@ def load_map(
     except (MapError, ValueError, TypeError, LookupError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
     digest = surfel_map.digest()
-    if digest != attributes['digest']:
+    if digest != attributes.get('digest'):
         raise FileFormatError(
-            f'{path}: damaged: digest {digest}, expected {attributes["digest"]}'
+            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
         )
     return surfel_map, scans
 

@@ -108,9 +108,9 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
     fill(surfel_map, columns, path)
     digest = surfel_map.digest()
-    if digest != attributes['digest']:
+    if digest != attributes.get('digest'):
         raise FileFormatError(
-            f'{path}: damaged: digest {digest}, expected {attributes["digest"]}'
+            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
         )
     return surfel_map
 
@@ -220,7 +220,7 @@ def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
             'channels': table(channel_columns(surfel_map)),
         }
         surfel_map.insert(checked_moments(parts, surfel_map, 'rows'))
-    except (MapError, ValueError) as error:
+    except (MapError, ValueError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
 
 

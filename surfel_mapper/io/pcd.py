@@ -150,6 +150,8 @@ def read_header(path: str | Path, file: BinaryIO) -> Header:
             for place, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
         ]
         layout = np.dtype(fields)
+        if not fields:
+            raise ValueError('no fields')
     except (LookupError, ValueError) as error:
         raise FileFormatError(f'{path}: a PCD header that does not fit: {error}') from error
     if num_points < 0 or encoding not in ('ascii', 'binary', 'binary_compressed'):

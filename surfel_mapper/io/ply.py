@@ -191,7 +191,8 @@ def text_columns(
             'truncated?'
         )
     try:
-        table = np.array(words, 'S').astype(np.float64).reshape(count, len(names))
+        # one by one: as an array of texts every number takes the room of the longest
+        table = np.array([float(word) for word in words]).reshape(count, len(names))
     except ValueError as error:
         raise FileFormatError(f'{path}: {error}') from error
     with np.errstate(invalid='ignore'):  # what is no whole number of its type becomes any

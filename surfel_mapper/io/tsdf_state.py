@@ -103,7 +103,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     blocks = BlockMap(config)
     try:
         content = checked(blocks, arrays)
-    except (ValueError, LookupError) as error:
+    except (ValueError, LookupError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
     if config.max_blocks and len(content) > config.max_blocks:
         raise MapLimitError(

@@ -95,6 +95,8 @@ def path_inside(directory: Path, url: str) -> Path:
         raise ConfigError(f'map_url: {url!r}, expected a file in output.directory, {directory}')
     wanted = unquote(parts.path) if parts.scheme else url
     path = directory / wanted
+    if not path.name:
+        raise ConfigError(f'map_url: {url!r}, expected the name of a map in {directory}')
     if path.suffix != '.npz':
         path = path.with_name(f'{path.name}.npz')
     if not path.resolve().is_relative_to(directory.resolve()):  # links are followed, and `..`

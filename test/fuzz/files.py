@@ -1,0 +1,241 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Harnesses of files: bags, maps, points, poses, settings; and of names of files asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import contextlib
+from functools import cache
+from pathlib import Path
+import tempfile
+from types import SimpleNamespace
+
+import numpy as np
+
+from surfel_mapper.config import load_config, TsdfConfig
+from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.chain import example as example_scan
+from surfel_mapper.io import pcd, ply
+from surfel_mapper.io.bag import BagReader
+from surfel_mapper.io.bag_compression import unpack_file, unpacked_message
+from surfel_mapper.io.map_state import load_map
+from surfel_mapper.io.parquet import read_map
+from surfel_mapper.io.scan_files import read_scan
+from surfel_mapper.io.state import load_state, save_state
+from surfel_mapper.io.trajectory import read_trajectory
+from surfel_mapper.io.tsdf_state import load_tsdf
+from test.fuzz.source import Source
+
+MOST_MESSAGES = 10_000
+"""So many messages of a bag are read: one that is twice as long holds nothing new."""
+
+
+@cache
+def folder() -> tempfile.TemporaryDirectory:
+    """Return a directory for inputs that have to be files; it vanishes with the process."""
+    return tempfile.TemporaryDirectory(prefix='surfel_mapper-fuzz-')
+
+
+def refused(function: Callable[..., object], name: str, data: bytes) -> None:
+    """Have a function read bytes as a file; an error of ours is an answer, any other a finding."""
+    path = Path(folder().name, name)
+    path.write_bytes(data)
+    with contextlib.suppress(SurfelMapperError):
+        function(path)
+
+
+def read_bag(path: Path) -> None:
+    """Read all of a bag that can be read; a message that cannot is no reason to end."""
+    with BagReader(path) as reader:
+        for topic in reader.topics:
+            reader.is_latched(topic.name)
+        for number, message in enumerate(reader.messages()):
+            with contextlib.suppress(SurfelMapperError):
+                reader.decode(message)
+            if number == MOST_MESSAGES:
+                return
+
+
+def mcap(data: bytes) -> None:
+    """Read an mcap file."""
+    refused(read_bag, 'input.mcap', data)
+
+
+def sqlite(data: bytes) -> None:
+    """Read a sqlite3 bag."""
+    refused(read_bag, 'input.db3', data)
+
+
+def ros1(data: bytes) -> None:
+    """Read a bag of ROS 1."""
+    refused(read_bag, 'input.bag', data)
+
+
+def metadata(data: bytes) -> None:
+    """Read the metadata.yaml of a rosbag2 directory."""
+    directory = Path(folder().name, 'bag')
+    directory.mkdir(exist_ok=True)
+    (directory / 'input.mcap').write_bytes(b'')
+    (directory / 'metadata.yaml').write_bytes(data)
+    with contextlib.suppress(SurfelMapperError):
+        read_bag(directory)
+
+
+def packed(data: bytes) -> None:
+    """Unpack a message and a file."""
+    with contextlib.suppress(Exception):  # its caller takes any for a damaged bag
+        unpacked_message(data)
+    refused(lambda path: unpack_file(path, path.with_suffix('.out')), 'input.zstd', data)
+
+
+def points_ply(data: bytes) -> None:
+    """Read a PLY file."""
+    refused(ply.read_points, 'input.ply', data)
+    refused(read_scan, 'input.ply', data)
+
+
+def points_pcd(data: bytes) -> None:
+    """Read a PCD file."""
+    refused(pcd.read_points, 'input.pcd', data)
+    refused(read_scan, 'input.pcd', data)
+
+
+def points_raw(data: bytes) -> None:
+    """Read a scan of bare numbers."""
+    refused(read_scan, 'input.bin', data)
+    refused(read_scan, 'input.pcd.bin', data)
+
+
+def parquet(data: bytes) -> None:
+    """Read a map in Parquet."""
+    refused(read_map, 'input.parquet', data)
+
+
+def read_state(path: Path) -> None:
+    """Read a file as every kind of state."""
+    for read in (load_map, lambda p: load_tsdf(p, TsdfConfig())):
+        with contextlib.suppress(SurfelMapperError):
+            read(path)
+
+
+def state_bytes(data: bytes) -> None:
+    """Read a saved map from any bytes."""
+    refused(read_state, 'input.npz', data)
+
+
+def state_content(data: bytes) -> None:
+    """Read a state that is whole and has the right hash, but holds what no map does."""
+    source = Source(data)
+    base = Path(folder().name, 'base.npz')
+    kind = source.pick(('map', 'tsdf'))
+    base.write_bytes(bases()[kind])
+    arrays, attributes = load_state(base)
+    for _ in range(1 + source.below(3)):
+        if source.chance(2):
+            attributes[source.pick(sorted(attributes))] = source.pick(
+                (None, -1, 0, 10**6, 2**70, 1e308, 'x', [], {}, ['rgb'], [[1]], True, 0.2)
+            )
+        else:
+            name = source.pick(sorted(arrays))
+            arrays[name] = changed(source, arrays[name])
+        if source.chance(8):
+            del attributes[source.pick(sorted(attributes))]
+        if source.chance(8):
+            del arrays[source.pick(sorted(arrays))]
+    path = Path(folder().name, 'content.npz')
+    try:
+        save_state(path, arrays, attributes)
+    except (ValueError, TypeError):
+        return
+    read_state(path)
+
+
+def changed(source: Source, array: np.ndarray) -> np.ndarray:
+    """Return an array with another type, shape or content."""
+    array = array.copy()
+    kind = source.below(6)
+    if kind == 0:
+        return array.astype(source.pick(('i1', 'u8', 'f8', '?', 'c16', 'S3', 'U2', '<i4')))
+    if kind == 1:
+        return array.reshape(source.pick(((-1,), (1, -1), (-1, 1))))
+    if kind == 2:
+        return array.reshape(-1)[0] if array.size else array[:0]
+    if kind == 3:
+        return array[: source.below(len(array) + 1)]
+    flat = array.reshape(-1)
+    if len(flat):
+        value = source.real() if array.dtype.kind == 'f' else source.number()
+        with np.errstate(over='ignore'):
+            flat[source.below(len(flat))] = np.array([value]).astype(array.dtype, copy=False)[0]
+    return array
+
+
+@cache
+def bases() -> dict[str, bytes]:
+    """Return a small saved map and a small saved TSDF."""
+    from test.fuzz import corpus
+
+    return {'map': corpus.state_bytes()[0], 'tsdf': corpus.tsdf()}
+
+
+def trajectory(data: bytes) -> None:
+    """Read poses in every format."""
+    for format_ in (None, 'tum', 'kitti', 'csv'):
+        refused(lambda path, f=format_: read_trajectory(path, f), 'poses.txt', data)
+
+
+def kitti_times(data: bytes) -> None:
+    """Read the stamps beside poses."""
+    times = Path(folder().name, 'times.txt')
+    times.write_bytes(data)
+    line = b'1 0 0 0 0 1 0 0 0 0 1 0\n'
+    refused(lambda path: read_trajectory(path, 'kitti'), 'poses.txt', line * data.count(b'\n'))
+    times.unlink()
+
+
+def settings(data: bytes) -> None:
+    """Read a file of settings."""
+    refused(load_config, 'input.yaml', data)
+
+
+def chain(data: bytes) -> None:
+    """Read a chain of filters, and have it filter."""
+
+    def run(path: Path) -> None:
+        chain_ = Chain.load(path)
+        if len(chain_) < 5:
+            with np.errstate(all='ignore'):
+                chain_.apply(example_scan(np.float32))
+
+    refused(run, 'input.yaml', data)
+
+
+def map_url(data: bytes) -> None:
+    """Ask for a map by any name: what is answered is inside the directory, or nothing."""
+    from surfel_mapper.ros.saving import path_inside
+
+    directory = Path(folder().name, 'maps')
+    directory.mkdir(exist_ok=True)
+    for name, target in (('out', '..'), ('deep', '/'), ('loop', 'loop')):
+        link = directory / name
+        if not link.is_symlink():
+            link.symlink_to(target)
+    try:
+        found = path_inside(directory, data.decode(errors='surrogateescape'))
+    except ConfigError:
+        return
+    assert found.resolve().is_relative_to(directory.resolve()), found
+
+
+def map_name(data: bytes) -> None:
+    """Take a text as a name to save under: it is a plain name, or refused."""
+    text = data.decode(errors='replace')
+    source = SimpleNamespace(name=text)
+    with contextlib.suppress(ConfigError):
+        from surfel_mapper.config import OutputConfig
+
+        found = OutputConfig(map_name=source.name).map_name
+        assert Path('/a', f'{found}.ply').parent == Path('/a'), found
+        assert '\0' not in found

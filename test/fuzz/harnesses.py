@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""All harnesses by name, each with where it begins and how many mutations the tests try."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from test.fuzz import corpus, files, messages
+
+
+class Harness(NamedTuple):
+    """A function that must take any bytes, and what it is tried with."""
+
+    one_input: Callable[[bytes], None]
+    corpus: Callable[[], list[bytes]]
+    number: int
+    """Mutations in the tests: about a second of each."""
+
+
+HARNESSES = {
+    'cloud_bytes': Harness(messages.cloud_bytes, corpus.clouds, 4000),
+    'cloud_message': Harness(messages.cloud_message, corpus.noise, 4000),
+    'depth_image': Harness(messages.depth_image, corpus.noise, 1500),
+    'drive': Harness(messages.drive, corpus.noise, 200),
+    'mcap': Harness(files.mcap, corpus.mcap, 80),
+    'sqlite': Harness(files.sqlite, corpus.sqlite, 80),
+    'ros1': Harness(files.ros1, corpus.ros1, 80),
+    'metadata': Harness(files.metadata, corpus.metadata, 100),
+    'packed': Harness(files.packed, corpus.packed, 1000),
+    'ply': Harness(files.points_ply, corpus.points_ply, 1000),
+    'pcd': Harness(files.points_pcd, corpus.points_pcd, 1000),
+    'raw': Harness(files.points_raw, corpus.points_raw, 1000),
+    'parquet': Harness(files.parquet, corpus.parquet, 80),
+    'state_bytes': Harness(files.state_bytes, corpus.state_bytes, 150),
+    'state_content': Harness(files.state_content, corpus.noise, 80),
+    'trajectory': Harness(files.trajectory, corpus.trajectory, 400),
+    'kitti_times': Harness(files.kitti_times, corpus.kitti_times, 400),
+    'settings': Harness(files.settings, corpus.settings, 300),
+    'chain': Harness(files.chain, corpus.chain, 300),
+    'map_url': Harness(files.map_url, corpus.map_url, 1000),
+    'map_name': Harness(files.map_name, corpus.map_url, 1000),
+}

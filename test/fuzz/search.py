@@ -1,0 +1,46 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One search with atheris, in a process that ends with it: ``test.fuzz`` starts these.
+
+The readers are instrumented as they are imported, so that the search sees which branches an
+input takes; the kernels are not, since numba compiles them.
+"""
+
+from __future__ import annotations
+
+import logging
+import sys
+import tempfile
+
+import atheris
+
+MOST_MB = 2048
+SLOWEST_S = 60
+"""Far beyond what any input takes, also on a busy machine: what takes longer hangs."""
+
+
+def main(name: str, corpus: str, seconds: str) -> None:
+    """Search from a corpus on with the harness of a name."""
+    with atheris.instrument_imports(
+        include=['surfel_mapper', 'rosbags.rosbag1', 'rosbags.rosbag2'],
+        exclude=['surfel_mapper.kernels'],
+        enable_loader_override=False,
+    ):
+        from test.fuzz.harnesses import HARNESSES
+    logging.disable(logging.CRITICAL)
+    arguments = [
+        sys.argv[0],
+        corpus,
+        f'-max_total_time={seconds}',
+        f'-timeout={SLOWEST_S}',
+        f'-rss_limit_mb={MOST_MB}',
+        '-max_len=65536',
+        f'-artifact_prefix={tempfile.gettempdir()}/{name}-',
+    ]
+    atheris.Setup(arguments, HARNESSES[name].one_input)
+    atheris.Fuzz()
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
