@@ -13,6 +13,7 @@ Every exception that this package raises on purpose.
         NotInMapError      removing moments that the map does not hold                (ValueError)
       FilterError          a filter cannot work on a scan                             (ValueError)
       AlignmentError       scans, pairs or poses from which no poses follow           (ValueError)
+      ModelError           points that no models can be fitted to                     (ValueError)
       BagError             a bag that cannot be read, or lacks what is asked of it
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
       ClusterError         workers or a scheduler that cannot be reached, or die again and again
@@ -60,6 +61,10 @@ class FilterError(SurfelMapperError, ValueError):
 
 class AlignmentError(SurfelMapperError, ValueError):
     """A graph of scans, its pairs or its poses are not fit for alignment; nothing has changed."""
+
+
+class ModelError(SurfelMapperError, ValueError):
+    """Points, or a viewpoint, that no models can be fitted to."""
 
 
 class BagError(SurfelMapperError):

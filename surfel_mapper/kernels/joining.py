@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which flat clusters belong to one surface: pair tests and connected components.
+
+The cheap tests on means and normals run for all pairs; only what passes them is looked at point
+by point, nearest pairs first, and not at all where two clusters hang together already, as only
+the components count. A point is compared with a cluster only inside its box, widened.
+"""
+
+from numba import njit
+import numpy as np
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gap(delta, distance, value_i, frame_i, value_j, frame_j):
+    """
+    Return a lower bound of the distance of two clusters: that of their boxes of three sigma.
+
+    delta     (3,) float64, between the means; distance is its length
+    value_*   (3,) float64, eigenvalues ascending
+    frame_*   (3, 3) float64, rows along eigenvalues descending
+    """
+    result = distance
+    for value, frame in ((value_i, frame_i), (value_j, frame_j)):
+        for k in range(3):
+            along = frame[k, 0] * delta[0] + frame[k, 1] * delta[1] + frame[k, 2] * delta[2]
+            result -= 3.0 * np.sqrt(value[2 - k]) * abs(along) / distance
+    return result
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def agree(normal_i, normal_j, delta, scale, rules):
+    """
+    Return whether two pieces lie on one plane, or on one arc.
+
+    scale  what lengths are multiplied by: 1 without noise
+    rules  (cos_plane, offset, cos_arc, arc_offset, gap, near)
+
+    Tangents of an arc make equal and opposite angles with its chord, so the sum of the normals
+    is across it; for parallel pieces the same expression is their step.
+    """
+    cosine = n_i = n_j = 0.0
+    for j in range(3):
+        cosine += normal_i[j] * normal_j[j]
+        n_i += normal_i[j] * delta[j]
+        n_j += normal_j[j] * delta[j]
+    if abs(cosine) > rules[0] and 0.5 * (abs(n_i) + abs(n_j)) < rules[1] * scale:
+        return True
+    return cosine > rules[2] and 0.5 * abs(n_i + n_j) < rules[3] * scale
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def find_root(parent, i):
+    """Return the lowest cluster that one hangs together with, shortening the way."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def components(points, starts, means, values, frames, scales, rules, parent):
+    """
+    Find the connected components of flat clusters.
+
+    points  (N, 3) float64; cluster k has the rows starts[k, 0] to starts[k, 1] - 1
+    starts  (K, 2) int64
+    means   (K, 3), values (K, 3), frames (K, 3, 3): of bisect
+    scales  (K,) float64, see agree
+    rules   (cos_plane, offset, cos_arc, arc_offset, gap, near), lengths in m; see agree; pairs
+            are further apart than gap by their boxes, or than near by their points, or joined
+    parent  (K,) int64, out: lowest cluster of the component
+    """
+    number = len(means)
+    first, second = np.empty(1024, np.int64), np.empty(1024, np.int64)
+    lengths = np.empty(1024)
+    found = 0
+    delta = np.empty(3)
+    for i in range(number):
+        parent[i] = i
+        for j in range(i):
+            length = 0.0
+            for k in range(3):
+                delta[k] = means[i, k] - means[j, k]
+                length += delta[k] * delta[k]
+            length = np.sqrt(length)
+            scale = 0.5 * (scales[i] + scales[j])
+            if not agree(frames[i, 2], frames[j, 2], delta, scale, rules):
+                continue
+            if length > 0.0 and not (
+                gap(delta, length, values[i], frames[i], values[j], frames[j]) < rules[4]
+            ):
+                continue
+            if found == len(first):
+                first, second = np.append(first, first), np.append(second, second)
+                lengths = np.append(lengths, lengths)
+            first[found], second[found], lengths[found] = i, j, length
+            found += 1
+    boxes = np.empty((number, 2, 3))
+    for k in range(number):
+        for j in range(3):
+            boxes[k, 0, j], boxes[k, 1, j] = np.inf, -np.inf
+            for i in range(starts[k, 0], starts[k, 1]):
+                boxes[k, 0, j] = min(boxes[k, 0, j], points[i, j])
+                boxes[k, 1, j] = max(boxes[k, 1, j], points[i, j])
+    for place in np.argsort(lengths[:found], kind='mergesort'):
+        i, j = first[place], second[place]
+        one, other = find_root(parent, i), find_root(parent, j)
+        if one != other and touch(points, starts[i], starts[j], boxes[i], boxes[j], rules[5]):
+            parent[max(one, other)] = min(one, other)
+    for k in range(number):
+        parent[k] = find_root(parent, k)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def touch(points, rows_i, rows_j, box_i, box_j, near):
+    """Return whether some point of one range of rows is nearer than that to one of another."""
+    for j in range(3):
+        if box_i[0, j] - near > box_j[1, j] or box_j[0, j] - near > box_i[1, j]:
+            return False
+    near_sq = near * near
+    inner = np.empty(rows_j[1] - rows_j[0], np.int64)
+    num_inner = 0
+    for i in range(rows_j[0], rows_j[1]):
+        if within(points[i], box_i, near):
+            inner[num_inner] = i
+            num_inner += 1
+    for i in range(rows_i[0], rows_i[1]):
+        if not within(points[i], box_j, near):
+            continue
+        for at in range(num_inner):
+            k = inner[at]
+            x, y, z = (points[i, 0] - points[k, 0], points[i, 1] - points[k, 1],
+                       points[i, 2] - points[k, 2])  # fmt: skip
+            if x * x + y * y + z * z < near_sq:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def within(point, box, margin):
+    """Return whether a point is in a box (2, 3), widened."""
+    for j in range(3):
+        if point[j] < box[0, j] - margin or point[j] > box[1, j] + margin:
+            return False
+    return True

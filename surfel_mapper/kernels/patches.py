@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Patches of planes and surfaces: frame, kind, grid of cells, and what is cut off at the rim.
+
+The points of patch k are rows starts[k] to starts[k + 1] - 1. Cells of all patches stand in
+one row, patch after patch, x by x. A rim cell loses, at the corner farthest from the mean of its
+points, two strips and a triangle in which there are none; they are kept as bytes, rounded down,
+so that no point is ever cut off.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
+
+LEAST_CELLS = 8
+"""With fewer cells the bend of a patch is not looked at."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def describe(points, starts, normals, viewpoint, rules, means, covariances, frames, curved):
+    """
+    Find mean, covariance, frame and kind of every patch.
+
+    points       (N, 3) float64, m
+    starts       (K + 1,) int64
+    normals      (K, 3) float64, mean normals of the clusters in each
+    viewpoint    (3,) float64
+    rules        thickness (K,) float64, m: of a plane; pitch, m: of the cells that a bend is
+                 sought in; bent: whether it is; mean_normal: whether surfaces face along it
+    means        (K, 3) float64, out
+    covariances  (K, 3, 3) float64, out
+    frames       (K, 3, 3) float64, out: rows x, y, normal
+    curved       (K,) bool, out
+    """
+    thickness, pitch, bent, mean_normal = rules
+    mean, value = np.empty(3), np.empty(3)
+    scatter, frame = np.empty((3, 3)), np.empty((3, 3))
+    for k in range(len(starts) - 1):
+        low, high = starts[k], starts[k + 1]
+        range_moments(points, low, high, mean, scatter)
+        scatter /= max(high - low - 1, 1)
+        means[k], covariances[k] = mean, scatter
+        eigen_frame(scatter, value, frame)
+        orient(frame, mean, viewpoint)
+        frames[k] = frame
+        thick = 6.0 * math.sqrt(value[0])
+        turn(frame, normals[k])
+        curved[k] = thick >= thickness[k]
+        if bent:
+            bend = bend_of(points, low, high, mean, frame, pitch)
+            if bend >= 0.0:
+                curved[k] = bend > thickness[k] or thick >= 2.0 * thickness[k]
+        if curved[k] and mean_normal:
+            frames[k] = frame
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def turn(frame, normal):
+    """Give a frame another normal, keeping x as near as it can be."""
+    along = 0.0
+    for j in range(3):
+        along += frame[0, j] * normal[j]
+    x = np.empty(3)
+    length = 0.0
+    for j in range(3):
+        x[j] = frame[0, j] - along * normal[j]
+        length += x[j] * x[j]
+    if length < 1e-12:
+        return
+    length = math.sqrt(length)
+    for j in range(3):
+        frame[0, j], frame[2, j] = x[j] / length, normal[j]
+    for j in range(3):
+        a, b = (j + 1) % 3, (j + 2) % 3
+        frame[1, j] = frame[2, a] * frame[0, b] - frame[2, b] * frame[0, a]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def bend_of(points, low, high, mean, frame, pitch):
+    """
+    Return how high the curved part of a patch rises, m, 5th to 95th of 100 cells.
+
+    0 where a quadric does not fit twice as well as a plane; -1 where there are too few cells.
+    """
+    local = np.empty((high - low, 3))
+    ends = np.empty((2, 2))
+    to_local(points, low, high, mean, frame, local, ends)
+    nx = np.int64((ends[1, 0] - ends[0, 0]) / pitch) + 1
+    ny = np.int64((ends[1, 1] - ends[0, 1]) / pitch) + 1
+    sums = np.zeros((nx * ny, 4))
+    for i in range(len(local)):
+        x = np.int64((local[i, 0] - ends[0, 0]) / pitch)
+        y = np.int64((local[i, 1] - ends[0, 1]) / pitch)
+        row = x * ny + y
+        for j in range(3):
+            sums[row, j] += local[i, j]
+        sums[row, 3] += 1.0
+    num = 0
+    scale = max(ends[1, 0], -ends[0, 0], ends[1, 1], -ends[0, 1])
+    for row in range(len(sums)):
+        if sums[row, 3] > 0.0:
+            weight = sums[row, 3]
+            for j in range(3):
+                sums[num, j] = sums[row, j] / (weight * scale)
+            sums[num, 3] = weight
+            num += 1
+    if num < LEAST_CELLS:
+        return -1.0
+    cells = sums[:num]
+    plane, quadric = np.zeros(6), np.zeros(6)
+    error_plane = fit_quadric(cells, 3, plane)
+    error_quadric = fit_quadric(cells, 6, quadric)
+    if not error_quadric < 0.25 * error_plane:  # squares: half of the root mean square
+        return 0.0
+    rise = np.empty(num)
+    for i in range(num):
+        x, y = cells[i, 0], cells[i, 1]
+        rise[i] = quadric[3] * x * x + quadric[4] * x * y + quadric[5] * y * y
+    rise.sort()
+    return scale * (rise[np.int64(0.95 * (num - 1))] - rise[np.int64(0.05 * (num - 1))])
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fit_quadric(cells, terms, found):
+    """
+    Fit z as 1, x, y and with six terms x^2, x y, y^2 too; return the weighted sum of squares.
+
+    cells  (C, 4) float64: x, y, z, weight
+    found  (6,) float64, out
+    """
+    normal, right = np.zeros((6, 6)), np.zeros(6)
+    basis = np.empty(6)
+    total = 0.0
+    for i in range(len(cells)):
+        x, y = cells[i, 0], cells[i, 1]
+        basis[0], basis[1], basis[2] = 1.0, x, y
+        basis[3], basis[4], basis[5] = x * x, x * y, y * y
+        weight = cells[i, 3]
+        total += weight
+        for p in range(terms):
+            right[p] += weight * basis[p] * cells[i, 2]
+            for q in range(p + 1):
+                normal[p, q] += weight * basis[p] * basis[q]
+    for p in range(terms):  # Cholesky, with a ridge for cells in one line
+        normal[p, p] += 1e-12 * total
+        for q in range(p + 1):
+            value = normal[p, q]
+            for m in range(q):
+                value -= normal[p, m] * normal[q, m]
+            normal[p, q] = math.sqrt(max(value, 1e-14 * total)) if p == q else value / normal[q, q]
+    for p in range(terms):
+        for m in range(p):
+            right[p] -= normal[p, m] * right[m]
+        right[p] /= normal[p, p]
+    for p in range(terms - 1, -1, -1):
+        for m in range(p + 1, terms):
+            right[p] -= normal[m, p] * right[m]
+        right[p] /= normal[p, p]
+    error = 0.0
+    for p in range(terms):
+        found[p] = right[p]
+    for i in range(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        z -= found[0] + found[1] * x + found[2] * y
+        if terms == 6:
+            z -= found[3] * x * x + found[4] * x * y + found[5] * y * y
+        error += cells[i, 3] * z * z
+    return error
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def to_local(points, low, high, mean, frame, local, ends):
+    """
+    Bring points into the frame of their patch.
+
+    local  (high - low, 3) float64, out
+    ends   (2, 2) float64, out: least and largest x, y
+    """
+    for j in range(2):
+        ends[0, j], ends[1, j] = np.inf, -np.inf
+    for i in range(low, high):
+        x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
+        for j in range(3):
+            value = frame[j, 0] * x + frame[j, 1] * y + frame[j, 2] * z
+            local[i - low, j] = value
+            if j < 2:
+                ends[0, j] = min(ends[0, j], value)
+                ends[1, j] = max(ends[1, j], value)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def lay_grids(points, starts, means, frames, pitches, snapped, local, origins, sizes):
+    """
+    Bring all points into the frames of their patches and lay a grid over each.
+
+    pitches  (K,) float64, m
+    snapped  whether grids begin at multiples of their pitch, else at the first point
+    local    (N, 3) float64, out
+    origins  (K, 2) float64, out: lowest corner, m
+    sizes    (K, 2) int64, out: cells along x and y
+    """
+    ends = np.empty((2, 2))
+    for k in range(len(starts) - 1):
+        low, high = starts[k], starts[k + 1]
+        to_local(points, low, high, means[k], frames[k], local[low:high], ends)
+        for j in range(2):
+            lowest = ends[0, j]
+            if snapped:
+                lowest = math.floor(lowest / pitches[k]) * pitches[k]
+            origins[k, j] = lowest
+            sizes[k, j] = np.int64((ends[1, j] - lowest) / pitches[k]) + 1
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fill_cells(local, starts, pitches, origins, sizes, first, sums, rim, corner, cuts, margin):
+    """
+    Sum the points of every cell, and cut the cells at the rim.
+
+    local    (N, 3) float64, of lay_grids, as are pitches, origins, sizes
+    first    (K,) int64, first cell of each patch
+    sums     (C, 4) float64, zeros; out: sum of x, y, z and number of points
+    rim      (C,) bool, zeros; out: holds points and some neighbour across an edge does not
+    corner   (C,) uint8, zeros; out: 1 for the high x, 2 for the high y
+    cuts     (C, 3) uint8, zeros; out: strips along x and y in 1/255 of the pitch, triangle in
+             2/255
+    margin   m, is left between a cut and the points
+    """
+    least = np.full((len(sums), 3), np.inf)
+    for k in range(len(starts) - 1):
+        nx, ny = sizes[k, 0], sizes[k, 1]
+        pitch, x0, y0, begin = pitches[k], origins[k, 0], origins[k, 1], first[k]
+        for i in range(starts[k], starts[k + 1]):
+            x = min(np.int64((local[i, 0] - x0) / pitch), nx - 1)
+            y = min(np.int64((local[i, 1] - y0) / pitch), ny - 1)
+            row = begin + x * ny + y
+            for j in range(3):
+                sums[row, j] += local[i, j]
+            sums[row, 3] += 1.0
+        for x in range(nx):
+            for y in range(ny):
+                row = begin + x * ny + y
+                if sums[row, 3] == 0.0 or not on_rim(sums, begin, nx, ny, x, y):
+                    continue
+                rim[row] = True
+                high_x = sums[row, 0] / sums[row, 3] < x0 + (x + 0.5) * pitch
+                high_y = sums[row, 1] / sums[row, 3] < y0 + (y + 0.5) * pitch
+                corner[row] = 1 * high_x + 2 * high_y
+        for i in range(starts[k], starts[k + 1]):
+            x = min(np.int64((local[i, 0] - x0) / pitch), nx - 1)
+            y = min(np.int64((local[i, 1] - y0) / pitch), ny - 1)
+            row = begin + x * ny + y
+            if rim[row]:
+                from_x = abs(local[i, 0] - (x0 + (x + (corner[row] & 1)) * pitch))
+                from_y = abs(local[i, 1] - (y0 + (y + (corner[row] >> 1)) * pitch))
+                least[row, 0] = min(least[row, 0], from_x)
+                least[row, 1] = min(least[row, 1], from_y)
+                least[row, 2] = min(least[row, 2], from_x + from_y)
+        for x in range(nx):
+            for y in range(ny):
+                row = begin + x * ny + y
+                if rim[row] and not surrounded(sums, begin, nx, ny, x, y, corner[row]):
+                    for j in range(3):
+                        away = margin if j < 2 else math.sqrt(2.0) * margin
+                        unit = pitch / 255.0 if j < 2 else 2.0 * pitch / 255.0
+                        cuts[row, j] = np.uint8(
+                            min(max(math.floor((least[row, j] - away) / unit), 0.0), 255.0)
+                        )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def occupied(sums, begin, nx, ny, x, y):
+    """Return whether a cell holds points; none does beyond the grid."""
+    return 0 <= x < nx and 0 <= y < ny and sums[begin + x * ny + y, 3] > 0.0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def on_rim(sums, begin, nx, ny, x, y):
+    """Return whether a neighbour across an edge is empty."""
+    return not (
+        occupied(sums, begin, nx, ny, x - 1, y)
+        and occupied(sums, begin, nx, ny, x + 1, y)
+        and occupied(sums, begin, nx, ny, x, y - 1)
+        and occupied(sums, begin, nx, ny, x, y + 1)
+    )
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def surrounded(sums, begin, nx, ny, x, y, corner):
+    """Return whether the three other cells at a corner all hold points."""
+    dx = 1 if corner & 1 else -1
+    dy = 1 if corner & 2 else -1
+    return (
+        occupied(sums, begin, nx, ny, x + dx, y)
+        and occupied(sums, begin, nx, ny, x, y + dy)
+        and occupied(sums, begin, nx, ny, x + dx, y + dy)
+    )

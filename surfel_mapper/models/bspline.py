@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Height fields: z(x, y) as a tensor product of B-splines over the grid of a patch.
+
+A grid of N cells an axis has N + 2 control points, one beyond each end, and clamped knots. The
+parameter is affine in x, as the fit needs it; equally spaced control points would bend x by up
+to 0.9 of a cell, so as a NURBS patch they stand at the Greville abscissae, where x(u) is affine
+and z the same.
+
+There are more control points than cells, so the fit needs more than the data: pspline adds
+second differences (Eilers and Marx 1996) and fills holes and rims with them; lsqr takes the
+solution nearest to the initial control points, which is where gradient descent would end.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import solveh_banded
+from scipy.sparse import csr_array
+from scipy.sparse.linalg import lsqr
+
+Array = npt.NDArray[np.float64]
+
+RIDGE = 1e-6
+"""Keeps control points far from all data at 0 instead of anywhere."""
+
+LSQR_STEPS = 2000
+
+
+def knots(num_cells: int, degree: int) -> Array:
+    """
+    Return the clamped knots for num_cells + 2 control points, in [0, 1].
+
+    Parameters
+    ----------
+    num_cells : int
+        Cells along the axis, at least 1.
+    degree : int
+        At most num_cells + 1.
+
+    """
+    inner = np.arange(1, num_cells + 2 - degree) / (num_cells + 2 - degree)
+    return np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
+
+
+def axis_degree(num_cells: int, degree: int) -> int:
+    """Return the degree that an axis of so many cells can have."""
+    return min(degree, num_cells + 1)
+
+
+def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Array, Array]:
+    """
+    Evaluate the splines that are not zero.
+
+    Parameters
+    ----------
+    u : (M,) float64
+        In [0, 1].
+    knot : (n,) float64
+        Of knots().
+    degree : int
+        Of the splines.
+
+    Returns
+    -------
+    (M,) int64
+        The first spline that is not zero; the others follow it.
+    (M, degree + 1) float64
+        Their values; each row sums to 1.
+    (M, degree + 1) float64
+        Their derivatives.
+
+    """
+    num = len(knot) - degree - 1
+    span = np.clip(np.searchsorted(knot, u, side='right') - 1, degree, num - 1)
+    values = np.ones((len(u), 1))
+    lower = values
+    for order in range(1, degree + 1):
+        lower = values
+        at = span[:, None] + np.arange(1 - order, 1)
+        left, right = knot[at], knot[at + order]
+        share = (u[:, None] - left) / (right - left) * values
+        values = np.zeros((len(u), order + 1))
+        values[:, 1:] = share
+        values[:, :-1] += lower - share
+    at = span[:, None] + np.arange(1 - degree, 1)
+    slope = degree * lower / (knot[at + degree] - knot[at])
+    slopes = np.zeros_like(values)
+    slopes[:, 1:] = slope
+    slopes[:, :-1] -= slope
+    return span - degree, values, slopes
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class HeightField:
+    """
+    A surface z(x, y) over a grid of cells.
+
+    Attributes
+    ----------
+    pitch_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        Lowest corner of the grid.
+    degrees : (2,) int
+        Of the splines along x and y.
+    control : (Nx + 2, Ny + 2) float64, m
+        Heights of the control points.
+
+    """
+
+    pitch_m: float
+    origin: Array
+    degrees: tuple[int, int]
+    control: Array
+
+    def heights(self, xy: Array) -> Array:
+        """Return z at (M, 2) x and y, m; beyond the grid, that of its end."""
+        rows, weights, _ = design(self, xy)
+        result: Array = np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
+        return result
+
+    def slopes(self, xy: Array) -> Array:
+        """Return dz/dx and dz/dy at (M, 2) x and y."""
+        result = np.empty((len(xy), 2))
+        for axis in range(2):
+            rows, weights, unit = design(self, xy, along=axis)
+            result[:, axis] = unit * np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
+        return result
+
+    def greville(self) -> tuple[Array, Array]:
+        """Return x (Nx + 2,) and y (Ny + 2,) of the control points of the same NURBS patch, m."""
+        found = []
+        for axis in range(2):
+            cells, degree = self.control.shape[axis] - 2, self.degrees[axis]
+            knot = knots(cells, degree)
+            mean = np.array([knot[i + 1 : i + 1 + degree].mean() for i in range(cells + 2)])
+            found.append(self.origin[axis] + self.pitch_m * ((cells + 1) * mean - 0.5))
+        return found[0], found[1]
+
+
+def design(
+    field: HeightField, xy: Array, along: int = -1
+) -> tuple[npt.NDArray[np.int64], Array, float]:
+    """
+    Return which control points a height depends on, and how much on each.
+
+    Parameters
+    ----------
+    field : HeightField
+        Its control points do not matter.
+    xy : (M, 2) float64, m
+        Where.
+    along : int
+        0 or 1: the derivative along that axis instead; -1: the height.
+
+    Returns
+    -------
+    (M, W) int64
+        Numbers of the control points, x by x.
+    (M, W) float64
+        Their weights.
+    float
+        The derivatives are to be multiplied by this.
+
+    """
+    firsts, parts, unit = [], [], 1.0
+    for axis in range(2):
+        cells, degree = field.control.shape[axis] - 2, field.degrees[axis]
+        width_m = (cells + 1) * field.pitch_m
+        u = (xy[:, axis] - field.origin[axis] + 0.5 * field.pitch_m) / width_m
+        first, values, slopes = basis(np.clip(u, 0.0, 1.0), knots(cells, degree), degree)
+        firsts.append(first[:, None] + np.arange(degree + 1))
+        parts.append(slopes if axis == along else values)
+        unit = 1.0 / width_m if axis == along else unit
+    rows = firsts[0][:, :, None] * field.control.shape[1] + firsts[1][:, None, :]
+    weights = parts[0][:, :, None] * parts[1][:, None, :]
+    return rows.reshape(len(xy), -1), weights.reshape(len(xy), -1), unit
+
+
+def initial_field(
+    pitch_m: float, origin: Array, heights: Array, filled: npt.NDArray[np.bool_], degree: int
+) -> HeightField:
+    """
+    Return the field whose control points are the mean heights of the cells, 0 elsewhere.
+
+    Parameters
+    ----------
+    pitch_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        Lowest corner of the grid.
+    heights : (Nx, Ny) float64, m
+        Mean z in each cell.
+    filled : (Nx, Ny) bool
+        Which cells hold points.
+    degree : int
+        Of the splines, where the grid has cells enough.
+
+    """
+    control = np.zeros((heights.shape[0] + 2, heights.shape[1] + 2))
+    control[1:-1, 1:-1] = np.where(filled, heights, 0.0)
+    degrees = axis_degree(heights.shape[0], degree), axis_degree(heights.shape[1], degree)
+    return HeightField(pitch_m, origin, degrees, control)
+
+
+def fit_lsqr(start: HeightField, xy: Array, z: Array) -> HeightField:
+    """
+    Return the field through (M,) heights at (M, 2) that is nearest to the one to start from.
+
+    Where it cannot pass through all, the sum of squares is least.
+    """
+    rows, weights, _ = design(start, xy)
+    shape = (len(xy), start.control.size)
+    ends = np.arange(0, rows.size + 1, rows.shape[1])
+    matrix = csr_array((weights.ravel(), rows.ravel(), ends), shape=shape)
+    missing = z - matrix @ start.control.ravel()
+    change = lsqr(matrix, missing, atol=1e-12, btol=1e-12, iter_lim=LSQR_STEPS)[0]
+    control = start.control + change.reshape(start.control.shape)
+    return HeightField(start.pitch_m, start.origin, start.degrees, control)
+
+
+def fit_pspline(
+    start: HeightField, xy: Array, z: Array, weight: Array, smoothing: float
+) -> HeightField:
+    """
+    Return the field of least weighted squares at (M, 2) and squared second differences.
+
+    Parameters
+    ----------
+    start : HeightField
+        Grid and degrees.
+    xy, z, weight : (M, 2), (M,), (M,) float64
+        What to fit, and how much each counts.
+    smoothing : float
+        Weight of the second differences, where the mean weight is 1.
+
+    """
+    if start.control.shape[1] > start.control.shape[0]:  # the band is as wide as the short side
+        turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
+        return transposed(turned)
+    rows, weights, _ = design(start, xy)
+    num_x, num_y = start.control.shape
+    reach = start.degrees[0] * num_y + start.degrees[1]
+    band = np.zeros((max(reach, 2 * num_y) + 1, num_x * num_y))
+    weight = weight / weight.mean()
+    products = (weights * weight[:, None])[:, :, None] * weights[:, None, :]
+    later = rows[:, None, :] - rows[:, :, None]
+    below = later >= 0
+    columns = np.broadcast_to(rows[:, :, None], later.shape)[below]
+    flat = later[below] * band.shape[1] + columns
+    band += np.bincount(flat, products[below], band.size).reshape(band.shape)
+    add_differences(band, start, smoothing)
+    band[0] += RIDGE
+    right = np.bincount(
+        rows.ravel(), (weights * (weight * z)[:, None]).ravel(), start.control.size
+    )
+    control = solveh_banded(band, right, lower=True, check_finite=False)
+    return HeightField(
+        start.pitch_m, start.origin, start.degrees, control.reshape(start.control.shape)
+    )
+
+
+def add_differences(band: Array, field: HeightField, smoothing: float) -> None:
+    """
+    Add the squares of the second differences along both axes to a lower band, in place.
+
+    They are those at the Greville abscissae, which crowd at the ends, so planes cost nothing.
+    """
+    number = np.arange(field.control.size).reshape(field.control.shape)
+    for axis, step in ((0, field.control.shape[1]), (1, 1)):
+        before, after = np.diff(field.greville()[axis])[:-1], np.diff(field.greville()[axis])[1:]
+        total = before + after
+        second = np.stack([2.0 * after / total, np.full(len(total), -2.0), 2.0 * before / total])
+        first = number.swapaxes(0, axis)[:-2]
+        for i in range(3):
+            for j in range(i, 3):
+                product = smoothing * second[i] * second[j]
+                band[(j - i) * step, first + i * step] += product[:, None]
+
+
+def transposed(field: HeightField) -> HeightField:
+    """Return the field with x and y exchanged."""
+    x, y = field.degrees
+    return HeightField(field.pitch_m, field.origin[::-1], (y, x), field.control.T)

@@ -1,0 +1,195 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Clusters of a cloud, and which of them form one surface that has only one height everywhere.
+
+A surface that turns away from its mean normal by more than ``fold_angle_deg`` is no graph over
+one plane: it is halved by its normals until it is, so a cylinder becomes two charts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.kernels.clustering import bisect, NOISE_SPREAD
+from surfel_mapper.kernels.joining import components
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+FAR_GAP_VOXELS = 5.0
+NEAR_GAP_VOXELS = 3.0
+"""Clusters join where their boxes are nearer than the first and their points than the second."""
+
+FOLD_PERCENTILE = 98.0
+MEANS_ITERATIONS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Clusters:
+    """
+    Clusters of points, K rows.
+
+    Attributes
+    ----------
+    points : (N, 3) float64, m
+        Reordered, so that a cluster is a range of rows.
+    order : (N,) int64
+        Where each was before.
+    rows : (K, 2) int64
+        First row of each cluster, and the one after its last; together all, ascending.
+    flat : (K,) bool
+        Whether it is a piece of a plane.
+    mean : (K, 3) float64, m
+    eigenvalues : (K, 3) float64, m^2
+        Of the covariance, ascending.
+    frames : (K, 3, 3) float64
+        Rows x (largest eigenvalue), y, normal.
+
+    """
+
+    points: Array
+    order: Indices
+    rows: Indices
+    flat: npt.NDArray[np.bool_]
+    mean: Array
+    eigenvalues: Array
+    frames: Array
+
+    def __len__(self) -> int:
+        """Return how many clusters there are."""
+        return len(self.flat)
+
+    @property
+    def num_points(self) -> Indices:
+        """Points of each cluster, (K,)."""
+        counts: Indices = self.rows[:, 1] - self.rows[:, 0]
+        return counts
+
+    def covariances(self) -> Array:
+        """Return the covariances (K, 3, 3), m^2."""
+        scaled = self.eigenvalues[:, ::-1, None] * self.frames
+        result: Array = np.einsum('kij,kil->kjl', self.frames, scaled)
+        return result
+
+
+def is_paper(config: ModelsConfig) -> bool:
+    """Return whether the rules are those of the paper."""
+    return config.profile == 'paper'
+
+
+def clusters_of(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
+    """Cluster (N, 3) points; normals face the viewpoint (3,), m."""
+    number = len(points)
+    points, order = points.copy(), np.arange(number)
+    rows, flat = np.empty((number, 2), np.int64), np.empty(number, np.bool_)
+    means, values = np.empty((2, number, 3))
+    frames = np.empty((number, 3, 3))
+    by_paper = is_paper(config)
+    rules = (
+        config.voxel_size_m,
+        config.min_density_radius,
+        float(config.max_mixture_points),
+        float(config.min_points),
+        0.0 if by_paper else config.outlier_share,
+        0.0 if by_paper else config.noise_m,
+        0.0 if by_paper else config.noise_per_range_sq,
+        0.0 if by_paper else 1.0,
+    )
+    num = bisect(points, order, viewpoint, rules, rows, flat, means, values, frames)
+    at = np.argsort(rows[:num, 0])
+    return Clusters(points, order, rows[at], flat[at], means[at], values[at], frames[at])
+
+
+def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:
+    """Return how thick, 6 sigma, a plane may be at (K, 3) places, m: a voxel, and noise."""
+    if is_paper(config):
+        return np.full(len(means), config.voxel_size_m)
+    range_sq = ((means - viewpoint) ** 2).sum(axis=1)
+    sigma = NOISE_SPREAD * (config.noise_m + config.noise_per_range_sq * range_sq)
+    result: Array = np.sqrt(config.voxel_size_m**2 + 36.0 * sigma**2)
+    return result
+
+
+def surfaces_of(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -> list[Indices]:
+    """Return the flat clusters of each surface: their rows, (n,) int64, lowest first."""
+    flat = np.flatnonzero(clusters.flat)
+    scales = thickness(clusters.mean, config, viewpoint) / config.voxel_size_m
+    found: list[Indices] = []
+    waiting = joined(clusters, flat, scales, config)[::-1]
+    while waiting:
+        members = waiting.pop()
+        side = folded(clusters, members, config)
+        if side is None:
+            found.append(members)
+        else:
+            for half in (members[side], members[~side]):
+                waiting += joined(clusters, half, scales, config)[::-1]
+    return found
+
+
+def joined(
+    clusters: Clusters, members: Indices, scales: Array, config: ModelsConfig
+) -> list[Indices]:
+    """Return the connected components among some clusters."""
+    a, by_paper = config.voxel_size_m, is_paper(config)
+    rules = (
+        math.cos(math.radians(config.max_angle_deg)),
+        config.max_offset_voxels * a,
+        2.0 if by_paper else math.cos(math.radians(config.arc_angle_deg)),
+        config.arc_offset_voxels * a,
+        FAR_GAP_VOXELS * a,
+        NEAR_GAP_VOXELS * a,
+    )
+    parent = np.empty(len(members), np.int64)
+    components(
+        clusters.points,
+        clusters.rows[members],
+        clusters.mean[members],
+        clusters.eigenvalues[members],
+        clusters.frames[members],
+        scales[members],
+        rules,
+        parent,
+    )
+    order = np.argsort(parent, kind='stable')
+    ends = np.flatnonzero(np.diff(parent[order])) + 1
+    return [part for part in np.split(members[order], ends) if len(part)]
+
+
+def mean_normal(clusters: Clusters, members: Indices) -> Array:
+    """Return the mean unit normal (3,) of clusters by their points; 0 where they cancel."""
+    total = clusters.num_points[members] @ clusters.frames[members, 2]
+    length = float(np.linalg.norm(total))
+    unit: Array = total / length if length > 0.0 else total
+    return unit
+
+
+def folded(
+    clusters: Clusters, members: Indices, config: ModelsConfig
+) -> npt.NDArray[np.bool_] | None:
+    """Return how to halve a surface (n,) bool, or None where it has one height everywhere."""
+    normals = clusters.frames[members, 2]
+    cosines = normals @ mean_normal(clusters, members)
+    limit = math.cos(math.radians(config.fold_angle_deg))
+    if len(members) < 2 or cosines.min() >= limit:
+        return None
+    if np.percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
+        return None
+    centred = normals - normals.mean(axis=0)
+    axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
+    side: npt.NDArray[np.bool_] = centred @ axis > 0.0
+    for _ in range(MEANS_ITERATIONS):
+        if side.all() or not side.any():
+            return None
+        first, second = normals[side].mean(axis=0), normals[~side].mean(axis=0)
+        nearer = normals @ (first - second) > 0.5 * (first @ first - second @ second)
+        if (nearer == side).all():
+            break
+        side = nearer
+    return side if 0 < side.sum() < len(side) else None

@@ -1,0 +1,103 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How well models stand for a cloud: distances both ways, coverage, and how small they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from surfel_mapper.models.multi_model import MultiModel
+
+POINT_BYTES = 12
+"""A point as three float32."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """
+    Models against the cloud that they stand for; nan where either is empty.
+
+    Attributes
+    ----------
+    precision_rms_m, precision_p95_m : float
+        Distance of what the models generate to the nearest point of the cloud.
+    completeness_rms_m, completeness_p95_m : float
+        Distance of the points of the cloud to the nearest that is generated.
+    coverage : float
+        Share of the points of the cloud nearer than a voxel to what is generated.
+    num_planes, num_surfaces, num_gaussians, size_bytes : int
+        What the models are.
+    compression : float
+        Bytes of the cloud as float32 by those of the models.
+
+    """
+
+    precision_rms_m: float
+    precision_p95_m: float
+    completeness_rms_m: float
+    completeness_p95_m: float
+    coverage: float
+    num_planes: int
+    num_surfaces: int
+    num_gaussians: int
+    size_bytes: int
+    compression: float
+
+
+def evaluate(model: MultiModel, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
+    """
+    Compare what models generate with a cloud.
+
+    Parameters
+    ----------
+    model : MultiModel
+        What to judge.
+    reference : (..., 3) float, m
+        The cloud as it came from the sensor, not thinned; what is not finite is left out.
+    seed : int
+        Of what is drawn from the Gaussians.
+
+    """
+    cloud = reference.reshape(-1, 3).astype(np.float64)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    made = model.resample(seed=seed)
+    precise = nearest(made, cloud)
+    complete = nearest(cloud, made)
+    size = model.size_bytes
+    return Evaluation(
+        precision_rms_m=rms(precise),
+        precision_p95_m=p95(precise),
+        completeness_rms_m=rms(complete),
+        completeness_p95_m=p95(complete),
+        coverage=float(np.mean(complete < model.voxel_size_m)) if complete.size else np.nan,
+        num_planes=len(model.planes),
+        num_surfaces=len(model.surfaces),
+        num_gaussians=len(model.gaussians),
+        size_bytes=size,
+        compression=POINT_BYTES * len(cloud) / size if size else np.nan,
+    )
+
+
+def nearest(
+    points: npt.NDArray[np.float64], others: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return the distance of each point to the nearest of the others, m; none without both."""
+    if not len(points) or not len(others):
+        return np.empty(0)
+    distance: npt.NDArray[np.float64] = cKDTree(others).query(points)[0]
+    return distance
+
+
+def rms(values: npt.NDArray[np.float64]) -> float:
+    """Return the root of the mean square; nan of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if values.size else np.nan
+
+
+def p95(values: npt.NDArray[np.float64]) -> float:
+    """Return what 95 of 100 values are below; nan of nothing."""
+    return float(np.percentile(values, 95.0)) if values.size else np.nan

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+From a cloud to planes, B-spline surfaces and Gaussians.
+
+The cloud is thinned to a point a voxel, in the order of the voxels, so that the result does not
+depend on the order of the points; then clustered until every cluster is flat or small; flat ones
+are joined to surfaces, which become planes or height fields; the rest are Gaussians.
+
+Source: Gao and Dong 2025 (A Real-Time Multi-Model Parametric Representation of Point Clouds).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.errors import ModelError
+from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
+from surfel_mapper.kernels.finite_points import take_finite
+from surfel_mapper.models.clusters import (
+    Clusters,
+    clusters_of,
+    is_paper,
+    mean_normal,
+    surfaces_of,
+    thickness,
+)
+from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.patches import Groups, patches_of
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+
+def fit(
+    points: npt.NDArray[Any],
+    config: ModelsConfig | None = None,
+    viewpoint: npt.ArrayLike = (0.0, 0.0, 0.0),
+) -> MultiModel:
+    """
+    Return planes, surfaces and Gaussians for a cloud.
+
+    Parameters
+    ----------
+    points : (..., 3) float32 or float64, m
+        Organised or not; what is not finite is left out.
+    config : ModelsConfig, optional
+        Settings; the defaults without it.
+    viewpoint : (3,) float, m
+        Where the sensor was; normals face it, and its noise grows with the distance.
+
+    Returns
+    -------
+    MultiModel
+        Empty for no points; exact planes, points on a line and repeated ones are no exception.
+
+    Raises
+    ------
+    ModelError
+        If points or viewpoint are of another shape or type.
+    FilterError
+        If the cloud extends over more voxels than can be numbered.
+
+    """
+    config = config or ModelsConfig()
+    view = np.asarray(viewpoint, np.float64)
+    if points.ndim < 2 or points.shape[-1] != 3 or points.dtype not in (np.float32, np.float64):
+        raise ModelError(
+            f'points: {points.dtype} {points.shape}, expected (..., 3) float32 or float64'
+        )
+    if view.shape != (3,) or not np.isfinite(view).all():
+        raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
+    laps = [perf_counter()]
+    thinned, voxel_of = thin(points.reshape(-1, 3), config.voxel_size_m)
+    laps.append(perf_counter())
+    clusters = clusters_of(thinned, config, view)
+    laps.append(perf_counter())
+    everything = config.kinds == 'all'
+    surfaces = surfaces_of(clusters, config, view) if everything else []
+    laps.append(perf_counter())
+    patches = fitted_patches(clusters, surfaces, config, view)
+    laps.append(perf_counter())
+    names = ('thin', 'cluster', 'join', 'fit')
+    times = [1e3 * (end - start) for start, end in pairwise(laps)]
+    model, labels = assembled(clusters, patches, config)
+    of_point = np.full(len(voxel_of), -1, np.int32)
+    of_point[voxel_of >= 0] = labels[voxel_of[voxel_of >= 0]]
+    return replace(model, labels=of_point, milliseconds=dict(zip(names, times, strict=True)))
+
+
+def thin(points: npt.NDArray[Any], voxel_size_m: float) -> tuple[Array, npt.NDArray[np.int32]]:
+    """
+    Return the means of the points of each voxel, (M, 3) m, in the order of the voxels.
+
+    Also the row of the mean that each point (N, 3) went into, (N,) int32; -1: it is not finite.
+    """
+    taken, rows = np.empty((3, len(points)), points.dtype), np.empty(len(points), np.int32)
+    number = take_finite(points, taken, rows)
+    voxel_of = np.full(len(points), -1, np.int32)
+    if not number:
+        return np.empty((0, 3)), voxel_of
+    xyz = taken[:, :number].T
+    keys, sums, groups = VoxelGrid.over(xyz, np.full(3, voxel_size_m), 'origin').group(xyz, True)
+    order = np.argsort(keys)
+    rank = np.empty(len(order), np.int32)
+    rank[order] = np.arange(len(order), dtype=np.int32)
+    voxel_of[rows[:number]] = rank[groups.rows]
+    sums = sums[order]
+    return sums[:, :3] / sums[:, 3:], voxel_of
+
+
+def fitted_patches(
+    clusters: Clusters, surfaces: list[Indices], config: ModelsConfig, viewpoint: Array
+) -> list[tuple[Plane, Indices]]:
+    """Return the patches that fit, each with the rows of its clusters."""
+    least = 1 if is_paper(config) else config.min_surface_points
+    counts = clusters.num_points
+    kept = [members for members in surfaces if counts[members].sum() >= least]
+    if not kept:
+        return []
+    every = np.concatenate(kept)
+    starts = np.concatenate([[0], np.cumsum([counts[members].sum() for members in kept])])
+    means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
+    groups = Groups(
+        points=clusters.points[ranges(clusters.rows[every])],
+        starts=starts,
+        normals=np.array([mean_normal(clusters, members) for members in kept]),
+        thickness=thickness(means, config, viewpoint),
+    )
+    patches = patches_of(groups, config, viewpoint)
+    return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
+
+
+def ranges(rows: Indices) -> Indices:
+    """Return the numbers in each of the ranges (K, 2), one after the other."""
+    lengths = rows[:, 1] - rows[:, 0]
+    ends = np.cumsum(lengths)
+    first: Indices = np.repeat(rows[:, 0] - (ends - lengths), lengths)
+    return first + np.arange(len(first))
+
+
+def assembled(
+    clusters: Clusters, patches: list[tuple[Plane, Indices]], config: ModelsConfig
+) -> tuple[MultiModel, npt.NDArray[np.int32]]:
+    """Return the model, numbered anew, and the labels (M,) of the thinned points."""
+    planes = [patch for patch in patches if not isinstance(patch[0], Surface)]
+    surfaces = [patch for patch in patches if isinstance(patch[0], Surface)]
+    of_cluster = np.full(len(clusters), -1, np.int64)
+    numbered: list[Plane] = []
+    for number, (patch, members) in enumerate([*planes, *surfaces]):
+        of_cluster[members] = number
+        numbered.append(replace(patch, id=number))
+    rest = np.flatnonzero(of_cluster < 0)
+    of_cluster[rest] = len(numbered) + np.arange(len(rest))
+    labels = np.empty(len(clusters.points), np.int32)
+    labels[clusters.order] = np.repeat(of_cluster, clusters.num_points)
+    model = MultiModel(
+        planes=numbered[: len(planes)],
+        surfaces=[patch for patch in numbered if isinstance(patch, Surface)],
+        gaussians=Gaussians(
+            id=of_cluster[rest],
+            num_points=clusters.num_points[rest],
+            mean=clusters.mean[rest],
+            covariance=clusters.covariances()[rest],
+        ),
+        labels=labels,
+        voxel_size_m=config.voxel_size_m,
+        num_thinned=len(clusters.points),
+    )
+    return model, labels

@@ -1,0 +1,91 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which part of its plane a patch covers: cells, and what is cut off those at the rim.
+
+A byte a cut, in 1/255 of the pitch (2/255 for the triangle), rounded down when it is made, so
+that no point that the patch was made of lies outside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid:
+    """
+    Cells over the plane of a patch, in its frame.
+
+    Attributes
+    ----------
+    pitch_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        Lowest corner of cell (0, 0).
+    filled : (Nx, Ny) bool
+        Cells that hold points.
+    rim : (Nx, Ny) bool
+        Those of them with an empty neighbour across an edge; there is nothing beyond the grid.
+    corner : (Nx, Ny) uint8
+        Where a rim cell is cut: 1 for its high x, 2 for its high y.
+    cuts : (Nx, Ny, 3) uint8
+        How much: strip along x and y in 1/255 of the pitch, triangle in 2/255.
+
+    """
+
+    pitch_m: float
+    origin: Array
+    filled: npt.NDArray[np.bool_]
+    rim: npt.NDArray[np.bool_]
+    corner: npt.NDArray[np.uint8]
+    cuts: npt.NDArray[np.uint8]
+
+    def contains(self, xy: Array) -> npt.NDArray[np.bool_]:
+        """Return which of (M, 2) places in the frame of the patch are covered, (M,) bool."""
+        cell = np.floor((xy - self.origin) / self.pitch_m).astype(np.int64)
+        # the last point of a grid may stand on its end
+        on_end = (xy - self.origin) <= np.array(self.filled.shape) * self.pitch_m
+        last = np.array(self.filled.shape) - 1
+        cell = np.where(on_end, np.minimum(cell, last), cell)
+        inside: npt.NDArray[np.bool_] = ((cell >= 0) & (cell <= last)).all(axis=1)
+        x, y = np.clip(cell, 0, last).T
+        inside &= self.filled[x, y]
+        corner = self.corner[x, y]
+        from_x = np.abs(xy[:, 0] - self.origin[0] - (x + (corner & 1)) * self.pitch_m)
+        from_y = np.abs(xy[:, 1] - self.origin[1] - (y + (corner >> 1)) * self.pitch_m)
+        cut = self.cuts[x, y] * (np.array([1.0, 1.0, 2.0]) * self.pitch_m / 255.0)
+        inside &= ~((from_x < cut[:, 0]) | (from_y < cut[:, 1]) | (from_x + from_y < cut[:, 2]))
+        return inside
+
+    def samples(self, step_m: float) -> Array:
+        """Return covered places (M, 2) at about this distance, so many a cell, m."""
+        per_side = max(round(self.pitch_m / step_m), 1)
+        inner = np.argwhere(np.ones((per_side, per_side))) + 0.5
+        cells = np.argwhere(self.filled)
+        xy = (cells[:, None] + inner / per_side).reshape(-1, 2)
+        xy = self.origin + xy * self.pitch_m
+        kept: Array = xy[self.contains(xy)]
+        return kept
+
+    def mask(self, per_side: int) -> npt.NDArray[np.bool_]:
+        """Return which parts of the cells are covered by their middle, so many a side."""
+        shape = np.array(self.filled.shape) * per_side
+        xy = self.origin + (np.argwhere(np.ones(shape)) + 0.5) * (self.pitch_m / per_side)
+        return self.contains(xy).reshape(tuple(shape))
+
+    def area_m2(self, per_side: int = 16) -> float:
+        """Return how much is covered, m^2, from so many samples along a cell."""
+        step_m = self.pitch_m / per_side
+        return float(len(self.samples(step_m)) * step_m**2)
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes when packed: header, two bits a cell, two bits and three bytes a rim cell."""
+        cuts = int(self.rim.sum())
+        return 16 + 2 * -(-self.filled.size // 8) + 3 * cuts + -(-cuts // 4)

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Patches from groups of points: their frames, what they cover, and their splines.
+
+All patches of a cloud go through each kernel together; a call for each would take longer than
+the work.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.kernels.patches import describe, fill_cells, lay_grids
+from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
+from surfel_mapper.models.clusters import is_paper
+from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.multi_model import Plane, Surface
+
+Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
+
+PAPER_PLANE_PITCH_VOXELS = 5.0
+SURFACE_PITCH_VOXELS = 3.0
+MARGIN_VOXELS = 0.5
+
+FAR_VOXELS, FAR_SHARE = 1.5, 0.05
+"""A surface has several heights in one place where more points than this are so far from it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Groups:
+    """
+    Points of K patches, one patch after the other.
+
+    Attributes
+    ----------
+    points : (N, 3) float64, m
+    starts : (K + 1,) int64
+        First point of each patch, and N.
+    normals : (K, 3) float64
+        Mean normals.
+    thickness : (K,) float64, m
+        How thick, 6 sigma, a plane may be.
+
+    """
+
+    points: Array
+    starts: Indices
+    normals: Array
+    thickness: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """The cells of all patches, one row each; see kernels/patches.py."""
+
+    pitches: Array
+    origins: Array
+    sizes: Indices
+    first: Indices
+    sums: Array
+    rim: npt.NDArray[np.bool_]
+    corner: npt.NDArray[np.uint8]
+    cuts: npt.NDArray[np.uint8]
+
+    def of(self, patch: int) -> slice:
+        """Return the rows of a patch."""
+        begin = self.first[patch]
+        return slice(begin, begin + self.sizes[patch].prod())
+
+    def grid(self, patch: int) -> Grid:
+        """Return what a patch covers."""
+        rows, shape = self.of(patch), tuple(self.sizes[patch])
+        return Grid(
+            pitch_m=float(self.pitches[patch]),
+            origin=self.origins[patch],
+            filled=(self.sums[rows, 3] > 0.0).reshape(shape),
+            rim=self.rim[rows].reshape(shape),
+            corner=self.corner[rows].reshape(shape),
+            cuts=self.cuts[rows].reshape(*shape, 3),
+        )
+
+
+def patches_of(groups: Groups, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
+    """Return a Plane or Surface for every group, numbered in order; None where neither fits."""
+    number, by_paper = len(groups.thickness), is_paper(config)
+    a = config.voxel_size_m
+    means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
+    covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
+    rules = (groups.thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
+    describe(
+        groups.points, groups.starts, groups.normals, viewpoint, rules,
+        means, covariances, frames, curved,
+    )  # fmt: skip
+    local = np.empty_like(groups.points)
+    plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
+    pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
+    cells = cells_of(groups, (means, frames, pitches, local), a, snapped=not by_paper)
+    found: list[Plane | None] = []
+    for k in range(number):
+        points = local[groups.starts[k] : groups.starts[k + 1]]
+        plane = Plane(
+            id=len(found),
+            num_points=len(points),
+            mean=means[k],
+            covariance=covariances[k],
+            R_patch_map=frames[k],
+            rms_m=float(np.sqrt(np.mean(points[:, 2] ** 2))),
+            grid=cells.grid(k),
+        )
+        found.append(surface_of(plane, cells, points, config) if curved[k] else plane)
+    return found
+
+
+def cells_of(
+    groups: Groups, frames: tuple[Array, Array, Array, Array], a: float, *, snapped: bool
+) -> Cells:
+    """Return the cells of all patches; frames: means, rotations, pitches, local coordinates."""
+    means, rotations, pitches, local = frames
+    origins, sizes = np.empty((len(means), 2)), np.empty((len(means), 2), np.int64)
+    lay_grids(
+        groups.points, groups.starts, means, rotations, pitches, snapped, local, origins, sizes
+    )
+    ends = np.cumsum(sizes.prod(axis=1))
+    total = int(ends[-1]) if len(ends) else 0
+    cells = Cells(
+        pitches=pitches,
+        origins=origins,
+        sizes=sizes,
+        first=ends - sizes.prod(axis=1),
+        sums=np.zeros((total, 4)),
+        rim=np.zeros(total, np.bool_),
+        corner=np.zeros(total, np.uint8),
+        cuts=np.zeros((total, 3), np.uint8),
+    )
+    fill_cells(
+        local, groups.starts, pitches, origins, sizes, cells.first,
+        cells.sums, cells.rim, cells.corner, cells.cuts, MARGIN_VOXELS * a,
+    )  # fmt: skip
+    return cells
+
+
+def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) -> Surface | None:
+    """Return the surface through (n, 3) points in a frame; None where it has several heights."""
+    sums = cells.sums[cells.of(plane.id)]
+    used = sums[:, 3] > 0.0
+    means = np.zeros((len(sums), 3))
+    means[used] = sums[used, :3] / sums[used, 3:]
+    grid = plane.grid
+    heights = means[:, 2].reshape(grid.filled.shape)
+    start = initial_field(grid.pitch_m, grid.origin, heights, grid.filled, config.degree)
+    spline = fitted(start, means[used], sums[used, 3], config)
+    error = points[:, 2] - spline.heights(points[:, :2])
+    if np.mean(np.abs(error) > FAR_VOXELS * config.voxel_size_m) > FAR_SHARE:
+        return None
+    return Surface(
+        id=plane.id,
+        num_points=plane.num_points,
+        mean=plane.mean,
+        covariance=plane.covariance,
+        R_patch_map=plane.R_patch_map,
+        rms_m=float(np.sqrt(np.mean(error**2))),
+        grid=grid,
+        spline=spline,
+    )
+
+
+def fitted(start: HeightField, means: Array, number: Array, config: ModelsConfig) -> HeightField:
+    """Return the spline through (C, 3) means of cells that hold (C,) points."""
+    if is_paper(config) or config.solver == 'lsqr':
+        return fit_lsqr(start, means[:, :2], means[:, 2])
+    return fit_pspline(start, means[:, :2], means[:, 2], number, config.smoothing)

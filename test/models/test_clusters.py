@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Clusters: what is flat, how clouds are split, and which clusters belong together."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
+from surfel_mapper.kernels.joining import agree, gap
+from surfel_mapper.models import fit
+from surfel_mapper.models.clusters import clusters_of, surfaces_of
+from surfel_mapper.models.fitting import thin
+from test.models.scenes import A, room, sheet, VIEW
+
+OFF_GRID = (0.011, 0.004, 0.007)
+"""A sheet through the edges of voxels crosses half as many as any other of its direction."""
+
+ABOVE = np.array([0.0, 0.0, 5.0])
+
+
+def clustered(points, viewpoint=ABOVE, **settings):
+    config = ModelsConfig(**{'voxel_size_m': A, **settings})
+    return clusters_of(thin(points, config.voxel_size_m)[0], config, viewpoint), config
+
+
+def flat_share(clusters):
+    return clusters.num_points[clusters.flat].sum() / max(clusters.num_points.sum(), 1)
+
+
+@pytest.mark.parametrize(
+    ('cloud', 'is_flat'),
+    [
+        (sheet(0.9, 0.6, A), True),
+        (sheet(0.9, 0.6, A, sigma=A / 8), True),
+        (sheet(0.9, 0.6, A, sigma=A / 2), False),  # thicker than a voxel
+        (sheet(0.9, 0.6, 2.5 * A), False),  # sparse
+        (sheet(0.9, A / 2, A / 2), False),  # a line
+    ],
+)
+def test_a_cluster_is_flat_where_it_is_thin_dense_and_wide(cloud, is_flat):
+    clusters = clusters_of(cloud, ModelsConfig(voxel_size_m=A, min_points=100_000), ABOVE)
+    assert clusters.flat.tolist() == [is_flat]
+
+
+def test_a_share_of_outliers_is_allowed_and_by_the_paper_none():
+    cloud = np.concatenate([sheet(0.9, 0.9, A), [[0.0, 0.0, 0.05]] * 5])
+    strict = ModelsConfig(voxel_size_m=A, min_points=100_000, outlier_share=0.0)
+    allowed = ModelsConfig(voxel_size_m=A, min_points=100_000, outlier_share=0.02)
+    assert not clusters_of(cloud, strict, ABOVE).flat[0]
+    assert clusters_of(cloud, allowed, ABOVE).flat[0]
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'cloud',
+    [
+        np.empty((0, 3)),
+        np.full((7, 3), np.nan),
+        np.zeros((1, 3)),
+        np.ones((3, 3)),
+        np.zeros((500, 3)),
+        np.arange(600.0)[:, None] * [0.02, 0.0, 0.0],
+        np.arange(600.0)[:, None] * [0.013, 0.017, -0.011],
+        sheet(1.0, 1.0, 0.02),
+        sheet(1.0, 1.0, 0.02, normal=(1.0, 2.0, -3.0)),
+        sheet(0.1, 0.1, 0.04) + 1e6,
+        np.repeat(sheet(0.2, 0.2, 0.1), 300, axis=0),
+    ],
+)
+@pytest.mark.parametrize('profile', ['robust', 'paper'])
+def test_degenerate_clouds_give_a_result_that_holds_every_point_once(cloud, profile):
+    model = fit(cloud, ModelsConfig(voxel_size_m=A, profile=profile))
+    total = sum(p.num_points for p in model.patches) + model.gaussians.num_points.sum()
+    assert total == model.num_thinned
+    finite = np.isfinite(cloud).all(axis=1)
+    assert ((model.labels >= 0) == finite).all()
+    assert np.isfinite(model.resample()).all()
+
+
+def test_clusters_hold_every_point_once_and_know_their_moments():
+    points, _ = room(160, 120)
+    clusters, _ = clustered(points, VIEW)
+    assert sorted(clusters.order) == list(range(len(clusters.points)))
+    assert clusters.rows[0, 0] == 0
+    assert clusters.rows[-1, 1] == len(clusters.points)
+    assert (clusters.rows[1:, 0] == clusters.rows[:-1, 1]).all()
+    covariances = clusters.covariances()
+    for k in range(len(clusters)):
+        own = clusters.points[slice(*clusters.rows[k])]
+        np.testing.assert_allclose(clusters.mean[k], own.mean(axis=0), atol=1e-12)
+        if len(own) > 1:
+            np.testing.assert_allclose(covariances[k], np.cov(own.T), atol=1e-12)
+
+
+def test_the_order_of_the_points_does_not_matter_and_runs_agree():
+    points, _ = room(160, 120)
+    config = ModelsConfig(voxel_size_m=A)
+    order = np.random.default_rng(5).permutation(len(points))
+    once, again, other = (fit(p, config, VIEW) for p in (points, points, points[order]))
+    assert (once.labels == again.labels).all()
+    assert (once.labels[order] == other.labels).all()
+
+
+@pytest.mark.parametrize('normal', [(0, 0, 1), (0, 1, 1), (1, 1, 1), (1, 0, 0), (1, 2, 5)])
+def test_full_sheets_of_any_direction_are_flat(normal):
+    clusters, _ = clustered(sheet(2.0, 1.5, A / 6, normal, OFF_GRID))
+    assert flat_share(clusters) >= 0.97
+
+
+def test_by_the_paper_a_floor_is_not_dense_enough_to_be_flat():
+    """Its least density of 2 is just above that of an axis-aligned sheet, a point a voxel."""
+    floor, diagonal = sheet(2.0, 1.5, A / 6), sheet(2.0, 1.5, A / 6, (1, 1, 1), OFF_GRID)
+    assert flat_share(clustered(floor, profile='paper')[0]) < 0.6
+    assert flat_share(clustered(diagonal, profile='paper')[0]) > 0.95
+
+
+def test_a_noisy_room_is_mostly_flat_where_the_noise_is_known():
+    points, _ = room(320, 240, noise_per_range_sq=1.425e-3)
+    assert flat_share(clustered(points, VIEW, noise_per_range_sq=1.425e-3)[0]) >= 0.8
+
+
+def test_frames_are_right_handed_ascending_and_face_the_viewpoint():
+    rng = np.random.default_rng(6)
+    for _ in range(50):
+        points = rng.standard_normal((30, 3)) * rng.uniform(0.01, 3.0, 3) + 100.0
+        mean, scatter = np.empty(3), np.empty((3, 3))
+        values, frame = np.empty(3), np.empty((3, 3))
+        range_moments(points, 0, 30, mean, scatter)
+        expected = np.linalg.eigvalsh(np.cov(points.T) * 29)
+        eigen_frame(scatter, values, frame)
+        orient(frame, mean, np.zeros(3))
+        np.testing.assert_allclose(values, expected, rtol=1e-9)
+        np.testing.assert_allclose(frame @ frame.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(frame) > 0.0
+        assert frame[2] @ -mean >= 0.0
+
+
+def pairs(clusters):
+    return itertools.combinations(np.flatnonzero(clusters.flat), 2)
+
+
+def gap_of(clusters, i, j):
+    delta = clusters.mean[i] - clusters.mean[j]
+    value, frame = clusters.eigenvalues, clusters.frames
+    return gap(delta, np.linalg.norm(delta), value[i], frame[i], value[j], frame[j])
+
+
+def test_the_gap_of_boxes_is_symmetric_and_rejects_no_pair_whose_points_touch():
+    points, _ = room(160, 120)
+    clusters, _ = clustered(points, VIEW)
+    for i, j in pairs(clusters):
+        found = gap_of(clusters, i, j)
+        assert found == pytest.approx(gap_of(clusters, j, i), abs=1e-12)
+        if found >= 5.0 * A:
+            one, other = (clusters.points[slice(*clusters.rows[k])] for k in (i, j))
+            assert cdist(one, other).min() >= 3.0 * A
+
+
+def test_components_are_those_of_the_whole_graph():
+    points, _ = room(160, 120)
+    clusters, config = clustered(points, VIEW, fold_angle_deg=89.0)
+    label = np.arange(len(clusters))
+    rules = (math.cos(math.radians(15)), A, math.cos(math.radians(30)), 0.5 * A)
+    for i, j in pairs(clusters):
+        delta = clusters.mean[i] - clusters.mean[j]
+        normals = clusters.frames[i, 2], clusters.frames[j, 2]
+        one, other = (clusters.points[slice(*clusters.rows[k])] for k in (i, j))
+        cheap = agree(*normals, delta, 1.0, rules) and gap_of(clusters, i, j) < 5.0 * A
+        if cheap and cdist(one, other).min() < 3.0 * A:
+            label[label == label[i]] = label[j]
+    expected = {frozenset(np.flatnonzero(label == x)) for x in label[clusters.flat]}
+    found = {frozenset(members) for members in surfaces_of(clusters, config, VIEW)}
+    # charts only cut further; at 89 deg nothing here is cut
+    assert found == expected
+
+
+def test_parallel_planes_merge_within_an_offset_and_not_beyond():
+    def num_planes(step):
+        both = np.concatenate([
+            sheet(0.6, 0.6, A, centre=(-0.3, 0, 0.0)), sheet(0.6, 0.6, A, centre=(0.3, 0, step))
+        ])  # fmt: skip
+        return len(fit(both, ModelsConfig(voxel_size_m=A), ABOVE).planes)
+
+    assert num_planes(0.5 * A) == 1
+    assert num_planes(3.0 * A) == 2
+
+
+@pytest.mark.parametrize('angle_deg', [30.0, 45.0, 90.0])
+def test_two_sheets_that_meet_at_an_angle_are_two_planes(angle_deg):
+    t = math.radians(angle_deg)
+    flat = sheet(0.9, 0.9, A / 6, centre=(-0.45, 0, 0))
+    normal = (-math.sin(t), 0.0, math.cos(t))
+    other = sheet(0.9, 0.9, A / 6, normal, (0.45 * math.cos(t), 0, 0.45 * math.sin(t)))
+    model = fit(np.concatenate([flat, other]) + OFF_GRID, ModelsConfig(voxel_size_m=A), ABOVE)
+    assert not model.surfaces
+    large = [p for p in model.planes if p.num_points > 300]
+    assert len(large) == 2
+    between = math.degrees(math.acos(abs(large[0].normal @ large[1].normal)))
+    assert between == pytest.approx(angle_deg, abs=2.0)

@@ -1,0 +1,176 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models of whole clouds: what is found in a room, how well it stands for it, what is refused."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.errors import ConfigError, ModelError
+from surfel_mapper.io.scan_files import read_scan
+from surfel_mapper.models import evaluate, fit
+from surfel_mapper.models.clusters import clusters_of, folded, surfaces_of
+from surfel_mapper.models.fitting import thin
+from test.models.scenes import (
+    A,
+    BACK,
+    BALL,
+    BALL_RADIUS,
+    CENTRE,
+    CYLINDER,
+    FLOOR,
+    FRONT,
+    LEFT,
+    room,
+    sheet,
+    SIDE,
+    TOP,
+    VIEW,
+)
+
+FLAT = (FLOOR, LEFT, BACK, TOP, FRONT, SIDE)
+
+
+@pytest.fixture(scope='module')
+def seen():
+    points, lies_on = room()
+    return points, lies_on, fit(points, ModelsConfig(voxel_size_m=A), VIEW)
+
+
+def owner(model, patch, lies_on):
+    """Return what most points of a patch lie on, and the share of them."""
+    counts = np.bincount(lies_on[model.labels == patch.id], minlength=8)
+    return counts.argmax(), counts.max() / counts.sum()
+
+
+def test_floor_walls_and_faces_are_one_plane_each(seen):
+    _, lies_on, model = seen
+    found = [owner(model, plane, lies_on) for plane in model.planes if plane.num_points >= 100]
+    assert sorted(which for which, _ in found) == sorted(FLAT)
+    assert min(share for _, share in found) > 0.95
+    for which in FLAT:
+        labels = model.labels[lies_on == which]
+        assert np.bincount(labels).max() / len(labels) > 0.9
+
+
+@pytest.mark.parametrize(('which', 'most'), [(CYLINDER, 2), (BALL, 4)])
+def test_what_is_round_is_few_surfaces_within_7_mm(seen, which, most):
+    _, lies_on, model = seen
+    own = [s for s in model.surfaces if owner(model, s, lies_on)[0] == which]
+    assert 1 <= len(own) <= most
+    assert max(surface.rms_m for surface in own) <= 0.007
+
+
+def test_surfaces_lie_on_the_ball_and_their_normals_point_out(seen):
+    _, lies_on, model = seen
+    for surface in model.surfaces:
+        if owner(model, surface, lies_on)[0] == BALL:
+            xy = surface.grid.samples(A)
+            out = surface.lifted(xy) - CENTRE
+            radius = np.linalg.norm(out, axis=1)
+            assert math.sqrt(np.mean((radius - BALL_RADIUS) ** 2)) < 0.007
+            assert np.median((surface.normals(xy) * out).sum(axis=1) / radius) > 0.99
+
+
+def test_every_chart_of_a_closed_cylinder_has_one_height_everywhere():
+    angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 400), np.arange(0, 1.5, A / 2))
+    tube = np.stack([0.35 * np.cos(angle), 0.35 * np.sin(angle), z], -1).reshape(-1, 3)
+    config = ModelsConfig(voxel_size_m=A)
+    inside = np.array([0.0, 0.0, 0.75])  # sees all of it, its normals point inwards
+    clusters = clusters_of(thin(tube, A)[0], config, inside)
+    charts = surfaces_of(clusters, config, inside)
+    assert len(charts) >= 2
+    assert all(folded(clusters, chart, config) is None for chart in charts)
+    model = fit(tube, config, inside)
+    assert sum(surface.num_points for surface in model.surfaces) > 0.8 * model.num_thinned
+    for surface in model.surfaces:
+        place = surface.samples(A)
+        radius = np.linalg.norm(place[:, :2], axis=1)
+        assert math.sqrt(np.mean((radius - 0.35) ** 2)) < 0.007
+
+
+def test_an_exact_plane_comes_back_to_half_a_voxel():
+    cloud = sheet(1.5, 1.0, A / 4, (1.0, 2.0, 3.0), (5.0, -2.0, 1.0))
+    model = fit(cloud, ModelsConfig(voxel_size_m=A), (5.0, 5.0, 20.0))
+    (plane,) = model.planes
+    assert plane.normal == pytest.approx(np.array([1, 2, 3]) / math.sqrt(14), abs=1e-9)
+    assert plane.normal @ cloud.T + plane.offset_m == pytest.approx(0.0, abs=1e-9)
+    found = evaluate(model, cloud)
+    assert found.precision_rms_m < A / 2
+    assert found.completeness_rms_m < A
+    assert found.coverage == 1.0
+
+
+def test_the_models_are_twice_as_precise_as_gaussians_alone(seen):
+    points, _, model = seen
+    alone = fit(points, ModelsConfig(voxel_size_m=A, kinds='gaussians'), VIEW)
+    assert not alone.patches
+    assert len(alone.gaussians) > len(model.gaussians)
+    ours, theirs = evaluate(model, points), evaluate(alone, points)
+    assert theirs.precision_rms_m / ours.precision_rms_m >= 2.0
+    assert ours.completeness_rms_m < theirs.completeness_rms_m
+    assert ours.compression > 100.0
+
+
+@pytest.mark.parametrize('voxel_size_m', [0.01, 0.02])
+def test_on_real_frames_precision_is_half_that_of_gaussians(data_folder, voxel_size_m):
+    found = []
+    for name in ('test0', 'test11'):
+        points, _ = read_scan(data_folder / 'data' / 'osd' / f'{name}.pcd')
+        for kinds in ('all', 'gaussians'):
+            model = fit(points, ModelsConfig(voxel_size_m=voxel_size_m, kinds=kinds))
+            row = evaluate(model, points)
+            found.append((row.precision_rms_m, row.completeness_rms_m))
+    ours, theirs = np.mean(found[::2], axis=0), np.mean(found[1::2], axis=0)
+    assert ours[0] < (0.5 if voxel_size_m == 0.01 else 0.6) * theirs[0]
+    assert ours[1] < 0.85 * theirs[1]
+    assert max(ours) < 0.03
+
+
+def test_an_organised_cloud_has_labels_for_all_its_points():
+    cloud = np.full((40, 50, 3), np.nan, np.float32)
+    cloud[5:, :, :] = sheet(1.0, 0.7, 0.02)[: 35 * 50].reshape(35, 50, 3)
+    model = fit(cloud, ModelsConfig(voxel_size_m=A))
+    assert model.labels.shape == (2000,)
+    assert (model.labels[:250] == -1).all()
+    assert (model.labels[250:] >= 0).all()
+
+
+def test_samples_of_gaussians_end_at_three_sigma_and_have_their_moments():
+    rng = np.random.default_rng(8)
+    blob = rng.standard_normal((30_000, 3)) * [0.3, 0.2, 0.1]
+    model = fit(blob, ModelsConfig(voxel_size_m=0.02, kinds='gaussians', min_points=100_000))
+    (mean,), (covariance,) = model.gaussians.mean, model.gaussians.covariance
+    drawn = model.resample()
+    assert len(drawn) == model.num_thinned
+    away = drawn - mean
+    distance_sq = np.einsum('ij,jk,ik->i', away, np.linalg.inv(covariance), away)
+    assert distance_sq.max() <= 9.0 + 1e-9
+    assert drawn.mean(axis=0) == pytest.approx(mean, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ('points', 'viewpoint'),
+    [
+        (np.zeros((3, 2)), (0, 0, 0)),
+        (np.zeros(3), (0, 0, 0)),
+        (np.zeros((4, 3), int), (0, 0, 0)),
+        (np.zeros((4, 3)), (0, 0)),
+        (np.zeros((4, 3)), (0, 0, math.nan)),
+    ],
+)
+def test_what_is_no_cloud_is_refused(points, viewpoint):
+    with pytest.raises(ModelError, match='expected'):
+        fit(points, None, viewpoint)
+
+
+@pytest.mark.parametrize(
+    'settings', [{'profile': 'quick'}, {'voxel_size_m': 0.0}, {'min_density_radius': 3.0}]
+)
+def test_settings_out_of_bounds_are_refused(settings):
+    with pytest.raises(ConfigError, match=next(iter(settings))):
+        ModelsConfig(**settings)

@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""What patches cover: cells, rims and cuts, against slow loops and true areas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.kernels.patches import fill_cells
+from surfel_mapper.models import fit
+from test.models.scenes import A, room, sheet, VIEW
+
+PITCH = 4 * A
+
+
+def shape(inside, size=2.0):
+    """Return the points of a fine sheet that are inside a shape."""
+    points = sheet(size, size, A / 2)
+    return points[inside(points[:, 0], points[:, 1])]
+
+
+SHAPES = {
+    'square': (lambda x, y: np.maximum(abs(x), abs(y)) < 0.9, 3.24, 7.2),
+    'L': (lambda x, y: (np.maximum(abs(x), abs(y)) < 0.9) & ((x < 0.0) | (y < 0.0)), 2.43, 7.2),
+    'annulus': (lambda x, y: (x * x + y * y < 0.81) & (x * x + y * y > 0.16), 2.042, 8.17),
+    'triangle': (lambda x, y: (x > -0.9) & (y > -0.9) & (x + y < 0.0), 1.62, 6.15),
+}
+
+
+@pytest.mark.parametrize('name', SHAPES)
+def test_the_area_is_that_of_the_shape_but_for_a_cell_and_a_half_along_its_rim(name):
+    inside, area, perimeter = SHAPES[name]
+    (plane,) = fit(shape(inside), ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
+    assert plane.grid.area_m2() == pytest.approx(area, abs=0.75 * perimeter * PITCH)
+
+
+@pytest.mark.parametrize('profile', ['robust', 'paper'])
+def test_no_point_is_outside_the_patch_that_it_made(profile):
+    points, _ = room(160, 120)
+    config = ModelsConfig(voxel_size_m=A, profile=profile)
+    model = fit(points, config, VIEW)
+    # a cloud of voxel means goes through unchanged, so its labels are those of the means
+    means = fitted_points(points)
+    again = fit(means, config, VIEW)
+    assert model.patches
+    for patch in again.patches:
+        own = means[again.labels == patch.id]
+        assert patch.grid.contains(patch.to_local(own)[:, :2]).all()
+
+
+def fitted_points(points):
+    """Return points, one a voxel, in the middle of it: thinning leaves them as they are."""
+    return np.unique(np.floor(points.astype(np.float64) / A), axis=0) * A + A / 2
+
+
+def test_cells_and_rims_are_those_of_a_slow_loop():
+    cloud = fitted_points(shape(SHAPES['annulus'][0]))
+    (plane,) = fit(cloud, ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
+    grid, xy = plane.grid, plane.to_local(cloud)[:, :2]
+    filled = np.zeros_like(grid.filled)
+    for x, y in xy:
+        filled[int((x - grid.origin[0]) / PITCH), int((y - grid.origin[1]) / PITCH)] = True
+    assert (grid.filled == filled).all()
+    for (i, j), is_rim in np.ndenumerate(grid.rim):
+        around = [(i - 1, j), (i + 1, j), (i, j - 1), (i, j + 1)]
+        alone = any(
+            not (0 <= x < filled.shape[0] and 0 <= y < filled.shape[1] and filled[x, y])
+            for x, y in around
+        )
+        assert is_rim == (filled[i, j] and alone)
+
+
+def test_a_corner_that_cells_surround_is_not_cut():
+    """Three by three cells, the middle one filled at its high x only, beside an empty one."""
+    around = [(x, y) for x in range(3) for y in range(3) if (x, y) not in ((1, 1), (2, 1))]
+    middles = [(x + 0.5, y + 0.5) for x, y in around]
+    local = np.array([(x, y, 0.0) for x, y in [*middles, (1.9, 1.4), (2.99, 2.99), (0.0, 0.0)]])
+    rim, corner = np.zeros(9, bool), np.zeros(9, np.uint8)
+    sums, cuts = np.zeros((9, 4)), np.zeros((9, 3), np.uint8)
+    starts, first = np.array([0, len(local)]), np.array([0])
+    origins, sizes = np.zeros((1, 2)), np.full((1, 2), 3)
+    pitches = np.ones(1)
+    fill_cells(local, starts, pitches, origins, sizes, first, sums, rim, corner, cuts, 0.1)
+    middle = 4
+    assert rim[middle]
+    assert corner[middle] == 2  # low x, high y: all around it is filled
+    assert not cuts[middle].any()
+    beside = 7  # empty
+    assert not rim[beside]
+    assert cuts[8].any()  # its corner is that of the grid
