@@ -11,14 +11,15 @@ eigenvalue at 1 km is what float32 moments give after 1e5 cycles, and nothing is
 
 Numbers that bound it: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m),
 2^23 points a voxel in one scan, 2^31 in the map.
+
+(Longer than other files: most of it is the description of what users call. The work is done in
+voxel_table, reducer, surfels, levels, change_log and digest.)
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
-from itertools import takewhile
 import math
 from typing import Any
 
@@ -27,7 +28,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
-from surfel_mapper.kernels.surfels import rows_changed_at
+from surfel_mapper.mapping.change_log import ChangeLog
 from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.digest import digest_of
 from surfel_mapper.mapping.levels import coarse_moments
@@ -40,9 +41,6 @@ from surfel_mapper.mapping.voxel_table import VoxelTable
 
 Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 """Lowest and highest voxel index, (3,) each."""
-
-LOGGED = 1 << 18
-"""At least so many changes are remembered, so that asking for the latest ones is quick."""
 
 
 class SurfelMap:
@@ -67,8 +65,8 @@ class SurfelMap:
     Raises
     ------
     ValueError
-        If the voxel size is not positive and finite, a column is none that can be summed, or
-        there is no thread.
+        If the voxel size is not positive and finite, a column is none that can be summed,
+        there is no thread, or the level is negative or beyond 20.
 
     """
 
@@ -85,6 +83,8 @@ class SurfelMap:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         if threads < 1:
             raise ValueError(f'threads: {threads}, expected 1 or more')
+        if level not in range(layout.INDEX_BITS):
+            raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
         self.voxel_size_m = float(voxel_size_m)
         self.level = level
         self.version = 0
@@ -98,9 +98,7 @@ class SurfelMap:
 
     def _reset(self) -> None:
         self._table = VoxelTable(len(self._channel_names))
-        self._log: deque[tuple[int, npt.NDArray[np.int32]]] = deque()
-        self._logged = 0
-        self._log_start = self.version
+        self._changes = ChangeLog(self.version)
         self._reported = self.version
 
     def __len__(self) -> int:
@@ -215,7 +213,8 @@ class SurfelMap:
         self._check_lattice(moments)
         self._check_counts(moments)
         self.version += 1
-        self._remember(self._table.add(moments, self.version))
+        changed = self._table.add(moments, self.version)
+        self._changes.add(self.version, changed, self.num_voxels)
 
     def remove(self, moments: ScanMoments, min_points: int = 1) -> npt.NDArray[np.int32]:
         """
@@ -254,7 +253,7 @@ class SurfelMap:
             )
         self.version += 1
         fallen = self._table.subtract(moments, self.version, found, min_points)
-        self._remember(found)
+        self._changes.add(self.version, found, self.num_voxels)
         return unpack_keys(fallen)
 
     def merge(self, other: SurfelMap) -> None:
@@ -383,13 +382,10 @@ class SurfelMap:
         """
         if since is None:
             since, self._reported = self._reported, self.version
-        if since < self._log_start:
-            return self._derive(self._table.changed_after(since, min_points))
-        parts = [
-            rows_changed_at(self._table.rows, changed, version, max(min_points, 1))
-            for version, changed in takewhile(lambda entry: entry[0] > since, reversed(self._log))
-        ]
-        return self._derive(np.concatenate(parts) if parts else np.empty(0, np.int32))
+        changed = self._changes.since(since, self._table.rows, min_points)
+        if changed is None:
+            changed = self._table.changed_after(since, min_points)
+        return self._derive(changed)
 
     def moments(self, voxel_index: npt.NDArray[Any] | None = None) -> ScanMoments:
         """
@@ -456,16 +452,6 @@ class SurfelMap:
             return surfels
         sums = self._table.channels(chosen)
         return replace(surfels, channels=means(sums, surfels.num_points, self._channel_names))
-
-    def _remember(self, changed: npt.NDArray[np.int32]) -> None:
-        """Log the rows that the present version changed; forget the oldest beyond a bound."""
-        if not len(changed):
-            return
-        self._log.append((self.version, changed))
-        self._logged += len(changed)
-        while self._logged > max(LOGGED, self.num_voxels):
-            self._log_start, forgotten = self._log.popleft()
-            self._logged -= len(forgotten)
 
     def _check_lattice(self, moments: ScanMoments) -> None:
         if (moments.voxel_size_m, moments.level) != (self.voxel_size_m, self.level):

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import NotInMapError
-from surfel_mapper.mapping import surfel_map as module
+from surfel_mapper.mapping import change_log as module
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.reference import add_moments, as_twin, digest, scan_moments
 
@@ -51,14 +51,14 @@ class MapBesideTwin(RuleBasedStateMachine):
         logged=st.sampled_from([0, 3, 10, 2**18]),
     )
     def make(self, size_m, offset_m, logged):
-        self.saved, module.LOGGED = module.LOGGED, logged
+        self.saved, module.LEAST = module.LEAST, logged
         self.map, self.twin = SurfelMap(size_m), {}
         self.size_m, self.offset_m = size_m, offset_m
         self.live, self.gone, self.touched, self.reported = [], [], {}, 0
 
     def teardown(self):
         if hasattr(self, 'saved'):
-            module.LOGGED = self.saved
+            module.LEAST = self.saved
             self.check_against_the_live_scans_alone()
 
     def place(self, fractions, dtype=np.float64):
