@@ -22,6 +22,12 @@ LATEST = 1000
 """Times of so many scans are kept for the percentiles."""
 
 
+MOST_FRAMES = 128
+"""Drops of so many frames and topics are told apart; those of all further ones are OTHERS."""
+
+OTHERS = '(others)'
+
+
 @dataclass(slots=True)
 class FilterCounts:
     """What one filter of the chain did so far: points in and out, its latest times."""
@@ -91,6 +97,9 @@ class Counters:
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
         self.dropped[cause] += number
+        is_new = frame_id not in self.dropped_by_frame
+        if is_new and len(self.dropped_by_frame) >= MOST_FRAMES:
+            frame_id = OTHERS
         self.dropped_by_frame.setdefault(frame_id, Counter())[cause] += number
 
     def add_time(self, stage: str, milliseconds: float) -> None:

@@ -35,6 +35,7 @@ REMEDIES = {
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
     'stamp_back': 'do two sensors share one frame?',
     'stamp_repeated': 'does somebody publish the same clouds twice?',
+    'too_many_frames': 'give every sensor one frame for good',
 }
 """What to do about scans that are dropped, by cause."""
 

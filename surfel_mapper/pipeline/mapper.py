@@ -39,7 +39,7 @@ from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.inserter import Inserter
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
-from surfel_mapper.pipeline.scan_queue import ScanQueue
+from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
@@ -120,6 +120,10 @@ class Mapper:
         ``input.reset_after_s`` clears the map first. The topic it came on is for the log.
         """
         self.counters.received += 1
+        if not self._queue.has_room_for(scan.frame_id):
+            reason = f'scans of {MAX_FRAMES} other frames came before'
+            self._drops.scan(scan, 'too_many_frames', reason)
+            return
         if topic:
             self._drops.topics[scan.frame_id] = topic
         if not scan.frame_id:

@@ -14,6 +14,9 @@ from collections import deque
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.scan import Scan
 
+MAX_FRAMES = 64
+"""Sensors of one robot; more are frame names that change, and would be remembered forever."""
+
 
 class ScanQueue:
     """
@@ -68,6 +71,10 @@ class ScanQueue:
         """Return by how much the stamp of a scan is before the newest, s; 0 where it is not."""
         newest_ns = self.newest_ns
         return 0.0 if newest_ns is None else max(newest_ns - scan.stamp_ns, 0) / 1e9
+
+    def has_room_for(self, frame_id: str) -> bool:
+        """Return whether scans of a frame are taken: at most MAX_FRAMES have an order kept."""
+        return frame_id in self._newest_ns or len(self._newest_ns) < MAX_FRAMES
 
     def push(self, scan: Scan) -> None:
         """Add a scan, unless its stamp is not newer than the last of its frame."""

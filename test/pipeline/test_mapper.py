@@ -18,11 +18,13 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import Config
+from surfel_mapper.counters import MOST_FRAMES, OTHERS
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, interpolate, pose_matrix
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.pipeline.scan_queue import MAX_FRAMES
 from surfel_mapper.scan import Scan
 from test import reference
 
@@ -627,6 +629,20 @@ def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
     (update,) = insert(mapper, scan_at(3.0))  # evicts the first, without what was cleared
     removed = update.removed_voxel_index.tolist()
     assert not set(map(tuple, gone.tolist())) & set(map(tuple, removed))
+    assert_counts_add_up(mapper)
+
+
+def test_frame_names_without_end_are_refused_and_do_not_pile_up():
+    mapper = mapper_with(pose__source='identity')
+    for number in range(MAX_FRAMES + MOST_FRAMES + 50):
+        insert(mapper, scan_at(1.0 + number, frame_id=f'lidar_{number}'))
+    assert mapper.counters.mapped == MAX_FRAMES
+    assert dropped(mapper) == {'too_many_frames': MOST_FRAMES + 50}
+    by_frame = mapper.counters.dropped_by_frame
+    assert len(by_frame) == MOST_FRAMES + 1
+    assert by_frame[OTHERS]['too_many_frames'] == 50
+    insert(mapper, scan_at(1e4, frame_id='lidar_0'))  # those known go on
+    assert mapper.counters.mapped == MAX_FRAMES + 1
     assert_counts_add_up(mapper)
 
 
