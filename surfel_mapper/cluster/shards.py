@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 import math
+from pathlib import Path
 import resource
 import time
 from typing import Any
@@ -285,5 +286,10 @@ def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has had."""
+    """Return the most memory that this process has had since its program began."""
+    status = Path('/proc/self/status')
+    for line in status.read_text().splitlines() if status.exists() else []:
+        if line.startswith('VmHWM:'):
+            return int(line.split()[1]) * 1024
+    # elsewhere; on Linux this counts what the parent had, too
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
