@@ -17,32 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import GridConfig
+from surfel_mapper.mapping.cost_grid import CostGrid, OBSTACLE, UNKNOWN
 from surfel_mapper.mapping.surfels import Surfels
-
-UNKNOWN = -1
-
-OBSTACLE = 100
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TraversabilityGrid:
-    """
-    Costs of the cells around a place.
-
-    Attributes
-    ----------
-    resolution_m : float
-        Edge of a cell.
-    origin : (2,) float64, m
-        x and y of the outer corner of the first cell.
-    cost : (rows along y, columns along x) int8
-        0 flat, 100 obstacle, -1 never seen.
-
-    """
-
-    resolution_m: float
-    origin: npt.NDArray[np.float64]
-    cost: npt.NDArray[np.int8]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +33,7 @@ class Ground:
 
 def traversability(
     surfels: Surfels, voxel_size_m: float, center: npt.ArrayLike, limits: GridConfig
-) -> TraversabilityGrid:
+) -> CostGrid:
     """
     Return the grid of a map.
 
@@ -74,7 +50,7 @@ def traversability(
 
     Returns
     -------
-    TraversabilityGrid
+    CostGrid
         The larger of slope and step, in percent of its limit; 100 from the limit on.
 
     """
@@ -92,7 +68,7 @@ def traversability(
         share = np.maximum(slope_deg / limits.max_slope_deg, step_m / limits.max_step_m)
         cost[ground.cell] = np.minimum(share * OBSTACLE, OBSTACLE).astype(np.int8)
     origin = first.astype(np.float64) * voxel_size_m
-    return TraversabilityGrid(voxel_size_m, origin, cost.reshape(number, number))
+    return CostGrid(voxel_size_m, origin, cost.reshape(number, number))
 
 
 def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float) -> Ground:

@@ -20,9 +20,8 @@ from std_msgs.msg import Header
 from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns, surfel_columns
 
 if TYPE_CHECKING:
+    from surfel_mapper.mapping.cost_grid import CostGrid
     from surfel_mapper.mapping.surfels import Surfels
-    from surfel_mapper.mapping.traversability import TraversabilityGrid
-    from surfel_mapper.tsdf.obstacles import Slice
 
 
 def surfel_cloud(surfels: Surfels, stamp_ns: int, frame_id: str) -> PointCloud2:
@@ -50,9 +49,7 @@ def cloud_message(content: CloudBytes, stamp_ns: int, frame_id: str) -> PointClo
     )
 
 
-def grid_message(
-    grid: TraversabilityGrid | Slice, stamp_ns: int, frame_id: str
-) -> OccupancyGrid:
+def grid_message(grid: CostGrid, stamp_ns: int, frame_id: str) -> OccupancyGrid:
     """Return the message of a grid: 0 free to 100 occupied, -1 unknown."""
     message = OccupancyGrid(header=Header(stamp=time_message(stamp_ns), frame_id=frame_id))
     message.info.map_load_time = message.header.stamp

@@ -17,35 +17,16 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.mapping.cost_grid import CostGrid, OBSTACLE
+from surfel_mapper.mapping.cost_grid import UNKNOWN as UNSEEN
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.queries import OCCUPIED, states, UNKNOWN
 
 MAX_VOXELS = 1 << 27
 """Of a box: its distances take 0.5 GB, and making them four times as much."""
 
-COSTS = np.array([-1, 0, 100], np.int8)
+COSTS = np.array([UNSEEN, 0, OBSTACLE], np.int8)
 """Of unknown, free and occupied voxels in an occupancy grid."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Slice:
-    """
-    A horizontal layer of voxels.
-
-    Attributes
-    ----------
-    resolution_m : float
-        Edge of a cell.
-    origin : (2,) float64, m
-        x and y of the outer corner of the first cell.
-    cost : (rows along y, columns along x) int8
-        0 free, 100 occupied, -1 unknown.
-
-    """
-
-    resolution_m: float
-    origin: npt.NDArray[np.float64]
-    cost: npt.NDArray[np.int8]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,7 +71,7 @@ class DistanceField:
         return self.distance_m[:, :, layer]
 
 
-def slice_at(blocks: BlockMap, height_m: float) -> Slice:
+def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
     """
     Return what is free and what is not at a height, over all blocks there.
 
@@ -105,12 +86,12 @@ def slice_at(blocks: BlockMap, height_m: float) -> Slice:
     index = blocks.index(blocks.rows())
     index = index[index[:, 2] == layer // blocks.config.voxels_per_side]
     if not len(index):
-        return Slice(resolution_m=size_m, origin=np.zeros(2), cost=np.empty((0, 0), np.int8))
+        return CostGrid(resolution_m=size_m, origin=np.zeros(2), cost=np.empty((0, 0), np.int8))
     low, high = extent(blocks, index)
     low[2], high[2] = layer, layer + 1
     found = box_states(blocks, low, high)[:, :, 0]
     origin = np.asarray(low[:2] * size_m, np.float64)
-    return Slice(resolution_m=size_m, origin=origin, cost=COSTS[found.T])
+    return CostGrid(resolution_m=size_m, origin=origin, cost=COSTS[found.T])
 
 
 def distance_field(

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import GridConfig
+from surfel_mapper.mapping.cost_grid import OBSTACLE, UNKNOWN
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.traversability import OBSTACLE, traversability, UNKNOWN
+from surfel_mapper.mapping.traversability import traversability
 
 H = 0.5
 LIMITS = GridConfig(size_m=8.0, max_slope_deg=30.0, max_step_m=0.25, clearance_m=2.0)
