@@ -25,7 +25,9 @@ from types import ModuleType
 import surfel_mapper
 from surfel_mapper.errors import SurfelMapperError
 
-VERBS = ('node', 'replay', 'play', 'info', 'filters', 'simulate', 'merge', 'evaluate')
+VERBS = (
+    'node', 'replay', 'play', 'info', 'filters', 'extract', 'simulate', 'merge', 'evaluate',
+)  # fmt: skip
 
 EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
 

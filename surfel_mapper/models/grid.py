@@ -53,7 +53,7 @@ class Grid:
         on_end = (xy - self.origin) <= np.array(self.filled.shape) * self.pitch_m
         last = np.array(self.filled.shape) - 1
         cell = np.where(on_end, np.minimum(cell, last), cell)
-        inside: npt.NDArray[np.bool_] = ((cell >= 0) & (cell <= last)).all(axis=1)
+        inside: npt.NDArray[np.bool_] = np.all((cell >= 0) & (cell <= last), axis=1)
         x, y = np.clip(cell, 0, last).T
         inside &= self.filled[x, y]
         corner = self.corner[x, y]

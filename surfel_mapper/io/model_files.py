@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Models in files: JSON with everything, Parquet with a row a primitive, OBJ with triangles.
+
+JSON is for people and scripts, Parquet for tables of many clouds, OBJ for CAD and viewers: each
+plane and surface is an object of its own there, and Gaussians are left out.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.io.files import replace_file
+from surfel_mapper.io.parquet import import_pyarrow
+from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.outlines import outline, triangles
+
+FORMAT, VERSION = 'surfel_mapper models', 1
+
+
+def write_json(path: str | Path, model: MultiModel) -> None:
+    """
+    Write models as JSON, lengths in m.
+
+    A patch: id, num_points, mean, R_patch_map (rows x, y, normal), rms_m, normal and offset_m of
+    its plane, and outline, a list of rings. A surface besides: pitch_m, origin, degrees and
+    control of its spline. A Gaussian: id, num_points, mean, covariance.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    content = {
+        'format': FORMAT,
+        'version': VERSION,
+        'voxel_size_m': model.voxel_size_m,
+        'planes': [patch_content(plane) for plane in model.planes],
+        'surfaces': [surface_content(surface) for surface in model.surfaces],
+        'gaussians': gaussian_content(model.gaussians),
+    }
+    with replace_file(path) as file:
+        file.write(json.dumps(content, allow_nan=False).encode())
+
+
+def patch_content(patch: Plane) -> dict[str, Any]:
+    """Return a patch as plain values."""
+    return {
+        'id': patch.id,
+        'num_points': patch.num_points,
+        'mean': patch.mean.tolist(),
+        'R_patch_map': patch.R_patch_map.tolist(),
+        'covariance': patch.covariance.tolist(),
+        'rms_m': patch.rms_m,
+        'normal': patch.normal.tolist(),
+        'offset_m': patch.offset_m,
+        'outline': [ring.tolist() for ring in outline(patch)],
+    }
+
+
+def surface_content(surface: Surface) -> dict[str, Any]:
+    """Return a surface as plain values."""
+    spline = surface.spline
+    return {
+        **patch_content(surface),
+        'pitch_m': spline.pitch_m,
+        'origin': spline.origin.tolist(),
+        'degrees': list(spline.degrees),
+        'control': spline.control.tolist(),
+        'greville': [axis.tolist() for axis in spline.greville()],
+    }
+
+
+def gaussian_content(gaussians: Gaussians) -> list[dict[str, Any]]:
+    """Return Gaussians as plain values."""
+    return [
+        {
+            'id': int(gaussians.id[k]),
+            'num_points': int(gaussians.num_points[k]),
+            'mean': gaussians.mean[k].tolist(),
+            'covariance': gaussians.covariance[k].tolist(),
+        }
+        for k in range(len(gaussians))
+    ]
+
+
+def columns(model: MultiModel) -> dict[str, npt.NDArray[Any]]:
+    """
+    Return a row a primitive, in the order of their ids.
+
+    id, kind, num_points, mean_x to mean_z, cov_xx to cov_zz, and for planes and surfaces the
+    normal, offset_m, rms_m and area_m2; nan for Gaussians.
+    """
+    patches, gaussians = model.patches, model.gaussians
+    kinds = ['plane'] * len(model.planes) + ['surface'] * len(model.surfaces)
+    means = np.array([patch.mean for patch in patches]).reshape(-1, 3)
+    covariances = np.array([patch.covariance for patch in patches]).reshape(-1, 3, 3)
+    mean = np.concatenate([means, gaussians.mean])
+    covariance = np.concatenate([covariances, gaussians.covariance])
+    flat = [[*p.normal, p.offset_m, p.rms_m, p.grid.area_m2(PARTS_OF_AREA)] for p in patches]
+    extra = np.full((len(mean), 6), np.nan)
+    extra[: len(patches)] = np.array(flat).reshape(-1, 6)
+    names = ('normal_x', 'normal_y', 'normal_z', 'offset_m', 'rms_m', 'area_m2')
+    numbers = [patch.num_points for patch in patches]
+    return {
+        'id': np.arange(len(mean), dtype=np.int64),
+        'kind': np.array(kinds + ['gaussian'] * len(gaussians), dtype=object),
+        'num_points': np.concatenate([np.array(numbers, np.int64), gaussians.num_points]),
+        **{f'mean_{axis}': mean[:, k] for k, axis in enumerate('xyz')},
+        **{
+            f'cov_{"xyz"[i]}{"xyz"[j]}': covariance[:, i, j]
+            for i in range(3)
+            for j in range(i, 3)
+        },
+        **{name: extra[:, k] for k, name in enumerate(names)},
+    }
+
+
+PARTS_OF_AREA = 8
+"""Areas are sums of squares of this part of a cell."""
+
+
+def write_parquet(path: str | Path, model: MultiModel) -> None:
+    """
+    Write a row a primitive as Parquet; see columns.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+    DependencyError
+        If pyarrow is not installed.
+
+    """
+    arrow, parquet = import_pyarrow()
+    with replace_file(path) as file:
+        parquet.write_table(arrow.table(columns(model)), file, compression='zstd')
+
+
+def write_obj(path: str | Path, model: MultiModel) -> None:
+    """
+    Write planes and surfaces as triangles, an OBJ object each, named by kind and id.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    begin = 1  # OBJ counts vertices from 1, through all objects
+    with replace_file(path) as file:
+        file.write(b'# surfel_mapper models, m\n')
+        for patch in model.patches:
+            vertices, faces = triangles(patch)
+            kind = 'surface' if isinstance(patch, Surface) else 'plane'
+            file.write(f'o {kind}_{patch.id}\n'.encode())
+            np.savetxt(file, vertices, 'v %.6f %.6f %.6f')
+            np.savetxt(file, faces + begin, 'f %d %d %d')
+            begin += len(vertices)

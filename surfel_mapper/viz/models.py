@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+models.png: a cloud, and beside it what the models that stand for it make of it.
+
+Both are seen from where the sensor was, without perspective, painted from far to near. Every
+plane and surface has a colour of its own; what is drawn from Gaussians is grey.
+"""
+
+from __future__ import annotations
+
+import colorsys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.io.files import replace_file
+from surfel_mapper.models.multi_model import MultiModel
+
+Array = npt.NDArray[np.float64]
+
+GREY = (0.62, 0.62, 0.62)
+GOLDEN = 0.618033988749895
+"""Hues this far apart never come close to one another again soon."""
+
+MOST_POINTS = 120_000
+"""Of a larger cloud only every so many point is drawn."""
+
+WIDTH_INCH, HEIGHT_INCH, DPI = 13.0, 6.0, 120
+
+
+def draw_models(
+    path: str | Path, points: npt.NDArray[Any], model: MultiModel, viewpoint: Array
+) -> None:
+    """
+    Draw a cloud and its models as a PNG file, written whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    points : (N, 3) float, m
+        The cloud; what is not finite is left out.
+    model : MultiModel
+        Its models.
+    viewpoint : (3,) float64, m
+        Where they are seen from.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    cloud = cloud[:: max(len(cloud) // MOST_POINTS, 1)]
+    parts = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
+    colors = [colorsys.hsv_to_rgb(k * GOLDEN % 1.0, 0.75, 0.9) for k in range(len(parts))]
+    parts.append(model.gaussians.samples())
+    colors.append(GREY)
+    made = np.concatenate(parts)
+    painted = np.repeat(np.array(colors), [len(part) for part in parts], axis=0)
+    R = view_axes(cloud, viewpoint)
+    figure = Figure(figsize=(WIDTH_INCH, HEIGHT_INCH), dpi=DPI, layout='constrained')
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(1, 2, sharex=True, sharey=True)
+    titles = (
+        f'{len(points)} points',
+        f'{len(model.planes)} planes, {len(model.surfaces)} surfaces, '
+        f'{len(model.gaussians)} Gaussians: {model.size_bytes} bytes',
+    )
+    for ax, title, drawn, shade in zip(
+        axes, titles, (cloud, made), (shaded(cloud @ R[2]), painted), strict=True
+    ):
+        order = np.argsort(-(drawn @ R[2]))
+        seen = drawn[order] @ R[:2].T
+        ax.scatter(seen[:, 0], seen[:, 1], s=1.5, c=shade[order], linewidths=0)
+        ax.set_title(title)
+        ax.set_aspect('equal')
+        ax.set_axis_off()
+    with replace_file(path) as file:
+        figure.savefig(file, format='png')
+
+
+def shaded(depth: Array) -> Array:
+    """Return the colours (N, 3) of points by how far they are: near ones are bright."""
+    low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, 1.0)
+    far = np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
+    near_color, far_color = np.array([0.95, 0.75, 0.25]), np.array([0.15, 0.2, 0.45])
+    colors: Array = (1.0 - far) * near_color + far * far_color
+    return colors
+
+
+def view_axes(cloud: Array, viewpoint: Array) -> Array:
+    """
+    Return the axes (3, 3) of a picture as rows: to the right, up, away from the viewer.
+
+    Up is z, as of a map; for a camera that looks along z it is -y.
+    """
+    ahead = cloud.mean(axis=0) - viewpoint if len(cloud) else np.zeros(3)
+    length = float(np.linalg.norm(ahead))
+    ahead = ahead / length if length > 1e-9 else np.array([0.0, 0.6, -0.8])
+    up = np.array([0.0, -1.0, 0.0]) if abs(ahead[2]) > 0.8 else np.array([0.0, 0.0, 1.0])
+    right = np.cross(ahead, up)
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(right, ahead), ahead])

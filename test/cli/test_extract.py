@@ -1,0 +1,74 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper extract``: from clouds and maps to files, and what it refuses."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.io import ply
+from surfel_mapper.io.map_state import save_map
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.models.scenes import room, sheet, VIEW
+
+FILES = ('models.json', 'models.parquet', 'models.obj', 'models.png')
+
+
+def write_cloud(path, points):
+    ply.write_points(path, {name: points[:, k] for k, name in enumerate('xyz')})
+
+
+def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
+    write_cloud(tmp_path / 'room.ply', room(160, 120)[0])
+    place = ['--viewpoint', *map(str, VIEW), '--voxel-size', '0.03']
+    arguments = [str(tmp_path / 'room.ply'), '--output', str(tmp_path / 'out'), *place]
+    assert main(['extract', *arguments, '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['planes'] >= 6
+    assert found['surfaces'] >= 2
+    assert found['coverage'] > 0.95
+    assert all((tmp_path / 'out' / name).stat().st_size > 0 for name in FILES)
+    assert main(['extract', *arguments]) == 0
+    assert 'planes' in capsys.readouterr().out
+
+
+def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
+    surfel_map = SurfelMap(voxel_size_m=0.2)
+    floor = sheet(8.0, 6.0, 0.04, centre=(3.0, 1.0, 0.31), sigma=0.005)
+    wall = sheet(2.4, 6.0, 0.04, (1.0, 0.0, 0.0), (-0.91, 1.0, 1.6))
+    surfel_map.add(np.concatenate([floor, wall]), origin=(3.0, 1.0, 1.5))
+    save_map(tmp_path / 'map.npz', surfel_map)
+    out = str(tmp_path / 'out')
+    assert main(['extract', str(tmp_path / 'map.npz'), '--output', out, '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['planes'] == 2
+    planes = json.loads((tmp_path / 'out' / 'models.json').read_text())['planes']
+    offsets = sorted(abs(plane['offset_m']) for plane in planes)
+    assert offsets == pytest.approx([0.31, 0.91], abs=0.01)
+
+
+def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
+    write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
+    out = str(tmp_path / 'out')
+    assert main(['extract', str(tmp_path / 'none.ply'), '--output', out, '--json']) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found['planes'] == 0
+    assert found['precision_rms_m'] is None
+
+
+@pytest.mark.parametrize('name', ['room.txt', 'missing.ply', 'missing.npz'])
+def test_what_is_no_cloud_is_refused_with_its_name(tmp_path, capsys, name):
+    if name == 'room.txt':
+        (tmp_path / name).write_text('1 2 3\n')
+    assert main(['extract', str(tmp_path / name), '--output', str(tmp_path / 'out')]) == 1
+    assert name in capsys.readouterr().err
+
+
+def test_a_voxel_size_of_nothing_is_refused(tmp_path, capsys):
+    write_cloud(tmp_path / 'a.ply', sheet(1.0, 1.0, 0.1).astype(np.float32))
+    arguments = [str(tmp_path / 'a.ply'), '--output', str(tmp_path / 'out')]
+    assert main(['extract', *arguments, '--voxel-size', '0']) == 1
+    assert 'voxel_size_m' in capsys.readouterr().err
