@@ -100,15 +100,6 @@ def test_shared_memory_holds_a_large_cloud_several_times():
     assert found == [str(64 * 2**20)]
 
 
-def test_the_readme_links_to_files_that_are_there():
-    root = Path(settings.README).parent
-    readme = settings.README.read_text(encoding='utf-8')
-    links = [part.partition(')')[0] for part in readme.split('](')[1:]]
-    assert links
-    missing = [link for link in links if '://' not in link and not (root / link).exists()]
-    assert missing == []
-
-
 def test_the_command_line_prints_the_table_of_the_readme(capsys):
     assert main(['info', '--parameters']) == 0
     assert f'{settings.BEGIN}{capsys.readouterr().out}{settings.END}' in (

@@ -1,0 +1,52 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Many bags into one map, on the processes of this machine or the workers of a Dask scheduler.
+
+    pip install 'surfel_mapper[cluster]'
+    python examples/dask_run.py monday.mcap tuesday.mcap --output city/ --workers 2
+    python examples/dask_run.py /shelf/*.mcap --output /shelf/city/ --scheduler tcp://head:8786
+
+``surfel-mapper replay BAG... --workers 2`` does the same; this is for those who have more to do
+with the result. The digest is that of a single process, however the work was shared out.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from surfel_mapper import load_config
+from surfel_mapper.cluster.engines import engine
+from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.cluster.shards import cut
+from surfel_mapper.offline.recording import Request
+
+
+def main() -> None:
+    """Map bags."""
+    parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
+    parser.add_argument('bags', nargs='+', type=Path)
+    parser.add_argument('--output', required=True, type=Path, metavar='DIR')
+    parser.add_argument('--config', type=Path, metavar='FILE')
+    parser.add_argument('--shard', type=float, default=30.0, metavar='S', help='s of recording')
+    who = parser.add_mutually_exclusive_group()
+    who.add_argument('--workers', type=int, metavar='N', help='processes of this machine')
+    who.add_argument('--scheduler', metavar='ADDRESS', help='of a Dask scheduler')
+    args = parser.parse_args()
+
+    config = load_config(args.config)
+    shards = [
+        shard for bag in args.bags for shard in cut(Request(path=bag), config, args.shard)
+    ]
+    with engine(args.workers, args.scheduler) as running:
+        mapped = map_bags(shards, running, args.output)
+    tiled = mapped.map
+    print(
+        f'{len(shards)} shards, {tiled.points} points, {tiled.surfels} surfels '
+        f'in {tiled.tiles} tiles of {tiled.directory}\ndigest {tiled.digest}'
+    )
+
+
+if __name__ == '__main__':  # worker processes import this file
+    main()

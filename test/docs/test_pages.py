@@ -1,0 +1,83 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Pages are in the menu, links lead to files and headings, the reference covers what is public."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+import yaml
+
+import surfel_mapper
+from surfel_mapper.cli.main import VERBS
+from test.settings import README, ROOT
+
+DOCS = ROOT / 'docs'
+PAGES = sorted(DOCS.rglob('*.md'))
+TEXTS = [README, ROOT / 'CONTRIBUTING.md', *PAGES]
+
+
+def without_code(text):
+    return re.sub(r'```.*?```|`[^`\n]*`', '', text, flags=re.DOTALL)
+
+
+def anchors(path):
+    """Return the anchors of the headings of a page, as GitHub and mkdocs make them."""
+    text = re.sub(r'```.*?```', '', path.read_text(encoding='utf-8'), flags=re.DOTALL)
+    headings = re.findall(r'^#+ +(.+)$', text, flags=re.MULTILINE)
+    return {re.sub(r'[^\w\- ]', '', it).strip().lower().replace(' ', '-') for it in headings}
+
+
+def menu(entries):
+    """Yield the pages of the menu of mkdocs.yml."""
+    for entry in entries:
+        for value in [entry] if isinstance(entry, str) else entry.values():
+            yield from menu(value) if isinstance(value, list) else [value]
+
+
+def test_every_page_is_in_the_menu_once():
+    config = yaml.safe_load((ROOT / 'mkdocs.yml').read_text(encoding='utf-8'))
+    listed = sorted(menu(config['nav']))
+    assert listed == sorted(page.relative_to(DOCS).as_posix() for page in PAGES)
+
+
+@pytest.mark.parametrize('path', TEXTS, ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_link_leads_to_a_file_and_heading_that_are_there(path):
+    broken = []
+    for link in re.findall(r'\]\(([^)\s]+)\)', without_code(path.read_text(encoding='utf-8'))):
+        if '://' in link:
+            continue
+        name, _, anchor = link.partition('#')
+        target = (path.parent / name) if name else path
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            broken.append(link)
+        elif path in PAGES and not target.resolve().is_relative_to(DOCS):
+            broken.append(f'{link}: not part of the site')
+    assert broken == []
+
+
+def test_the_reference_has_every_public_name():
+    pages = ''.join(path.read_text(encoding='utf-8') for path in DOCS.glob('api/*.md'))
+    described = {line.rpartition('.')[2] for line in re.findall(r'^::: (\S+)', pages, re.M)}
+    assert set(surfel_mapper.__all__) - {'__version__'} <= described
+
+
+def test_the_readme_names_every_verb():
+    readme = README.read_text(encoding='utf-8')
+    assert [verb for verb in VERBS if f'`surfel-mapper {verb}' not in readme] == []
+
+
+def test_the_readme_names_every_topic_and_service_of_the_node():
+    readme = README.read_text(encoding='utf-8')
+    sources = ''.join(
+        path.read_text(encoding='utf-8') for path in (ROOT / 'surfel_mapper/ros').glob('*.py')
+    )
+    names = set(re.findall(r"'(~/[a-z_]+)'", sources))
+    assert len(names) > 15
+    assert sorted(name for name in names if f'`{name}`' not in readme) == []
+
+
+def test_pictures_are_small():
+    sizes = {path.name: path.stat().st_size for path in (DOCS / 'images').iterdir()}
+    assert {name: size for name, size in sizes.items() if size > 200_000} == {}

@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every tutorial is followed line by line, and prints what it shows.
+
+``pycon`` blocks are doctests that share one namespace. In ``console`` blocks lines after ``$ ``
+are commands of a shell, and the lines below are what they print: ``...`` stands for any text
+within a line, and alone on a line for any lines.
+"""
+
+from __future__ import annotations
+
+import doctest
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+TUTORIALS = ROOT / 'docs' / 'tutorials'
+OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+
+
+def blocks(name, language):
+    text = (TUTORIALS / name).read_text(encoding='utf-8')
+    return re.findall(rf'^```{language}\n(.*?)^```', text, flags=re.MULTILINE | re.DOTALL)
+
+
+def pages(language):
+    names = [path.name for path in sorted(TUTORIALS.glob('*.md')) if blocks(path.name, language)]
+    assert names
+    return names
+
+
+def pattern(shown):
+    """Return an expression for what a tutorial shows as printed."""
+    parts = [
+        '(?:.*\n)*' if line == '...' else '.*'.join(map(re.escape, line.split('...'))) + '\n'
+        for line in shown
+    ]
+    return ''.join(parts)
+
+
+def steps(block):
+    """Yield every command of a block with the lines shown below it."""
+    for step in re.split(r'^\$ ', block, flags=re.MULTILINE)[1:]:
+        command, *shown = step.rstrip('\n').split('\n')
+        yield command, [line.strip() for line in shown]
+
+
+@pytest.fixture
+def shell(tmp_path):
+    """Return a function that runs a command in a folder, with surfel-mapper and python ours."""
+    tools = tmp_path / 'tools'
+    tools.mkdir()
+    for name, arguments in (('python', ''), ('surfel-mapper', ' -m surfel_mapper.cli.main')):
+        (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}"{arguments} "$@"\n')
+        (tools / name).chmod(0o755)
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    path = f'{tools}:{os.environ["PATH"]}'
+
+    def run(command):
+        done = subprocess.run(
+            ['bash', '-o', 'pipefail', '-c', command],
+            cwd=folder,
+            env={**os.environ, 'PATH': path, 'PYTHONPATH': str(ROOT)},
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, f'{command}\n{done.stderr}'
+        return ''.join(f'{line.strip()}\n' for line in done.stdout.splitlines())
+
+    return run
+
+
+@pytest.mark.parametrize('name', pages('console'))
+def test_every_command_of_a_tutorial_prints_what_is_shown(name, shell):
+    if 'workers' in name or name == 'many_bags.md':
+        pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
+    for block in blocks(name, 'console'):
+        for command, shown in steps(block):
+            printed = shell(command)
+            assert re.fullmatch(pattern(shown), printed), f'{command}\n{printed}'
+
+
+@pytest.mark.parametrize('name', pages('pycon'))
+def test_every_line_of_python_in_a_tutorial_gives_what_is_shown(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    parser, runner = doctest.DocTestParser(), doctest.DocTestRunner(optionflags=OPTIONS)
+    names, said = {}, []
+    for number, block in enumerate(blocks(name, 'pycon')):
+        test = parser.get_doctest(block, names, f'{name} block {number}', None, 0)
+        runner.run(test, out=said.append, clear_globs=False)
+        names = test.globs
+    assert runner.tries > 20
+    assert runner.failures == 0, ''.join(said)
+
+
+def test_three_dots_stand_for_text_in_a_line_and_for_lines():
+    assert re.fullmatch(pattern(['a ... c', '...']), 'a b c\nd\ne\n')
+    assert not re.fullmatch(pattern(['a ... c']), 'a b\nc\n')

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every example runs, as a process of its own, and what it prints is true.
+
+What they print is compared with the command line, with a second way to the same number, or with
+what a reader of the file it writes finds there.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+from pathlib import Path
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import yaml
+
+from surfel_mapper.cli.main import main
+from surfel_mapper.io.map_state import save_map
+from surfel_mapper.io.ply import read_points
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / 'examples'
+
+
+def run(name, *arguments, folder):
+    """Run an example in a folder; return what it printed."""
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *map(str, arguments)],
+        cwd=folder,
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope='module')
+def street(tmp_path_factory):
+    """Return a folder with the bag of a short drive, and its map."""
+    folder = tmp_path_factory.mktemp('street')
+    lidar = ['--scans', '20', '--beams', '16', '--columns', '360']
+    assert main(['simulate', 'street', '--output', str(folder / 'bag'), *lidar]) == 0
+    formats = ['--formats', 'ply,npz', '--output', str(folder / 'mapped')]
+    assert main(['replay', str(folder / 'bag'), *formats]) == 0
+    return folder
+
+
+def digest_of(folder):
+    return json.loads((folder / 'summary.json').read_text(encoding='utf-8'))['digest']
+
+
+def test_every_example_says_in_its_first_lines_how_it_is_run():
+    examples = sorted(EXAMPLES.glob('*.py'))
+    assert len(examples) >= 6
+    for path in examples:
+        doc = ast.get_docstring(ast.parse(path.read_text(encoding='utf-8')))
+        assert f'examples/{path.name}' in doc or 'make demo' in doc
+
+
+def test_ten_lines_give_the_map_of_the_last_ten_scans(tmp_path):
+    printed = run('ten_lines.py', folder=tmp_path)
+    assert re.match(r'\d{4} surfels, \d{3} of them flat and level\n', printed)
+    assert printed.endswith('equal to a map of these alone: True\n')
+
+
+def test_slope_costs_are_a_map_that_nav2_reads(street, tmp_path):
+    run('slope_costs.py', street / 'mapped/map.npz', 'costs', '--max-slope', 20, folder=tmp_path)
+
+    place = yaml.safe_load((tmp_path / 'costs.yaml').read_text(encoding='utf-8'))
+    content = (tmp_path / place['image']).read_bytes()
+    kind, columns, rows, most = content[: content.index(b'255\n') + 3].split()
+    image = np.frombuffer(content[-int(rows) * int(columns) :], np.uint8)
+    assert (kind, most, place['mode']) == (b'P5', b'255', 'raw')
+    assert set(np.unique(image[image > 100])) == {255}
+    assert image.min() < 50  # the street climbs
+    assert (image == 100).any()
+
+
+def test_slope_costs_have_level_ground_free_and_a_wall_blocked_where_they_are(tmp_path):
+    rng = np.random.default_rng(1)
+    ground = rng.uniform([0.0, 0.0, 0.1], [10.0, 6.0, 0.12], (20000, 3))
+    wall = rng.uniform([4.1, 0.0, 0.1], [4.12, 6.0, 2.0], (20000, 3))
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.concatenate([ground, wall]))
+    save_map(tmp_path / 'map.npz', surfel_map)
+
+    run('slope_costs.py', 'map.npz', 'costs', folder=tmp_path)
+
+    place = yaml.safe_load((tmp_path / 'costs.yaml').read_text(encoding='utf-8'))
+    content = (tmp_path / 'costs.pgm').read_bytes()
+    columns = int(content.split()[1])
+    image = np.frombuffer(content[-columns * columns :], np.uint8).reshape(columns, columns)
+
+    def cost(x, y):
+        column, row = ((np.array([x, y]) - place['origin'][:2]) / place['resolution']).astype(int)
+        return image[columns - 1 - row, column]
+
+    assert cost(1.25, 3.25) < 10
+    assert cost(8.25, 3.25) < 10
+    assert cost(4.25, 3.25) == 100
+    assert cost(1.25, 7.25) == 255
+
+
+def test_equal_maps_compare_as_equal(street, tmp_path):
+    map_file = street / 'mapped/map.npz'
+    printed = run('compare_maps.py', map_file, map_file, folder=tmp_path)
+    assert printed == f'equal to the bit: {digest_of(street / "mapped")}\n'
+
+
+def test_what_came_and_went_between_two_maps_is_counted_and_written(tmp_path):
+    rng = np.random.default_rng(2)
+    before, after = SurfelMap(0.5), SurfelMap(0.5)
+    stays, goes, comes = (rng.uniform(low, low + 0.5, (50, 3)) for low in (0.0, 2.0, 4.0))
+    for surfel_map, points in ((before, goes), (after, comes)):
+        surfel_map.add(stays)
+        surfel_map.add(points)
+    save_map(tmp_path / 'before.npz', before)
+    save_map(tmp_path / 'after.npz', after)
+
+    printed = run(
+        'compare_maps.py', 'before.npz', 'after.npz', '--output', 'new.ply', folder=tmp_path
+    )
+
+    assert '2 surfels before, 2 after, 1 in the same voxels\n1 came, 1 went, 0 turned' in printed
+    written = read_points(tmp_path / 'new.ply')
+    assert [written['x'][0], len(written['x'])] == [pytest.approx(comes[:, 0].mean()), 1]
+
+
+def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
+    pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
+    arguments = ['--output', 'city', '--workers', 2, '--shard', 1]
+    printed = run('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
+    assert printed.startswith('3 shards')
+    assert f'digest {digest_of(street / "mapped")}' in printed
