@@ -27,6 +27,7 @@ from surfel_mapper.kernels.voxels import (
     first_missing,
     subtract_moments,
 )
+from surfel_mapper.mapping.hash_table import HashTable
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.mapping.thinning import smallest
@@ -50,13 +51,8 @@ class VoxelTable:
         """Make an empty table."""
         self._rows = Slab(1024, layout.ROW)
         self._channels = Slab(1024, num_channels) if num_channels else None
-        self._buckets = Slab(1, hashing.SEGMENT)
-        self._directory = np.zeros(1, np.int32)
-        self._held = np.zeros(1, np.int32)
-        self._local_depth = np.zeros(1, np.int8)
-        self._state = np.zeros(hashing.STATE, np.int64)
-        self._state[hashing.FREE_ROW] = -1
-        self._state[hashing.SEGMENTS] = 1
+        self._hash = HashTable(MAX_DEPTH)
+        self._state = self._hash.state
 
     @property
     def rows(self) -> npt.NDArray[np.int64]:
@@ -66,7 +62,7 @@ class VoxelTable:
     @property
     def num_voxels(self) -> int:
         """Voxels that hold at least one point."""
-        return int(self._state[hashing.VOXELS])
+        return self._hash.num_keys
 
     @property
     def num_points(self) -> int:
@@ -77,9 +73,7 @@ class VoxelTable:
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
         width = layout.ROW + (self._channels.array.shape[1] if self._channels else 0)
-        rows = int(self._state[hashing.ROWS_USED]) * width * 8
-        buckets = int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
-        return rows + buckets + self._directory.nbytes + self._held.nbytes
+        return self._hash.rows_used * width * 8 + self._hash.nbytes
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
@@ -99,7 +93,7 @@ class VoxelTable:
                 moments.arrays,
                 moments.view_is_sum,
                 self.rows,
-                self._hash_table,
+                self._hash.arrays,
                 self._state,
                 version,
                 done,
@@ -116,7 +110,7 @@ class VoxelTable:
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 where there is none."""
         found = np.empty(len(key), np.int32)
-        find_rows(key, self.rows, self._hash_table, self._state, found)
+        find_rows(key, self.rows, self._hash.arrays, self._state, found)
         return found
 
     def first_missing(self, moments: ScanMoments, found: npt.NDArray[np.int32]) -> int:
@@ -136,7 +130,7 @@ class VoxelTable:
             moments.arrays,
             moments.view_is_sum,
             self.rows,
-            self._hash_table,
+            self._hash.arrays,
             self._state,
             version,
             found,
@@ -155,28 +149,22 @@ class VoxelTable:
 
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
         """Return the rows changed after a version that hold at least so many points."""
-        used = int(self._state[hashing.ROWS_USED])
+        used = self._hash.rows_used
         return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
 
     def keys_in_box(
         self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.int64]:
         """Return the keys of the voxels with indices from low to high, (3,) each."""
-        used = int(self._state[hashing.ROWS_USED])
+        used = self._hash.rows_used
         return np.asarray(keys_in_box(self.rows, used, low, high), np.int64)
 
     def thinned(self, min_points: int, at_most: int) -> npt.NDArray[np.int32]:
         """Return the rows with at least so many points, or of more than at_most some; sorted."""
-        used = int(self._state[hashing.ROWS_USED])
+        used = self._hash.rows_used
         chosen, mixed = np.empty(used, np.int32), np.empty(used, np.uint64)
         num = rows_held(self.rows, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
-
-    @property
-    def _hash_table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The hash table as the kernels take it."""
-        buckets = self._buckets.array.reshape(-1)
-        return self._directory, buckets, self._held, self._local_depth
 
     def _make_room_or_undo(self, added: ScanMoments, version: int) -> None:
         """Make room for one more voxel; if that fails, take out again what was added."""
@@ -190,16 +178,7 @@ class VoxelTable:
 
     def _make_room(self) -> None:
         """Enlarge what kept add_moments from placing a new voxel."""
-        num_segments = len(self._held)
-        used = int(self._state[hashing.ROWS_USED])
-        if self._state[hashing.FREE_ROW] < 0 and used == len(self.rows):
-            self._rows.grow(2 * used)
-        elif self._state[hashing.SEGMENTS] == num_segments:
-            self._buckets.grow(2 * num_segments)
-            self._held = np.append(self._held, np.zeros_like(self._held))
-            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
-        elif self._state[hashing.DEPTH] < MAX_DEPTH:
-            self._directory = np.repeat(self._directory, 2)
-            self._state[hashing.DEPTH] += 1
+        if self._hash.lacks_row(len(self.rows)):
+            self._rows.grow(2 * len(self.rows))
         else:
-            raise MapLimitError(f'{self.num_voxels} voxels: the hash table is full')
+            self._hash.grow()

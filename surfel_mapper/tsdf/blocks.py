@@ -32,7 +32,6 @@ import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels import hashing
 from surfel_mapper.kernels.blocks import (
     find_blocks,
     FREE,
@@ -44,6 +43,7 @@ from surfel_mapper.kernels.blocks import (
     VERSION,
 )
 from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
+from surfel_mapper.mapping.hash_table import HashTable
 from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks, some
 
@@ -93,13 +93,8 @@ class BlockMap:
         }
         self._slabs = {name: Slab(FIRST_ROWS, width) for name, width in widths.items() if width}
         self._row_bytes = 8 * sum(widths.values())
-        self._buckets = Slab(1, hashing.SEGMENT)
-        self._directory = np.zeros(1, np.int32)
-        self._held = np.zeros(1, np.int32)
-        self._local_depth = np.zeros(1, np.int8)
-        self._state = np.zeros(hashing.STATE, np.int64)
-        self._state[hashing.FREE_ROW] = -1
-        self._state[hashing.SEGMENTS] = 1
+        self._hash = HashTable(MAX_DEPTH)
+        self._state = self._hash.state
 
     @property
     def voxels_per_block(self) -> int:
@@ -109,13 +104,12 @@ class BlockMap:
     @property
     def num_blocks(self) -> int:
         """Blocks in the map."""
-        return int(self._state[hashing.VOXELS])
+        return self._hash.num_keys
 
     @property
     def nbytes(self) -> int:
         """Bytes in use for blocks and their hash table."""
-        rows = int(self._state[hashing.ROWS_USED]) * self._row_bytes
-        return rows + int(self._state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
+        return self._hash.rows_used * self._row_bytes + self._hash.nbytes
 
     @property
     def head(self) -> Int64:
@@ -157,7 +151,7 @@ class BlockMap:
     @property
     def lookup(self) -> tuple[Any, ...]:
         """What kernels find blocks with: head, table, state; only until the map grows."""
-        return self.head, self._table, self._state
+        return self.head, self._hash.arrays, self._state
 
     def rows(self) -> Int64:
         """Return the rows in use, ascending."""
@@ -175,7 +169,7 @@ class BlockMap:
         """Return the rows of blocks given by (..., 3) index, -1 where the map has none."""
         keys = block_keys(np.asarray(index))
         rows = np.empty(keys.size, np.int64)
-        find_blocks(keys.ravel(), self.head, self._table, self._state, rows)
+        find_blocks(keys.ravel(), self.head, self._hash.arrays, self._state, rows)
         return rows.reshape(keys.shape)
 
     def neighbours(self, rows: Int64, offsets: npt.ArrayLike = UPPER) -> Int64:
@@ -217,7 +211,7 @@ class BlockMap:
         rows = np.full(len(keys), -1, np.int64)
         done = 0
         while done < len(keys):
-            done = place_blocks(keys, self.head, self._table, self._state, limit, done, rows)
+            done = place_blocks(keys, self.head, self._hash.arrays, self._state, limit, done, rows)
             if done < len(keys):
                 try:
                     self._make_room()
@@ -236,7 +230,7 @@ class BlockMap:
         """Remove those of some blocks that were placed and never changed; return how many."""
         rows = rows[rows >= 0]
         rows = rows[self.head[rows, VERSION] == NEW]
-        remove_blocks(rows, self.head, self._table, self._state)
+        remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return len(rows)
 
     def clear_updated(self) -> None:
@@ -281,7 +275,7 @@ class BlockMap:
         for name, slab in self._slabs.items():
             if name != 'head':
                 slab.array[rows] = 0
-        remove_blocks(rows, self.head, self._table, self._state)
+        remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return removed
 
     def copied(self, rows: Int64) -> Blocks:
@@ -323,28 +317,14 @@ class BlockMap:
         return flat.reshape(-1, width, self.voxels_per_block)
 
     def _used_head(self) -> Int64:
-        return self.head[: self._state[hashing.ROWS_USED]]
-
-    @property
-    def _table(self) -> tuple[npt.NDArray[Any], ...]:
-        """The hash table as the kernels take it."""
-        buckets = self._buckets.array.reshape(-1)
-        return self._directory, buckets, self._held, self._local_depth
+        return self.head[: self._hash.rows_used]
 
     def _make_room(self) -> None:
         """Enlarge what kept place_blocks from placing a block."""
-        num_segments, num_rows = len(self._held), len(self.head)
-        used = int(self._state[hashing.ROWS_USED])
-        if self._state[hashing.FREE_ROW] < 0 and used == num_rows:
-            for slab in reversed(self._slabs.values()):  # the head, which says how many, last
-                if len(slab.array) < 2 * num_rows:
-                    slab.grow(2 * num_rows)
-        elif self._state[hashing.SEGMENTS] == num_segments:
-            self._buckets.grow(2 * num_segments)
-            self._held = np.append(self._held, np.zeros_like(self._held))
-            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
-        elif self._state[hashing.DEPTH] < MAX_DEPTH:
-            self._directory = np.repeat(self._directory, 2)
-            self._state[hashing.DEPTH] += 1
-        else:
-            raise MapLimitError(f'{self.num_blocks} blocks: the hash table is full')
+        num_rows = len(self.head)
+        if not self._hash.lacks_row(num_rows):
+            self._hash.grow()
+            return
+        for slab in reversed(self._slabs.values()):  # the head, which says how many, last
+            if len(slab.array) < 2 * num_rows:
+                slab.grow(2 * num_rows)
