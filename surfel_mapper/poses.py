@@ -32,6 +32,9 @@ NS_PER_S = 1_000_000_000
 MAX_SKEW = 1e-6
 """R R^T of a transform differs from the identity by no more; float32 gives some 1e-7."""
 
+MAX_EDGES = 10_000
+"""Trees of robots have some hundred; ever new names shall fill no memory."""
+
 MAX_NAMES = 12
 """So many frames are named in a message."""
 
@@ -235,6 +238,8 @@ class TransformBuffer:
             if below and self._edges[below[-1]].parent == child:
                 loop = ' -> '.join([child, *reversed(below), child])
                 raise PoseError(f'{name}: closes the loop {loop}')
+            if len(self._edges) >= MAX_EDGES:
+                raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
             return _Edge(parent, child, is_static)
         if edge.parent != parent:
             raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
+from surfel_mapper.depth import SceneImage
 from surfel_mapper.deskew import point_times
 from surfel_mapper.errors import (
     CloudFormatError,
@@ -124,7 +125,7 @@ class Mapper:
             reason = f'scans of {MAX_FRAMES} other frames came before'
             self._drops.scan(scan, 'too_many_frames', reason)
             return
-        if topic:
+        if topic and len(self._drops.topics) < MAX_FRAMES:
             self._drops.topics[scan.frame_id] = topic
         if not scan.frame_id:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
@@ -182,6 +183,14 @@ class Mapper:
         """Count messages other than clouds that are not used, and warn about it."""
         self._drops.message(cause, reason, number)
 
+    def add_image(self, image: SceneImage) -> None:
+        """Take an image that scans get colours or labels from; see layers.tsdf.color_topic."""
+        self._inserter.images.add(image)
+
+    def end_images(self) -> None:
+        """Wait for no more images."""
+        self._inserter.images.ended = True
+
     def insert_ready(self) -> Iterator[Update]:
         """
         Map the waiting scans whose poses are there, in order; yield what each did.
@@ -189,11 +198,14 @@ class Mapper:
         A scan whose pose cannot come any more, or did not in time, is dropped and counted.
         """
         while (scan := self._queue.first) is not None:
+            waited_s = (self._now_ns() - scan.end_ns) / 1e9
+            may_wait = waited_s <= self.config.pose.max_wait_s
+            if may_wait and self._inserter.images.is_waiting(scan):
+                return
             try:
                 pose = self._poses.of(scan, self._queue.second)
             except PoseNotYetError as error:
-                waited_s = (self._now_ns() - scan.end_ns) / 1e9
-                if waited_s <= self.config.pose.max_wait_s:
+                if may_wait:
                     return
                 self._queue.pop()
                 self._drops.scan(scan, 'no_pose', f'no pose within {waited_s:.3f} s: {error}')

@@ -9,11 +9,15 @@ input takes; the kernels are not, since numba compiles them.
 
 from __future__ import annotations
 
+import importlib
 import logging
+import pkgutil
 import sys
 import tempfile
 
 import atheris
+
+import surfel_mapper.kernels
 
 MOST_MB = 2048
 SLOWEST_S = 60
@@ -22,9 +26,10 @@ SLOWEST_S = 60
 
 def main(name: str, corpus: str, seconds: str) -> None:
     """Search from a corpus on with the harness of a name."""
+    for module in pkgutil.iter_modules(surfel_mapper.kernels.__path__):
+        importlib.import_module(f'surfel_mapper.kernels.{module.name}')
     with atheris.instrument_imports(
         include=['surfel_mapper', 'rosbags.rosbag1', 'rosbags.rosbag2'],
-        exclude=['surfel_mapper.kernels'],
         enable_loader_override=False,
     ):
         from test.fuzz.harnesses import HARNESSES

@@ -1,0 +1,294 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Disks, directories, descriptors, and ends of the process: files are whole, or as before."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from std_srvs.srv import Trigger
+
+from surfel_mapper.cli.replay_files import Mapped, write_files
+from surfel_mapper.config import Config
+from surfel_mapper.io.map_state import load_map
+from surfel_mapper.io.ply import read_points
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.ros.saving import save_map
+from surfel_mapper.scan import Scan
+from surfel_mapper.viz.history import History
+from test.ros.fault_table import fault
+from test.ros.live import NODE, Peer, Process, ROOT
+from test.ros.test_node import ARGUMENTS, drive, send
+
+
+def mapper_of(num_scans, folder):
+    """Return a mapper that has mapped scans and would save into a folder."""
+    mapper = Mapper(
+        Config.from_mapping({'pose.source': 'identity', 'output.directory': str(folder)})
+    )
+    for number in range(num_scans):
+        points = np.random.default_rng(number).uniform(-4.0, 4.0, (2000, 3))
+        mapper.add_scan(Scan(points=points, stamp_ns=(number + 1) * 10**8, frame_id='odom'))
+        list(mapper.insert_ready())
+    return mapper
+
+
+def ends_at(number, how, function):
+    """Call a function in a process that a signal ends at a step of writing; tell if it did."""
+    child = os.fork()
+    if child:
+        return os.WIFSIGNALED(os.waitpid(child, 0)[1])
+    if how != signal.SIGKILL:
+        signal.signal(how, signal.SIG_DFL)
+    steps = itertools.count()
+
+    def come_to_a_step():
+        if next(steps) == number:
+            os.kill(os.getpid(), how)
+
+    def stepping(original):
+        def step(*args):
+            come_to_a_step()
+            original(*args)
+            come_to_a_step()
+
+        return step
+
+    os.fsync, os.replace = stepping(os.fsync), stepping(os.replace)
+    try:
+        function()
+    finally:
+        os._exit(0)
+
+
+def leftovers(folder):
+    return [path for path in folder.iterdir() if path.suffix == '.part']
+
+
+@fault(
+    'SIGKILL or SIGTERM at any step of `~/save_map`',
+    happens='each file is the old one or the new one, whole',
+    counted='nothing',
+    lost='at most the map that was being saved; a `.part` file may stay',
+)
+@pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM])
+def test_a_process_that_ends_while_saving_leaves_whole_maps(tmp_path, how):
+    old, new = mapper_of(2, tmp_path), mapper_of(3, tmp_path)
+    digests = {old.map.digest(), new.map.digest()}
+    sizes = {len(m.map.surfels(5)) for m in (old, new)}
+    number = 0
+    while True:
+        save_map(old)
+        was_ended = ends_at(number, how, lambda: save_map(new))
+        assert load_map(tmp_path / 'map.npz')[0].digest() in digests
+        assert len(read_points(tmp_path / 'map.ply')['x']) in sizes
+        if not was_ended:
+            break
+        number += 1
+    assert number == 8  # flush and rename of two files, before and after each
+    assert load_map(tmp_path / 'map.npz')[0].digest() == new.map.digest()
+    assert len(leftovers(tmp_path)) <= 8
+
+
+@fault(
+    'SIGKILL or SIGTERM at any step of what `replay` writes',
+    happens='each file is whole or not there; `summary.json` comes last',
+    counted='nothing',
+    lost='that replay; a `.part` file may stay',
+)
+def test_a_replay_that_ends_while_writing_leaves_whole_files(tmp_path, monkeypatch):
+    from surfel_mapper.viz import picture
+
+    mapper = mapper_of(2, tmp_path)
+    # a picture takes a second, of which the steps of writing are no part
+    monkeypatch.setattr(picture, 'draw_map', lambda _, path, *rest, **more: path.write_bytes(b''))
+    summary = {'bag': 'a', 'replay_s': 1.0, 'recorded_s': 1.0, **mapper.summary()}
+    monkeypatch.setattr('surfel_mapper.viz.report.write_report', lambda path, *rest: None)
+    output = tmp_path / 'out'
+
+    def write():
+        write_files(output, ['npz', 'ply', 'pcd'], mapper, Mapped(), summary, History())
+
+    number = 0
+    while ends_at(number, (signal.SIGKILL, signal.SIGTERM)[number % 2], write):
+        whole = {path.name for path in output.iterdir() if path.suffix != '.part'}
+        assert 'summary.json' not in whole or {'map.npz', 'map.ply', 'map.pcd'} <= whole
+        if 'map.npz' in whole:
+            assert load_map(output / 'map.npz')[0].digest() == mapper.map.digest()
+        if 'map.ply' in whole:
+            read_points(output / 'map.ply')
+        shutil.rmtree(output)
+        number += 1
+    assert number == 16
+
+
+class Disk:
+    """A small file system of its own."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        folder.mkdir()
+        self.mount('size=256k')
+
+    def mount(self, options):
+        done = subprocess.run(
+            ['mount', '-t', 'tmpfs', '-o', options, 'tmpfs', str(self.folder)],
+            capture_output=True,
+            check=False,
+        )
+        if done.returncode:
+            pytest.skip('mounting is not allowed here')
+
+    def unmount(self):
+        subprocess.run(['umount', '--lazy', str(self.folder)], check=False)
+
+
+@pytest.fixture
+def disk(tmp_path):
+    if shutil.which('mount') is None:
+        pytest.skip('no mount')
+    disk = Disk(tmp_path / 'disk')
+    yield disk
+    disk.unmount()
+
+
+@pytest.fixture(scope='module')
+def running(compiled, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('files')
+    maps = folder / 'maps'
+    node = Process(['node', *ARGUMENTS, '-p', f'output.directory:={maps}'], folder)
+    peer = Peer()
+    peer.advertise('/odom', '/points')
+    send(peer, drive(3))
+    peer.diagnosis({'scans.mapped': 3})
+    yield node, peer, maps
+    peer.close()
+    node.kill()
+
+
+def saves(peer):
+    """Return whether the map is saved, and what is said."""
+    answer = peer.call('save_map')
+    return answer.success, answer.message
+
+
+def goes_on(node, peer):
+    """Check that a node works as before."""
+    assert node.is_running()
+    assert 'Traceback' not in node.output
+    _, values = peer.diagnosis()
+    assert values['scans.mapped'] == values['scans.received'] == '3'
+
+
+def pointed(maps, target):
+    """Have the directory of maps lead elsewhere."""
+    if maps.is_symlink():
+        maps.unlink()
+    elif maps.exists():
+        maps.rename(maps.with_name(f'{maps.name}_{target.name}'))
+    maps.symlink_to(target)
+
+
+@fault(
+    'disk full while saving',
+    happens='refused with the reason; what was saved before stays; works again when there is room',
+    counted='the answer of the service, and the log',
+    lost='nothing: the map is in memory',
+)
+def test_a_full_disk_is_answered_and_the_node_goes_on(running, disk):
+    node, peer, maps = running
+    pointed(maps, disk.folder)
+    filler = disk.folder / 'filler'
+    filler.write_bytes(bytes(250 << 10))
+    success, said = saves(peer)
+    assert not success
+    assert 'No space left on device' in said
+    assert not leftovers(disk.folder)
+    filler.unlink()
+    disk.unmount()
+    disk.mount('size=64m')
+    assert saves(peer)[0]
+    goes_on(node, peer)
+
+
+@fault(
+    'read-only directory',
+    happens='refused with the reason; the node goes on',
+    counted='the answer of the service, and the log',
+    lost='nothing: the map is in memory',
+)
+def test_a_read_only_directory_is_answered_and_the_node_goes_on(running, disk):
+    node, peer, maps = running
+    disk.unmount()
+    disk.mount('ro')
+    pointed(maps, disk.folder)
+    success, said = saves(peer)
+    assert not success
+    assert 'Read-only file system' in said
+    goes_on(node, peer)
+
+
+@fault(
+    'no file descriptors left',
+    happens='saving is refused with the reason, whoever is connected stays so; works again later',
+    counted='the answer of the service, and the log',
+    lost='who comes anew is not connected until there are some',
+)
+def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
+    node, peer, maps = running
+    pointed(maps, tmp_path)
+    pid = node._process.pid
+    client = peer.node.create_client(Trigger, f'{NODE}/save_map')
+    peer.spin_until(client.service_is_ready)
+    peer.spin_for(0.5)
+    before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, before[1]))  # fewer than are open
+    try:
+        answer = peer.result(client.call_async(Trigger.Request()))
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
+    assert not answer.success
+    assert 'Too many open files' in answer.message
+    assert peer.result(client.call_async(Trigger.Request())).success
+    goes_on(node, peer)
+
+
+@fault(
+    'cache directory of compiled kernels unwritable',
+    happens='they are kept in a temporary one and compiled at every start; a warning says so',
+    counted='the log',
+    lost='half a minute at the start',
+)
+def test_without_a_cache_the_kernels_load(disk, tmp_path):
+    disk.unmount()
+    disk.mount('size=32m')
+    package = disk.folder / 'surfel_mapper'
+    shutil.copytree(
+        ROOT / 'surfel_mapper', package, ignore=shutil.ignore_patterns('__pycache__', 'viz')
+    )
+    subprocess.run(['mount', '-o', 'remount,ro', str(disk.folder)], check=True)
+    unwritable = {'HOME': '/proc/nowhere', 'NUMBA_CACHE_DIR': '/proc/nowhere'}
+    code = 'from surfel_mapper.kernels import boxes; print(boxes.__file__)'
+    done = subprocess.run(
+        [sys.executable, '-c', code],
+        cwd=tmp_path,
+        env={**os.environ, **unwritable, 'PYTHONPATH': str(disk.folder), 'TMPDIR': str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() == str(package / 'kernels' / 'boxes.py')
+    assert 'set NUMBA_CACHE_DIR' in done.stderr
+    assert not list(tmp_path.glob('surfel_mapper-kernels-*'))

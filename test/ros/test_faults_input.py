@@ -1,0 +1,363 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+One node that is fed all that goes wrong with sensors, poses and clocks, fault after fault.
+
+Whatever comes, the node goes on, every cloud is accounted for, and in the end its map is to the
+bit what a map made anew is.
+"""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+
+from test.ros.fault_table import fault, PAGE, page_with, table
+from test.ros.live import cloud, NODE, odometry, Peer, Process, room, ROOT, START_NS, TIMEOUT_S
+from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
+
+SECOND_NS = 10**9
+
+
+class Stream:
+    """A node with a peer, stamps that go on from test to test, and what its counts grew by."""
+
+    def __init__(self, node, peer):
+        self.node, self.peer = node, peer
+        self.now_ns = START_NS
+        self._reports = peer.collect(DiagnosticArray, '/diagnostics')
+        peer.spin_until(lambda: self._reports)
+        peer.advertise('/odom', '/points')
+        self.begin()
+
+    def begin(self):
+        """Take the counts as they are for nothing."""
+        self.peer.spin_for(0.3)
+        self._before = self.values()
+
+    def step(self, period_ns=PERIOD_NS):
+        """Return the next stamp."""
+        self.now_ns += period_ns
+        return self.now_ns
+
+    def pose(self, stamp_ns=None, **names):
+        self.peer.publish('/odom', odometry(stamp_ns or self.now_ns, (0.0, 0.0, 0.0), **names))
+
+    def scan(self, stamp_ns=None, num=400, frame_id='lidar'):
+        points = room(seed=num, num=num)
+        self.peer.publish('/points', cloud(stamp_ns or self.now_ns, points, frame_id))
+
+    def pair(self, **options):
+        """Send a pose and a cloud of the next stamp; soon, so that no history overflows."""
+        self.step()
+        self.pose()
+        self.scan(**options)
+        self.peer.spin_for(0.01)
+
+    def values(self):
+        status = self._reports[-1].status[0]
+        found = {item.key: item.value for item in status.values}
+        return {key: int(value) for key, value in found.items() if value.lstrip('-').isdigit()}
+
+    def grown(self):
+        now = self.values()
+        return {key: value - self._before.get(key, 0) for key, value in now.items()}
+
+    def wait(self, **expected):
+        """Wait until counts have grown by so much; nothing may be dropped beyond it."""
+        wanted = {key.replace('__', '.'): value for key, value in expected.items()}
+        self.peer.spin_until(
+            lambda: all(self.grown().get(key, 0) == value for key, value in wanted.items()),
+            what=lambda: f'{wanted} not in {self.grown()}: {self.node.output[-2000:]}',
+        )
+        self.check(wanted)
+
+    def check(self, wanted):
+        grown = self.grown()
+        dropped = {k: v for k, v in grown.items() if k.startswith('scans.dropped.') and v}
+        assert dropped == {k: v for k, v in wanted.items() if k.startswith('scans.dropped.') and v}
+        assert grown['scans.received'] == grown['scans.mapped'] + sum(dropped.values())
+        assert self.node.is_running()
+        assert 'Traceback' not in self.node.output
+
+    def settle(self):
+        """Wait until every cloud that came is accounted for, and none comes any more."""
+        last = [None, time.monotonic()]
+
+        def is_settled():
+            grown = self.grown()
+            if grown != last[0] and grown.get('scans.received') != (last[0] or {}).get(
+                'scans.received'
+            ):
+                last[:] = [grown, time.monotonic()]
+            dropped = sum(v for k, v in grown.items() if k.startswith('scans.dropped.'))
+            is_whole = grown['scans.received'] == grown['scans.mapped'] + dropped
+            return is_whole and time.monotonic() - last[1] > 1.0
+
+        self.peer.spin_until(is_settled, what=lambda: str(self.grown()))
+        assert self.node.is_running()
+        assert 'Traceback' not in self.node.output
+        return self.grown()
+
+
+@pytest.fixture(scope='module')
+def running(compiled, tmp_path_factory):
+    folder = tmp_path_factory.mktemp('faults')
+    node = Process(['node', *ARGUMENTS, '-p', f'output.directory:={folder}'], folder)
+    peer = Peer()
+    yield Stream(node, peer)
+    peer.close()
+    node.kill()
+
+
+@pytest.fixture
+def stream(running):
+    running.begin()
+    return running
+
+
+SENDER = """
+import sys, time
+from test.ros.live import Peer, cloud, odometry, room
+peer = Peer()
+peer.advertise('/odom', '/points')
+for number in range(10_000):
+    stamp_ns = int(sys.argv[1]) + number * 10_000_000
+    peer.publish('/odom', odometry(stamp_ns, (0.0, 0.0, 0.0)))
+    peer.publish('/points', cloud(stamp_ns, room(seed=1, num=400)))
+    peer.spin_for(0.02)
+"""
+
+
+@fault(
+    'publisher killed (SIGKILL) and started again',
+    happens='mapping stops and goes on with the first cloud of the new one',
+    counted='silence in the diagnostics',
+    lost='nothing that was sent',
+)
+def test_a_publisher_that_was_killed_is_heard_again(stream):
+    for _ in range(2):
+        before = stream.grown().get('scans.mapped', 0)
+        command = [sys.executable, '-c', SENDER, str(stream.step(200 * SECOND_NS))]
+        with subprocess.Popen(command, cwd=ROOT) as sender:
+            stream.peer.spin_until(
+                lambda b=before: stream.grown()['scans.mapped'] >= b + 5, TIMEOUT_S
+            )
+            sender.send_signal(signal.SIGKILL)
+    stream.step(200 * SECOND_NS)
+    grown = stream.settle()
+    assert not any(value for key, value in grown.items() if key.startswith('scans.dropped.'))
+
+
+@fault(
+    'every cloud sent three times',
+    happens='the first is mapped',
+    counted='`stamp_repeated`, each of the others',
+    lost='nothing',
+)
+def test_clouds_that_come_again_are_mapped_once(stream):
+    for _ in range(5):
+        stream.pair()
+        stream.scan()
+        stream.scan()
+        stream.peer.spin_for(0.02)
+    stream.wait(scans__mapped=5, scans__dropped__stamp_repeated=10)
+
+
+@fault(
+    'clouds out of order',
+    happens='those older than the newest are dropped, the map stays',
+    counted='`stamp_back`',
+    lost='the clouds that came too late',
+)
+def test_clouds_out_of_order_are_dropped(stream):
+    for _ in range(4):
+        stream.step()
+        stream.pose()
+        stream.pair()
+        stream.scan(stream.now_ns - PERIOD_NS)
+    stream.wait(scans__mapped=4, scans__dropped__stamp_back=4)
+
+
+@fault(
+    'clock set back by an hour, and forth again',
+    happens='set back, the map is cleared and mapping goes on; set forth, it goes on',
+    counted='`resets`, one for each time back',
+    lost='the map before it, on purpose: it is of another time',
+)
+def test_a_clock_set_back_and_forth_is_followed(stream):
+    for hours, resets in ((-1, 1), (1, 1), (-1, 2)):
+        mapped_before = stream.grown()['scans.mapped']
+        stream.now_ns += hours * 3600 * SECOND_NS
+        stream.pair()
+        stream.pair()
+        stream.wait(scans__mapped=mapped_before + 2, resets=resets)
+
+
+@fault(
+    'no transform at all for a cloud',
+    happens='it waits `pose.max_wait_s` of data time, then it is dropped',
+    counted='`no_pose`, by frame',
+    lost='clouds that nobody says the place of',
+)
+def test_a_cloud_without_a_transform_is_dropped(stream):
+    stream.step()
+    stream.scan()
+    stream.peer.spin_for(0.1)
+    stream.step(SECOND_NS)
+    stream.pose(child='something_else')
+    stream.wait(scans__mapped=0, scans__dropped__no_pose=1)
+    stream.pair()
+    stream.wait(scans__mapped=1, scans__dropped__no_pose=1)
+
+
+@fault(
+    'transforms late',
+    happens='clouds wait for them, in order',
+    counted='nothing',
+    lost='nothing',
+)
+def test_clouds_wait_for_transforms_that_are_late(stream):
+    stamps = [stream.step() for _ in range(3)]
+    for stamp_ns in stamps:
+        stream.scan(stamp_ns)
+    stream.peer.spin_for(0.2)
+    assert stream.grown()['scans.mapped'] == 0
+    for stamp_ns in stamps:
+        stream.pose(stamp_ns)
+    stream.wait(scans__mapped=3)
+
+
+@fault(
+    'transforms in a loop, or with two parents, or no numbers',
+    happens='they are left out, with a warning; the tree stays',
+    counted='`messages_ignored`',
+    lost='nothing',
+)
+def test_transforms_that_contradict_are_left_out(stream):
+    stream.pair()
+    broken = odometry(stream.now_ns, (np.nan, 0.0, 0.0))
+    unturned = odometry(stream.now_ns, (0.0, 0.0, 0.0))
+    unturned.pose.pose.orientation.w = 0.0
+    for names in (('base_link', 'odom'), ('elsewhere', 'base_link'), ('odom', 'odom'), ('', '')):
+        stream.pose(parent=names[0], child=names[1])
+    for message in (broken, unturned):
+        stream.peer.publish('/odom', message)
+    stream.pair()
+    stream.wait(scans__mapped=2)
+    grown = stream.grown()
+    assert sum(v for k, v in grown.items() if k.startswith('messages_ignored')) == 6
+
+
+@fault(
+    'bursts at ten times the rate',
+    happens='clouds are mapped as fast as it goes, the oldest that wait give way',
+    counted='`overload`; what the middleware has no room for, `clouds_lost`, as far as it tells',
+    lost='clouds beyond `input.max_waiting_clouds`',
+)
+def test_a_burst_is_mapped_as_far_as_it_goes(stream):
+    for _ in range(100):
+        stream.step(PERIOD_NS // 10)
+        stream.pose()
+        stream.scan(num=20_000)
+    grown = stream.settle()
+    assert grown['scans.mapped'] > 0
+    stream.begin()
+    stream.pair()
+    stream.wait(scans__mapped=1)
+
+
+@fault(
+    'a subscriber that takes nothing',
+    happens='the node does not wait for it',
+    counted='nothing',
+    lost='nothing in the map; that subscriber misses messages',
+)
+def test_a_subscriber_that_is_slow_holds_nobody_up(stream):
+    asleep = Peer()  # nobody spins it
+    try:
+        for topic in ('normals', 'changed'):
+            asleep.subscribe(PointCloud2, f'{NODE}/{topic}', QoSProfile(depth=1))
+        stream.peer.spin_for(0.5)
+        for _ in range(30):
+            stream.pair(num=4000)
+        stream.wait(scans__mapped=30)
+    finally:
+        asleep.close()
+
+
+@fault(
+    'thousands of tiny clouds',
+    happens='each is mapped, or dropped where they come too fast',
+    counted='`overload`',
+    lost='clouds beyond `input.max_waiting_clouds`',
+)
+def test_thousands_of_tiny_clouds_are_accounted_for(stream):
+    for number in range(2000):
+        stream.step(PERIOD_NS // 100)
+        if number % 10 == 0:
+            stream.pose()
+        stream.scan(num=4)
+        if number % 10 == 9:
+            stream.peer.spin_for(0.002)
+    stream.pose()
+    grown = stream.settle()
+    assert grown['scans.mapped'] > 100
+
+
+@fault(
+    'a few huge clouds (12 MB)',
+    happens='they are mapped, those behind them wait',
+    counted='nothing; lost on the way without shared memory: `clouds_lost`',
+    lost='nothing, with a reliable publisher',
+)
+def test_a_few_huge_clouds_are_mapped(stream):
+    for _ in range(3):
+        wanted = stream.grown()['scans.mapped'] + 1
+        stream.pair(num=1_000_000)
+        stream.peer.spin_until(lambda w=wanted: stream.grown()['scans.mapped'] >= w)
+    stream.wait(scans__mapped=3)
+
+
+@fault(
+    'clouds of ever new frames',
+    happens='they are treated as those of any sensor, up to 1000 frames',
+    counted='by frame for the first 100, then as `(others)`; beyond 1000 `too_many_frames`',
+    lost='clouds beyond those',
+)
+def test_frames_without_end_cost_no_memory_without_end(stream):
+    for number in range(150):
+        stream.step(PERIOD_NS // 10)
+        stream.scan(num=4, frame_id=f'frame{number}')
+        stream.peer.spin_for(0.005)
+    stream.step(2 * SECOND_NS)
+    stream.pair()
+    grown = stream.settle()
+    assert grown['scans.dropped.queue_full'] >= 100  # nobody said where they are
+    by_frame = {k.split('.')[2] for k in stream.values() if k.startswith('scans.dropped_by_frame')}
+    assert len(by_frame) <= 101
+
+
+def test_after_all_that_the_map_is_exact(stream):
+    assert stream.peer.call('clear').success
+    messages = drive(5)
+    send(stream.peer, [(c, p) for c, p in messages])  # long ago: the map starts anew
+    _, mapper = mapped(messages)
+    stream.peer.spin_until(lambda: stream.grown()['scans.mapped'] == 5)
+    assert mapper.map.digest() in stream.peer.call('save_map').message
+    assert stream.node.stop(signal.SIGTERM) == 0
+
+
+def test_the_table_of_faults_is_that_of_the_tests():
+    assert PAGE.read_text(encoding='utf-8') == page_with(table()), 'python -m test.ros.fault_table'
