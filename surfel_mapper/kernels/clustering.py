@@ -18,14 +18,16 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
+from surfel_mapper.kernels.mixture import split_mixture
 
 MAX_DEPTH = 66
 MEANS_ITERATIONS = 10
-MIXTURE_ITERATIONS = 10
+MEANS_SAMPLE = 4096
+"""The means of more points are those of every so many of them that about so many are left."""
+
 SETTLED_SHARE = 0.002
 """2-means ends when fewer points than this change sides."""
 
-SETTLED_RESPONSIBILITY = 1e-2
 THREE_SIGMA_SQ = 9.0
 NOISE_SPREAD = 1.5
 """
@@ -169,7 +171,11 @@ def partition(points, order, low, high, side, spare):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def split_means(points, low, high, mean, value, frame, side):
-    """Put each point on the side of the nearer of two means, which begin on the long axis."""
+    """
+    Put each point on the side of the nearer of two means, which begin on the long axis.
+
+    The means of many points follow from every so many of them.
+    """
     reach = math.sqrt(2.0 * value[2] / math.pi)
     ax, ay, az = reach * frame[0, 0], reach * frame[0, 1], reach * frame[0, 2]
     centre = np.empty((2, 3))
@@ -177,18 +183,17 @@ def split_means(points, low, high, mean, value, frame, side):
         sign = 1.0 if k == 1 else -1.0
         centre[k, 0], centre[k, 1], centre[k, 2] = sign * ax, sign * ay, sign * az
     mx, my, mz = mean[0], mean[1], mean[2]
+    stride = 1 + (high - low) // MEANS_SAMPLE
+    number = 1 + (high - 1 - low) // stride
+    plane = np.empty(4)
     for iteration in range(MEANS_ITERATIONS):
-        dx, dy = centre[1, 0] - centre[0, 0], centre[1, 1] - centre[0, 1]
-        dz = centre[1, 2] - centre[0, 2]
-        offset = 0.0
-        for j in range(3):
-            offset += 0.5 * (centre[1, j] ** 2 - centre[0, j] ** 2)
+        between(centre, plane)
         sx = sy = sz = 0.0
         tx = ty = tz = 0.0
         second, changed = 0, 0
-        for i in range(low, high):
+        for i in range(low, high, stride):
             x, y, z = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
-            is_second = x * dx + y * dy + z * dz > offset
+            is_second = x * plane[0] + y * plane[1] + z * plane[2] > plane[3]
             weight = 1.0 if is_second else 0.0
             sx += weight * x
             sy += weight * y
@@ -199,89 +204,24 @@ def split_means(points, low, high, mean, value, frame, side):
             second += is_second
             changed += side[i] != is_second
             side[i] = is_second
-        first = (high - low) - second
-        if first == 0 or second == 0:
-            return
-        if iteration > 0 and changed < SETTLED_SHARE * (high - low):
-            return
+        first = number - second
+        settled = iteration > 0 and changed < SETTLED_SHARE * number
+        if first == 0 or second == 0 or settled:
+            break
         centre[1, 0], centre[1, 1], centre[1, 2] = sx / second, sy / second, sz / second
         centre[0, 0] = (tx - sx) / first
         centre[0, 1] = (ty - sy) / first
         centre[0, 2] = (tz - sz) / first
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def split_mixture(points, low, high, mean, side, share):
-    """Put each point on the side of the likelier of two Gaussians that begin with the sides."""
-    gaussian = np.empty((2, 10))
+    between(centre, plane)
     for i in range(low, high):
-        share[i] = side[i]
-    for _ in range(MIXTURE_ITERATIONS):
-        if not fit_gaussians(points, low, high, mean, share, gaussian):
-            break
-        largest = 0.0
-        for i in range(low, high):
-            x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
-            against = score(gaussian[0], x, y, z) - score(gaussian[1], x, y, z)
-            new = 1.0 / (1.0 + math.exp(min(against, 700.0)))
-            largest = max(largest, abs(new - share[i]))
-            share[i] = new
-        if largest < SETTLED_RESPONSIBILITY:
-            break
-    for i in range(low, high):
-        side[i] = share[i] > 0.5
+        x, y, z = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
+        side[i] = x * plane[0] + y * plane[1] + z * plane[2] > plane[3]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fit_gaussians(points, low, high, mean, share, gaussian):
-    """
-    Fit two Gaussians to points that belong to the second by their share; False where one is empty.
-
-    gaussian  (2, 10) float64, out: mean about the given one, lower Cholesky factor's inverse
-              11 21 22 31 32 33, and the logarithm of weight over root of determinant
-    """
-    for k in range(2):
-        weight = sx = sy = sz = 0.0
-        xx = xy = xz = yy = yz = zz = 0.0
-        for i in range(low, high):
-            w = share[i] if k == 1 else 1.0 - share[i]
-            x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
-            weight += w
-            sx += w * x
-            sy += w * y
-            sz += w * z
-            xx += w * x * x
-            xy += w * x * y
-            xz += w * x * z
-            yy += w * y * y
-            yz += w * y * z
-            zz += w * z * z
-        if weight < 1e-6:
-            return False
-        sx, sy, sz = sx / weight, sy / weight, sz / weight
-        xx, yy, zz = xx / weight - sx * sx, yy / weight - sy * sy, zz / weight - sz * sz
-        xy, xz, yz = xy / weight - sx * sy, xz / weight - sx * sz, yz / weight - sy * sz
-        add = 1e-8 + 1e-4 * max(xx + yy + zz, 0.0) / 3.0
-        l11 = math.sqrt(max(xx, 0.0) + add)
-        l21, l31 = xy / l11, xz / l11
-        l22 = math.sqrt(max(yy + add - l21 * l21, 0.5 * add))
-        l32 = (yz - l31 * l21) / l22
-        l33 = math.sqrt(max(zz + add - l31 * l31 - l32 * l32, 0.5 * add))
-        g = gaussian[k]
-        g[0], g[1], g[2] = sx, sy, sz
-        g[3], g[5], g[8] = 1.0 / l11, 1.0 / l22, 1.0 / l33
-        g[4] = -l21 * g[3] * g[5]
-        g[7] = -l32 * g[5] * g[8]
-        g[6] = -(l31 * g[3] + l32 * g[4]) * g[8]
-        g[9] = math.log(weight / (high - low)) + math.log(g[3] * g[5] * g[8])
-    return True
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def score(g, x, y, z):
-    """Return the logarithm of the weighted density at a point, up to a constant."""
-    x, y, z = x - g[0], y - g[1], z - g[2]
-    u = g[3] * x
-    v = g[4] * x + g[5] * y
-    w = g[6] * x + g[7] * y + g[8] * z
-    return g[9] - 0.5 * (u * u + v * v + w * w)
+def between(centre, plane):
+    """Find the plane half way between two places: direction to the second, and offset."""
+    plane[3] = 0.0
+    for j in range(3):
+        plane[j] = centre[1, j] - centre[0, j]
+        plane[3] += 0.5 * (centre[1, j] ** 2 - centre[0, j] ** 2)

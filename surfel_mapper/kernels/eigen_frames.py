@@ -21,7 +21,7 @@ SWEEPS = 12
 @njit(cache=True, nogil=True, error_model='numpy')
 def range_moments(points, low, high, mean, scatter):
     """
-    Sum the points of rows low to high - 1; at least one.
+    Sum the points of rows low to high - 1, at least one, in one pass about the first of them.
 
     points   (N, 3) float64
     mean     (3,) float64, out
@@ -30,20 +30,22 @@ def range_moments(points, low, high, mean, scatter):
     number = high - low
     x0, y0, z0 = points[low, 0], points[low, 1], points[low, 2]
     sx = sy = sz = 0.0
-    for i in range(low, high):
-        sx += points[i, 0] - x0
-        sy += points[i, 1] - y0
-        sz += points[i, 2] - z0
-    mx, my, mz = x0 + sx / number, y0 + sy / number, z0 + sz / number
     xx = xy = xz = yy = yz = zz = 0.0
     for i in range(low, high):
-        x, y, z = points[i, 0] - mx, points[i, 1] - my, points[i, 2] - mz
+        x, y, z = points[i, 0] - x0, points[i, 1] - y0, points[i, 2] - z0
+        sx += x
+        sy += y
+        sz += z
         xx += x * x
         xy += x * y
         xz += x * z
         yy += y * y
         yz += y * z
         zz += z * z
+    mx, my, mz = sx / number, sy / number, sz / number
+    xx, yy, zz = max(xx - sx * mx, 0.0), max(yy - sy * my, 0.0), max(zz - sz * mz, 0.0)
+    xy, xz, yz = xy - sx * my, xz - sx * mz, yz - sy * mz
+    mx, my, mz = x0 + mx, y0 + my, z0 + mz
     mean[0], mean[1], mean[2] = mx, my, mz
     scatter[0, 0], scatter[1, 1], scatter[2, 2] = xx, yy, zz
     scatter[0, 1] = scatter[1, 0] = xy

@@ -23,6 +23,8 @@ from scipy.linalg import solveh_banded
 from scipy.sparse import csr_array
 from scipy.sparse.linalg import lsqr
 
+from surfel_mapper.kernels.splines import basis_at
+
 Array = npt.NDArray[np.float64]
 
 RIDGE = 1e-6
@@ -75,24 +77,10 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
         Their derivatives.
 
     """
-    num = len(knot) - degree - 1
-    span = np.clip(np.searchsorted(knot, u, side='right') - 1, degree, num - 1)
-    values = np.ones((len(u), 1))
-    lower = values
-    for order in range(1, degree + 1):
-        lower = values
-        at = span[:, None] + np.arange(1 - order, 1)
-        left, right = knot[at], knot[at + order]
-        share = (u[:, None] - left) / (right - left) * values
-        values = np.zeros((len(u), order + 1))
-        values[:, 1:] = share
-        values[:, :-1] += lower - share
-    at = span[:, None] + np.arange(1 - degree, 1)
-    slope = degree * lower / (knot[at + degree] - knot[at])
-    slopes = np.zeros_like(values)
-    slopes[:, 1:] = slope
-    slopes[:, :-1] -= slope
-    return span - degree, values, slopes
+    first = np.empty(len(u), np.int64)
+    values, slopes = np.empty((2, len(u), degree + 1))
+    basis_at(u, knot, degree, first, values, slopes)
+    return first, values, slopes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,7 +126,7 @@ class HeightField:
         for axis in range(2):
             cells, degree = self.control.shape[axis] - 2, self.degrees[axis]
             knot = knots(cells, degree)
-            mean = np.array([knot[i + 1 : i + 1 + degree].mean() for i in range(cells + 2)])
+            mean = sum(knot[k : k + cells + 2] for k in range(1, degree + 1)) / degree
             found.append(self.origin[axis] + self.pitch_m * ((cells + 1) * mean - 0.5))
         return found[0], found[1]
 
@@ -272,8 +260,10 @@ def add_differences(band: Array, field: HeightField, smoothing: float) -> None:
     They are those at the Greville abscissae, which crowd at the ends, so planes cost nothing.
     """
     number = np.arange(field.control.size).reshape(field.control.shape)
-    for axis, step in ((0, field.control.shape[1]), (1, 1)):
-        before, after = np.diff(field.greville()[axis])[:-1], np.diff(field.greville()[axis])[1:]
+    for axis, place in enumerate(field.greville()):
+        step = field.control.shape[1] if axis == 0 else 1
+        apart = np.diff(place)
+        before, after = apart[:-1], apart[1:]
         total = before + after
         second = np.stack([2.0 * after / total, np.full(len(total), -2.0), 2.0 * before / total])
         first = number.swapaxes(0, axis)[:-2]

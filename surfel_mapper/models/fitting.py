@@ -12,7 +12,7 @@ Source: Gao and Dong 2025 (A Real-Time Multi-Model Parametric Representation of 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -23,7 +23,7 @@ import numpy.typing as npt
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
-from surfel_mapper.kernels.finite_points import take_finite
+from surfel_mapper.kernels.finite_points import give_labels, take_finite
 from surfel_mapper.models.clusters import (
     Clusters,
     clusters_of,
@@ -78,9 +78,9 @@ def fit(
     if view.shape != (3,) or not np.isfinite(view).all():
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [perf_counter()]
-    thinned, voxel_of = thin(points.reshape(-1, 3), config.voxel_size_m)
+    thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
     laps.append(perf_counter())
-    clusters = clusters_of(thinned, config, view)
+    clusters = clusters_of(thinned.means, config, view)
     laps.append(perf_counter())
     everything = config.kinds == 'all'
     surfaces = surfaces_of(clusters, config, view) if everything else []
@@ -90,30 +90,56 @@ def fit(
     names = ('thin', 'cluster', 'join', 'fit')
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
     model, labels = assembled(clusters, patches, config)
-    of_point = np.full(len(voxel_of), -1, np.int32)
-    of_point[voxel_of >= 0] = labels[voxel_of[voxel_of >= 0]]
-    return replace(model, labels=of_point, milliseconds=dict(zip(names, times, strict=True)))
+    return replace(model, labels=thinned.spread(labels), milliseconds=dict(zip(names, times, strict=True)))
 
 
-def thin(points: npt.NDArray[Any], voxel_size_m: float) -> tuple[Array, npt.NDArray[np.int32]]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Thinned:
     """
-    Return the means of the points of each voxel, (M, 3) m, in the order of the voxels.
+    A point for every voxel with points.
 
-    Also the row of the mean that each point (N, 3) went into, (N,) int32; -1: it is not finite.
+    Attributes
+    ----------
+    means : (M, 3) float64, m
+        Means of the points, in the order of the voxels.
+    order : (M,) int64
+        Which of the voxels, as they first appear, each is.
+    rows : (n,) int32
+        Rows of the points that are finite.
+    voxels : (n,) int32
+        The voxels of these, as they first appear.
+    num_points : int
+        All points, finite or not.
+
     """
+
+    means: Array
+    order: Indices
+    rows: npt.NDArray[np.int32]
+    voxels: npt.NDArray[np.int32]
+    num_points: int
+
+    def spread(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+        """Return labels for all points from those of the means, -1 where they are not finite."""
+        found = np.full(self.num_points, -1, np.int32)
+        by_voxel = np.empty_like(labels)
+        by_voxel[self.order] = labels
+        give_labels(self.rows, self.voxels, by_voxel, found)
+        return found
+
+
+def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
+    """Return the means of the points (N, 3) in each voxel."""
     taken, rows = np.empty((3, len(points)), points.dtype), np.empty(len(points), np.int32)
     number = take_finite(points, taken, rows)
-    voxel_of = np.full(len(points), -1, np.int32)
     if not number:
-        return np.empty((0, 3)), voxel_of
+        none = np.empty(0, np.int64)
+        return Thinned(np.empty((0, 3)), none, rows[:0], rows[:0], len(points))
     xyz = taken[:, :number].T
     keys, sums, groups = VoxelGrid.over(xyz, np.full(3, voxel_size_m), 'origin').group(xyz, True)
     order = np.argsort(keys)
-    rank = np.empty(len(order), np.int32)
-    rank[order] = np.arange(len(order), dtype=np.int32)
-    voxel_of[rows[:number]] = rank[groups.rows]
     sums = sums[order]
-    return sums[:, :3] / sums[:, 3:], voxel_of
+    return Thinned(sums[:, :3] / sums[:, 3:], order, rows[:number], groups.rows, len(points))
 
 
 def fitted_patches(

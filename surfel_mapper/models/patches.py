@@ -10,6 +10,7 @@ the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -110,7 +111,7 @@ def patches_of(groups: Groups, config: ModelsConfig, viewpoint: Array) -> list[P
             mean=means[k],
             covariance=covariances[k],
             R_patch_map=frames[k],
-            rms_m=float(np.sqrt(np.mean(points[:, 2] ** 2))),
+            rms_m=rms_across(covariances[k], frames[k, 2], len(points)),
             grid=cells.grid(k),
         )
         found.append(surface_of(plane, cells, points, config) if curved[k] else plane)
@@ -168,6 +169,12 @@ def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) 
         grid=grid,
         spline=spline,
     )
+
+
+def rms_across(covariance: Array, normal: Array, number: int) -> float:
+    """Return the root mean square of what points are off their mean along a direction."""
+    variance = max(float(normal @ covariance @ normal), 0.0)
+    return math.sqrt(variance * (number - 1) / number)
 
 
 def fitted(start: HeightField, means: Array, number: Array, config: ModelsConfig) -> HeightField:

@@ -15,6 +15,9 @@ from surfel_mapper.mapping.surfels import Surfels
 
 Array = npt.NDArray[np.float64]
 
+LEAST_WIDTH = 0.04
+"""A surfel of less variance across than along is a line, whose normal says little: one point."""
+
 ABOVE_EXTENTS = 1.0
 """A map is looked at from so many of its diagonals above its middle."""
 
@@ -34,7 +37,8 @@ def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
     surfels = surfels.select(np.flatnonzero(np.isfinite(surfels.planarity)))
     x, y = across(surfels.normal)
     # the directions across the normal in which the disc is wide are not known: it is taken round
-    wide = np.sqrt(3.0 * np.maximum(surfels.eigenvalues[:, 1:].mean(axis=1), 0.0))
+    wide = np.sqrt(3.0 * surfels.eigenvalues[:, 1:].mean(axis=1))
+    wide[surfels.eigenvalues[:, 1] < LEAST_WIDTH * surfels.eigenvalues[:, 2]] = 0.0
     half = np.minimum(wide, voxel_size_m * np.sqrt(0.5))[:, None]
     low = surfels.voxel_index * voxel_size_m
     steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]

@@ -27,7 +27,7 @@ ABOVE = np.array([0.0, 0.0, 5.0])
 
 def clustered(points, viewpoint=ABOVE, **settings):
     config = ModelsConfig(**{'voxel_size_m': A, **settings})
-    return clusters_of(thin(points, config.voxel_size_m)[0], config, viewpoint), config
+    return clusters_of(thin(points, config.voxel_size_m).means, config, viewpoint), config
 
 
 def flat_share(clusters):

@@ -81,7 +81,7 @@ def test_every_chart_of_a_closed_cylinder_has_one_height_everywhere():
     tube = np.stack([0.35 * np.cos(angle), 0.35 * np.sin(angle), z], -1).reshape(-1, 3)
     config = ModelsConfig(voxel_size_m=A)
     inside = np.array([0.0, 0.0, 0.75])  # sees all of it, its normals point inwards
-    clusters = clusters_of(thin(tube, A)[0], config, inside)
+    clusters = clusters_of(thin(tube, A).means, config, inside)
     charts = surfaces_of(clusters, config, inside)
     assert len(charts) >= 2
     assert all(folded(clusters, chart, config) is None for chart in charts)

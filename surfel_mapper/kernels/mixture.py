@@ -1,0 +1,154 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Split points by a mixture of two Gaussians, by expectation maximisation.
+
+One pass over the points an iteration: the logarithm of the ratio of two Gaussians is one quadric,
+and the moments of the second component leave those of the first.
+
+Source: Dempster, Laird and Rubin 1977; covariances are regularised, as those of few points are
+singular.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+ITERATIONS = 10
+SETTLED = 1e-2
+"""It ends when no responsibility changes by more than this."""
+
+LEAST_WEIGHT = 1e-6
+"""A component of fewer points is empty."""
+
+TERMS = 10
+"""1, x, y, z, xx, xy, xz, yy, yz, zz: moments, and coefficients of a quadric."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def split_mixture(points, low, high, mean, side, share):
+    """
+    Put each point on the side of the likelier of two Gaussians.
+
+    points  (N, 3) float64; those of rows low to high - 1
+    mean    (3,) float64, of these
+    side    (N,) uint8, where they begin; out: where they end
+    share   (N,) float64, scratch
+    """
+    total, second, quadric = np.zeros(TERMS), np.zeros(TERMS), np.zeros(TERMS)
+    for i in range(low, high):
+        share[i] = side[i]
+        x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
+        add_moments(total, 1.0, x, y, z)
+        add_moments(second, share[i], x, y, z)
+    for _ in range(ITERATIONS):
+        quadric[:] = 0.0
+        if not subtract_score(second, total[0], quadric, 1.0):
+            break
+        for k in range(TERMS):
+            second[k] = total[k] - second[k]
+        if not subtract_score(second, total[0], quadric, -1.0):
+            break
+        if iterate(points, low, high, mean, share, quadric, second) < SETTLED:
+            break
+    for i in range(low, high):
+        side[i] = share[i] > 0.5
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def iterate(points, low, high, mean, share, quadric, second):
+    """Find the shares of the second component and its moments; return the largest change."""
+    q0, qx, qy, qz = quadric[0], quadric[1], quadric[2], quadric[3]
+    qxx, qxy, qxz, qyy, qyz, qzz = quadric[4:]
+    w0 = wx = wy = wz = 0.0
+    wxx = wxy = wxz = wyy = wyz = wzz = 0.0
+    largest = 0.0
+    for i in range(low, high):
+        x, y, z = points[i, 0] - mean[0], points[i, 1] - mean[1], points[i, 2] - mean[2]
+        against = (
+            q0
+            + x * (qx + qxx * x + qxy * y + qxz * z)
+            + y * (qy + qyy * y + qyz * z)
+            + z * (qz + qzz * z)
+        )
+        new = 1.0 / (1.0 + math.exp(min(against, 700.0)))
+        largest = max(largest, abs(new - share[i]))
+        share[i] = new
+        u, v, w = new * x, new * y, new * z
+        w0 += new
+        wx += u
+        wy += v
+        wz += w
+        wxx += u * x
+        wxy += u * y
+        wxz += u * z
+        wyy += v * y
+        wyz += v * z
+        wzz += w * z
+    second[0], second[1], second[2], second[3] = w0, wx, wy, wz
+    second[4], second[5], second[6] = wxx, wxy, wxz
+    second[7], second[8], second[9] = wyy, wyz, wzz
+    return largest
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_moments(moments, weight, x, y, z):
+    """Add a weighted point."""
+    moments[0] += weight
+    moments[1] += weight * x
+    moments[2] += weight * y
+    moments[3] += weight * z
+    moments[4] += weight * x * x
+    moments[5] += weight * x * y
+    moments[6] += weight * x * z
+    moments[7] += weight * y * y
+    moments[8] += weight * y * z
+    moments[9] += weight * z * z
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def subtract_score(moments, number, quadric, factor):
+    """
+    Subtract factor times the logarithm of a Gaussian's weighted density; False if it is empty.
+
+    moments  (TERMS,) float64, of its points
+    number   of all points
+    quadric  (TERMS,) float64, in place: coefficients
+    """
+    weight = moments[0]
+    if weight < LEAST_WEIGHT:
+        return False
+    mx, my, mz = moments[1] / weight, moments[2] / weight, moments[3] / weight
+    xx, xy = moments[4] / weight - mx * mx, moments[5] / weight - mx * my
+    xz, yy = moments[6] / weight - mx * mz, moments[7] / weight - my * my
+    yz, zz = moments[8] / weight - my * mz, moments[9] / weight - mz * mz
+    add = 1e-8 + 1e-4 * max(xx + yy + zz, 0.0) / 3.0
+    # lower Cholesky factor, then its inverse
+    l11 = math.sqrt(max(xx, 0.0) + add)
+    l21, l31 = xy / l11, xz / l11
+    l22 = math.sqrt(max(yy + add - l21 * l21, 0.5 * add))
+    l32 = (yz - l31 * l21) / l22
+    l33 = math.sqrt(max(zz + add - l31 * l31 - l32 * l32, 0.5 * add))
+    a, c, f = 1.0 / l11, 1.0 / l22, 1.0 / l33
+    b, e = -l21 * a * c, -l32 * c * f
+    d = -(l31 * a + l32 * b) * f
+    # inverse covariance
+    ixx, ixy, ixz = a * a + b * b + d * d, b * c + d * e, d * f
+    iyy, iyz, izz = c * c + e * e, e * f, f * f
+    half = 0.5 * factor
+    tx = ixx * mx + ixy * my + ixz * mz
+    ty = ixy * mx + iyy * my + iyz * mz
+    tz = ixz * mx + iyz * my + izz * mz
+    quadric[0] += half * (tx * mx + ty * my + tz * mz)
+    quadric[0] -= factor * (math.log(weight / number) + math.log(a * c * f))
+    quadric[1] -= factor * tx
+    quadric[2] -= factor * ty
+    quadric[3] -= factor * tz
+    quadric[4] += half * ixx
+    quadric[5] += factor * ixy
+    quadric[6] += factor * ixz
+    quadric[7] += half * iyy
+    quadric[8] += factor * iyz
+    quadric[9] += half * izz
+    return True
