@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import configparser
 import os
 from pathlib import Path
 import re
@@ -64,6 +65,12 @@ def test_every_file_carries_the_licence():
         if 'SPDX-License-Identifier: Apache-2.0' not in path.read_text(encoding='utf-8')[:400]
     ]
     assert without == []
+
+
+def test_colcon_makes_an_executable_that_takes_the_python_of_the_shell():
+    settings = configparser.ConfigParser()
+    settings.read(ROOT / 'setup.cfg')
+    assert settings['build_scripts']['executable'] == '/usr/bin/env python3'
 
 
 @pytest.mark.parametrize('name', ['node', 'replay'])
