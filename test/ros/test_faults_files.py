@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import os
+from pathlib import Path
 import resource
 import shutil
 import signal
@@ -251,9 +252,11 @@ def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
     pid = node._process.pid
     client = peer.node.create_client(Trigger, f'{NODE}/save_map')
     peer.spin_until(client.service_is_ready)
-    peer.spin_for(0.5)
+    assert peer.result(client.call_async(Trigger.Request())).success
     before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
-    resource.prlimit(pid, resource.RLIMIT_NOFILE, (3, before[1]))  # fewer than are open
+    used = {int(path.name) for path in Path(f'/proc/{pid}/fd').iterdir()}
+    first_free = next(number for number in itertools.count() if number not in used)
+    resource.prlimit(pid, resource.RLIMIT_NOFILE, (first_free, before[1]))
     try:
         answer = peer.result(client.call_async(Trigger.Request()))
     finally:

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import json
 import sys
@@ -16,6 +16,8 @@ from test.bench.report import Row, table
 from test.soak import core
 
 BLOCKS = 20
+NODE_BLOCK = 5000
+
 ROAD = 300
 """Scans of the road that is driven up and down."""
 
@@ -30,6 +32,10 @@ def parser() -> argparse.ArgumentParser:
         description='Drive up and down the street and watch memory and times.',
     )
     result.add_argument('--scans', type=int, default=1_000_000, metavar='N', help='%(default)s')
+    result.add_argument('--node', action='store_true', help='through the node, over DDS')
+    result.add_argument(
+        '--minutes', type=float, default=0.0, help='of the node at most; 0: until all are sent'
+    )
     result.add_argument('--points', type=int, default=8192, choices=SIZES, help='%(default)s')
     return result
 
@@ -41,12 +47,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = replace(Options(), scans=ROAD, beams=beams, columns=columns)
     print(', '.join(f'{name} {value}' for name, value in facts().items()))
     rows: list[Row] = []
-    for row in core.run(args.scans, -(-args.scans // BLOCKS), options):
+    for row in driven(args, options):
         rows.append(row)
         print(json.dumps(row), flush=True)
     print(table(rows))
     print(verdict(rows))
     return 0
+
+
+def driven(args: argparse.Namespace, options: Options) -> Iterator[Row]:
+    """Return the rows of the drive that is asked for."""
+    if not args.node:
+        return core.run(args.scans, -(-args.scans // BLOCKS), options)
+    from test.soak import node
+
+    return node.run(args.scans, NODE_BLOCK, options, args.minutes * 60.0)
 
 
 def verdict(rows: Sequence[Row]) -> str:
