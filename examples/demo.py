@@ -110,8 +110,8 @@ def node(*ros_args: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def play(running: subprocess.Popen[bytes], bag: Path) -> dict[str, dict[str, int]]:
-    """Play the bag once the node has subscribed; return what was published."""
-    words = command('play', bag, '--wait-for', '/points', '/odom', '--timeout', 90, '--json')
+    """Play the bag once the node has subscribed, which may compile first; return what was sent."""
+    words = command('play', bag, '--wait-for', '/points', '/odom', '--timeout', 600, '--json')
     with subprocess.Popen(words, stdout=subprocess.PIPE) as playing:
         while playing.poll() is None:
             if running.poll() is not None:
