@@ -19,6 +19,9 @@ import numpy.typing as npt
 
 from surfel_mapper.kernels.depth import unproject
 
+COLOR, LABEL = 'color', 'label'
+"""What images that are joined with scans hold."""
+
 UNIT_M = {np.dtype(np.uint16): 1e-3, np.dtype(np.float32): 1.0}
 """What one unit of depth is, by type of image (REP 118): millimetres or metres."""
 
@@ -63,6 +66,33 @@ class PinholeCamera:
             )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SceneImage:
+    """
+    An image of colours or labels.
+
+    Attributes
+    ----------
+    kind : str
+        color or label.
+    stamp_ns : int
+        When it was taken.
+    frame_id : str
+        The optical frame of its camera.
+    camera : PinholeCamera, optional
+        Which took it; None where it fits a depth image pixel by pixel.
+    pixels : (H, W, 3) uint8 or (H, W) int32
+        Red, green and blue, or labels, -1 for unknown.
+
+    """
+
+    kind: str
+    stamp_ns: int
+    frame_id: str
+    camera: PinholeCamera | None
+    pixels: npt.NDArray[Any]
+
+
 def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[np.float32]:
     """
     Return the points that a depth image shows.
@@ -98,3 +128,19 @@ def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[
     image = np.require(depth, None, ['C', 'A', 'W'])
     num = unproject(image, UNIT_M[depth.dtype], across, down, points)
     return np.asfortranarray(points[:, :num].T)
+
+
+def free_rays(
+    depth: npt.NDArray[Any], camera: PinholeCamera
+) -> npt.NDArray[np.float32] | None:
+    """Return unit vectors of the pixels that are inf: nothing there up to the range; or None."""
+    if depth.dtype.kind != 'f':
+        return None
+    rows, columns = np.nonzero(depth == np.inf)
+    if not len(rows):
+        return None
+    rays = np.ones((len(rows), 3), np.float32)
+    rays[:, 0] = (columns - camera.cx) / camera.fx
+    rays[:, 1] = (rows - camera.cy) / camera.fy
+    unit: npt.NDArray[np.float32] = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    return unit

@@ -60,6 +60,8 @@ class Scan:
     camera : tuple of float
         Of points of a depth image: width and height of the image, focal lengths and centre
         fx, fy, cx, cy, all in pixels.
+    free : (K, 3) float, optional
+        Unit vectors along which the sensor found nothing up to its range, as far as it says so.
     msg : sensor_msgs/PointCloud2, optional
         The cloud that it was read from, whose points are these: as many, in this order.
 
@@ -78,6 +80,7 @@ class Scan:
     T_fixed_sensor: npt.NDArray[np.float64] | None = None
     times: PointTimes | None = None
     camera: tuple[float, ...] = ()
+    free: npt.NDArray[Any] | None = None
     msg: Any = None
 
     def __post_init__(self) -> None:

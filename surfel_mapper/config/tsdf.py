@@ -132,6 +132,18 @@ class TsdfConfig(Stage):
     extra_labels: tuple[float, ...] = setting((), 'Only these labels do, where any are given.')
     skip_extra_channels: bool = setting(False, 'Neither colours nor labels are written there.')
     color: bool = setting(False, 'Keep a colour a voxel.')
+    color_topic: str = setting(
+        '',
+        'Images that colour points without a colour of their own; nothing: none. Those of a depth '
+        'camera fit its depth pixel by pixel, for a lidar camera_info beside them is read too.',
+    )
+    label_topic: str = setting('', 'Images of labels, likewise; 8 or 16 bits, or 32SC1.')
+    image_tolerance_s: float = setting(
+        0.02,
+        'An image belongs to a scan if their stamps differ by no more, s.',
+        low=0.0,
+        high=10.0,
+    )
     tracking: bool = setting(False, 'Keep the first and last stamp of every voxel.')
     semantics: str = setting(
         'none',
@@ -149,13 +161,17 @@ class TsdfConfig(Stage):
     )
     invalid_labels: tuple[float, ...] = setting((), 'Labels treated the same: sky, the robot.')
     mesh_rate_hz: float = setting(
-        1.0, 'Rate of ~/mesh, Hz, while somebody reads it; 0: never.', low=0.0, high=100.0
+        1.0,
+        'Rate of ~/mesh, Hz, while somebody reads it; 0: never.',
+        low=0.0,
+        high=100.0,
+        live=True,
     )
     slice_rate_hz: float = setting(
-        0.0, 'Rate of ~/tsdf_slice, Hz; 0: never.', low=0.0, high=100.0
+        0.0, 'Rate of ~/tsdf_slice, Hz; 0: never.', low=0.0, high=100.0, live=True
     )
     slice_height_m: float = setting(
-        0.5, 'Height of ~/tsdf_slice in the fixed frame, m.', low=-1e5, high=1e5
+        0.5, 'Height of ~/tsdf_slice in the fixed frame, m.', low=-1e5, high=1e5, live=True
     )
     mesh_min_weight: float = setting(
         1e-4, 'The mesh uses voxels of at least this weight.', low=0.0, high=1e9
@@ -183,6 +199,12 @@ class TsdfConfig(Stage):
                 self.max_range_m > self.min_range_m,
                 f'more than min_range_m = {self.min_range_m}',
             ),
+            ('color', self.color or not self.color_topic, 'true where color_topic is given'),
+            (
+                'semantics',
+                self.semantics != 'none' or not self.label_topic,
+                'another where label_topic is given',
+            ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
         )
         for name, holds, expected in checks:
@@ -194,6 +216,12 @@ class TsdfConfig(Stage):
                     raise ConfigError(
                         f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
                     )
+
+    @property
+    def image_topics(self) -> dict[str, str]:
+        """What is joined with the scans, color or label, and the topics of its images."""
+        topics = {'color': self.color_topic, 'label': self.label_topic}
+        return {kind: topic for kind, topic in topics.items() if topic and self.enabled}
 
     @property
     def block_size_m(self) -> float:

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.depth import depth_points, PinholeCamera
+from surfel_mapper.depth import depth_points, free_rays, PinholeCamera
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import checked_stamp_ns
 from surfel_mapper.scan import Scan
@@ -144,6 +144,7 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
         stamp_ns=stamp_ns,
         frame_id=str(msg.header.frame_id),
         camera=astuple(image.camera),
+        free=free_rays(depth, image.camera),
     )
 
 
@@ -168,18 +169,33 @@ def depth_in(msg: Any, topic: str = 'depth') -> npt.NDArray[Any]:
         raise CloudFormatError(
             f'{topic}: encoding {msg.encoding!r}, expected 16UC1 or 32FC1; is this a depth image?'
         )
+    return pixels_in(msg, topic, ENCODINGS[msg.encoding])[:, :, 0]
+
+
+def pixels_in(msg: Any, topic: str, type_: str, channels: int = 1) -> npt.NDArray[Any]:
+    """
+    Return the pixels of an image, (H, W, C) in native byte order.
+
+    Raises
+    ------
+    CloudFormatError
+        If there are fewer bytes than pixels.
+
+    """
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
-    dtype = np.dtype(('>' if msg.is_bigendian else '<') + ENCODINGS[msg.encoding])
+    dtype = np.dtype(('>' if msg.is_bigendian else '<') + type_)
+    pixel_bytes = channels * dtype.itemsize
     try:
         data = np.frombuffer(msg.data, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
         raise CloudFormatError(
             f'{topic}: data is a {type(msg.data).__name__}, expected a buffer of bytes: {error}'
         ) from error
-    if step < width * dtype.itemsize or len(data) != step * height:
+    if step < width * pixel_bytes or len(data) != step * height:
         raise CloudFormatError(
             f'{topic}: {len(data)} bytes in rows of {step}, expected height {height} rows of '
-            f'at least {width * dtype.itemsize}'
+            f'at least {width * pixel_bytes}'
         )
-    pixels: npt.NDArray[Any] = np.ndarray((height, width), dtype, data, 0, (step, dtype.itemsize))
+    strides = (step, pixel_bytes, dtype.itemsize)
+    pixels: npt.NDArray[Any] = np.ndarray((height, width, channels), dtype, data, 0, strides)
     return pixels.astype(dtype.newbyteorder('='), copy=False)

@@ -57,11 +57,19 @@ def apply_mask(mask, tau, u, v, mixed, signed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def all_known(alpha, mixed):
+    """Return whether the first of (2, 2) pixels, or all where they are mixed, are not 0."""
+    if mixed == 0:
+        return alpha[0, 0] != 0
+    return alpha[0, 0] != 0 and alpha[0, 1] != 0 and alpha[1, 0] != 0 and alpha[1, 1] != 0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
     """
     Take the colours of the image into the mean colours of the band, in place.
 
-    image   (rows, columns, 3) uint8
+    image   (rows, columns, 3 or 4) uint8; pixels whose fourth channel is 0 have no colour
     color   (4, N) float32: red, green, blue, and their weight
     """
     for n in range(len(signed)):
@@ -69,6 +77,8 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
         if w == _ZERO or s >= tau or (skip_extra and s <= -tau):
             continue
         i, j, du, dv = pixel(u[n], v[n], mixed[n])
+        if image.shape[2] > 3 and not all_known(image[j : j + 2, i : i + 2, 3], mixed[n]):
+            continue
         together = color[3, n] + w
         gain = w / together
         for channel in range(3):

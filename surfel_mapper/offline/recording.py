@@ -159,6 +159,8 @@ class BagRecording:
         names: list[str | None] = [*named] or [None]
         kind = CLOUD if config.input.kind == 'cloud' else IMAGE
         self.topics = [reader.topics.choose(kind, name) for name in dict.fromkeys(names)]
+        for name in config.tsdf.image_topics.values():
+            reader.topics.choose(IMAGE, f'/{name.lstrip("/")}')
         check_mounts(request, self.topics, config)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})

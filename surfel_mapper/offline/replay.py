@@ -26,6 +26,7 @@ if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not ne
     import numpy.typing as npt
 
     from surfel_mapper.offline.depth_feed import Decode, DepthFeed
+    from surfel_mapper.offline.scene_feed import SceneFeed
     from surfel_mapper.pipeline import Mapper, Update
 
 ALL_SCANS = {
@@ -105,10 +106,14 @@ def replay(
 
     images = depth_feed(clouds, add) if mapper.config.input.kind == 'depth' else None
     infos = images.info_topics if images else {}
-    for message in messages(reader, {*clouds, *infos}, poses, span):
+    beside = scene_feed(mapper)
+    scenes = beside.topics if beside else set()
+    for message in messages(reader, {*clouds, *infos, *scenes}, poses, span):
         if stopped():
             break
-        if images and message.topic in infos:
+        if beside and message.topic in scenes:
+            beside.take(reader, message)
+        elif images and message.topic in infos:
             add_camera_info(reader, mapper, message, images)
         elif message.topic not in clouds:
             add_poses(reader, mapper, message, poses)
@@ -117,6 +122,9 @@ def replay(
                 number = first[message.topic] + seen[message.topic]
                 (images.take_image if images else add)(message, number)
             seen[message.topic] += 1
+        yield from mapper.insert_ready()
+    if beside:
+        mapper.end_images()
         yield from mapper.insert_ready()
     mapper.finish()
 
@@ -128,6 +136,15 @@ def depth_feed(
     from surfel_mapper.offline.depth_feed import DepthFeed
 
     return DepthFeed(clouds, add)
+
+
+def scene_feed(mapper: Mapper) -> SceneFeed | None:
+    """Return what takes images of colours and labels, where the mapper wants any."""
+    if not mapper.config.tsdf.image_topics:
+        return None
+    from surfel_mapper.offline.scene_feed import SceneFeed
+
+    return SceneFeed(mapper)
 
 
 def messages(

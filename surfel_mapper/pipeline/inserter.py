@@ -35,9 +35,11 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.free_rays import free_directions
 from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.reduction import moments_at, reduced
+from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
@@ -67,6 +69,8 @@ class Inserter:
     ----------
     map, window, chain, tsdf
         See Mapper.
+    images : ScanImages
+        What colours and labels the points.
     derives : bool
         Whether updates hold the surfels that changed; they are none where nobody looks at them.
 
@@ -91,6 +95,7 @@ class Inserter:
         )
         sensors = SensorModels(config.tsdf)
         self.tsdf = TsdfLayer(config.tsdf, sensors) if config.tsdf.enabled else None
+        self.images = ScanImages(config.tsdf)
         self._moved: MovedAway | None = None
         if config.dynamic.clear:
             self._moved = MovedAway(config.dynamic, self.map.voxel_size_m, sensors)
@@ -215,6 +220,9 @@ class Inserter:
         if times is not None:
             scan = self._poses.deskewed(scan, times)
             laps.end('deskew')
+        if self.tsdf is not None:
+            scan = self._with_surroundings(scan)
+            laps.end('images')
         filtered: Scan | None = scan
         if len(self.chain):
             filtered = self._filter(scan, pose)
@@ -238,6 +246,26 @@ class Inserter:
             )
         pose = self.aligner.to_map(pose)
         return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
+
+    def _with_surroundings(self, scan: Scan) -> Scan:
+        """Return a scan with what the TSDF wants beside its points, before any is left out."""
+        if scan.free is None:
+            scan = replace(scan, free=free_directions(scan))
+        try:
+            scan, missing = self.images.joined(
+                scan, lambda image: self._poses.seen_from(image.frame_id, image.stamp_ns, scan)
+            )
+        except (CloudFormatError, PoseError) as error:
+            self._drops.warn('images', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
+            return scan
+        for kind in missing:
+            self._drops.warn(
+                f'no_{kind}_image',
+                f'scan at {scan.stamp_ns / 1e9:.6f} s: no {kind} image within '
+                f'{self._config.tsdf.image_tolerance_s:g} s; layers.tsdf.image_tolerance_s '
+                'allows more',
+            )
+        return scan
 
     def _is_gated(self, pose: Transform) -> bool:
         """Return whether the motion gate leaves out a scan at a pose, and count it."""

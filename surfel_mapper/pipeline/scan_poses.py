@@ -17,7 +17,7 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.deskew import deskewed
 from surfel_mapper.errors import PoseError
-from surfel_mapper.geometry import pose_matrix, Transform
+from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.poses import TransformBuffer
@@ -122,6 +122,27 @@ class ScanPoses:
             return self.transforms.lookup(self._config.frames.base, scan.frame_id, scan.stamp_ns)
         except PoseError:
             return None
+
+    def seen_from(self, frame_id: str, stamp_ns: int, scan: Scan) -> Transform:
+        """
+        Return T_frame_sensor: from the sensor of a scan to where a frame was at another time.
+
+        Where the robot is not known at both times, it is taken to have stood still.
+
+        Raises
+        ------
+        PoseError
+            If the frame is not known to belong to the robot.
+
+        """
+        if frame_id in self._config.frames.sensors:
+            self.mount(frame_id)
+        try:
+            T_fixed_frame = self._at(frame_id, stamp_ns)
+            T_fixed_sensor = self._at(scan.frame_id, scan.stamp_ns)
+        except PoseError:
+            return self.transforms.lookup(frame_id, scan.frame_id, scan.stamp_ns)
+        return compose(inverse(T_fixed_frame), T_fixed_sensor)
 
     def _at(self, frame_id: str, stamp_ns: int) -> Transform:
         """Return T_fixed_sensor at a time."""

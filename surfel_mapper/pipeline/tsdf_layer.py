@@ -24,7 +24,7 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrated, Integrator
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
-from surfel_mapper.tsdf.range_image import from_points
+from surfel_mapper.tsdf.range_image import from_points, RangeImage
 
 
 class TsdfLayer:
@@ -91,12 +91,7 @@ class TsdfLayer:
             See follow.
 
         """
-        columns, colors = scan.columns, None
-        if self.config.color and {'rgb', 'rgba'} & columns.keys():
-            colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
-        labels = columns.get('label') if self.config.semantics != 'none' else None
-        sensor = self._sensors.of(scan)
-        image = from_points(sensor, scan.points, colors=colors, labels=labels)
+        image = self._range_image(scan)
         self.blocks.clear_updated()
         done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
@@ -131,7 +126,38 @@ class TsdfLayer:
             'voxel_size_m': self.config.voxel_size_m,
         }
 
+    def _range_image(self, scan: Scan) -> RangeImage:
+        """Return what the sensor of a scan measured: its points, and where it found nothing."""
+        columns, points = scan.columns, scan.points
+        sensor = self._sensors.of(scan)
+        colors = colors_of(scan) if self.config.color else None
+        labels = columns.get('label') if self.config.semantics != 'none' else None
+        if scan.free is not None:
+            beyond = 2.0 * self.config.max_range_m * scan.free
+            points = np.concatenate([points, beyond.astype(points.dtype)])
+            if colors is not None:
+                colors = np.pad(colors, ((0, len(beyond)), (0, 0)))
+            if labels is not None:
+                labels = np.pad(labels, (0, len(beyond)), constant_values=-1)
+        return from_points(sensor, points, colors=colors, labels=labels)
+
     def _settle(self, windowed: WindowedScan) -> None:
         scan = self._waiting.pop(windowed.stamp_ns, None)
         if scan is not None:
             self.insert(scan, windowed.T_map_sensor)
+
+
+def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
+    """
+    Return the colours of the points, (N, 3), or (N, 4) with the fourth 0 where there is none.
+
+    Alpha tells which have one, unless it is 0 everywhere: some drivers leave it so.
+    """
+    columns = scan.columns
+    if not {'rgb', 'rgba'} & columns.keys():
+        return None
+    colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
+    packed = columns['rgba'] if 'rgb' not in columns else None
+    if packed is None or packed.dtype != np.uint32 or not (packed >> 24).any():
+        return colors
+    return np.column_stack([colors, (packed >> 24).astype(np.uint8)])

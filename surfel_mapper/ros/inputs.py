@@ -27,6 +27,7 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from surfel_mapper.config import Config
+from surfel_mapper.depth import SceneImage
 from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError
 from surfel_mapper.io.depth_image import (
     camera_info_topic,
@@ -36,6 +37,7 @@ from surfel_mapper.io.depth_image import (
     warm_up,
 )
 from surfel_mapper.io.pose_messages import ODOMETRY, POSE, poses_in, TF
+from surfel_mapper.io.scene_image import SceneImages
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.scan import Scan
 
@@ -96,6 +98,7 @@ class Inputs:
         self.lost: dict[str, int] = {}
         self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         self._images = DepthImages()
+        self._scenes = SceneImages(config)
         self._largest_bytes = 0
         self._node = node
         self._config = config
@@ -131,6 +134,8 @@ class Inputs:
             warm_up()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
+        for kind, name in self._config.tsdf.image_topics.items():
+            self._subscribe_images(kind, self._node.resolve_topic_name(name))
 
     def unsubscribe(self) -> None:
         """Take no more messages."""
@@ -177,6 +182,21 @@ class Inputs:
             CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic), CLOUDS
         )
         self._subscribe(Image, topic, partial(self._on_image, topic), CLOUDS, lost)
+
+    def _subscribe_images(self, kind: str, topic: str) -> None:
+        """Subscribe to images of colours or labels, and to the calibration where needed."""
+        if self._scenes.needs_cameras:
+            on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
+            self._subscribe(CameraInfo, camera_info_topic(topic), on_info, CLOUDS)
+        on_image = partial(self._on_scene, partial(self._scenes.add_image, kind, topic))
+        self._subscribe(Image, topic, on_image, CLOUDS)
+
+    def _on_scene(self, take: Callable[[Any], list[SceneImage]], msg: Any) -> None:
+        try:
+            for image in take(msg):
+                self._thread.put_image(image)
+        except CloudFormatError as error:
+            self._node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
     def _subscribe_static(self) -> None:
         """Subscribe to how sensors are mounted, which odometry does not say."""

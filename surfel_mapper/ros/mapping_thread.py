@@ -17,11 +17,13 @@ from concurrent.futures import Future
 import threading
 from typing import Any, NamedTuple, TypeVar
 
+from surfel_mapper.depth import SceneImage
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.drops import REMEDIES
+from surfel_mapper.pipeline.scan_images import MAX_IMAGES
 from surfel_mapper.scan import Scan
 
 MAX_POSES = 10_000
@@ -75,6 +77,7 @@ class MappingThread:
         self._changed = threading.Condition()
         self._max_clouds = mapper.config.input.max_waiting_clouds
         self._poses: deque[tuple[StampedPose, bool]] = deque()
+        self._images: deque[SceneImage] = deque(maxlen=MAX_IMAGES)
         self._work: deque[Cloud | Call] = deque()
         self._num_clouds = 0
         self._clouds_lost: Counter[tuple[str, str]] = Counter()
@@ -104,6 +107,12 @@ class MappingThread:
             while len(self._poses) > MAX_POSES:
                 self._poses.popleft()
                 self._poses_lost += 1
+            self._changed.notify()
+
+    def put_image(self, image: SceneImage) -> None:
+        """Queue an image of colours or labels; like poses, they overtake clouds."""
+        with self._changed:
+            self._images.append(image)
             self._changed.notify()
 
     def put_cloud(
@@ -165,10 +174,13 @@ class MappingThread:
     def _step(self, on_update: Callable[[Update], None]) -> bool:
         """Wait for something to do and do it; false at the end."""
         with self._changed:
-            self._changed.wait_for(lambda: self._stopping or self._poses or self._work)
-            if not (self._poses or self._work):
+            self._changed.wait_for(
+                lambda: self._stopping or self._poses or self._images or self._work
+            )
+            if not (self._poses or self._images or self._work):
                 return False
             poses, self._poses = self._poses, deque()
+            images = [self._images.popleft() for _ in range(len(self._images))]
             item = self._work.popleft() if self._work else None
             self._num_clouds -= isinstance(item, Cloud)
             clouds_lost, self._clouds_lost = self._clouds_lost, Counter()
@@ -176,6 +188,8 @@ class MappingThread:
         self._count_lost(clouds_lost, poses_lost)
         for pose, static in poses:
             self._mapper.add_pose(*pose, static=static)
+        for image in images:
+            self._mapper.add_image(image)
         if isinstance(item, Cloud):
             self._add(item)
         elif item is not None:

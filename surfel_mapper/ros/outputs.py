@@ -151,7 +151,7 @@ class Outputs:
                     self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
                 )
         if self._tsdf is not None:
-            self._tsdf.start_timers()
+            self._tsdf.start_timers(config.tsdf)
 
     def stop_timers(self) -> None:
         """Publish nothing at a rate any more."""

@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from visualization_msgs.msg import Marker
 
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.io.cdr import marker_bytes
 from surfel_mapper.io.mesh_marker import mesh_marker
 from surfel_mapper.pipeline import Mapper, Update
@@ -59,9 +60,8 @@ class TsdfOutputs:
         """Take note of a scan; called in the mapping thread."""
         self._stamp_ns = update.stamp_ns
 
-    def start_timers(self) -> None:
-        """Publish at the rates of the configuration; called in the executor's thread."""
-        config = self._layer.config
+    def start_timers(self, config: TsdfConfig) -> None:
+        """Publish at the rates of these settings; called in the executor's thread."""
         for rate_hz, callback in (
             (config.mesh_rate_hz, self._on_mesh_timer),
             (config.slice_rate_hz, self._on_slice_timer),
@@ -92,5 +92,5 @@ class TsdfOutputs:
         self._mesh.publish(marker_bytes(marker))
 
     def _publish_slice(self) -> None:
-        found = slice_at(self._layer.blocks, self._layer.config.slice_height_m)
+        found = slice_at(self._layer.blocks, self._mapper.config.tsdf.slice_height_m)
         self._slice.publish(grid_message(found, self._stamp_ns, self._mapper.map_frame))

@@ -46,8 +46,8 @@ class RangeImage:
         The largest range, at most max_range_m; 0 where there is none.
     num_used : int
         Pixels or points that say something.
-    color : (rows, columns or one more, 3) uint8, optional
-        Red, green, blue.
+    color : (rows, columns or one more, 3 or 4) uint8, optional
+        Red, green, blue; where the fourth is 0 the colour is not known.
     label : (rows, columns or one more) int32, optional
         -1: unknown.
     mask : (rows, columns or one more) uint8, optional
@@ -78,8 +78,8 @@ class RangeImage:
 
         Parameters
         ----------
-        color : (rows, columns, 3) uint8, optional
-            Red, green, blue.
+        color : (rows, columns, 3 or 4) uint8, optional
+            Red, green, blue; where the fourth is 0 the colour is not known.
         label : (rows, columns) int, optional
             From -1, for unknown, to 2^24 - 1.
         mask : (rows, columns) bool or int, optional
@@ -93,7 +93,9 @@ class RangeImage:
         """
         more: dict[str, Any] = {}
         if color is not None:
-            more['color'] = self._fitted('color', np.asarray(color), (3,))
+            image = np.asarray(color)
+            channels = 4 if image.shape[-1:] == (4,) else 3
+            more['color'] = self._fitted('color', image, (channels,))
             if more['color'].dtype != np.uint8:
                 raise CloudFormatError(f'color: {more["color"].dtype}, expected uint8')
         if label is not None:
@@ -194,8 +196,8 @@ def from_points(
         Which measured them.
     points : (N, 3) float32 or float64
         In its frame, m; those not finite or out of view are left out.
-    colors : (N, 3) uint8, optional
-        Red, green, blue of each point.
+    colors : (N, 3 or 4) uint8, optional
+        Red, green, blue of each point; where the fourth is 0 its colour is not known.
     labels : (N,) int, optional
         Label of each point, -1 for unknown.
 
@@ -215,7 +217,8 @@ def from_points(
     found = RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
     more: dict[str, npt.NDArray[Any]] = {}
     if colors is not None:
-        more['color'] = taken('colors', colors, (len(points), 3), source, 0)
+        channels = 4 if colors.shape[-1:] == (4,) else 3
+        more['color'] = taken('colors', colors, (len(points), channels), source, 0)
     if labels is not None:
         more['label'] = taken('labels', labels, (len(points),), source, -1)
     return found.with_images(**more) if more else found

@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Where the rays of a lidar went that met nothing.
+
+REP 117 has inf stand for a return beyond the range, and such a point has no direction. In an
+organised cloud it is that of its neighbours: points of a row have one elevation, those of a
+column one azimuth but for an offset of the row. Points that are nan or 0 say nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.scan import Scan
+
+MOST_OFF = 0.6
+"""Steps between columns that half of the points may be off where rows and columns are those."""
+
+ROUNDS = 4
+"""In each, columns follow from rows and rows from columns; four leave less than 0.1 deg."""
+
+
+def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
+    """
+    Return unit vectors of the points at infinity, (K, 3); None where there are none.
+
+    Parameters
+    ----------
+    scan : Scan
+        With the cloud that it was read from, whose rows or columns are the beams of a lidar;
+        for one that is not so there is nothing to know.
+
+    """
+    rows, columns = int(getattr(scan.msg, 'height', 0)), int(getattr(scan.msg, 'width', 0))
+    if min(rows, columns) < 2 or rows * columns != len(scan):
+        return None
+    infinite = np.isinf(scan.points).any(axis=1).reshape(rows, columns)
+    if not infinite.any():
+        return None
+    points = np.where(np.isfinite(scan.points), scan.points, 0.0).reshape(rows, columns, 3)
+    if rows > columns:  # some drivers have a row for each azimuth
+        return rays_of_beams(points.swapaxes(0, 1), infinite.T)
+    return rays_of_beams(points, infinite)
+
+
+def rays_of_beams(
+    points: npt.NDArray[Any], infinite: npt.NDArray[np.bool_]
+) -> npt.NDArray[np.float32] | None:
+    """Return the directions of some pixels, (beams, columns, 3), by those that have points."""
+    level = points[..., 0] + 1j * points[..., 1].astype(np.float64)
+    reach = np.abs(level)
+    known = reach > 0.0
+    heading = np.divide(level, reach, out=np.zeros_like(level), where=known)
+    slope = np.divide(points[..., 2], reach, out=np.zeros_like(reach), where=known)
+    offset = np.ones(len(points), np.complex128)
+    for _ in range(ROUNDS):  # columns with gaps have other rows than those without
+        across = unit((heading * offset.conj()[:, None]).sum(axis=0))
+        offset = unit((heading * across.conj()).sum(axis=1))
+    predicted = offset[:, None] * across
+    step = 2.0 * np.pi / points.shape[1]
+    off = np.abs(np.angle(heading[known] * predicted[known].conj()))
+    if not len(off) or np.median(off) > MOST_OFF * step:
+        return None
+    beam = slope.sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    row, column = np.nonzero(infinite & (predicted != 0.0))
+    found = predicted[row, column]
+    rays = np.stack([found.real, found.imag, beam[row]], axis=1)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    return rays.astype(np.float32) if len(rays) else None
+
+
+def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+    """Return complex numbers of length 1, and 0 where there is none."""
+    length = np.abs(numbers)
+    return np.divide(numbers, length, out=np.zeros_like(numbers), where=length > 0.0)

@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Colours and labels of points out of images, joined with scans by their stamps.
+
+A scan waits until an image that is not older has come, so which one it gets does not depend on
+the order in which the two arrive; like poses, images are waited for no longer than
+``pose.max_wait_s``. What a point gets becomes a column of the scan, and so passes the filters and
+waits with it. Columns that a cloud has itself stay.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.depth import LABEL, PinholeCamera, SceneImage
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.geometry import Transform
+from surfel_mapper.scan import Scan
+
+MAX_IMAGES = 60
+"""Images kept of each kind, 2 s at 30 Hz."""
+
+COLUMNS = {'color': ('rgba', 'rgb'), LABEL: ('label',)}
+"""Columns of a scan that hold what images of a kind hold; the first is that which they give."""
+
+
+class ScanImages:
+    """
+    The latest images of every kind.
+
+    Parameters
+    ----------
+    config : TsdfConfig
+        Says which there are, and how far stamps may differ.
+
+    """
+
+    def __init__(self, config: TsdfConfig) -> None:
+        """Have none yet."""
+        self._images: dict[str, deque[SceneImage]] = {
+            kind: deque(maxlen=MAX_IMAGES) for kind in config.image_topics
+        }
+        self._tolerance_ns = round(config.image_tolerance_s * 1e9)
+        self.ended = False
+
+    def add(self, image: SceneImage) -> None:
+        """Take an image; an older one than the last begins anew."""
+        images = self._images[image.kind]
+        if images and image.stamp_ns < images[-1].stamp_ns:
+            images.clear()
+        images.append(image)
+
+    def is_waiting(self, scan: Scan) -> bool:
+        """Return whether an image may come that belongs to a scan."""
+        return not self.ended and any(
+            not images or images[-1].stamp_ns < scan.stamp_ns
+            for kind, images in self._images.items()
+            if not has_column(scan, kind)
+        )
+
+    def joined(
+        self, scan: Scan, place: Callable[[SceneImage], Transform]
+    ) -> tuple[Scan, list[str]]:
+        """
+        Return a scan with what the images say of its points, and the kinds that none came for.
+
+        Parameters
+        ----------
+        scan : Scan
+            In the frame of its sensor.
+        place : callable
+            Returns T_camera_sensor for an image.
+
+        Raises
+        ------
+        CloudFormatError
+            If an image is not of the size of the depth image.
+
+        """
+        columns, missing = dict(scan.columns), []
+        for kind in self._images:
+            if has_column(scan, kind):
+                continue
+            image = self._nearest(kind, scan.stamp_ns)
+            if image is None:
+                missing.append(kind)
+                continue
+            seen = seen_in(image, scan, place)
+            if seen is not None:
+                columns[COLUMNS[kind][0]] = seen
+        return replace(scan, columns=columns), missing
+
+    def _nearest(self, kind: str, stamp_ns: int) -> SceneImage | None:
+        """Return the image taken nearest to a time, the older of two; None if none is near."""
+        images = self._images[kind]
+        nearest = min(images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
+        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > self._tolerance_ns:
+            return None
+        return nearest
+
+
+def has_column(scan: Scan, kind: str) -> bool:
+    """Return whether the points of a scan have what images of a kind would give them."""
+    return any(name in scan.columns for name in COLUMNS[kind])
+
+
+def seen_in(
+    image: SceneImage, scan: Scan, place: Callable[[SceneImage], Transform]
+) -> npt.NDArray[Any] | None:
+    """
+    Return what an image shows where the points of a scan are in it; None where none is.
+
+    (N,) uint32, packed with an alpha of 255, or labels, (N,) int32. Points that are not in the
+    image get 0, whose alpha is 0 too, or -1.
+    """
+    if scan.camera:
+        width, height = int(scan.camera[0]), int(scan.camera[1])
+        if image.pixels.shape[:2] != (height, width):
+            raise CloudFormatError(
+                f'{image.kind} image of {image.pixels.shape[1]} x {image.pixels.shape[0]} pixels, '
+                f'expected {width} x {height} as the depth image has'
+            )
+        camera, points = PinholeCamera(width, height, *scan.camera[2:]), scan.points
+    else:
+        assert image.camera is not None, 'those beside a lidar come with their camera'
+        camera, T = image.camera, place(image)
+        points = scan.points @ T[:3, :3].T + T[:3, 3]
+    rows, columns, inside = pixels_of(camera, points, image.pixels.shape[:2])
+    if not len(rows):
+        return None
+    if image.kind == LABEL:
+        labels = np.full(len(points), -1, np.int32)
+        labels[inside] = image.pixels[rows, columns]
+        return labels
+    red, green, blue = image.pixels[rows, columns].T.astype(np.uint32)
+    colors = np.zeros(len(points), np.uint32)
+    colors[inside] = (np.uint32(255) << 24) | (red << 16) | (green << 8) | blue
+    return colors
+
+
+def pixels_of(
+    camera: PinholeCamera, points: npt.NDArray[Any], size: tuple[int, ...]
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
+    """Return row and column of the points in view of a camera, and which these are, (N,)."""
+    with np.errstate(all='ignore'):  # points behind it and those that are none
+        x, y, z = points.T
+        column = np.floor(camera.fx * (x / z) + (camera.cx + 0.5))
+        row = np.floor(camera.fy * (y / z) + (camera.cy + 0.5))
+        inside = (z > 0) & (column >= 0) & (column < size[1]) & (row >= 0) & (row < size[0])
+    return row[inside].astype(np.int64), column[inside].astype(np.int64), inside

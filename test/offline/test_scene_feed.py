@@ -1,0 +1,64 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A bag of depth and colour images: the mesh has the colours, whichever is recorded first."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import BagError
+from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.offline.test_depth import camera_info, IMAGE, image, replayed, SETTINGS
+
+TOPIC = '/camera/color/image'
+COLORED = {
+    **SETTINGS,
+    'input.topics': ['/camera/depth/image'],
+    'layers.tsdf.enabled': True,
+    'layers.tsdf.voxel_size_m': 0.1,
+    'layers.tsdf.color': True,
+    'layers.tsdf.color_topic': 'camera/color/image',
+}
+RED = (240, 30, 10)
+
+
+def color_image(entries, number, late_ns, encoding='rgb8'):
+    stamp_ns = START_NS + number * PERIOD_NS
+    pixels = np.full((30, 40, 3), RED, np.uint8)
+    message = entries.make(
+        IMAGE,
+        header=entries.header(stamp_ns, 'optical'),
+        height=30, width=40, encoding=encoding, is_bigendian=0, step=120, data=pixels.ravel(),
+    )  # fmt: skip
+    entries.append((TOPIC, IMAGE, stamp_ns + late_ns, message))
+
+
+def recorded(tmp_path, late_ns=0, **changes):
+    entries = Entries()
+    camera_info(entries, START_NS - 10)
+    for number in range(3):
+        image(entries, number)
+        color_image(entries, number, late_ns, **changes)
+    entries.sort(key=lambda entry: entry[2])
+    return write_rosbag2(tmp_path / 'bag', entries)
+
+
+@pytest.mark.parametrize('late_ns', [-1000, 1000, 40_000_000])
+def test_every_depth_image_gets_its_colours(tmp_path, late_ns):
+    mapper, _ = replayed(recorded(tmp_path, late_ns), COLORED)
+    assert mapper.counters.mapped == 3
+    colors = mapper.tsdf.mesh().colors
+    assert len(colors) > 100
+    assert set(map(tuple, colors.tolist())) == {RED}
+
+
+def test_images_that_cannot_be_read_are_counted_and_the_depth_is_mapped(tmp_path):
+    mapper, _ = replayed(recorded(tmp_path, encoding='yuv422'), COLORED)
+    assert mapper.counters.mapped == 3
+    assert mapper.counters.messages_ignored == {'bad_image': 3}
+    assert not mapper.tsdf.mesh().colors.any()
+
+
+def test_a_topic_that_is_not_in_the_bag_is_refused(tmp_path):
+    settings = {**COLORED, 'layers.tsdf.color_topic': 'nothing'}
+    with pytest.raises(BagError, match='no topic /nothing; Image topics: /camera/'):
+        replayed(recorded(tmp_path), settings)
