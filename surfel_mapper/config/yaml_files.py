@@ -41,8 +41,11 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
     try:
         check_nesting(text)
         return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)
+    except yaml.MarkedYAMLError as error:
+        # without the line itself: whoever may name a file may not be allowed to read it
+        raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
     except yaml.YAMLError as error:
-        raise ValueError(str(error)) from error
+        raise ValueError('characters that YAML does not allow') from error
 
 
 def check_nesting(text: str) -> None:
@@ -52,10 +55,15 @@ def check_nesting(text: str) -> None:
     are_named: list[bool] = []
     for event in yaml.parse(text, yaml.BaseLoader):
         if isinstance(event, yaml.AliasEvent) and any(are_named):
-            raise ValueError(f'an alias inside of what has a name{event.start_mark}')
+            raise ValueError(f'an alias inside of what has a name{place(event.start_mark)}')
         if isinstance(event, yaml.CollectionStartEvent):
             are_named.append(event.anchor is not None)
         elif isinstance(event, yaml.CollectionEndEvent):
             are_named.pop()
         if len(are_named) > MAX_DEPTH:
-            raise ValueError(f'nested deeper than {MAX_DEPTH}{event.start_mark}')
+            raise ValueError(f'nested deeper than {MAX_DEPTH}{place(event.start_mark)}')
+
+
+def place(mark: Any) -> str:
+    """Return where in a file something is."""
+    return f' in line {mark.line + 1}, column {mark.column + 1}' if mark else ''

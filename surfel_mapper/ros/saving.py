@@ -28,6 +28,8 @@ def save_map(mapper: Mapper) -> str:
 
     Raises
     ------
+    ConfigError
+        If a file of that name is a link that leads out of the directory.
     FileFormatError, OSError
         If the file or its directory cannot be written.
 
@@ -36,6 +38,9 @@ def save_map(mapper: Mapper) -> str:
     directory = directory_of(output)
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f'{output.map_name}.ply'
+    for file in (path, path.with_suffix('.npz')):
+        if not is_inside(directory, file):
+            raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     write_surfels(path, surfels)
     digest = save_state(path.with_suffix('.npz'), mapper.map, mapper.window)
@@ -99,6 +104,11 @@ def path_inside(directory: Path, url: str) -> Path:
         raise ConfigError(f'map_url: {url!r}, expected the name of a map in {directory}')
     if path.suffix != '.npz':
         path = path.with_name(f'{path.name}.npz')
-    if not path.resolve().is_relative_to(directory.resolve()):  # links are followed, and `..`
+    if not is_inside(directory, path):
         raise ConfigError(f'map_url: {url!r} is not inside output.directory, {directory}')
     return path
+
+
+def is_inside(directory: Path, path: Path) -> bool:
+    """Return whether a path is inside a directory, with links followed, and ``..``."""
+    return path.resolve().is_relative_to(directory.resolve())

@@ -8,6 +8,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 import json
+import math
 import sys
 
 from test.bench.machine import facts
@@ -33,9 +34,8 @@ def parser() -> argparse.ArgumentParser:
     )
     result.add_argument('--scans', type=int, default=1_000_000, metavar='N', help='%(default)s')
     result.add_argument('--node', action='store_true', help='through the node, over DDS')
-    result.add_argument(
-        '--minutes', type=float, default=0.0, help='of the node at most; 0: until all are sent'
-    )
+    result.add_argument('--block', type=int, default=50_000, metavar='N', help='%(default)s a row')
+    result.add_argument('--minutes', type=float, default=math.inf, help='at most; %(default)s')
     result.add_argument('--points', type=int, default=8192, choices=SIZES, help='%(default)s')
     return result
 
@@ -58,10 +58,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def driven(args: argparse.Namespace, options: Options) -> Iterator[Row]:
     """Return the rows of the drive that is asked for."""
     if not args.node:
-        return core.run(args.scans, -(-args.scans // BLOCKS), options)
+        block = min(-(-args.scans // BLOCKS), args.block)
+        return core.run(args.scans, block, options, args.minutes * 60.0)
     from test.soak import node
 
-    return node.run(args.scans, NODE_BLOCK, options, args.minutes * 60.0)
+    return node.run(args.scans, min(args.block, NODE_BLOCK), options, args.minutes * 60.0)
 
 
 def verdict(rows: Sequence[Row]) -> str:

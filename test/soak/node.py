@@ -13,6 +13,7 @@ from __future__ import annotations
 from array import array
 from collections import deque
 from collections.abc import Iterable, Iterator
+import math
 import os
 from pathlib import Path
 import tempfile
@@ -125,7 +126,7 @@ def ros_message(raw: RawCloud) -> PointCloud2:
     return message
 
 
-def run(num_scans: int, block: int, options: Options, most_s: float = 0.0) -> Iterator[Row]:
+def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
     """
     Yield a row for every block of scans, until there were so many or the time is up.
 
@@ -154,7 +155,7 @@ def blocks(
         drive.send(number, turn, place)
         sent = number + 1
         drive.wait_for(sent - UNDER_WAY)
-        is_last = sent == num_scans or (most_s and time.monotonic() - start > most_s)
+        is_last = sent == num_scans or time.monotonic() - start > most_s
         if sent % block == 0 or is_last:
             drive.wait_for(sent)
             now = time.monotonic()

@@ -1,0 +1,143 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What SECURITY.md promises of the source, read from the source; and files stay where they belong.
+
+What readers do with damaged and hostile input is in test/fuzz, what the node does in test/ros.
+"""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+import re
+
+import pytest
+
+from surfel_mapper.config import load_config, OutputConfig
+from surfel_mapper.errors import ConfigError
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / 'surfel_mapper'
+
+MODULES = {'pickle', 'cPickle', 'marshal', 'shelve', 'dill', 'cloudpickle', 'joblib', 'subprocess'}
+"""What runs what a file says, or programs."""
+
+CALLS = {'eval', 'exec', 'compile', '__import__', 'os.system', 'os.popen', 'tempfile.mktemp'}
+
+SOURCES = sorted(PACKAGE.rglob('*.py'))
+
+
+def name_of(node):
+    """Return the dotted name of what is called."""
+    if isinstance(node, ast.Attribute):
+        return f'{name_of(node.value)}.{node.attr}'
+    return node.id if isinstance(node, ast.Name) else ''
+
+
+def dangers(source):
+    """Return what in a source runs code or programs that come from elsewhere."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names if alias.name.split('.')[0] in MODULES]
+        elif isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] in MODULES:
+            found.append(node.module)
+        elif isinstance(node, ast.Call):
+            found += dangers_of_call(node)
+    return found
+
+
+def dangers_of_call(call):
+    name = name_of(call.func)
+    given = {word.arg: word.value for word in call.keywords}
+    pickles = given.get('allow_pickle')
+    arguments = [name_of(argument) for argument in (*call.args, *given.values())]
+    if name in CALLS or re.match(r'os\.(exec|spawn)', name):
+        return [name]
+    if name in ('np.load', 'np.save') or (pickles is not None and pickles.value is not False):
+        return [f'{name} may pickle']
+    if 'shell' in given:
+        return [f'{name} with a shell']
+    if name in ('yaml.load', 'yaml.load_all'):
+        safe = {'yaml.SafeLoader', 'yaml.BaseLoader'}
+        loads = [n for n in ast.walk(call) if isinstance(n, ast.Attribute)]
+        return [] if {name_of(n) for n in loads} & safe else [name]
+    return [a for a in arguments if a in ('eval', 'exec')]
+
+
+@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+def test_no_source_unpickles_evaluates_or_starts_programs(path):
+    assert dangers(path.read_text(encoding='utf-8')) == []
+
+
+@pytest.mark.parametrize(
+    'source',
+    [
+        'import pickle',
+        'from subprocess import run',
+        'eval(x)',
+        'os.system(x)',
+        'os.execv(x, y)',
+        'np.load(x)',
+        'np.lib.format.read_array(x, allow_pickle=True)',
+        'run(x, shell=True)',
+        'yaml.load(x, yaml.Loader)',
+    ],
+)
+def test_what_is_dangerous_is_found(source):
+    assert dangers(source)
+
+
+def requirements():
+    """Return all requirements in setup.py: what stands in its lists, by their names."""
+    tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and isinstance(node.value, ast.List):
+            for item in node.value.elts:
+                if isinstance(item, ast.Constant):
+                    yield item.value
+                elif isinstance(item, ast.JoinedStr):
+                    yield item.values[0].value
+
+
+def test_every_dependency_has_a_lower_bound():
+    found = list(requirements())
+    assert len(found) > 15
+    unbound = [name for name in found if not re.match(r'[\w.\[\]-]+>=\d', name)]
+    assert unbound == []
+
+
+@pytest.mark.parametrize('name', ['', '.', '..', '.x', 'a/b', '/etc/x', 'a\\b', 'a\0b', '../a'])
+def test_names_of_maps_that_lead_elsewhere_are_refused(name):
+    with pytest.raises(ConfigError, match='map_name'):
+        OutputConfig(map_name=name)
+
+
+def test_an_error_in_a_file_does_not_say_what_is_in_it(tmp_path):
+    path = tmp_path / 'shadow'
+    path.write_text('root: [secret\nuser: x: y\n')
+    with pytest.raises(ConfigError) as raised:
+        load_config(path)
+    assert 'secret' not in str(raised.value)
+    assert 'line 2' in str(raised.value)
+
+
+def test_a_map_is_not_saved_through_a_link_that_leads_elsewhere(tmp_path):
+    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    from surfel_mapper.config import Config
+    from surfel_mapper.pipeline import Mapper
+    from surfel_mapper.ros.saving import save_map
+
+    outside, maps = tmp_path / 'precious', tmp_path / 'maps'
+    outside.write_text('as it was')
+    maps.mkdir()
+    settings = {'pose.source': 'identity', 'output.directory': str(maps)}
+    for suffix in ('ply', 'npz'):
+        link = maps / f'map.{suffix}'
+        link.symlink_to(outside)
+        with pytest.raises(ConfigError, match='leads out of output'):
+            save_map(Mapper(Config.from_mapping(settings)))
+        link.unlink()
+    assert outside.read_text() == 'as it was'
+    assert list(maps.iterdir()) == []
