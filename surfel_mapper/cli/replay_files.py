@@ -77,9 +77,11 @@ def write_files(
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper)
+    mesh = None
     if mapper.tsdf is not None:
         mapper.tsdf.finish(mapper.window)
-        write_mesh(output / 'mesh.ply', mapper.tsdf.mesh())
+        mesh = mapper.tsdf.mesh()
+        write_mesh(output / 'mesh.ply', mesh)
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (
@@ -88,7 +90,7 @@ def write_files(
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
     draw_map(surfels, picture, title, trajectory=mapped.positions)
-    write_report(page, title, summary, surfels, history, picture)
+    write_report(page, title, summary, surfels, history, picture, mesh)
     with replace_file(figures) as file:
         file.write((json.dumps(summary, indent=2) + '\n').encode())
     return [*(output / FORMATS[name] for name in formats), picture, page, figures]

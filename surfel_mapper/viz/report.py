@@ -5,7 +5,8 @@ report.html: one page that says what was mapped, with plots and the map to turn 
 
 Everything is inside the file, and a content security policy forbids the page to load anything
 else. Names in bags are anyone's: all text is escaped, and data for the script is JSON in which
-no tag can begin. The map is 12 bytes a surfel, 1.6 MB of text for the 100,000 shown at most.
+no tag can begin. The map is 12 bytes a surfel, 1.6 MB of text for the 100,000 shown at most; the
+mesh of the TSDF takes up to 4 MB more.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.io.files import replace_file
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, named_bars, short
 from surfel_mapper.viz.history import History
+from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
 from surfel_mapper.viz.picture import limits, sides_m, SPREAD
 
 Array = npt.NDArray[np.float64]
@@ -51,6 +54,7 @@ def write_report(
     surfels: Surfels,
     history: History | None = None,
     picture: str | Path | None = None,
+    mesh: Mesh | None = None,
 ) -> None:
     """
     Write a report, whole or not at all.
@@ -70,6 +74,8 @@ def write_report(
         What happened scan by scan; without it there are no plots over time.
     picture : str or Path, optional
         A PNG file, for browsers that cannot draw in 3D.
+    mesh : Mesh, optional
+        The surface of the TSDF, to be shown in the place of the surfels.
 
     Raises
     ------
@@ -82,7 +88,7 @@ def write_report(
     parts = [
         f'<h1>{escape(title)}</h1><p class="about">{escape(about(summary))}</p>',
         figures(summary, history),
-        view(valid, history.trajectory, summary, picture),
+        view(valid, history.trajectory, summary, picture, mesh),
         plots(valid, summary, history),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',
         settings_table(summary.get('settings', {})),
@@ -139,6 +145,7 @@ def view(
     trajectory: Array,
     summary: Mapping[str, Any],
     picture: str | Path | None,
+    mesh: Mesh | None,
 ) -> str:
     """Return the 3D view with its data."""
     shown = within_sight(surfels)
@@ -147,7 +154,13 @@ def view(
     shown = shown.select(mixed[:MAX_SHOWN])
     if len(mixed) > MAX_SHOWN:
         note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
-    data = json.dumps(view_data(shown, trajectory)).replace('<', '\\u003c')
+    choice = ''
+    if mesh is not None and len(mesh):
+        kinds = '<option>surfels</option><option>mesh</option>'
+        choice = f'<label>show <select id="shown">{kinds}</select></label>'
+        if len(mesh) > MAX_TRIANGLES:
+            note += f' The mesh of {len(mesh):,} triangles is made smaller.'
+    data = json.dumps(view_data(shown, trajectory, mesh)).replace('<', '\\u003c')
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
@@ -156,7 +169,8 @@ def view(
     return (
         '<h2>The map</h2><div class="view"><canvas id="surfels"></canvas>'
         f'<div id="picture" hidden>{fallback}</div>'
-        f'<div class="tools"><label>colour <select id="colouring">{colours}</select></label>'
+        f'<div class="tools">{choice}'
+        f'<label>colour <select id="colouring">{colours}</select></label>'
         '<label><input type="checkbox" id="hide" checked> hide what faces away</label>'
         '<button id="reset">reset</button></div>'
         '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
@@ -173,11 +187,15 @@ def within_sight(surfels: Surfels) -> Surfels:
     return surfels.select(np.asarray(inside.all(axis=1)))
 
 
-def view_data(surfels: Surfels, trajectory: Array) -> dict[str, Any]:
+def view_data(
+    surfels: Surfels, trajectory: Array, mesh: Mesh | None = None
+) -> dict[str, Any]:
     """Return what page/view.js needs: everything about the middle of the map, in metres."""
     from matplotlib import colormaps
 
     low, high = np.zeros(3), np.ones(3)
+    if not len(surfels) and mesh is not None and len(mesh):
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     if len(surfels):
         low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
     size = np.maximum(high - low, 1e-3)
@@ -196,6 +214,7 @@ def view_data(surfels: Surfels, trajectory: Array) -> dict[str, Any]:
         'ramp': encoded(ramp.astype(np.uint8)),
         'size': [float(side) for side in size],
         'largest': largest,
+        **({'mesh': mesh_data(mesh, low, size)} if mesh is not None and len(mesh) else {}),
         'heights': [f'{low[2]:.3g} m', f'{high[2]:.3g} m'],
     }
 

@@ -19,6 +19,8 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.mesh import vertex_normals
 from surfel_mapper.viz.picture import sides_m, SPREAD
 
 if TYPE_CHECKING:
@@ -114,10 +116,25 @@ class Viewer:
         return np.array([*self._positions[::step], self._positions[-1]])
 
     def _log_map(self) -> None:
-        """Log all surfels."""
+        """Log all surfels, and the mesh of the TSDF where there is one."""
         mapper = self._mapper
         self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
         self._logged_voxels, self._removed = mapper.map.num_voxels, 0
+        if mapper.tsdf is not None:
+            self._log_mesh(mapper.tsdf.mesh())
+
+    def _log_mesh(self, mesh: Mesh) -> None:
+        """Log the surface of the TSDF, in its colours where it has any."""
+        if len(mesh):
+            self._stream.log(
+                'map/mesh',
+                self._rerun.Mesh3D(
+                    vertex_positions=mesh.vertices.astype(np.float32),
+                    triangle_indices=mesh.triangles.astype(np.uint32),
+                    vertex_normals=vertex_normals(mesh),
+                    vertex_colors=mesh.colors if len(mesh.colors) else None,
+                ),
+            )
 
     def _log_surfels(self, name: str, surfels: Surfels) -> None:
         """Log surfels as points as large as their discs, in the colours of planarity."""

@@ -111,5 +111,5 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
     y, x = np.nonzero(np.array(grid.data).reshape(grid.info.height, grid.info.width) == 100)
     corner = grid.info.origin.position
     distance = np.hypot(corner.x + (x + 0.5) * 0.2 - 0.1, corner.y + (y + 0.5) * 0.2)
-    # 2 m above the sensor the sphere of 5 m is a circle of sqrt(21) m.
-    assert np.median(distance) == pytest.approx(21**0.5, abs=0.2)
+    # 2 m above the sensor the sphere of 5 m is a circle of sqrt(21) m; its inside is free.
+    assert 21**0.5 - 0.4 < distance.min() < 21**0.5

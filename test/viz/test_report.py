@@ -43,11 +43,11 @@ class Parsed(HTMLParser):
         return found
 
 
-def report(tmp_path, drawn=None, title='street', **summary):
+def report(tmp_path, drawn=None, title='street', mesh=None, **summary):
     mapper, history = mapped(3)
     surfels = mapper.map.surfels(2) if drawn is None else drawn
     path = tmp_path / 'report.html'
-    write_report(path, title, {**mapper.summary(), **summary}, surfels, history)
+    write_report(path, title, {**mapper.summary(), **summary}, surfels, history, mesh=mesh)
     return Parsed(path.read_text(encoding='utf-8'))
 
 

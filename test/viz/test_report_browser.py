@@ -12,6 +12,7 @@ from matplotlib.image import imread
 import numpy as np
 import pytest
 
+from test.viz.test_mesh import sphere
 from test.viz.test_report import plane, report
 
 playwright = pytest.importorskip(
@@ -117,6 +118,25 @@ def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
     drawn = np.ptp(by_normal, axis=2) > 0.1
     assert (by_normal[drawn].argmax(axis=1) == 2).mean() > 0.95
     assert complaints == []
+
+
+def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):
+    report(tmp_path, plane(30), mesh=sphere(40, 3.0, (7.5, 7.5, 5.0)))
+    complaints, page = [], browser.new_page(viewport={'width': 900, 'height': 800})
+    page.on('console', lambda message: complaints.append(message.text))
+    page.on('pageerror', lambda error: complaints.append(str(error)))
+    page.goto((tmp_path / 'report.html').as_uri())
+    page.locator('#shown').select_option('mesh')
+    settle(page)
+    image = pixels(page)
+    red = (image[..., 0] > 0.3) & (image[..., 1:].max(axis=2) < 0.05)
+    blue = (image[..., 2] > 0.3) & (image[..., :2].max(axis=2) < 0.05)
+    # seen from above, more of the upper half
+    assert red.sum() > blue.sum() > 500
+    assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean()
+    assert not page.locator('#colouring').is_visible()
+    assert complaints == []
+    page.close()
 
 
 def test_without_webgl_the_page_says_so(browser, tmp_path):

@@ -13,6 +13,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.io.recorded import drive, write_rosbag2
+from test.pipeline.test_tsdf_layer import insert, mapper_with
 
 pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
 
@@ -50,3 +51,11 @@ def test_points_are_picked_evenly_and_finite():
 def test_a_file_that_cannot_be_written_is_an_error(tmp_path):
     with pytest.raises(FileFormatError, match='nowhere'):
         Viewer(Mapper(), tmp_path / 'nowhere' / 'a.rrd')
+
+
+def test_the_mesh_of_a_tsdf_is_recorded(tmp_path):
+    mapper = mapper_with()
+    with Viewer(mapper, tmp_path / 'a.rrd') as viewer:
+        for update in insert(mapper, 1):
+            viewer.add(update)
+    assert '/map/mesh' in rerun('print', tmp_path / 'a.rrd').stdout

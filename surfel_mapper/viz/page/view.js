@@ -10,6 +10,8 @@
 // where there is no graphics card. The picture is drawn only when something has changed, and
 // while it moves with so few surfels, larger ones, that a frame takes no longer than SLOW_MS;
 // they come in random order, so the first are as good as any.
+// In the place of the surfels the mesh of a TSDF can be shown, where there is one: 16 bytes a vertex
+// (place, colour, normal), drawn whole, and lit from where the eye is.
 // The view has z up; it turns about a point that panning moves.
 'use strict';
 
@@ -42,6 +44,19 @@
     in vec3 colour;
     out vec4 pixel;
     void main() { pixel = vec4(colour, 1); }`;
+  const MESH_VERTEX = `#version 300 es
+    in vec3 place;
+    in vec3 paint;
+    in vec3 normal;
+    uniform mat4 camera;
+    uniform vec3 reach, eye;
+    out vec3 colour;
+    void main() {
+      vec3 at = (2.0 * place - 1.0) * reach;
+      float facing = dot(normalize(normal + vec3(0, 0, 1e-6)), normalize(eye - at));
+      gl_Position = camera * vec4(at, 1);
+      colour = paint * (0.45 + 0.55 * abs(facing));
+    }`;
   const LINE_VERTEX = `#version 300 es
     in vec3 place;
     uniform mat4 camera;
@@ -123,6 +138,29 @@
   const path = new Float32Array(bytes(data.trajectory).buffer);
   buffer(path);
   attribute(line, 'place', 3, gl.FLOAT, false, 0, 0);
+
+  const mesh = data.mesh ? program(MESH_VERTEX, FRAGMENT) : null;
+  const meshArrays = gl.createVertexArray();
+  let wedges = null;
+  if (mesh) {
+    gl.bindVertexArray(meshArrays);
+    buffer(bytes(data.mesh.vertices));
+    attribute(mesh, 'place', 3, gl.UNSIGNED_SHORT, true, 16, 0);
+    attribute(mesh, 'paint', 3, gl.UNSIGNED_BYTE, true, 16, 8);
+    attribute(mesh, 'normal', 3, gl.BYTE, true, 16, 12);
+    wedges = new Uint32Array(bytes(data.mesh.triangles).buffer);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, wedges, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    document.getElementById('shown').addEventListener('change', () => {
+      for (const part of ['colouring', 'hide']) {
+        document.getElementById(part).closest('label').hidden = showsMesh();
+      }
+      document.querySelector('.scale').style.display = showsMesh() ? 'none' : '';
+      redraw();
+    });
+  }
+  const showsMesh = () => mesh !== null && document.getElementById('shown').selectedIndex === 1;
 
   const ramp = bytes(data.ramp);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -209,6 +247,24 @@
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const eye = eyeOf();
     const matrix = camera(eye);
+    if (showsMesh()) drawMesh(matrix, eye);
+    else drawDiscs(drawn, matrix, eye);
+    gl.useProgram(line);
+    gl.bindVertexArray(lineArrays);
+    gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
+    gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
+  }
+
+  function drawMesh(matrix, eye) {
+    gl.useProgram(mesh);
+    gl.bindVertexArray(meshArrays);
+    gl.uniformMatrix4fv(gl.getUniformLocation(mesh, 'camera'), false, matrix);
+    gl.uniform3f(gl.getUniformLocation(mesh, 'reach'), ...data.mesh.reach);
+    gl.uniform3f(gl.getUniformLocation(mesh, 'eye'), ...eye);
+    gl.drawElements(gl.TRIANGLES, wedges.length, gl.UNSIGNED_INT, 0);
+  }
+
+  function drawDiscs(drawn, matrix, eye) {
     gl.useProgram(discs);
     gl.bindVertexArray(discArrays);
     const at = (name) => gl.getUniformLocation(discs, name);
@@ -220,10 +276,6 @@
     gl.uniform1f(at('hide'), document.getElementById('hide').checked ? 1 : 0);
     gl.uniform1i(at('colouring'), document.getElementById('colouring').selectedIndex);
     gl.drawElements(gl.TRIANGLES, 12 * drawn, gl.UNSIGNED_INT, 0);
-    gl.useProgram(line);
-    gl.bindVertexArray(lineArrays);
-    gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
-    gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
   }
 
   function redraw() {
