@@ -26,6 +26,8 @@ EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
 
 MAPS = ('.npz', '.parquet')
 
+FORMATS = ('json', 'obj', 'parquet')
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -33,6 +35,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'cloud', type=Path, metavar='CLOUD|MAP', help='.ply, .pcd, .bin; or a map, .npz, .parquet'
     )
     parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='made if needed')
+    parser.add_argument(
+        '--formats',
+        nargs='+',
+        choices=FORMATS,
+        default=('json', 'obj'),
+        metavar='FORMAT',
+        help=f'of {", ".join(FORMATS)}; default json obj',
+    )
     parser.add_argument(
         '--voxel-size', type=float, metavar='M', help='default 0.04; half of that of a map'
     )
@@ -75,9 +85,8 @@ def run(args: argparse.Namespace) -> int:
     )
     model = fit(points, config, viewpoint)
     args.output.mkdir(parents=True, exist_ok=True)
-    model_files.write_json(args.output / 'models.json', model)
-    model_files.write_parquet(args.output / 'models.parquet', model)
-    model_files.write_obj(args.output / 'models.obj', model)
+    for name in args.formats:
+        getattr(model_files, f'write_{name}')(args.output / f'models.{name}', model)
     draw_models(args.output / 'models.png', points, model, viewpoint)
     content = figures(model, evaluate(model, points), len(points))
     print(json.dumps(content) if args.json else report(content))

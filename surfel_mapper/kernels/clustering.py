@@ -22,7 +22,7 @@ from surfel_mapper.kernels.mixture import split_mixture
 
 MAX_DEPTH = 66
 MEANS_ITERATIONS = 10
-MEANS_SAMPLE = 4096
+MEANS_SAMPLE = 2048
 """The means of more points are those of every so many of them that about so many are left."""
 
 SETTLED_SHARE = 0.002

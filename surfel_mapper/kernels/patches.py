@@ -50,7 +50,7 @@ def describe(points, starts, normals, viewpoint, rules, means, covariances, fram
         thick = 6.0 * math.sqrt(value[0])
         turn(frame, normals[k])
         curved[k] = thick >= thickness[k]
-        if bent:
+        if bent and curved[k]:  # what bends by a thickness is thicker than that
             bend = bend_of(points, low, high, mean, frame, pitch)
             if bend >= 0.0:
                 curved[k] = bend > thickness[k] or thick >= 2.0 * thickness[k]

@@ -90,7 +90,8 @@ def fit(
     names = ('thin', 'cluster', 'join', 'fit')
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
     model, labels = assembled(clusters, patches, config)
-    return replace(model, labels=thinned.spread(labels), milliseconds=dict(zip(names, times, strict=True)))
+    stages = dict(zip(names, times, strict=True))
+    return replace(model, labels=thinned.spread(labels), milliseconds=stages)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from test.bench.report import Row, table
 
 BENCHES = (
     'mapping', 'scaling', 'live', 'offline', 'compare', 'filters', 'lum', 'align', 'accuracy',
-    'registration', 'outputs', 'tsdf', 'workers',
+    'registration', 'outputs', 'tsdf', 'models', 'workers',
 )  # fmt: skip
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
