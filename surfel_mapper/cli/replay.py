@@ -25,7 +25,14 @@ from typing import TYPE_CHECKING
 
 from surfel_mapper.cli import replay_many
 from surfel_mapper.cli.progress import progress, stopped_by_interrupt
-from surfel_mapper.cli.replay_files import BAG, FORMATS, Mapped, write_files
+from surfel_mapper.cli.replay_files import (
+    BAG,
+    check_truth,
+    FORMATS,
+    Mapped,
+    pose_errors,
+    write_files,
+)
 from surfel_mapper.cli.replay_report import causes, report
 
 if TYPE_CHECKING:
@@ -100,6 +107,10 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply)',
     )  # fmt: skip
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
+    add(
+        '--truth', type=Path, metavar='FILE',
+        help='state how far the poses are from those of this file or simulated bag, of the sensor',
+    )  # fmt: skip
     add('--view', action='store_true', help='show it in rerun while it happens')
     add('--rrd', type=Path, metavar='FILE', help='write that to a file, for rerun to open')
     add('--json', action='store_true', help='print the summary as JSON')
@@ -149,6 +160,8 @@ def run(args: argparse.Namespace) -> int:
         load_start(mapper)
         mapper.warm_up()
         bag = normals_bag(output, mapper, files) if BAG in formats_wanted else None
+        if args.truth is not None:
+            check_truth(args.truth)
         history = History()
         listeners: list[Callable[[Update], None]] = [partial(history.add, mapper)]
         listeners += [*viewers(args, mapper, files), *([bag.add] if bag else [])]
@@ -168,6 +181,7 @@ def run(args: argparse.Namespace) -> int:
             'interrupted': was_stopped,
             'cut': list(recording.cuts),
             **aligned,
+            **pose_errors(args.truth, mapped),
             **mapper.summary(),
             'settings': mapper.config.to_mapping(),
         }

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import json
+import logging
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -29,6 +30,12 @@ FORMATS = {
     BAG: 'normals',
 }
 """What the map is written as, and where: npz and parquet are exact, to be loaded again."""
+
+
+SAME_TIME_NS = 10_000_000
+"""Poses of a scan and of the truth at most so far apart are of one time."""
+
+_log = logging.getLogger(__name__)
 
 
 class Mapped:
@@ -109,3 +116,35 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
         parquet.write_map(path, mapper.map)
     elif name == 'npz':
         map_state.save_map(path, mapper.map, mapper.window)
+
+
+def check_truth(truth: Path) -> None:
+    """Refuse a file or bag without true poses, before hours of work."""
+    import numpy as np
+
+    from surfel_mapper.cli.evaluate import true_poses
+
+    true_poses(truth, np.zeros(1, np.int64))
+
+
+def pose_errors(truth: Path | None, mapped: Mapped) -> dict[str, Any]:
+    """Return how far the poses are from the true ones, for the summary; nothing without truth."""
+    import numpy as np
+
+    from surfel_mapper.alignment.trajectory_errors import compare
+    from surfel_mapper.cli.evaluate import true_poses
+
+    if truth is None:
+        return {}
+    stamps_ns = np.array(mapped.stamps_ns, np.int64)
+    try:
+        errors = compare(
+            stamps_ns,
+            np.array(mapped.poses).reshape(-1, 4, 4),
+            *true_poses(truth, stamps_ns),
+            max_difference_ns=SAME_TIME_NS,
+        )
+    except ValueError as error:
+        _log.warning('--truth %s: %s', truth, error)
+        return {}
+    return {'pose_errors': errors}

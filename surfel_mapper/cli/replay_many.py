@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 CUT = 3
 """Exit code: a recording ends too early and --strict was given."""
 
-ONE_PROCESS = ('window', 'align', 'poses_out', 'view', 'rrd', 'formats')
+ONE_PROCESS = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
 
 

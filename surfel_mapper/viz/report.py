@@ -90,6 +90,7 @@ def write_report(
         figures(summary, history),
         view(valid, history.trajectory, summary, picture, mesh),
         plots(valid, summary, history),
+        pose_errors_table(summary.get('pose_errors')),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',
         settings_table(summary.get('settings', {})),
     ]
@@ -268,6 +269,30 @@ def fates(summary: Mapping[str, Any]) -> dict[str, int]:
 def named(counts: Mapping[str, int]) -> dict[str, int]:
     """Return counts by cause in words, those that are not zero."""
     return {str(cause).replace('_', ' '): int(n) for cause, n in counts.items() if n}
+
+
+def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
+    """Return how far the poses are from the true ones, where these are known."""
+    if errors is None:
+        return ''
+    rows = ''
+    for kind in ('absolute', 'relative'):
+        for name, unit, factor in (('translation_m', 'mm', 1e3), ('rotation_deg', 'deg', 1.0)):
+            found = errors[kind][name]
+            cells = ''.join(
+                f'<td class="number">{found[figure] * factor:.3f}</td>'
+                for figure in ('rmse', 'mean', 'median', 'max')
+            )
+            rows += f'<tr><td>{kind}, {unit}</td>{cells}</tr>'
+    head = ''.join(f'<th class="number">{name}</th>' for name in ('rmse', 'mean', 'median', 'max'))
+    drift = (
+        f'{errors["num_poses"]} poses compared; drift {errors["drift_m_per_100m"]:.3f} m and '
+        f'{errors["drift_deg_per_100m"]:.3f} deg in 100 m.'
+    )
+    return (
+        f'<h2>Errors of the poses</h2><table><tr><th></th>{head}</tr>{rows}</table>'
+        f'<p>{escape(drift)}</p>'
+    )
 
 
 def times_table(summary: Mapping[str, Any]) -> str:

@@ -155,6 +155,34 @@ def test_an_output_without_permission_is_refused_before_the_work(tmp_path, capsy
     assert 'no permission to write in' in capsys.readouterr().err
 
 
+def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path):
+    first, second = tmp_path / 'first', tmp_path / 'second'
+    track = tmp_path / 'track.tum'
+    assert main(['replay', str(bag), '--output', str(first), '--poses-out', str(track)]) == 0
+    lines = track.read_text().splitlines()
+    shifted = [line.split() for line in lines if not line.startswith('#')]
+    for row, values in enumerate(shifted):
+        values[1] = repr(float(values[1]) + 0.1 * (row % 2))  # every other pose is off by 10 cm
+    track.write_text('\n'.join(' '.join(values) for values in shifted))
+
+    assert main(['replay', str(bag), '--output', str(second), '--truth', str(track)]) == 0
+
+    assert 'pose_errors' not in summary_of(first)
+    errors = summary_of(second)['pose_errors']
+    assert errors['num_poses'] == len(shifted)
+    steps = errors['relative']['translation_m']
+    assert steps['max'] == pytest.approx(0.1, abs=1e-6)
+    assert 'Errors of the poses' in (second / 'report.html').read_text()
+    assert 'Errors of the poses' not in (first / 'report.html').read_text()
+
+
+def test_a_truth_that_is_none_is_refused_before_the_work(bag, tmp_path, capsys):
+    output = tmp_path / 'out'
+    assert main(['replay', str(bag), '--output', str(output), '--truth', '/nowhere']) == 1
+    assert '/nowhere' in capsys.readouterr().err
+    assert not output.exists()
+
+
 def test_warnings_go_to_stderr_only(tmp_path, capsys, caplog):
     entries = drive()
     entries[4][3].point_step = 15
