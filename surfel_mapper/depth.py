@@ -25,6 +25,9 @@ COLOR, LABEL = 'color', 'label'
 UNIT_M = {np.dtype(np.uint16): 1e-3, np.dtype(np.float32): 1.0}
 """What one unit of depth is, by type of image (REP 118): millimetres or metres."""
 
+END = {np.dtype(np.uint16): 65535.0, np.dtype(np.float32): np.inf}
+"""From this depth on there is none: Kinects write 65535 where they see nothing."""
+
 
 @dataclass(frozen=True, slots=True)
 class PinholeCamera:
@@ -100,7 +103,8 @@ def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[
     Parameters
     ----------
     depth : (H, W) uint16, mm, or float32, m
-        Along the optical axis; 0, negative values, nan and inf mean that there is none.
+        Along the optical axis; 0, negative values, nan, inf and, with some cameras, 65535 mm mean
+        that there is none.
     camera : PinholeCamera
         Which took it.
 
@@ -126,7 +130,8 @@ def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[
     down = (np.arange(camera.height) - camera.cy) / camera.fy
     points = np.empty((3, depth.size), np.float32)
     image = np.require(depth, None, ['C', 'A', 'W'])
-    num = unproject(image, UNIT_M[depth.dtype], across, down, points)
+    unit_m, end = UNIT_M[depth.dtype], END[depth.dtype]
+    num = unproject(image, unit_m, end, across, down, points)
     return np.asfortranarray(points[:, :num].T)
 
 

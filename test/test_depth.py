@@ -51,6 +51,14 @@ def test_pixels_without_depth_give_no_point(nothing):
     assert len(depth_points(np.full((30, 40), nothing, np.float32), CAMERA)) == 0
 
 
+def test_the_largest_number_of_millimetres_is_no_depth():
+    depth = np.full((30, 40), 2000, np.uint16)
+    depth[4, 5:8] = 65535, 65534, 0
+    points = depth_points(depth, CAMERA)
+    assert len(points) == 1198
+    assert points[:, 2].max() == np.float32(65.534)
+
+
 def test_any_layout_of_the_image_will_do():
     depth = np.random.default_rng(3).uniform(1, 2, (30, 40)).astype(np.float32)
     expected = depth_points(depth, CAMERA)
@@ -67,7 +75,7 @@ def test_the_kernel_goes_row_by_row(call):
     depth = np.array([[1000, 0], [3000, 4000]], np.uint16)
     points = np.empty((3, 4), np.float32)
     across, down = np.array([-0.5, 0.5]), np.array([0.0, 0.25])
-    assert call(unproject, depth, 1e-3, across, down, points) == 3
+    assert call(unproject, depth, 1e-3, 65535.0, across, down, points) == 3
     np.testing.assert_allclose(
         points[:, :3], [[-0.5, -1.5, 2.0], [0.0, 0.75, 1.0], [1.0, 3.0, 4.0]], rtol=1e-7
     )

@@ -133,26 +133,34 @@ def seen_in(
         assert image.camera is not None, 'those beside a lidar come with their camera'
         camera, T = image.camera, place(image)
         points = scan.points @ T[:3, :3].T + T[:3, 3]
-    rows, columns, inside = pixels_of(camera, points, image.pixels.shape[:2])
-    if not len(rows):
+    pixel = pixels_of(camera, points, image.pixels.shape[:2])
+    if not len(pixel) or pixel.max() < 0:
         return None
     if image.kind == LABEL:
-        labels = np.full(len(points), -1, np.int32)
-        labels[inside] = image.pixels[rows, columns]
-        return labels
-    red, green, blue = image.pixels[rows, columns].T.astype(np.uint32)
-    colors = np.zeros(len(points), np.uint32)
-    colors[inside] = (np.uint32(255) << 24) | (red << 16) | (green << 8) | blue
-    return colors
+        values, nothing = image.pixels.ravel(), -1
+    else:
+        values, nothing = packed(image.pixels), 0
+    seen = values[pixel]
+    seen[pixel < 0] = nothing
+    return seen
+
+
+def packed(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
+    """Return the colours of an image as points have them in rgba, with an alpha of 255."""
+    rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
+    rgba[..., 2::-1] = pixels
+    return rgba.view('<u4').astype(np.uint32, copy=False).ravel()
 
 
 def pixels_of(
     camera: PinholeCamera, points: npt.NDArray[Any], size: tuple[int, ...]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Return row and column of the points in view of a camera, and which these are, (N,)."""
+) -> npt.NDArray[np.int32]:
+    """Return in which pixel of a camera each point is, counted row by row; -1 for none, (N,)."""
+    x, y, z = (np.ascontiguousarray(points[:, axis], np.float32) for axis in range(3))
     with np.errstate(all='ignore'):  # points behind it and those that are none
-        x, y, z = points.T
-        column = np.floor(camera.fx * (x / z) + (camera.cx + 0.5))
-        row = np.floor(camera.fy * (y / z) + (camera.cy + 0.5))
-        inside = (z > 0) & (column >= 0) & (column < size[1]) & (row >= 0) & (row < size[0])
-    return row[inside].astype(np.int64), column[inside].astype(np.int64), inside
+        u = x / z * np.float32(camera.fx) + np.float32(camera.cx + 0.5)
+        v = y / z * np.float32(camera.fy) + np.float32(camera.cy + 0.5)
+        inside = (z > 0) & (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
+        pixel = v.astype(np.int32) * np.int32(size[1]) + u.astype(np.int32)
+    pixel[~inside] = -1
+    return pixel

@@ -1,10 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A real depth camera: what other images measured lies where the field says the surface is."""
+"""A real depth camera: what other images measured lies where field and mesh say the surface is."""
+
+from dataclasses import astuple
 
 import numpy as np
 import pytest
 
+from surfel_mapper.config import Config
+from surfel_mapper.depth import depth_points, PinholeCamera, SceneImage
+from surfel_mapper.geometry import q_xyzw
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.queries import FREE, sample, states
 from surfel_mapper.tsdf.range_image import from_depth
 from surfel_mapper.tsdf.sensors import Camera
@@ -63,3 +70,59 @@ def test_images_between_those_fused_lie_on_the_surface_and_have_its_colour(data_
         off = abs(fused[has, :3] - color[seen][there][has].astype(float))
         assert has.mean() > 0.8
         assert np.median(off) < 20.0
+
+
+def fused(data_folder, numbers):
+    """Return the mesh that a mapper makes of images, with the colours joined by stamp."""
+    mapper = Mapper(Config.from_mapping({
+        'input.kind': 'depth',
+        'pose.source': 'odometry',
+        'frames.base': 'kinect',
+        'layers.tsdf.enabled': True,
+        'layers.tsdf.voxel_size_m': 0.02,
+        'layers.tsdf.truncation_m': 0.08,
+        'layers.tsdf.min_range_m': 0.4,
+        'layers.tsdf.max_range_m': 4.0,
+        'layers.tsdf.carve': False,
+        'layers.tsdf.color': True,
+        'layers.tsdf.color_topic': 'color',
+    }))  # fmt: skip
+    camera = PinholeCamera(640, 480, 585.0, 585.0, 320.0, 240.0)
+    for depth, color, pose in frames(data_folder, numbers):
+        stamp_ns = (len(mapper.window) + 1) * 10**8
+        mapper.add_pose('odom', 'kinect', stamp_ns, pose[:3, 3], q_xyzw(pose))
+        mapper.add_image(
+            SceneImage(
+                kind='color', stamp_ns=stamp_ns, frame_id='kinect', camera=None, pixels=color
+            )
+        )
+        points = depth_points(depth, camera)
+        mapper.add_scan(
+            Scan(points=points, stamp_ns=stamp_ns, frame_id='kinect', camera=astuple(camera))
+        )
+        assert len(list(mapper.insert_ready())) == 1
+    return mapper.tsdf.mesh()
+
+
+def test_the_mesh_lies_on_what_other_images_show_and_looks_like_them(data_folder):
+    mesh = fused(data_folder, range(0, 200, 20))
+    assert len(mesh) > 50_000
+    off_m, off_color, covered = [], [], []
+    for depth, color, pose in frames(data_folder, range(10, 190, 60)):
+        x, y, z = ((mesh.vertices - pose[:3, 3]) @ pose[:3, :3]).T
+        z[z < 0.4] = np.nan
+        u, v = np.rint(585.0 * x / z + 320.0), np.rint(585.0 * y / z + 240.0)
+        inside = (u >= 0) & (u < 640) & (v >= 0) & (v < 480)
+        u, v, z = u[inside].astype(int), v[inside].astype(int), z[inside]
+        measured = depth[v, u] * 1e-3
+        known = (measured > 0.4) & (measured < 3.5)
+        visible = known & (np.abs(z - measured) < 0.08)  # others are hidden, or hide
+        off_m.append(np.abs(z - measured)[visible])
+        off_color.append(np.abs(mesh.colors[inside][visible] - color[v, u][visible].astype(float)))
+        shown = np.zeros((60, 80), bool)
+        shown[v[visible] // 8, u[visible] // 8] = True
+        there = ((depth > 400) & (depth < 3500)).reshape(60, 8, 80, 8).mean(axis=(1, 3)) > 0.9
+        covered.append(shown[there].mean())
+    assert np.median(np.concatenate(off_m)) < 0.018
+    assert np.median(np.concatenate(off_color)) < 20.0
+    assert min(covered) > 0.7
