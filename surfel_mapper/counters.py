@@ -21,16 +21,10 @@ import numpy as np
 LATEST = 1000
 """Times of so many scans are kept for the percentiles."""
 
-
 MOST_FRAMES = 128
 """Drops of so many frames and topics are told apart; those of all further ones are OTHERS."""
 
 OTHERS = '(others)'
-
-MAX_FRAMES = 100
-"""So many frames are counted one by one: whoever sends ever new names fills no memory."""
-
-OTHER_FRAMES = '(others)'
 
 
 @dataclass(slots=True)
@@ -102,8 +96,6 @@ class Counters:
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
         self.dropped[cause] += number
-        if frame_id not in self.dropped_by_frame and len(self.dropped_by_frame) >= MAX_FRAMES:
-            frame_id = OTHER_FRAMES
         is_new = frame_id not in self.dropped_by_frame
         if is_new and len(self.dropped_by_frame) >= MOST_FRAMES:
             frame_id = OTHERS

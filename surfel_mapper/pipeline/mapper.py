@@ -125,7 +125,7 @@ class Mapper:
             reason = f'scans of {MAX_FRAMES} other frames came before'
             self._drops.scan(scan, 'too_many_frames', reason)
             return
-        if topic and len(self._drops.topics) < MAX_FRAMES:
+        if topic:
             self._drops.topics[scan.frame_id] = topic
         if not scan.frame_id:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')

@@ -17,9 +17,6 @@ from surfel_mapper.scan import Scan
 MAX_FRAMES = 64
 """Sensors of one robot; more are frame names that change, and would be remembered forever."""
 
-MAX_FRAMES = 1000
-"""Sensors in a frame of their own each; ever new names shall fill no memory."""
-
 
 class ScanQueue:
     """
@@ -87,10 +84,6 @@ class ScanQueue:
             cause = 'stamp_back' if behind_s else 'stamp_repeated'
             reason = f'its stamp is {behind_s:.3f} s before the one before it'
             self._drops.scan(scan, cause, reason)
-            return
-        if last_ns is None and len(self._newest_ns) >= MAX_FRAMES:
-            reason = f'scans came in {MAX_FRAMES} frames already, no more are taken'
-            self._drops.scan(scan, 'too_many_frames', reason)
             return
         self._newest_ns[scan.frame_id] = scan.stamp_ns
         self._scans.append(scan)

@@ -12,8 +12,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from surfel_mapper import poses
 from surfel_mapper.config import load_config, TsdfConfig
-from surfel_mapper.errors import BagError, ConfigError, FileFormatError
+from surfel_mapper.errors import BagError, ConfigError, FileFormatError, PoseError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.io import bag_compression, pcd, ply
 from surfel_mapper.io.bag import BagReader
@@ -206,3 +207,13 @@ def test_a_map_without_a_name_is_refused_as_any_other_place(tmp_path):
     for url in ('/', 'file:///', '.', '../../x'):
         with pytest.raises(ConfigError, match='map_url'):
             path_inside(tmp_path, url)
+
+
+def test_ever_new_transforms_do_not_fill_the_buffer(monkeypatch):
+    monkeypatch.setattr(poses, 'MAX_EDGES', 3)
+    buffer = poses.TransformBuffer()
+    for number in range(3):
+        buffer.add('odom', f'frame{number}', 1, np.eye(4))
+    with pytest.raises(PoseError, match='no more are taken'):
+        buffer.add('odom', 'another', 1, np.eye(4))
+    buffer.add('odom', 'frame2', 2, np.eye(4))
