@@ -66,7 +66,7 @@ lint: $(STAMP)  ## style, types, layers
 
 docs: $(DOCS_STAMP)  ## build site/ from docs/ and the docstrings, without a warning, links checked
 	$(BIN)/python -m pytest -q test/docs/test_pages.py
-	$(BIN)/python -m mkdocs build --quiet --strict
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict  # its theme's advertisement
 	@echo 'site/index.html'
 
 dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/, and install the wheel into an empty environment
