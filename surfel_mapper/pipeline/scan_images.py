@@ -161,6 +161,7 @@ def pixels_of(
         u = x / z * np.float32(camera.fx) + np.float32(camera.cx + 0.5)
         v = y / z * np.float32(camera.fy) + np.float32(camera.cy + 0.5)
         inside = (z > 0) & (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])
-        pixel = v.astype(np.int32) * np.int32(size[1]) + u.astype(np.int32)
+        row, column = v.astype(np.int32), u.astype(np.int32)
+    pixel: npt.NDArray[np.int32] = row * np.int32(size[1]) + column
     pixel[~inside] = -1
     return pixel
