@@ -42,7 +42,7 @@ def table() -> str:
     for module in MODULES:
         importlib.import_module(module)
     rows = ['| fault | what happens | counted as | lost |', '|---|---|---|---|']
-    rows += [f'| {" | ".join(entry)} |' for entry in FAULTS]
+    rows += [f'| {" | ".join(entry)} |' for entry in sorted(FAULTS)]
     return '\n'.join([BEGIN, *rows, END])
 
 
