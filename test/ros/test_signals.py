@@ -7,18 +7,21 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 
+from llvmlite import binding as llvm
 import pytest
 
 from surfel_mapper.ros.inbox import Inbox
-from surfel_mapper.ros.signals import NUMBERS, Signals
+from surfel_mapper.ros.signals import NUMBERS, RETRY_S, Signals
 
 TIMEOUT_S = 20
+HANDLED = (*NUMBERS, signal.SIGALRM)
 
 
 @pytest.fixture(autouse=True)
 def handlers():
-    before = {number: signal.getsignal(number) for number in NUMBERS}
+    before = {number: signal.getsignal(number) for number in HANDLED}
     yield before
     for number, handler in before.items():
         signal.signal(number, handler)
@@ -41,23 +44,47 @@ def test_a_signal_interrupts_and_those_that_follow_do_not(number):
         signals.check()
 
 
-@pytest.mark.filterwarnings('ignore::pytest.PytestUnraisableExceptionWarning')
-def test_a_signal_that_is_lost_in_a_destructor_is_found_by_check():
-    class Freed:
-        def __del__(self):
-            send(signal.SIGINT)
+class Freed:
+    def __del__(self):
+        send(signal.SIGINT)
 
+
+def act_and_wait(action):
+    action()
+    threading.Event().wait(TIMEOUT_S)
+    raise TimeoutError('no signal came')
+
+
+def test_a_signal_within_a_destructor_is_found_by_check():
     with Signals() as signals:
         signals.check()
         Freed()
         with pytest.raises(KeyboardInterrupt):
             signals.check()
+        time.sleep(5 * RETRY_S)  # nor does it interrupt a second time
+
+
+def test_a_signal_within_a_destructor_interrupts_what_comes_after():
+    with Signals(), pytest.raises(KeyboardInterrupt):
+        act_and_wait(Freed)
+
+
+def test_a_signal_while_llvm_calls_back_interrupts_what_comes_after(capfd):
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    module = llvm.parse_assembly('define i32 @one() { ret i32 1 }')
+    machine = llvm.Target.from_default_triple().create_target_machine()
+    engine = llvm.create_mcjit_compiler(module, machine)
+    engine.set_object_cache(lambda *_: send(signal.SIGINT), None)
+    with Signals(), pytest.raises(KeyboardInterrupt):
+        act_and_wait(engine.finalize_object)
+    assert 'KeyboardInterrupt' not in capfd.readouterr().err
 
 
 def test_without_a_signal_all_is_as_before(handlers):
     with Signals() as signals:
         signals.check()
-    assert {number: signal.getsignal(number) for number in NUMBERS} == handlers
+    assert {number: signal.getsignal(number) for number in HANDLED} == handlers
 
 
 def nothing():
