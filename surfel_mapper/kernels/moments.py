@@ -58,9 +58,9 @@ def home(key, shift):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
+def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     """
-    Sum points first to last of a scan by voxel; return how many voxels, -1 if they may not fit.
+    Sum the points of a scan by voxel; return how many voxels, -1 if they may not fit.
 
     xyz       (3, N) float32 or float64, sensor frame, m
     pose      (3, 4) float64, takes points of the sensor frame to the map frame
@@ -82,8 +82,8 @@ def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
     left_out[:] = 0
     num_rows = 0
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
-    for start in range(first, last, CHUNK):
-        chunk = slice(start, min(start + CHUNK, last))
+    for start in range(0, len(all_x), CHUNK):
+        chunk = slice(start, start + CHUNK)
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
         quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
         num_runs = find_runs(chunk_keys, len(x), starts)
@@ -96,43 +96,6 @@ def reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out):
             if run_rows[run] < 0:
                 for i in range(starts[run], starts[run + 1]):
                     left_out[reason(x[i], y[i], z[i], range_sq)] += 1
-    return num_rows
-
-
-@njit(cache=True, nogil=True)
-def merge_sums(scratch, num_rows, other_keys, other_sums):
-    """
-    Add the sums of other points; return how many voxels there are then, -1 if too many.
-
-    scratch     as reduce_points leaves it, with num_rows voxels
-    other_keys  (K,) int64, voxel keys
-    other_sums  (K, 10) float64
-
-    If it returns -1, the table is clear again.
-    """
-    table, keys, sums = scratch
-    shift = hash_shift(len(table))
-    mask = len(table) - 1
-    if num_rows + len(other_keys) > len(keys):
-        table[:] = -1
-        return -1
-    for other in range(len(other_keys)):
-        if other + AHEAD < len(other_keys):
-            prefetch(table, home(other_keys[other + AHEAD], shift))
-        key = other_keys[other]
-        place = home(key, shift)
-        row = np.int64(table[place])
-        while row >= 0 and keys[row] != key:
-            place = (place + 1) & mask
-            row = np.int64(table[place])
-        if row < 0:
-            row = num_rows
-            num_rows += 1
-            table[place] = row
-            keys[row] = key
-            sums[row, :] = 0.0
-        for column in range(10):
-            sums[row, column] += other_sums[other, column]
     return num_rows
 
 

@@ -3,15 +3,13 @@
 """
 Reducer: from the points of a scan to its moments.
 
-Works in scratch memory that it keeps from scan to scan. With several threads each reduces a part
-of the points and the parts are added up in order; sums of integers do not depend on that, and
-not even the order of the voxels does.
+Works in scratch memory that it keeps from scan to scan, every thread in its own, so that several
+may reduce scans at the same time.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import Executor
 from dataclasses import replace
 import math
 from typing import Any
@@ -24,7 +22,6 @@ from surfel_mapper.kernels.channels import sum_channels
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.kernels.moments import (
     BEYOND,
-    merge_sums,
     NOT_FINITE,
     pack_moments,
     reduce_points,
@@ -34,7 +31,6 @@ from surfel_mapper.kernels.moments import (
 from surfel_mapper.kernels.queries import build_table
 from surfel_mapper.mapping.channels import channel_names, quantised
 from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.threads import split
 
 NARROW_COUNT = 1 << 16
 """Below so many points in every voxel the sums fit into int32."""
@@ -71,13 +67,10 @@ class Scratch:
         """As the kernels take them."""
         return self.table, self.keys, self.sums
 
-    def fill(self, xyz: npt.NDArray[Any], part: slice, quantisation: Quantisation) -> int:
-        """Sum a part of the points, with more room if need be; return how many voxels."""
-        pose, scale, range_sq = quantisation
-        first, last = part.start, part.stop
+    def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
+        """Sum points by voxel, with more room if need be; return how many voxels."""
         while True:
-            scratch, left_out = self.arrays, self.left_out
-            num = reduce_points(xyz, first, last, pose, scale, range_sq, scratch, left_out)
+            num = reduce_points(xyz, *quantisation, self.arrays, self.left_out)
             if num >= 0:
                 return int(num)
             self.reserve(2 * len(self.keys))
@@ -85,6 +78,11 @@ class Scratch:
     def clear(self) -> None:
         """Empty the table: faster as a whole than by the entries in use, which lie anywhere."""
         self.table.fill(-1)
+
+    def causes(self) -> dict[str, int]:
+        """Return how many points were left out, by cause; causes that did not occur are not in."""
+        counts = {name: int(self.left_out[row]) for name, row in CAUSES.items()}
+        return {name: number for name, number in counts.items() if number}
 
 
 class Reducer:
@@ -97,25 +95,13 @@ class Reducer:
         Edge of a voxel.
     columns : tuple of str
         Columns of the points to sum as well.
-    pool : Executor, optional
-        Where all parts of the points but the first are reduced.
-    threads : int
-        How many parts.
 
     """
 
-    def __init__(
-        self,
-        voxel_size_m: float,
-        columns: tuple[str, ...] = (),
-        *,
-        pool: Executor | None = None,
-        threads: int = 1,
-    ) -> None:
+    def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
         self.voxel_size_m = voxel_size_m
         self._columns = columns
-        self._pool = pool
-        self._scratch = [Scratch() for _ in range(threads if pool else 1)]
+        self._idle = [Scratch()]
 
     def reduce(
         self,
@@ -149,41 +135,27 @@ class Reducer:
         range_sq = np.array([min_range_m**2, max_range_m**2])
         scale = (1 << BITS) / self.voxel_size_m
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
-        num = self._sum(points.T, quantisation)
-        scratch = self._scratch[0]
+        try:
+            scratch = self._idle.pop()
+        except IndexError:  # all are in use by other threads
+            scratch = Scratch()
+        num = scratch.fill(points.T, quantisation)
         scratch.clear()
-        moments = self._pack(num, np.ascontiguousarray(seen_from))
-        if values is None:
-            return moments
-        build_table(moments.key, scratch.table)
-        sums = np.empty((num, values.shape[1]), np.int64)
-        sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
-        scratch.clear()
-        return replace(moments, channel_names=channel_names(self._columns), channels=sums)
-
-    def _sum(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
-        """Sum all points in the first scratch memory; return how many voxels."""
-        first, *others = self._scratch
-        own, *parts = split(xyz.shape[1], len(self._scratch))
-        futures = [
-            self._pool.submit(scratch.fill, xyz, part, quantisation)
-            for scratch, part in zip(others, parts, strict=True)
-            if self._pool
-        ]
-        num = first.fill(xyz, own, quantisation)
-        nums = [future.result() for future in futures]
-        for scratch in others:
+        moments = self._pack(scratch, num, np.ascontiguousarray(seen_from))
+        if values is not None:
+            build_table(moments.key, scratch.table)
+            sums = np.empty((num, values.shape[1]), np.int64)
+            sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
             scratch.clear()
-        for scratch, found in zip(others, nums, strict=True):
-            num = int(merge_sums(first.arrays, num, scratch.keys[:found], scratch.sums[:found]))
-            if num < 0:  # once more, with room for all
-                first.reserve(2 * max(len(first.keys), len(scratch.keys)))
-                return self._sum(xyz, quantisation)
-        return num
+            moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
+        self._idle.append(scratch)
+        return moments
 
-    def _pack(self, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
+    def _pack(
+        self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]
+    ) -> ScanMoments:
         """Turn the sums into integers."""
-        key, sums = self._scratch[0].keys[:num].copy(), self._scratch[0].sums[:num]
+        key, sums = scratch.keys[:num].copy(), scratch.sums[:num]
         largest = sums[:, 0].max(initial=0.0)
         if largest > MAX_SCAN_COUNT:
             raise MapLimitError(
@@ -197,7 +169,7 @@ class Reducer:
             total=np.empty((num, 3), np.int32 if largest < NARROW_COUNT else np.int64),
             product=np.empty((num, 6), np.int64),
             view=np.empty((num, 3), np.int16),
-            left_out=self._causes(),
+            left_out=scratch.causes(),
         )
         pack_moments(
             key,
@@ -210,12 +182,6 @@ class Reducer:
             moments.view,
         )
         return moments
-
-    def _causes(self) -> dict[str, int]:
-        """Return how many points were left out, by cause; causes that did not occur are not in."""
-        left_out = np.sum([scratch.left_out for scratch in self._scratch], axis=0)
-        counts = {name: int(left_out[row]) for name, row in CAUSES.items()}
-        return {name: number for name, number in counts.items() if number}
 
 
 def within(

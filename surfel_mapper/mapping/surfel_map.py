@@ -36,7 +36,6 @@ from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
-from surfel_mapper.mapping.threads import pool
 from surfel_mapper.mapping.voxel_table import VoxelTable
 
 Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
@@ -91,9 +90,7 @@ class SurfelMap:
         self.columns = columns
         self._channel_names = channel_names(columns)
         self._threads = threads
-        self._reducer = Reducer(
-            self.voxel_size_m, columns, pool=pool(threads), threads=threads
-        )
+        self._reducer = Reducer(self.voxel_size_m, columns)
         self._reset()
 
     def _reset(self) -> None:
@@ -172,6 +169,9 @@ class SurfelMap:
     ) -> ScanMoments:
         """
         Return the moments that points have in this map, without adding them.
+
+        Neither reads nor changes what the map holds, so another thread may reduce the next scan
+        while this one is inserted.
 
         A point p is quantised once, X = floor((((R0 x + R1 y) + R2 z) + t) 65536 / voxel size)
         in float64; the voxel index is X >> 16 and the place in the voxel (X & 65535) - 32768.

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.surfels import derive_surfels
-from surfel_mapper.mapping.threads import pool, split
+from surfel_mapper.mapping.threads import share
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,10 +127,5 @@ def derive(
         outputs = tuple(values[part] for values in surfels.arrays)
         derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
 
-    own, *others = split(num, threads)
-    executor = pool(threads)
-    futures = [executor.submit(derive_part, part) for part in others] if executor else []
-    derive_part(own)
-    for future in futures:
-        future.result()
+    share(derive_part, num, threads)
     return surfels

@@ -19,7 +19,6 @@ from surfel_mapper.kernels.moments import (
     find_runs,
     hash_shift,
     home,
-    merge_sums,
     NOT_FINITE,
     pack_moments,
     quantise,
@@ -121,7 +120,7 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
     table, keys, sums = scratch = scratch_for(max(2 * num, 1))
     left_out = np.full(4, -1, np.int64)
 
-    found = call(reduce_points, points.T.copy(), 0, num, *AS_THEY_ARE, scratch, left_out)
+    found = call(reduce_points, points.T.copy(), *AS_THEY_ARE, scratch, left_out)
 
     twin = reference.scan_moments(points, 0.5)
     assert list(map(tuple, unpack_keys(keys[:found]).tolist())) == list(twin)
@@ -140,36 +139,9 @@ def test_a_scan_that_does_not_fit_leaves_the_table_clean(call, room):
     points = np.random.default_rng(2).uniform(-9.0, 9.0, (3 * CHUNK, 3))
     points[: CHUNK + 9] = 0.1  # the first chunk fits
     scratch = (table, keys, sums)
-    asked = (points.T, 0, len(points), *AS_THEY_ARE, scratch, left_out)
+    asked = (points.T, *AS_THEY_ARE, scratch, left_out)
     assert call(reduce_points, *asked) == -1
     assert (table == -1).all()
-
-
-@both
-@pytest.mark.parametrize('cut', [0, 1, 700, CHUNK, 2999, 3000])
-def test_parts_of_a_scan_add_up_to_the_whole_in_the_same_order(call, cut):
-    points = some_points(3000)
-    whole, first, second = scratch_for(3000), scratch_for(3000), scratch_for(3000)
-    left_out = np.zeros(4, np.int64)
-    num = call(reduce_points, points.T.copy(), 0, 3000, *AS_THEY_ARE, whole, left_out)
-
-    merged = call(reduce_points, points.T.copy(), 0, cut, *AS_THEY_ARE, first, left_out)
-    other = call(reduce_points, points.T.copy(), cut, 3000, *AS_THEY_ARE, second, left_out)
-    merged = call(merge_sums, first, merged, second[1][:other], second[2][:other])
-
-    assert merged == num
-    np.testing.assert_array_equal(first[1][:num], whole[1][:num])
-    np.testing.assert_array_equal(first[2][:num], whole[2][:num])
-
-
-@both
-def test_parts_that_do_not_fit_together_leave_the_table_clean(call):
-    scratch = scratch_for(4)
-    points = np.full((3, 3), 0.1)
-    left_out = np.zeros(4, np.int64)
-    num = call(reduce_points, points.T.copy(), 0, 3, *AS_THEY_ARE, scratch, left_out)
-    assert call(merge_sums, scratch, num, np.arange(4), np.zeros((4, 10))) == -1
-    assert (scratch[0] == -1).all()
 
 
 @both
