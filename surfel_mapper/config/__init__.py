@@ -15,6 +15,7 @@ from surfel_mapper.config.configuration import Config, declarations, load_config
 from surfel_mapper.config.deskew import DeskewConfig
 from surfel_mapper.config.dynamic import DynamicConfig
 from surfel_mapper.config.grid import GridConfig
+from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
 from surfel_mapper.config.registration import RegistrationConfig
 from surfel_mapper.config.settings import Declaration, flatten, near, setting, Stage
@@ -41,6 +42,7 @@ __all__ = [
     'GridConfig',
     'InputConfig',
     'MapConfig',
+    'ModelsLayerConfig',
     'OutputConfig',
     'PoseConfig',
     'PublishConfig',

@@ -14,6 +14,7 @@ from surfel_mapper.config.align import AlignConfig
 from surfel_mapper.config.deskew import DeskewConfig
 from surfel_mapper.config.dynamic import DynamicConfig
 from surfel_mapper.config.grid import GridConfig
+from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
 from surfel_mapper.config.registration import RegistrationConfig
 from surfel_mapper.config.settings import (
@@ -54,6 +55,7 @@ class Config:
     grid: GridConfig = field(default_factory=GridConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
+    models: ModelsLayerConfig = field(default_factory=ModelsLayerConfig)
     dynamic: DynamicConfig = field(default_factory=DynamicConfig)
     clear: ClearConfig = field(default_factory=ClearConfig)
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)

@@ -20,7 +20,7 @@ from surfel_mapper.config.settings import setting, Stage
 class ModelsConfig(Stage):
     """Planes, B-spline surfaces and Gaussians."""
 
-    STAGE: ClassVar[str] = 'layers.models'
+    STAGE: ClassVar[str] = 'models'
 
     voxel_size_m: float = setting(
         0.04, 'Points are thinned to one a voxel of this edge, m.', low=0.001, high=10.0

@@ -14,6 +14,7 @@ from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
+from surfel_mapper.models.live import ModelUpdate
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
 
@@ -46,6 +47,8 @@ class Update:
         What the alignment of the window did that was due after this scan.
     alignment : Alignment, optional
         How the pose was found, where it comes from registration.
+    models : ModelUpdate, optional
+        What became of planes, surfaces and Gaussians, where they were brought up to date.
     milliseconds : dict of str to float
         Time by stage: filter (where there are any), reduce, insert (evictions included),
         normals, total.
@@ -63,6 +66,7 @@ class Update:
     milliseconds: dict[str, float]
     aligned: Aligned | None = None
     alignment: Alignment | None = None
+    models: ModelUpdate | None = None
 
 
 def removed_voxels(
