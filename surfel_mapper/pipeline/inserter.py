@@ -37,6 +37,7 @@ from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.free_rays import free_directions
 from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.models_layer import ModelsLayer
 from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.reduction import moments_at, reduced
 from surfel_mapper.pipeline.scan_images import ScanImages
@@ -96,6 +97,7 @@ class Inserter:
         sensors = SensorModels(config.tsdf)
         self.tsdf = TsdfLayer(config.tsdf, sensors) if config.tsdf.enabled else None
         self.images = ScanImages(config.tsdf)
+        self.models = ModelsLayer(config.models, self.map) if config.models.enabled else None
         self._moved: MovedAway | None = None
         if config.dynamic.clear:
             self._moved = MovedAway(config.dynamic, self.map.voxel_size_m, sensors)
@@ -129,6 +131,8 @@ class Inserter:
         self.aligner.reset()
         if self.tsdf is not None:
             self.tsdf.clear()
+        if self.models is not None:
+            self.models.clear()
         if self._moved is not None:
             self._moved.clear()
 
@@ -159,6 +163,8 @@ class Inserter:
             self._poses.registered.warm_up()
         if self.tsdf is not None:
             self.tsdf.warm_up()
+        if self.models is not None:
+            self.models.models.warm_up()
         if self._moved is not None:
             self._moved.warm_up()
 
@@ -195,6 +201,9 @@ class Inserter:
         if self.tsdf is not None:
             self._follow(self.tsdf, filtered, pose, evictions)
             laps.end('tsdf')
+        models = self.models.follow(scan.stamp_ns) if self.models else None
+        if models is not None:
+            laps.end('models')
         self._count(windowed, evictions, laps.milliseconds)
         return Update(
             scan=scan,
@@ -206,6 +215,7 @@ class Inserter:
             removed_voxel_index=removed_voxels(evictions, cleared, aligned, changed),
             evictions=tuple(evictions),
             milliseconds=laps.milliseconds,
+            models=models,
             aligned=aligned,
             alignment=alignment,
         )

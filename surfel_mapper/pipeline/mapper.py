@@ -77,6 +77,8 @@ class Mapper:
         self.map = self._inserter.map
         self.window = self._inserter.window
         self.tsdf = self._inserter.tsdf
+        layer = self._inserter.models
+        self.models = layer.models if layer else None
 
     @property
     def chain(self) -> Chain:
@@ -388,6 +390,7 @@ class Mapper:
             'surfels': len(self.map.surfels(self.config.map.min_points)),
             'digest': self.map.digest(),
             **({'tsdf': self.tsdf.summary()} if self.tsdf else {}),
+            **({'models': self.models.summary()} if self.models else {}),
         }
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
