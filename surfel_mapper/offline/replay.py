@@ -122,10 +122,10 @@ def replay(
                 number = first[message.topic] + seen[message.topic]
                 (images.take_image if images else add)(message, number)
             seen[message.topic] += 1
-        yield from mapper.insert_ready()
+        yield from mapper.insert_ready(more_follows=True)
     if beside:
         mapper.end_images()
-        yield from mapper.insert_ready()
+    yield from mapper.insert_ready()
     mapper.finish()
 
 

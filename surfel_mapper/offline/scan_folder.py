@@ -102,7 +102,8 @@ class ScanFolder:
             if stopped():
                 break
             self._add(mapper, number, frame)
-            yield from mapper.insert_ready()
+            yield from mapper.insert_ready(more_follows=True)
+        yield from mapper.insert_ready()
         mapper.finish()
 
     def _add(self, mapper: Mapper, number: int, frame: str) -> None:

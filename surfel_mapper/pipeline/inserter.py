@@ -3,31 +3,20 @@
 """
 Inserter: one scan with its pose, all the way into the map, the window and the layers.
 
-Deskewed, filtered, aligned to the map where poses come from there, reduced to moments, added;
-then what its coming changes: scans that leave, what has moved away, the alignment of the window,
-the TSDF.
+Prepared, reduced to moments, added; then what its coming changes: scans that leave, what has moved
+away, the alignment of the window, the TSDF.
 """
 
 from __future__ import annotations
 
-from dataclasses import astuple, replace
 import logging
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Counters, Laps
-from surfel_mapper.deskew import warm_up as warm_up_deskewing
-from surfel_mapper.errors import (
-    AlignmentError,
-    CloudFormatError,
-    FilterError,
-    MapError,
-    PoseError,
-)
-from surfel_mapper.filters.chain import Chain
+from surfel_mapper.errors import AlignmentError, CloudFormatError, MapError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import CHANNELS
 from surfel_mapper.mapping.reducer import NARROW_COUNT
@@ -35,12 +24,11 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.free_rays import free_directions
-from surfel_mapper.pipeline.motion_gate import stands_still
+from surfel_mapper.pipeline.look_ahead import LookAhead
 from surfel_mapper.pipeline.models_layer import ModelsLayer
 from surfel_mapper.pipeline.moved_away import MovedAway
-from surfel_mapper.pipeline.reduction import moments_at, reduced
-from surfel_mapper.pipeline.scan_images import ScanImages
+from surfel_mapper.pipeline.preparation import Preparation, Prepared
+from surfel_mapper.pipeline.reduction import moments_at
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
@@ -68,10 +56,10 @@ class Inserter:
 
     Attributes
     ----------
-    map, window, chain, tsdf
+    map, window, tsdf
         See Mapper.
-    images : ScanImages
-        What colours and labels the points.
+    preparation : Preparation
+        What is done to scans before.
     derives : bool
         Whether updates hold the surfels that changed; they are none where nobody looks at them.
 
@@ -86,7 +74,6 @@ class Inserter:
         self._counters = counters
         self._drops = drops
         self.derives = True
-        self.chain = Chain.load(config.filters) if config.filters else Chain()
         self.map = SurfelMap(
             config.map.voxel_size_m, columns=config.map.columns, threads=config.map.threads
         )
@@ -94,9 +81,12 @@ class Inserter:
         self.aligner = WindowAligner(
             lambda scan, pose: moments_at(scan, pose, self.map, self._config)
         )
+        self.preparation = Preparation(
+            config, poses, self.map, self.window, self.aligner, counters, drops
+        )
+        self._ahead = LookAhead(self.map, config.map.threads)
         sensors = SensorModels(config.tsdf)
         self.tsdf = TsdfLayer(config.tsdf, sensors) if config.tsdf.enabled else None
-        self.images = ScanImages(config.tsdf)
         self.models = ModelsLayer(config.models, self.map) if config.models.enabled else None
         self._moved: MovedAway | None = None
         if config.dynamic.clear:
@@ -117,10 +107,7 @@ class Inserter:
             If ``filters`` names a file that holds no chain; nothing has changed then.
 
         """
-        if config.filters != self._config.filters:
-            chain = Chain.load(config.filters) if config.filters else Chain()
-            chain.warm_up()
-            self.chain = chain
+        self.preparation.reconfigure(config)
         self._config = config
         self.window.config = config.window
         self.window.max_voxels = config.map.max_voxels
@@ -143,7 +130,7 @@ class Inserter:
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
-        self.chain.warm_up()
+        self.preparation.warm_up()
         if self._config.window.keep_points:
             self.aligner.warm_up()
         for dtype in (np.float32, np.float64):
@@ -157,10 +144,6 @@ class Inserter:
         surfel_map.digest()
         if self._config.publish.levels:
             surfel_map.coarsen(1).surfels()
-        if self._config.deskew.enabled:
-            warm_up_deskewing()
-        if self._poses.registered is not None:
-            self._poses.registered.warm_up()
         if self.tsdf is not None:
             self.tsdf.warm_up()
         if self.models is not None:
@@ -168,17 +151,43 @@ class Inserter:
         if self._moved is not None:
             self._moved.warm_up()
 
-    def insert(self, scan: Scan, pose: Transform) -> Update | None:
-        """Map a scan; None where the motion gate or the map leaves it out."""
+    @property
+    def looks_ahead(self) -> bool:
+        """Whether a scan is reduced by another thread while the one before is inserted."""
+        is_frozen = self._config.map.mode == 'frozen'
+        return self._ahead.is_possible and self.preparation.is_trivial and not is_frozen
+
+    def begin(self, scan: Scan, pose: Transform) -> None:
+        """Have another thread reduce the scan that will be inserted next."""
+        self._ahead.begin(scan, self.aligner.to_map(pose), self._config)
+
+    def insert(
+        self, scan: Scan, pose: Transform, following: tuple[Scan, Transform] | None = None
+    ) -> Update | None:
+        """
+        Map a scan; None where it is left out.
+
+        Parameters
+        ----------
+        scan : Scan
+            As it came in.
+        pose : (4, 4) float64
+            T_fixed_sensor.
+        following : Scan and pose, optional
+            Of the next one, which another thread begins with; only where ``looks_ahead``.
+
+        """
         laps, version = Laps(), self.map.version
-        prepared = self._prepare(scan, self.aligner.to_map(pose), laps)
+        prepared = self.preparation.prepare(scan, self.aligner.to_map(pose), laps)
         if prepared is None:
             return None
-        scan, filtered, pose, alignment = prepared
         if self._config.map.mode == 'frozen':
-            return self._only_posed(scan, pose, alignment, laps)
+            return self._only_posed(prepared, laps)
+        scan, filtered, pose = prepared.scan, prepared.filtered, prepared.T_map_sensor
         try:
-            windowed = reduced(filtered, pose, self.map, self._config)
+            windowed = self._ahead.reduced(filtered, pose, self._config)
+            if following is not None:
+                self.begin(*following)
             laps.end('reduce')
             self._counters.points_left_out.update(windowed.moments.left_out)
             if not len(windowed.moments):
@@ -217,114 +226,25 @@ class Inserter:
             milliseconds=laps.milliseconds,
             models=models,
             aligned=aligned,
-            alignment=alignment,
+            alignment=prepared.alignment,
         )
 
-    def _prepare(
-        self, scan: Scan, pose: Transform, laps: Laps
-    ) -> tuple[Scan, Scan, Transform, Alignment | None] | None:
-        """Deskew, filter and register a scan: deskewed, filtered, its pose; None if it is left."""
-        if self._poses.registered is None and self._is_gated(pose):
-            return None
-        times = scan.times
-        if times is not None:
-            scan = self._poses.deskewed(scan, times)
-            laps.end('deskew')
-        if self.tsdf is not None:
-            scan = self._with_surroundings(scan)
-            laps.end('images')
-        filtered: Scan | None = scan
-        if len(self.chain):
-            filtered = self._filter(scan, pose)
-            laps.end('filter')
-        if filtered is None or self._poses.registered is None:
-            return None if filtered is None else (scan, filtered, pose, None)
-        try:
-            pose, alignment = self._poses.registered.find(
-                filtered, times, self.map, self.aligner.T_map_fixed
-            )
-        except (AlignmentError, MapError, PoseError) as error:
-            self._drops.scan(scan, 'not_aligned', str(error))
-            return None
-        laps.end('register')
-        if alignment is not None and len(alignment.degenerate):
-            num = len(alignment.degenerate)
-            self._drops.warn(
-                'degenerate',
-                f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
-                'of motion open; there the prediction is kept',
-            )
-        pose = self.aligner.to_map(pose)
-        return None if self._is_gated(pose) else (scan, filtered, pose, alignment)
-
-    def _with_surroundings(self, scan: Scan) -> Scan:
-        """Return a scan with what the TSDF wants beside its points, before any is left out."""
-        if scan.free is None:
-            scan = replace(scan, free=free_directions(scan))
-        try:
-            scan, missing = self.images.joined(
-                scan, lambda image: self._poses.seen_from(image.frame_id, image.stamp_ns, scan)
-            )
-        except (CloudFormatError, PoseError) as error:
-            self._drops.warn('images', f'scan at {scan.stamp_ns / 1e9:.6f} s: {error}')
-            return scan
-        for kind in missing:
-            self._drops.warn(
-                f'no_{kind}_image',
-                f'scan at {scan.stamp_ns / 1e9:.6f} s: no {kind} image within '
-                f'{self._config.tsdf.image_tolerance_s:g} s; layers.tsdf.image_tolerance_s '
-                'allows more',
-            )
-        return scan
-
-    def _is_gated(self, pose: Transform) -> bool:
-        """Return whether the motion gate leaves out a scan at a pose, and count it."""
-        last = self.window.newest
-        if last is None or not stands_still(last.T_map_sensor, pose, self._config.window):
-            return False
-        self._counters.gated += 1
-        return True
-
-    def _filter(self, scan: Scan, pose: Transform) -> Scan | None:
-        """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
-        T_base_sensor = self._poses.of_base(scan)  # the filters that need it say if it lacks
-        try:
-            filtered, steps = self.chain.run(
-                replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
-            )
-        except FilterError as error:
-            self._drops.scan(scan, 'filter', str(error))
-            return None
-        for step in steps:
-            self._counters.add_filter(*astuple(step))
-        self._counters.points_left_out['filtered'] += len(scan) - len(filtered)
-        if not len(filtered):
-            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
-            return None
-        return filtered
-
-    def _only_posed(
-        self,
-        scan: Scan,
-        pose: Transform,
-        alignment: Alignment | None,
-        laps: Laps,
-    ) -> Update:
+    def _only_posed(self, prepared: Prepared, laps: Laps) -> Update:
         """Say where a scan was taken; a frozen map takes none."""
         self._counters.localised += 1
         for stage, milliseconds in laps.milliseconds.items():
             self._counters.add_time(stage, milliseconds)
         return Update(
-            scan=scan,
-            stamp_ns=scan.stamp_ns,
+            scan=prepared.scan,
+            stamp_ns=prepared.scan.stamp_ns,
             frame_id=self.map_frame,
-            T_fixed_sensor=pose,
+            T_fixed_sensor=prepared.T_map_sensor,
             num_points=0,
             changed=self.map.surfels_changed(self.map.version),
             removed_voxel_index=np.empty((0, 3), np.int32),
             evictions=(),
             milliseconds=laps.milliseconds,
-            alignment=alignment,
+            alignment=prepared.alignment,
         )
 
     def _clear_moved(

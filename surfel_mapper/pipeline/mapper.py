@@ -11,6 +11,7 @@ at any speed does alike.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 import logging
@@ -45,6 +46,11 @@ from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
 
+PosedScan = tuple[Scan, Transform]
+"""A scan and its T_fixed_sensor."""
+
+CLEARED = 'the map was cleared'
+
 _log = logging.getLogger(__name__)
 
 
@@ -70,6 +76,7 @@ class Mapper:
         self.counters = Counters()
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
+        self._ready: deque[PosedScan] = deque()
         self._poses = ScanPoses(self.config, self._drops)
         self._inserter = Inserter(self.config, self._poses, self.counters, self._drops)
         self.transforms = self._poses.transforms
@@ -83,7 +90,7 @@ class Mapper:
     @property
     def chain(self) -> Chain:
         """The filters that scans pass."""
-        return self._inserter.chain
+        return self._inserter.preparation.chain
 
     def add_pose(
         self,
@@ -187,39 +194,62 @@ class Mapper:
 
     def add_image(self, image: SceneImage) -> None:
         """Take an image that scans get colours or labels from; see layers.tsdf.color_topic."""
-        self._inserter.images.add(image)
+        self._inserter.preparation.images.add(image)
 
     def end_images(self) -> None:
         """Wait for no more images."""
-        self._inserter.images.ended = True
+        self._inserter.preparation.images.ended = True
 
-    def insert_ready(self) -> Iterator[Update]:
+    def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
         """
         Map the waiting scans whose poses are there, in order; yield what each did.
 
         A scan whose pose cannot come any more, or did not in time, is dropped and counted.
+
+        Parameters
+        ----------
+        more_follows : bool
+            Whether more input comes at once, as from a bag. Then the newest scan may be left for
+            the next call, while another thread (``map.threads``) reduces it. What is mapped is
+            the same to the bit. Call it once without at the end.
+
         """
+        while (found := self._next_ready(keeps_last=more_follows)) is not None:
+            if (update := self._insert(*found)) is not None:
+                yield update
+
+    def _next_ready(self, *, keeps_last: bool) -> PosedScan | None:
+        """Return the next scan to be mapped, or begin with the last and keep it."""
+        looks_ahead = self._inserter.looks_ahead
+        while len(self._ready) < 1 + looks_ahead:
+            found = self._next_posed()
+            if found is None:
+                break
+            self._ready.append(found)
+        if keeps_last and looks_ahead and len(self._ready) == 1:
+            self._inserter.begin(*self._ready[0])
+            return None
+        return self._ready.popleft() if self._ready else None
+
+    def _next_posed(self) -> PosedScan | None:
+        """Take the next scan whose pose is there from the queue; drop those that get none."""
         while (scan := self._queue.first) is not None:
             waited_s = (self._now_ns() - scan.end_ns) / 1e9
             may_wait = waited_s <= self.config.pose.max_wait_s
-            if may_wait and self._inserter.images.is_waiting(scan):
-                return
+            if may_wait and self._inserter.preparation.images.is_waiting(scan):
+                return None
             try:
                 pose = self._poses.of(scan, self._queue.second)
             except PoseNotYetError as error:
                 if may_wait:
-                    return
-                self._queue.pop()
-                self._drops.scan(scan, 'no_pose', f'no pose within {waited_s:.3f} s: {error}')
-                continue
+                    return None
+                reason = f'no pose within {waited_s:.3f} s: {error}'
             except PoseError as error:
-                self._queue.pop()
-                self._drops.scan(scan, 'no_pose', str(error))
-                continue
-            self._queue.pop()
-            update = self._insert(scan, pose)
-            if update is not None:
-                yield update
+                reason = str(error)
+            else:
+                return self._queue.pop(), pose
+            self._drops.scan(self._queue.pop(), 'no_pose', reason)
+        return None
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> None:
         """
@@ -255,7 +285,10 @@ class Mapper:
 
     def clear(self) -> None:
         """Forget all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
-        self._queue.drop_all('cleared', 'the map was cleared')
+        for scan, _ in self._ready:
+            self._drops.scan(scan, 'cleared', CLEARED)
+        self._ready.clear()
+        self._queue.drop_all('cleared', CLEARED)
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
@@ -419,4 +452,5 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: Transform) -> Update | None:
         """Map a scan whose pose is there; None where it is left out."""
-        return self._inserter.insert(scan, pose)
+        following = self._ready[0] if self._ready else None
+        return self._inserter.insert(scan, pose, following)

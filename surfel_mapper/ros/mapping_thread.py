@@ -194,7 +194,7 @@ class MappingThread:
             self._add(item)
         elif item is not None:
             fulfil(item)
-        for update in self._mapper.insert_ready():
+        for update in self._mapper.insert_ready(more_follows=self._num_clouds > 0):
             on_update(update)
         return True
 
