@@ -26,6 +26,8 @@ from surfel_mapper.io.pointcloud2 import Field
 ENCAPSULATION_BYTES = 4
 """A CDR message begins with so many bytes that state its encoding."""
 
+FLOAT64_BYTES = 8
+
 SMALLEST_FIELD_BYTES = 13
 """A field takes at least this much, so a count of fields can be checked before the loop."""
 
@@ -120,6 +122,15 @@ class Cursor:
         (value,) = struct.unpack_from(layout, self._raw, self._at)
         self._at += size
         return int(value)
+
+    def floats(self, number: int) -> tuple[float, ...]:
+        """Return so many float64."""
+        layout = f'{self._order}{number}d'
+        if not self.is_ros1:
+            self._at += -(self._at - self._start) % FLOAT64_BYTES
+        values = struct.unpack_from(layout, self._raw, self._at)
+        self._at += number * FLOAT64_BYTES
+        return values
 
     def sequence(self) -> memoryview:
         """Return the next sequence of bytes, as a view."""
