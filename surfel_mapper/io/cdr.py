@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-visualization_msgs/Marker and MarkerArray as bytes, from arrays.
+visualization_msgs/Marker, MarkerArray and polygons as bytes, from arrays.
 
 A marker of a surfel map has hundreds of thousands of vertices; as Python objects they take
 seconds, as the bytes of two arrays a millisecond. So the message is never made: its serialised
@@ -26,9 +26,11 @@ import numpy.typing as npt
 LITTLE_ENDIAN_CDR = b'\x00\x01\x00\x00'
 
 LINE_LIST = 5
+TEXT_VIEW_FACING = 9
 TRIANGLE_LIST = 11
 ADD = 0
 DELETE = 2
+DELETE_ALL = 3
 
 IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -45,19 +47,22 @@ class Marker:
     ns, id : str, int
         What a viewer knows the marker by: the next of the same name replaces it.
     type, action : int
-        TRIANGLE_LIST or LINE_LIST; ADD or DELETE.
+        TRIANGLE_LIST, LINE_LIST or TEXT_VIEW_FACING; ADD, DELETE or DELETE_ALL.
     frame_id, stamp_ns : str, int
         Coordinate frame of the points, and time in nanoseconds.
     pose : 7 floats
         Of the points in the frame: x y z in m, then qx qy qz qw.
     scale : 3 floats
-        A factor for triangles; for lines the first is their width in m.
+        A factor for triangles; for lines the first is their width, for text the last its height,
+        in m.
     color : 4 floats
         Red, green, blue, opacity in [0, 1]; of all points, where they have no colours.
     points : (P, 3) float64, m
         Corners of triangles, or ends of lines.
     colors : (P, 4) float32
         One of every point, or none.
+    text : str
+        Of a TEXT_VIEW_FACING.
 
     Raises
     ------
@@ -79,6 +84,7 @@ class Marker:
     colors: npt.NDArray[np.float32] = field(
         default_factory=lambda: np.empty((0, 4), np.float32)
     )
+    text: str = ''
 
     def __post_init__(self) -> None:
         """Check the shapes."""
@@ -148,12 +154,28 @@ def marker_bytes(marker: Marker) -> bytes:
     return writer.join()
 
 
-def write_marker(writer: Writer, marker: Marker) -> None:
-    """Write the members of a visualization_msgs/Marker of Jazzy, in its order."""
-    seconds, nanoseconds = divmod(marker.stamp_ns, NS_PER_S)
+def polygon_instance(
+    ring: npt.NDArray[np.float64], number: int, *, stamp_ns: int, frame_id: str
+) -> bytes:
+    """Return the serialised geometry_msgs/PolygonInstanceStamped of a ring (M, 3), m."""
+    writer = Writer()
+    write_header(writer, stamp_ns, frame_id)
+    writer.sequence(ring, '<f4')
+    writer.numbers('q', number)
+    return writer.join()
+
+
+def write_header(writer: Writer, stamp_ns: int, frame_id: str) -> None:
+    """Write the members of a std_msgs/Header."""
+    seconds, nanoseconds = divmod(stamp_ns, NS_PER_S)
     writer.numbers('i', seconds)
     writer.numbers('I', nanoseconds)
-    writer.string(marker.frame_id)
+    writer.string(frame_id)
+
+
+def write_marker(writer: Writer, marker: Marker) -> None:
+    """Write the members of a visualization_msgs/Marker of Jazzy, in its order."""
+    write_header(writer, marker.stamp_ns, marker.frame_id)
     writer.string(marker.ns)
     writer.numbers('i', marker.id, marker.type, marker.action)
     writer.numbers('d', *marker.pose, *marker.scale)
@@ -168,7 +190,7 @@ def write_marker(writer: Writer, marker: Marker) -> None:
     writer.string('')  # texture.format
     writer.numbers('I', 0)  # texture.data
     writer.numbers('I', 0)  # uv_coordinates
-    writer.string('')  # text
+    writer.string(marker.text)
     writer.string('')  # mesh_resource
     writer.string('')  # mesh_file.filename
     writer.numbers('I', 0)  # mesh_file.data

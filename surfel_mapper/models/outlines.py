@@ -31,11 +31,15 @@ def outline(patch: Plane) -> list[Array]:
 
     Outer ones run against the clock seen from the side that the normal points to, holes with it.
     """
+    return [patch.lifted(ring) for ring in local_outline(patch)]
+
+
+def local_outline(patch: Plane) -> list[Array]:
+    """Return the same as places (M, 2) in the frame of the patch, m."""
     side_m = patch.grid.pitch_m / PARTS
-    mask = patch.grid.mask(PARTS)
     return [
-        patch.lifted(patch.grid.origin + side_m * simplified(middles(ring)))
-        for ring in rings(mask)
+        patch.grid.origin + side_m * simplified(middles(ring))
+        for ring in rings(patch.grid.mask(PARTS))
     ]
 
 

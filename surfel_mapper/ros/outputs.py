@@ -42,6 +42,7 @@ from surfel_mapper.ros.alignment import AlignmentOutputs
 from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message, grid_message
+from surfel_mapper.ros.model_outputs import ModelOutputs
 from surfel_mapper.ros.tsdf_outputs import TsdfOutputs
 from surfel_mapper.ros.waiting import result_of
 from surfel_mapper.scan import Scan
@@ -81,6 +82,9 @@ class Outputs:
         self._changes = Changes(mapper)
         self._alignment = AlignmentOutputs(node, mapper)
         self._tsdf = TsdfOutputs(node, mapper, mapper.tsdf, thread) if mapper.tsdf else None
+        self._models: ModelOutputs | None = None
+        if mapper.models is not None:
+            self._models = ModelOutputs(node, mapper, mapper.models, thread)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
         self._levels = [
             node.create_publisher(PointCloud2, f'~/level_{level}/normals', LATCHED)
@@ -108,6 +112,8 @@ class Outputs:
         self._alignment.publish(update)
         if self._tsdf is not None:
             self._tsdf.note(update)
+        if self._models is not None:
+            self._models.note(update)
         if self._has_clients():
             self._publish_change(self._changes.of(update))
         else:
@@ -127,6 +133,8 @@ class Outputs:
         To be called whenever the map or its settings have changed in another way.
         """
         self._published.clear()
+        if self._models is not None:
+            self._models.expire()
         if self._has_clients():
             self._publish_change(self._changes.since_last())
 

@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What primitives look like: outlines, triangles and boxes of patches, ellipsoids of Gaussians.
+
+To find the outline of a floor takes tens of milliseconds, so Shapes keeps what has not changed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.models.filling import areas, filled
+from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.outlines import local_outline, triangles
+
+Array = npt.NDArray[np.float64]
+
+SIGMAS = 2.0
+"""Half axes of an ellipsoid, in standard deviations."""
+
+GOLDEN = 0.5 * (1.0 + 5.0**0.5)
+
+CORNERS = np.array(
+    [
+        np.roll([0.0, x, GOLDEN * y], turn)
+        for turn in range(3)
+        for x in (-1.0, 1.0)
+        for y in (-1.0, 1.0)
+    ]
+) / np.hypot(1.0, GOLDEN)
+"""Of an icosahedron within the unit sphere, (12, 3)."""
+
+
+def faces_of_icosahedron() -> npt.NDArray[np.int64]:
+    """Return the 20 faces (20, 3): three corners that are all as near as can be, facing out."""
+    near = np.linalg.norm(CORNERS[:, None] - CORNERS, axis=2) < 1.1
+    return np.array(
+        [
+            (a, b, c)
+            for a, b, c in np.ndindex(12, 12, 12)
+            if a < b and a < c and near[a, b] and near[b, c] and near[a, c] and b != c
+            and np.linalg.det(CORNERS[[a, b, c]]) > 0.0
+        ]
+    )  # fmt: skip
+
+
+FACES = faces_of_icosahedron()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchShape:
+    """
+    What a plane or surface looks like.
+
+    Attributes
+    ----------
+    patch : Plane
+        Whose shape it is.
+    rings : list of (M, 3) float64, m
+        Its outline; see outlines.outline.
+    corners : (T, 3, 3) float64, m
+        Its triangles; those of a plane cover exactly what the rings enclose.
+    low, high : (3,) float64, m
+        Of the box around them in the frame of the patch.
+    area_m2 : float
+        Of the triangles.
+
+    """
+
+    patch: Plane
+    rings: list[Array]
+    corners: Array
+    low: Array
+    high: Array
+    area_m2: float
+
+    @property
+    def is_curved(self) -> bool:
+        """Whether it is a surface."""
+        return isinstance(self.patch, Surface)
+
+    @property
+    def middle(self) -> Array:
+        """Middle of the box, (3,) m."""
+        middle: Array = 0.5 * (self.low + self.high) @ self.patch.R_patch_map + self.patch.mean
+        return middle
+
+
+def shape_of(patch: Plane) -> PatchShape:
+    """Return what a patch looks like."""
+    rims = local_outline(patch)
+    if isinstance(patch, Surface):
+        vertices, faces = triangles(patch)
+        corners = vertices[faces]
+    else:
+        flat = filled(rims)
+        corners = patch.lifted(flat.reshape(-1, 2)).reshape(-1, 3, 3)
+    rings = [patch.lifted(rim) for rim in rims]
+    local = patch.to_local(np.concatenate([corners.reshape(-1, 3), *rings]))
+    if not isinstance(patch, Surface):
+        local[:, 2] = 0.0
+    return PatchShape(
+        patch=patch,
+        rings=rings,
+        corners=corners,
+        low=local.min(axis=0),
+        high=local.max(axis=0),
+        area_m2=float(areas(corners).sum()),
+    )
+
+
+class Shapes:
+    """Shapes of patches, each made once and kept while its version stays."""
+
+    def __init__(self) -> None:
+        """Begin with none."""
+        self._kept: dict[int, tuple[int, PatchShape]] = {}
+
+    def of(self, model: MultiModel, versions: Mapping[int, int]) -> list[PatchShape]:
+        """Return the shapes of planes, then surfaces, whose versions are given by id."""
+        before, self._kept = self._kept, {}
+        for patch in model.patches:
+            version, kept = versions[patch.id], before.get(patch.id)
+            if kept is None or kept[0] != version:
+                kept = (version, shape_of(patch))
+            self._kept[patch.id] = kept
+        return [shape for _, shape in self._kept.values()]
+
+
+def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
+    """Return axes (G, 3, 3) as columns, right-handed, and half axes (G, 3), m, ascending."""
+    values, R_map_axes = np.linalg.eigh(gaussians.covariance)
+    R_map_axes[..., 2] *= np.sign(np.linalg.det(R_map_axes))[:, None]
+    return R_map_axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))
+
+
+def ellipsoids(gaussians: Gaussians) -> Array:
+    """Return triangles (G, 20, 3, 3), m, whose corners lie on the ellipsoids of Gaussians."""
+    R_map_axes, half = ellipsoid_frames(gaussians)
+    corners = CORNERS * half[:, None] @ np.swapaxes(R_map_axes, 1, 2) + gaussians.mean[:, None]
+    found: Array = corners[:, FACES]
+    return found
