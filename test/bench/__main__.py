@@ -19,8 +19,8 @@ from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
 BENCHES = (
-    'mapping', 'scaling', 'live', 'offline', 'compare', 'filters', 'lum', 'align', 'accuracy',
-    'registration', 'outputs', 'tsdf', 'models', 'workers',
+    'mapping', 'threads', 'scaling', 'live', 'offline', 'compare', 'filters', 'lum', 'align',
+    'accuracy', 'registration', 'outputs', 'tsdf', 'models', 'workers',
 )  # fmt: skip
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 

@@ -49,17 +49,22 @@ class Ours:
         times.append(perf_counter())
         moments = self.map.reduce(scan.points, pose, origin=pose[:3, 3])
         times.append(perf_counter())
+        times += self.put(moments)
+        return {
+            stage: (end - start) * 1e3
+            for stage, start, end in zip(STAGES, times[:-1], times[1:], strict=True)
+        }
+
+    def put(self, moments: ScanMoments) -> list[float]:
+        """Insert a reduced scan; return when that, evicting and deriving were done, s."""
         version = self.map.version
         self.map.insert(moments)
         self.scans.append(moments)
-        times.append(perf_counter())
+        times = [perf_counter()]
         if len(self.scans) > self._window:
             self.map.remove(self.scans.popleft())
         times.append(perf_counter())
         changed = self.map.surfels_changed(version)
         times.append(perf_counter())
         self.num_changed = len(changed)
-        return {
-            stage: (end - start) * 1e3
-            for stage, start, end in zip(STAGES, times[:-1], times[1:], strict=True)
-        }
+        return times

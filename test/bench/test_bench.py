@@ -65,6 +65,16 @@ def test_every_bench_of_times_gives_rows_of_figures(options, name, capsys):
     assert len(printed) == len(rows) + 4
 
 
+def test_two_threads_are_compared_with_one_on_the_same_scans(options):
+    rows = bench.run(['threads'], options)
+    assert [(row['voxel_m'], row['way']) for row in rows] == [
+        (size_m, way) for size_m in (0.5, 0.2) for way in ('calls', 'Mapper')
+    ]
+    for row in rows:
+        assert row['turns'] == (options.untimed + SCANS) // SCANS - options.untimed // SCANS
+        assert min(row['one_ms'], row['two_ms'], row['ratio']) > 0.0
+
+
 def test_every_bench_is_a_module_that_says_what_it_is():
     for name in bench.BENCHES:
         assert bench.summary(name).endswith('.')

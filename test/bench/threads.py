@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Two threads against one, the same scans through both: decode to normals.
+
+``calls``: one thread decodes and reduces the next scan while the other inserts this one and
+derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
+a replay or a node with a backlog. The two take turns, ten scans at a time, and every other turn
+in the opposite order; ``ratio`` is the median of the ratios of the turns. Maps have to be equal
+in the end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from time import perf_counter
+
+import numpy as np
+
+from surfel_mapper.config import Config
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.raw_cloud import RawCloud
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.threads import pool
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
+from test.bench.options import Options
+from test.bench.ours import Ours
+from test.bench.report import Row
+from test.bench.street import Street
+
+TURN = 10
+
+Turn = Sequence[tuple[int, RawCloud]]
+
+
+class ByCalls(Ours):
+    """The bare calls, by one thread or two."""
+
+    name = 'calls'
+
+    def __init__(self, street: Street, voxel_size_m: float, window: int, threads: int) -> None:
+        super().__init__(voxel_size_m, window)
+        self.map = SurfelMap(voxel_size_m, threads=threads)
+        self._street = street
+        self._helper = pool(threads)
+
+    def drive(self, turn: Turn) -> None:
+        """Map some scans."""
+        for moments in self._ahead(turn) if self._helper else map(self._moments, turn):
+            self.put(moments)
+
+    def _ahead(self, turn: Turn) -> Iterator[ScanMoments]:
+        """Yield the moments of every scan while the other thread makes those of the next."""
+        assert self._helper is not None
+        begun = self._helper.submit(self._moments, turn[0])
+        for scan in turn[1:]:
+            moments = begun.result()
+            begun = self._helper.submit(self._moments, scan)
+            yield moments
+        yield begun.result()
+
+    def _moments(self, scan: tuple[int, RawCloud]) -> ScanMoments:
+        number, message = scan
+        pose = self._street.pose(number)
+        return self.map.reduce(to_scan(message).points, pose, origin=pose[:3, 3])
+
+
+class ByMapper:
+    """The pipeline, with one thread or two."""
+
+    name = 'Mapper'
+
+    def __init__(self, street: Street, voxel_size_m: float, window: int, threads: int) -> None:
+        settings = {'voxel_size_m': voxel_size_m, 'min_points': 1, 'threads': threads}
+        self._mapper = Mapper(
+            Config.from_mapping(
+                {
+                    'map': settings,
+                    'window': {'max_scans': window},
+                    'pose': {'source': 'odometry'},
+                }
+            )
+        )
+        self.map = self._mapper.map
+        self._drive = street.simulation.drive
+        mount = self._drive.base_to_sensor
+        self._mapper.add_pose(BASE, SENSOR, 0, mount[:3], mount[3:], static=True)
+
+    def drive(self, turn: Turn) -> None:
+        """Map some scans."""
+        num = 0
+        for left, (_, message) in enumerate(turn, 1 - len(turn)):
+            scan = to_scan(message)
+            self._mapper.add_pose(ODOM, BASE, scan.stamp_ns, *self._drive.pose(scan.stamp_ns))
+            self._mapper.add_scan(scan)
+            num += sum(1 for _ in self._mapper.insert_ready(more_follows=left < 0))
+        if num != len(turn):
+            raise RuntimeError(f'{num} of {len(turn)} scans mapped')
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for every voxel size and way."""
+    street = Street(options)
+    street.prepare(options.untimed + options.scans)
+    return [
+        compared(street, options, size_m, way)
+        for size_m in options.voxel_sizes_m
+        for way in (ByCalls, ByMapper)
+    ]
+
+
+def compared(
+    street: Street,
+    options: Options,
+    size_m: float,
+    way: type[ByCalls] | type[ByMapper],
+) -> Row:
+    """Return a row for one voxel size and way."""
+    maps = [way(street, size_m, options.window, threads) for threads in (1, 2)]
+    times: list[list[float]] = []
+    turn: list[tuple[int, RawCloud]] = []
+    for number, message, counts in street.drive(options.untimed, options.scans):
+        turn.append((number, message))
+        if len(turn) < min(TURN, options.scans):
+            continue
+        timed = in_turn(maps, turn, reverse=len(times) % 2 == 1)
+        if counts:
+            times.append(timed)
+        turn = []
+    if maps[0].map != maps[1].map:
+        raise RuntimeError('one and two threads give different maps')
+    one, two = np.transpose(times)
+    return {
+        'voxel_m': size_m,
+        'way': way.name,
+        'one_ms': float(np.median(one)),
+        'two_ms': float(np.median(two)),
+        'ratio': float(np.median(one / two)),
+        'turns': len(times),
+    }
+
+
+def in_turn(maps: Sequence[ByCalls | ByMapper], turn: Turn, *, reverse: bool) -> list[float]:
+    """Give some scans to all maps, one after the other; return ms a scan of each."""
+    times = [0.0] * len(maps)
+    for place in sorted(range(len(maps)), reverse=reverse):
+        start = perf_counter()
+        maps[place].drive(turn)
+        times[place] = (perf_counter() - start) * 1e3 / len(turn)
+    return times

@@ -1,0 +1,202 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Two threads: the next scan is reduced while one is inserted, and nothing is different for it.
+
+A mapper with one thread gets the same input and has to do the same, update by update, whatever
+comes between two scans.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.threads import share
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.look_ahead import LookAhead
+from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.scan import Scan
+
+S = 10**9
+LEVEL = (0.0, 0.0, 0.0, 1.0)
+
+
+def mapper_with(threads, **changes):
+    settings = {
+        'pose.source': 'odometry',
+        'frames.base_to_sensor': (0.0, 0.0, 0.0, *LEVEL),
+        'map.min_points': 1,
+        'window.max_scans': 4,
+        'window.keep_points': True,
+        'map.threads': threads,
+    }
+    return Mapper(Config.from_mapping({**settings, **changes}))
+
+
+def add(mapper, number):
+    """Add a scan of a corner that stands still, and a pose that is a little off."""
+    rng = np.random.default_rng(number)
+    corner = rng.uniform(0.0, 6.0, (3000, 3))
+    corner[np.arange(3000), rng.integers(0, 3, 3000)] = 0.0
+    x = 0.3 * number
+    points = (corner - (x + 3.0, 3.0, 3.0)).astype(np.float32)
+    at = rng.normal(scale=0.05, size=3)
+    at[0] += x
+    mapper.add_pose('odom', 'base_link', number * S, at, LEVEL)
+    mapper.add_scan(Scan(points=points, stamp_ns=number * S, frame_id='lidar'))
+
+
+def drive(mapper, first, last):
+    """Add scans as fast as can be; return the updates."""
+    updates = []
+    for number in range(first, last):
+        add(mapper, number)
+        updates += mapper.insert_ready(more_follows=True)
+    return updates
+
+
+def same(found, expected):
+    assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
+    for left, right in zip(found, expected, strict=True):
+        assert left.num_points == right.num_points
+        np.testing.assert_array_equal(left.T_fixed_sensor, right.T_fixed_sensor)
+        np.testing.assert_array_equal(left.removed_voxel_index, right.removed_voxel_index)
+        for one, other in zip(left.changed.arrays, right.changed.arrays, strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def without_times(mapper):
+    summary = mapper.summary()
+    return {name: value for name, value in summary.items() if not name.startswith('millisecond')}
+
+
+@pytest.mark.parametrize('threads', [2, 3])
+def test_every_update_is_that_of_one_thread(threads):
+    one, several = mapper_with(1), mapper_with(threads)
+    expected, found = drive(one, 1, 12), drive(several, 1, 12)
+    assert len(expected) == 11
+    assert len(found) == 10  # the newest is kept
+    found += several.insert_ready()
+    same(found, expected)
+    assert without_times(several) == without_times(one)
+
+
+def test_scans_that_wait_together_are_mapped_together():
+    one, two = mapper_with(1), mapper_with(2)
+    for mapper in (one, two):
+        for number in range(1, 7):
+            add(mapper, number)
+    same(list(two.insert_ready()), list(one.insert_ready()))
+    assert two.map == one.map
+
+
+def shorten(mapper):
+    mapper.reconfigure(
+        Config.from_mapping({**mapper.config.to_mapping(), 'window.max_scans': 2})
+    )
+
+
+def gate(mapper):
+    mapper.reconfigure(
+        Config.from_mapping({**mapper.config.to_mapping(), 'window.gate_distance_m': 1.0})
+    )
+
+
+def carve(mapper):
+    mapper.clear_region(Ball(np.zeros(3), 2.0))
+
+
+@pytest.mark.parametrize('between', [shorten, gate, carve], ids=lambda act: act.__name__)
+def test_what_is_done_between_two_scans_holds_for_the_one_that_was_kept(between):
+    one, two = mapper_with(1), mapper_with(2)
+    expected, found = drive(one, 1, 6), drive(two, 1, 7)  # two keeps the sixth
+    assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
+    for mapper in (one, two):
+        between(mapper)
+    add(one, 6)
+    same(list(two.insert_ready()), list(one.insert_ready()))
+    assert two.map == one.map
+
+
+def test_a_scan_that_was_kept_goes_where_alignment_has_moved_the_map():
+    one, two = mapper_with(1), mapper_with(2)
+    drive(one, 1, 6)
+    drive(two, 1, 7)
+    for mapper in (one, two):
+        mapper.align()
+    assert not np.array_equal(two.T_map_fixed, np.eye(4))
+    add(one, 6)
+    same(list(two.insert_ready()), list(one.insert_ready()))
+    assert two.map == one.map
+
+
+def test_clearing_drops_and_counts_the_scan_that_was_kept():
+    mapper = mapper_with(2)
+    drive(mapper, 1, 4)
+    mapper.clear()
+    assert mapper.counters.dropped['cleared'] == 1
+    assert list(mapper.insert_ready()) == []
+    assert mapper.counters.received == mapper.counters.mapped + 1
+    assert mapper.map.num_voxels == 0
+
+
+def test_a_scan_that_cannot_be_mapped_is_dropped_and_the_next_comes():
+    mapper = mapper_with(2)
+    add(mapper, 1)
+    mapper.add_pose('odom', 'base_link', 2 * S, (0.6, 0.0, 0.0), LEVEL)
+    nothing = np.full((9, 3), np.nan, np.float32)
+    mapper.add_scan(Scan(points=nothing, stamp_ns=2 * S, frame_id='lidar'))
+    add(mapper, 3)
+    assert [update.stamp_ns // S for update in mapper.insert_ready()] == [1, 3]
+    assert mapper.counters.dropped['no_valid_points'] == 1
+
+
+@pytest.mark.parametrize(
+    'settings',
+    [
+        {'map.threads': 1},
+        {'map.mode': 'frozen', 'map.load': 'map.npz'},
+        {'layers.tsdf.enabled': True},
+        {'pose.source': 'registration'},
+    ],
+)
+def test_where_a_scan_depends_on_the_one_before_none_is_kept(settings):
+    mapper = mapper_with(2, **settings)
+    add(mapper, 1)
+    assert len(list(mapper.insert_ready(more_follows=True))) == 1
+
+
+def test_what_was_begun_counts_for_the_same_scan_at_the_same_pose_alone():
+    ahead, config = LookAhead(SurfelMap(0.5), 2), Config()
+    points = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 3))
+    scan = Scan(points=points, stamp_ns=1, frame_id='lidar')
+    moved = np.eye(4)
+    moved[0, 3] = 0.25
+    ahead.begin(scan, np.eye(4), config)
+    there = ahead.reduced(scan, moved, config)
+    expected = SurfelMap(0.5).reduce(points, moved, origin=moved[:3, 3], min_range_m=0.1)
+    np.testing.assert_array_equal(there.moments.key, expected.key)
+    np.testing.assert_array_equal(there.moments.total, expected.total)
+
+
+@pytest.mark.parametrize('threads', [1, 2, 3])
+@pytest.mark.parametrize('num_rows', [0, 1, 5, 1000])
+def test_shared_work_is_done_on_every_row_once(threads, num_rows):
+    done = np.zeros(num_rows, int)
+
+    def count(part):
+        done[part] += 1
+
+    share(count, num_rows, threads)
+    assert (done == 1).all()
+
+
+def test_an_error_in_shared_work_is_raised_to_the_caller():
+    def fail(part):
+        raise ValueError('row')
+
+    with pytest.raises(ValueError, match='row'):
+        share(fail, 100, 2)
