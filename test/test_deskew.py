@@ -20,7 +20,6 @@ from test.kernels.modes import both
 
 START_NS = 1_700_000_000_123_456_789
 MS = 10**6
-STATIONARY = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 
 def sweep(times, name='t', stamp_ns=START_NS, points=None):

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 import json
 from pathlib import Path
 import time
@@ -179,8 +178,3 @@ def write_overview(
     with replace_file(figures) as file:
         file.write((json.dumps(summary, indent=2) + '\n').encode())
     return [tiled.directory, picture, page, figures]
-
-
-def requests_of(bags: Sequence[Path], first: Request) -> list[Request]:
-    """Return what to map of every bag."""
-    return [replace(first, path=bag) for bag in bags]

@@ -39,7 +39,8 @@ class Filter:
     """
     Base of all filters: checks every parameter against its declaration.
 
-    A filter implements ``keep`` or ``apply``. ``name`` and ``theirs`` are given by ``register``.
+    A filter implements ``keep`` or ``apply``: ``register`` refuses one that does neither, and
+    gives the others ``name`` and ``theirs``.
     """
 
     name: ClassVar[str] = ''
@@ -60,7 +61,7 @@ class Filter:
         """Check what concerns several parameters; raise ConfigError."""
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay, (N,) bool."""
+        """Return which points stay, (N,) bool; nobody asks filters that implement ``apply``."""
         raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
 
     def apply(self, scan: Scan) -> Scan:

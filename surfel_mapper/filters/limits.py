@@ -93,14 +93,20 @@ def rounded(bounds: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
         return np.asarray(bounds, np.float64).astype(dtype)
 
 
-@register(theirs='DistanceLimitDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
-class DistanceLimit(Filter):
-    """Keep the points beyond, or before, a distance from the origin or along one axis."""
+class AxisFilter(Filter):
+    """Base of those that compare a distance from the origin, or one coordinate."""
 
     axis: int = parameter(
         -1, '-1: distance from the origin; 0, 1, 2: x, y, z.', low=-1, high=2, theirs='dim'
     )
+
+
+@register(theirs='DistanceLimitDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DistanceLimit(AxisFilter):
+    """Keep the points beyond, or before, a distance from the origin or along one axis."""
+
     distance_m: float = parameter(
         1.0, 'The limit, m; points at it do not stay; of a distance its size counts.',
         theirs='dist',
@@ -117,12 +123,9 @@ class DistanceLimit(Filter):
 
 @register(theirs='MaxDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MaxDist(Filter):
+class MaxDist(AxisFilter):
     """Keep the points nearer than a distance; distance_limit can do the same and more."""
 
-    axis: int = parameter(
-        -1, '-1: distance from the origin; 0, 1, 2: x, y, z.', low=-1, high=2, theirs='dim'
-    )
     max_m: float = parameter(1.0, 'Points here or farther are dropped, m.', theirs='maxDist')
 
     def keep(self, scan: Scan) -> Mask:
@@ -132,12 +135,9 @@ class MaxDist(Filter):
 
 @register(theirs='MinDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MinDist(Filter):
+class MinDist(AxisFilter):
     """Keep the points farther than a distance; distance_limit can do the same and more."""
 
-    axis: int = parameter(
-        -1, '-1: distance from the origin; 0, 1, 2: x, y, z.', low=-1, high=2, theirs='dim'
-    )
     min_m: float = parameter(1.0, 'Points here or nearer are dropped, m.', theirs='minDist')
 
     def keep(self, scan: Scan) -> Mask:

@@ -55,7 +55,7 @@ def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | C
     Raises
     ------
     ConfigError
-        If it is no filter, or another filter has the name.
+        If it is no filter, filters nothing, or another filter has the name.
 
     """
     if cls is None:
@@ -66,6 +66,8 @@ def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | C
 def _register(cls: F, *, name: str, theirs: str) -> F:
     if not (isinstance(cls, type) and issubclass(cls, Filter)):
         raise ConfigError(f'{cls!r}: expected a class derived from surfel_mapper.filters.Filter')
+    if cls.keep is Filter.keep and cls.apply is Filter.apply:
+        raise ConfigError(f'{cls.__name__}: a filter has to implement keep or apply')
     cls.name = name or re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', cls.__name__).lower()
     cls.theirs = theirs
     for each in filter(None, (cls.name, theirs)):

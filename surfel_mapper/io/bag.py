@@ -19,7 +19,6 @@ import heapq
 import logging
 from pathlib import Path
 import tempfile
-from types import TracebackType
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from surfel_mapper.errors import BagError, DependencyError
@@ -99,12 +98,7 @@ class BagReader:
         """Return the reader, to be closed at the end of the block."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Close the files."""
         self._files.close()
 

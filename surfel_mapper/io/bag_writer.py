@@ -16,7 +16,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 import shutil
 import tempfile
-from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -94,15 +93,10 @@ class BagWriter:
                 raise
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         """Give the bag its name, or remove what there is of it after an error."""
         try:
-            if error is not None:
+            if kind is not None:
                 self._writer.abort()
                 return
             with self._refusing():

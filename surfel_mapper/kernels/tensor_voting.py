@@ -21,6 +21,19 @@ REACH = 3.0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def direction(points, own, other):
+    """Return the unit vector to a point from another, and their squared distance, m^2."""
+    x = points[own, 0] - points[other, 0]
+    y = points[own, 1] - points[other, 1]
+    z = points[own, 2] - points[other, 2]
+    length_sq = (x * x + y * y) + z * z
+    length = math.sqrt(length_sq)
+    if length > 0.0:
+        x, y, z = x / length, y / length, z / length
+    return x, y, z, length_sq
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def first_votes(points, ids, sigma, votes):
     """
     Cast the votes of neighbours of which nothing is known, added to the point's own ball.
@@ -39,14 +52,10 @@ def first_votes(points, ids, sigma, votes):
             other = ids[i, k]
             if other == len(points):
                 break
-            x = points[own, 0] - points[other, 0]
-            y = points[own, 1] - points[other, 1]
-            z = points[own, 2] - points[other, 2]
-            length = math.sqrt((x * x + y * y) + z * z)
-            far = length / sigma
-            if not (length > 0.0 and far < REACH):
+            x, y, z, length_sq = direction(points, own, other)
+            far = math.sqrt(length_sq) / sigma
+            if not (length_sq > 0.0 and far < REACH):
                 continue
-            x, y, z = x / length, y / length, z / length
             end = (far - REACH) * (far - REACH)
             weight = far * far * (end * end) / 16.0
             xx += weight * (1.0 - x * x)
@@ -77,14 +86,9 @@ def closed_form_votes(points, ids, tensors, sigma, votes):
             other = ids[i, k]
             if other == len(points):
                 break
-            x = points[own, 0] - points[other, 0]
-            y = points[own, 1] - points[other, 1]
-            z = points[own, 2] - points[other, 2]
-            length_sq = (x * x + y * y) + z * z
-            length = math.sqrt(length_sq)
-            if not (length > 0.0 and length / sigma < REACH):
+            x, y, z, length_sq = direction(points, own, other)
+            if not (length_sq > 0.0 and math.sqrt(length_sq) / sigma < REACH):
                 continue
-            x, y, z = x / length, y / length, z / length
             txx, txy, txz = tensors[other, 0], tensors[other, 1], tensors[other, 2]
             tyy, tyz, tzz = tensors[other, 3], tensors[other, 4], tensors[other, 5]
             # with u = K r, s = r u: R K R = K - 2 (u r' + r u') + 4 s r r', R K R r = 2 s r - u

@@ -11,7 +11,6 @@ time, so that a recording holds each surfel some five times, not once a scan.
 from __future__ import annotations
 
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -75,12 +74,7 @@ class Viewer:
         """Return the viewer, to be closed at the end of the block."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: object, *_: object) -> None:
         """Log the map as it is in the end, and close."""
         if kind is None and self._positions:
             self._log_map()

@@ -9,17 +9,12 @@ the bit, and what happens when the table of voxels has to grow.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.kernels.voxel_grid import group_points, ROWS
-from test.kernels.modes import both, compiled
+from test.kernels.modes import both, compiled, printed
 
 SHORT_CHAINS = """
 import hashlib
@@ -51,20 +46,9 @@ for chain in CHAINS:
 
 @pytest.mark.timeout(200)
 def test_filters_give_the_same_to_the_bit_without_the_compiler():
-    printed = []
-    for disable in ('0', '1'):
-        done = subprocess.run(
-            [sys.executable, '-c', SHORT_CHAINS],
-            cwd=Path(__file__).parents[2],
-            env={**os.environ, 'NUMBA_DISABLE_JIT': disable},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        printed.append(done.stdout)
-    assert printed[0] == printed[1]
-    assert len(printed[0].splitlines()) == 20
+    text = printed(SHORT_CHAINS, compiled=True)
+    assert text == printed(SHORT_CHAINS, compiled=False)
+    assert len(text.splitlines()) == 20
 
 
 @both

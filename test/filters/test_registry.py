@@ -78,6 +78,11 @@ def test_a_name_can_be_given_and_taken_once():
         register(Broken)
 
 
+def test_a_filter_that_filters_nothing_is_refused():
+    with pytest.raises(ConfigError, match='Idle: a filter has to implement keep or apply'):
+        register(type('Idle', (Filter,), {}))
+
+
 def test_an_entry_point_is_found_by_its_name(monkeypatch):
     entry_points(monkeypatch, every_second=f'{__name__}:OddRows')
     assert find('every_second') is OddRows

@@ -2,12 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map made without the compiler, in a process of its own, equals one made with it."""
 
-import os
-from pathlib import Path
-import subprocess
-import sys
-
 import pytest
+
+from test.kernels.modes import printed
 
 SHORT_MAPPING = """
 import hashlib
@@ -45,19 +42,7 @@ except ValueError as error:
 
 @pytest.mark.timeout(200)
 def test_a_map_is_the_same_to_the_bit_without_the_compiler():
-    printed = []
-    for disable in ('0', '1'):
-        done = subprocess.run(
-            [sys.executable, '-c', SHORT_MAPPING],
-            cwd=Path(__file__).parents[2],
-            env={**os.environ, 'NUMBA_DISABLE_JIT': disable},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        assert done.stderr == ''
-        printed.append(done.stdout)
-    assert printed[0] == printed[1]
-    assert 'does not hold' in printed[0]
-    assert len(printed[0].splitlines()) == 16
+    text = printed(SHORT_MAPPING, compiled=True)
+    assert text == printed(SHORT_MAPPING, compiled=False)
+    assert 'does not hold' in text
+    assert len(text.splitlines()) == 16

@@ -2,13 +2,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """A distance field made without the compiler, in a process of its own, equals one made with it."""
 
-import os
-from pathlib import Path
-import subprocess
-import sys
-
 import numpy as np
 import pytest
+
+from test.kernels.modes import printed
 
 SHORT_FUSING = """
 import sys
@@ -61,21 +58,10 @@ np.savez(sys.argv[1], *found)
 
 @pytest.mark.timeout(200)
 def test_a_field_is_the_same_without_the_compiler(tmp_path):
-    printed, arrays = [], []
-    for disable in ('0', '1'):
-        path = tmp_path / f'{disable}.npz'
-        done = subprocess.run(
-            [sys.executable, '-c', SHORT_FUSING, str(path)],
-            cwd=Path(__file__).parents[2],
-            env={**os.environ, 'NUMBA_DISABLE_JIT': disable},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        assert done.returncode == 0, done.stderr
-        printed.append(done.stdout)
-        arrays.append([array for _, array in np.load(path).items()])
-    assert printed[0] == printed[1]
+    paths = tmp_path / 'compiled.npz', tmp_path / 'interpreted.npz'
+    text = printed(SHORT_FUSING, paths[0], compiled=True)
+    assert text == printed(SHORT_FUSING, paths[1], compiled=False)
+    arrays = [list(np.load(path).values()) for path in paths]
     assert len(arrays[0]) == 32
     for compiled, interpreted in zip(*arrays, strict=True):
         # The compiler may round once where numpy rounds twice.
