@@ -15,7 +15,17 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from surfel_mapper.io.cdr import ADD, DELETE, LINE_LIST, Marker, marker_array, TRIANGLE_LIST
+from surfel_mapper.io.cdr import (
+    ADD,
+    DELETE,
+    DELETE_ALL,
+    LINE_LIST,
+    Marker,
+    marker_array,
+    polygon_instance,
+    TEXT_VIEW_FACING,
+    TRIANGLE_LIST,
+)
 
 TEXTS = ['', 'a', 'ab', 'abc', 'odom', 'sensor', 'über', 'discs of a map']
 
@@ -66,7 +76,7 @@ def twin(markers):
         out.text('')
         out.text('')
         out.put('I', 0, 0)
-        out.text('')
+        out.text(m.text)
         out.text('')
         out.text('')
         out.put('I', 0)
@@ -98,12 +108,13 @@ MARKERS = st.lists(
         make_marker,
         frame_id=NAMES,
         ns=NAMES,
+        text=NAMES,
         points=st.integers(0, 4),
         coloured=st.booleans(),
         seed=st.integers(0, 9),
         id=st.integers(-(2**31), 2**31 - 1),
-        type=st.sampled_from([LINE_LIST, TRIANGLE_LIST]),
-        action=st.sampled_from([ADD, DELETE]),
+        type=st.sampled_from([LINE_LIST, TEXT_VIEW_FACING, TRIANGLE_LIST]),
+        action=st.sampled_from([ADD, DELETE, DELETE_ALL]),
         stamp_ns=st.integers(0, 2**31 * 10**9 - 1),
     ),
     max_size=4,
@@ -123,7 +134,7 @@ def ros_message(markers):
     from std_msgs.msg import ColorRGBA
 
     def ros_marker(m):
-        out = msgs.Marker(ns=m.ns, id=m.id, type=m.type, action=m.action)
+        out = msgs.Marker(ns=m.ns, id=m.id, type=m.type, action=m.action, text=m.text)
         out.header.frame_id = m.frame_id
         out.header.stamp.sec, out.header.stamp.nanosec = divmod(m.stamp_ns, 10**9)
         position, orientation = out.pose.position, out.pose.orientation
@@ -162,6 +173,22 @@ def test_rclpy_reads_what_was_written(markers):
     expected = ros_message(markers)
     found = serialization.deserialize_message(marker_array(markers), type(expected))
     assert found == expected
+
+
+@pytest.mark.parametrize('frame_id', TEXTS)
+@pytest.mark.parametrize('corners', [0, 1, 5])
+def test_rclpy_reads_the_polygon_that_was_written(frame_id, corners):
+    serialization = pytest.importorskip('rclpy.serialization')
+    from geometry_msgs.msg import PolygonInstanceStamped
+
+    ring = np.random.default_rng(1).normal(size=(corners, 3))
+    content = polygon_instance(ring, 2**40 + 3, stamp_ns=5 * 10**9 + 7, frame_id=frame_id)
+    found = serialization.deserialize_message(content, PolygonInstanceStamped)
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (5, 7)
+    assert found.header.frame_id == frame_id
+    assert found.polygon.id == 2**40 + 3
+    points = [(p.x, p.y, p.z) for p in found.polygon.polygon.points]
+    assert np.array_equal(np.array(points).reshape(-1, 3), ring.astype(np.float32))
 
 
 def test_arrays_of_other_types_and_layouts_are_converted():
