@@ -4,14 +4,11 @@
 report.html: one page that says what was mapped, with plots and the map to turn around.
 
 Everything is inside the file, and a content security policy forbids the page to load anything
-else. Names in bags are anyone's: all text is escaped, and data for the script is JSON in which
-no tag can begin. The map is 12 bytes a surfel, 1.6 MB of text for the 100,000 shown at most; the
-mesh of the TSDF takes up to 4 MB more.
+else. Names in bags are anyone's: all text is escaped.
 """
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
@@ -20,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.io.files import replace_file
@@ -28,23 +24,12 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, named_bars, short
 from surfel_mapper.viz.history import History
-from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
-from surfel_mapper.viz.picture import limits, sides_m, SPREAD
-
-Array = npt.NDArray[np.float64]
-
-MAX_SHOWN = 100_000
-"""Of a larger map so many surfels are shown, picked at random, always the same."""
+from surfel_mapper.viz.turning_view import turning_view
 
 STAGES = ('decode', 'filter', 'reduce', 'insert', 'normals', 'total')
 """Stages in the order in which a scan goes through them."""
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
-
-SURFEL = np.dtype(
-    [('place', '<u2', 3), ('radius', 'u1'), ('planarity', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
-)
-"""A surfel as page/view.js takes it."""
 
 
 def write_report(
@@ -88,7 +73,7 @@ def write_report(
     parts = [
         f'<h1>{escape(title)}</h1><p class="about">{escape(about(summary))}</p>',
         figures(summary, history),
-        view(valid, history.trajectory, summary, picture, mesh),
+        turning_view(valid, history.trajectory, summary, picture, mesh),
         plots(valid, summary, history),
         pose_errors_table(summary.get('pose_errors')),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',
@@ -139,90 +124,6 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
         shown['speed'] = f'{speed:.3g} \u00d7 real time'
     cells = ''.join(f'<div><dt>{k}</dt><dd>{escape(v)}</dd></div>' for k, v in shown.items())
     return f'<dl class="figures">{cells}</dl>'
-
-
-def view(
-    surfels: Surfels,
-    trajectory: Array,
-    summary: Mapping[str, Any],
-    picture: str | Path | None,
-    mesh: Mesh | None,
-) -> str:
-    """Return the 3D view with its data."""
-    shown = within_sight(surfels)
-    note = 'Drag to turn, with shift to move, wheel to zoom.'
-    mixed = np.random.default_rng(0).permutation(len(shown))  # while it turns, the first are drawn
-    shown = shown.select(mixed[:MAX_SHOWN])
-    if len(mixed) > MAX_SHOWN:
-        note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
-    choice = ''
-    if mesh is not None and len(mesh):
-        kinds = '<option>surfels</option><option>mesh</option>'
-        choice = f'<label>show <select id="shown">{kinds}</select></label>'
-        if len(mesh) > MAX_TRIANGLES:
-            note += f' The mesh of {len(mesh):,} triangles is made smaller.'
-    data = json.dumps(view_data(shown, trajectory, mesh)).replace('<', '\\u003c')
-    fallback = '<p class="none">This browser has no WebGL 2.</p>'
-    if picture is not None:
-        png = base64.b64encode(Path(picture).read_bytes()).decode()
-        fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
-    colours = ''.join(f'<option>{n}</option>' for n in ('planarity', 'height', 'slope', 'normal'))
-    return (
-        '<h2>The map</h2><div class="view"><canvas id="surfels"></canvas>'
-        f'<div id="picture" hidden>{fallback}</div>'
-        f'<div class="tools">{choice}'
-        f'<label>colour <select id="colouring">{colours}</select></label>'
-        '<label><input type="checkbox" id="hide" checked> hide what faces away</label>'
-        '<button id="reset">reset</button></div>'
-        '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
-        f'<span id="most">1</span></div></div><p class="none">{note}</p>'
-        f'<script type="application/json" id="map">{data}</script>'
-    )
-
-
-def within_sight(surfels: Surfels) -> Surfels:
-    """Return the surfels without those so far away that all others would be tiny."""
-    low, high = limits(surfels)
-    spare = 0.5 * (high - low)
-    inside = (surfels.position >= low - spare) & (surfels.position <= high + spare)
-    return surfels.select(np.asarray(inside.all(axis=1)))
-
-
-def view_data(
-    surfels: Surfels, trajectory: Array, mesh: Mesh | None = None
-) -> dict[str, Any]:
-    """Return what page/view.js needs: everything about the middle of the map, in metres."""
-    from matplotlib import colormaps
-
-    low, high = np.zeros(3), np.ones(3)
-    if not len(surfels) and mesh is not None and len(mesh):
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    if len(surfels):
-        low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
-    size = np.maximum(high - low, 1e-3)
-    radius = 0.5 * SPREAD * sides_m(surfels)
-    largest = float(radius.max(initial=1e-3))
-    packed = np.zeros(len(surfels), SURFEL)
-    packed['place'] = np.rint((surfels.position - low) / size * 65535.0)
-    packed['radius'] = np.ceil(radius / largest * 255.0)
-    packed['planarity'] = np.rint(surfels.planarity * 255.0)
-    packed['normal'] = np.rint(surfels.normal * 127.0)
-    path = (trajectory - (low + 0.5 * size)).astype('<f4')
-    ramp = np.rint(colormaps['viridis'](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0)
-    return {
-        'surfels': encoded(packed),
-        'trajectory': encoded(path),
-        'ramp': encoded(ramp.astype(np.uint8)),
-        'size': [float(side) for side in size],
-        'largest': largest,
-        **({'mesh': mesh_data(mesh, low, size)} if mesh is not None and len(mesh) else {}),
-        'heights': [f'{low[2]:.3g} m', f'{high[2]:.3g} m'],
-    }
-
-
-def encoded(values: npt.NDArray[Any]) -> str:
-    """Return the bytes of an array as text."""
-    return base64.b64encode(values.tobytes()).decode()
 
 
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:

@@ -13,7 +13,8 @@ from scipy.spatial import cKDTree
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.viz.report import MAX_SHOWN, SURFEL, write_report
+from surfel_mapper.viz.report import write_report
+from surfel_mapper.viz.turning_view import MAX_SHOWN, SURFEL
 from test.viz.test_history import mapped
 
 NASTY = '</title></script><script>alert("x")</script><img src=x onerror=alert(1)>'

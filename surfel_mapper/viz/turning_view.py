@@ -1,0 +1,118 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The map to turn around in report.html: its data, and the elements that page/view.js draws into.
+
+Data for the script is JSON in which no tag can begin. A surfel takes 12 bytes, 1.6 MB of text for
+the 100,000 shown at most; the mesh of the TSDF takes up to 4 MB more.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
+from surfel_mapper.viz.picture import limits, sides_m, SPREAD
+
+Array = npt.NDArray[np.float64]
+
+MAX_SHOWN = 100_000
+"""Of a larger map so many surfels are shown, picked at random, always the same."""
+
+SURFEL = np.dtype(
+    [('place', '<u2', 3), ('radius', 'u1'), ('planarity', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
+)
+"""A surfel as page/view.js takes it."""
+
+
+def turning_view(
+    surfels: Surfels,
+    trajectory: Array,
+    summary: Mapping[str, Any],
+    picture: str | Path | None,
+    mesh: Mesh | None,
+) -> str:
+    """Return the 3D view with its data."""
+    shown = within_sight(surfels)
+    note = 'Drag to turn, with shift to move, wheel to zoom.'
+    mixed = np.random.default_rng(0).permutation(len(shown))  # while it turns, the first are drawn
+    shown = shown.select(mixed[:MAX_SHOWN])
+    if len(mixed) > MAX_SHOWN:
+        note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
+    choice = ''
+    if mesh is not None and len(mesh):
+        kinds = '<option>surfels</option><option>mesh</option>'
+        choice = f'<label>show <select id="shown">{kinds}</select></label>'
+        if len(mesh) > MAX_TRIANGLES:
+            note += f' The mesh of {len(mesh):,} triangles is made smaller.'
+    data = json.dumps(view_data(shown, trajectory, mesh)).replace('<', '\\u003c')
+    fallback = '<p class="none">This browser has no WebGL 2.</p>'
+    if picture is not None:
+        png = base64.b64encode(Path(picture).read_bytes()).decode()
+        fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
+    colours = ''.join(f'<option>{n}</option>' for n in ('planarity', 'height', 'slope', 'normal'))
+    return (
+        '<h2>The map</h2><div class="view"><canvas id="surfels"></canvas>'
+        f'<div id="picture" hidden>{fallback}</div>'
+        f'<div class="tools">{choice}'
+        f'<label>colour <select id="colouring">{colours}</select></label>'
+        '<label><input type="checkbox" id="hide" checked> hide what faces away</label>'
+        '<button id="reset">reset</button></div>'
+        '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
+        f'<span id="most">1</span></div></div><p class="none">{note}</p>'
+        f'<script type="application/json" id="map">{data}</script>'
+    )
+
+
+def within_sight(surfels: Surfels) -> Surfels:
+    """Return the surfels without those so far away that all others would be tiny."""
+    low, high = limits(surfels)
+    spare = 0.5 * (high - low)
+    inside = (surfels.position >= low - spare) & (surfels.position <= high + spare)
+    return surfels.select(np.asarray(inside.all(axis=1)))
+
+
+def view_data(
+    surfels: Surfels, trajectory: Array, mesh: Mesh | None = None
+) -> dict[str, Any]:
+    """Return what page/view.js needs: everything about the middle of the map, in metres."""
+    from matplotlib import colormaps
+
+    low, high = np.zeros(3), np.ones(3)
+    if not len(surfels) and mesh is not None and len(mesh):
+        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    if len(surfels):
+        low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
+    size = np.maximum(high - low, 1e-3)
+    radius = 0.5 * SPREAD * sides_m(surfels)
+    largest = float(radius.max(initial=1e-3))
+    packed = np.zeros(len(surfels), SURFEL)
+    packed['place'] = np.rint((surfels.position - low) / size * 65535.0)
+    packed['radius'] = np.ceil(radius / largest * 255.0)
+    packed['planarity'] = np.rint(surfels.planarity * 255.0)
+    packed['normal'] = np.rint(surfels.normal * 127.0)
+    path = (trajectory - (low + 0.5 * size)).astype('<f4')
+    ramp = np.rint(colormaps['viridis'](np.linspace(0.0, 1.0, 256))[:, :3] * 255.0)
+    return {
+        'surfels': encoded(packed),
+        'trajectory': encoded(path),
+        'ramp': encoded(ramp.astype(np.uint8)),
+        'size': [float(side) for side in size],
+        'largest': largest,
+        **({'mesh': mesh_data(mesh, low, size)} if mesh is not None and len(mesh) else {}),
+        'heights': [f'{low[2]:.3g} m', f'{high[2]:.3g} m'],
+    }
+
+
+def encoded(values: npt.NDArray[Any]) -> str:
+    """Return the bytes of an array as text."""
+    return base64.b64encode(values.tobytes()).decode()
