@@ -107,6 +107,17 @@ class Grid:
         """Return the grid that holds all points; refuse what no key can number."""
         low = np.array([axis.min() for axis in points.T], np.float64)
         high = np.array([axis.max() for axis in points.T], np.float64)
+        return cls.between(low, high, size, anchor)
+
+    @classmethod
+    def between(
+        cls,
+        low: npt.NDArray[np.float64],
+        high: npt.NDArray[np.float64],
+        size: npt.NDArray[np.float64],
+        anchor: str,
+    ) -> Grid:
+        """Return the grid that holds what lies between two corners; refuse as over does."""
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise FilterError(
                 'a coordinate is nan or infinite; put remove_nan or a box or range before it'

@@ -86,7 +86,7 @@ def is_paper(config: ModelsConfig) -> bool:
 def clusters_of(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
     """Cluster (N, 3) points; normals face the viewpoint (3,), m."""
     number = len(points)
-    points, order = points.copy(), np.arange(number)
+    moved, order = np.empty((number, 3)), np.empty(number, np.int64)
     rows, flat = np.empty((number, 2), np.int64), np.empty(number, np.bool_)
     means, values = np.empty((2, number, 3))
     frames = np.empty((number, 3, 3))
@@ -101,9 +101,9 @@ def clusters_of(points: Array, config: ModelsConfig, viewpoint: Array) -> Cluste
         0.0 if by_paper else config.noise_per_range_sq,
         0.0 if by_paper else 1.0,
     )
-    num = bisect(points, order, viewpoint, rules, rows, flat, means, values, frames)
+    num = bisect(points, viewpoint, rules, moved, order, rows, flat, means, values, frames)
     at = np.argsort(rows[:num, 0])
-    return Clusters(points, order, rows[at], flat[at], means[at], values[at], frames[at])
+    return Clusters(moved, order, rows[at], flat[at], means[at], values[at], frames[at])
 
 
 def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:

@@ -23,7 +23,13 @@ import numpy.typing as npt
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
-from surfel_mapper.kernels.finite_points import give_labels, take_finite
+from surfel_mapper.kernels.voxel_means import (
+    finite_ends,
+    give_labels,
+    mean_runs,
+    sorted_runs,
+    voxel_runs,
+)
 from surfel_mapper.models.clusters import (
     Clusters,
     clusters_of,
@@ -78,7 +84,7 @@ def fit(
     if view.shape != (3,) or not np.isfinite(view).all():
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [perf_counter()]
-    thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
+    thinned = thin(np.ascontiguousarray(points.reshape(-1, 3)), config.voxel_size_m)
     laps.append(perf_counter())
     clusters = clusters_of(thinned.means, config, view)
     laps.append(perf_counter())
@@ -103,44 +109,42 @@ class Thinned:
     ----------
     means : (M, 3) float64, m
         Means of the points, in the order of the voxels.
-    order : (M,) int64
-        Which of the voxels, as they first appear, each is.
-    rows : (n,) int32
-        Rows of the points that are finite.
-    voxels : (n,) int32
-        The voxels of these, as they first appear.
+    runs : (R, 2) int32
+        First row of each run of finite points in one voxel, and the one after its last.
+    voxels : (R,) int32
+        Which of the means that of each run is.
     num_points : int
         All points, finite or not.
 
     """
 
     means: Array
-    order: Indices
-    rows: npt.NDArray[np.int32]
+    runs: npt.NDArray[np.int32]
     voxels: npt.NDArray[np.int32]
     num_points: int
 
     def spread(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels for all points from those of the means, -1 where they are not finite."""
         found = np.full(self.num_points, -1, np.int32)
-        by_voxel = np.empty_like(labels)
-        by_voxel[self.order] = labels
-        give_labels(self.rows, self.voxels, by_voxel, found)
+        give_labels(self.runs, self.voxels, labels, found)
         return found
 
 
 def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     """Return the means of the points (N, 3) in each voxel."""
-    taken, rows = np.empty((3, len(points)), points.dtype), np.empty(len(points), np.int32)
-    number = take_finite(points, taken, rows)
-    if not number:
-        none = np.empty(0, np.int64)
-        return Thinned(np.empty((0, 3)), none, rows[:0], rows[:0], len(points))
-    xyz = taken[:, :number].T
-    keys, sums, groups = VoxelGrid.over(xyz, np.full(3, voxel_size_m), 'origin').group(xyz, True)
-    order = np.argsort(keys)
-    sums = sums[order]
-    return Thinned(sums[:, :3] / sums[:, 3:], order, rows[:number], groups.rows, len(points))
+    ends, runs = np.empty((2, 3)), np.empty((len(points), 2), np.int32)
+    if not finite_ends(points, ends):
+        return Thinned(np.empty((0, 3)), runs[:0], np.empty(0, np.int32), len(points))
+    grid = VoxelGrid.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
+    keys = np.empty(len(points), np.int64)
+    num = voxel_runs(points, grid.size, grid.shift, grid.base, grid.bits, keys, runs)
+    keys, runs, key_bits, run_bits = keys[:num], runs[:num], int(grid.bits.sum()), num.bit_length()
+    if key_bits + run_bits > 63:
+        keys, key_bits = np.unique(keys, return_inverse=True)[1], run_bits
+    ordered = sorted_runs(keys, key_bits, run_bits)
+    means, voxels = np.empty((num, 3)), np.empty(num, np.int32)
+    num_voxels = mean_runs(points, runs, ordered, run_bits, means, voxels)
+    return Thinned(means[:num_voxels], runs, voxels, len(points))
 
 
 def fitted_patches(
