@@ -40,6 +40,7 @@ ROS = [
 
 FORMATS = [
     'pyarrow>=14',  # maps as Parquet
+    'ezdxf>=1.1',  # planes and surfaces as DXF, for CAD
     'python-neo-lzf>=0.3',  # scans in compressed PCD files
 ]
 

@@ -55,6 +55,7 @@ HOMES = {
     'dask': 'cluster/',
     'diagnostic_msgs': 'ros/',
     'distributed': 'cluster/',
+    'ezdxf': 'io/dxf',
     'geometry_msgs': 'ros/',
     'lifecycle_msgs': 'ros/',
     'llvmlite': 'kernels/',

@@ -26,7 +26,7 @@ EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
 
 MAPS = ('.npz', '.parquet')
 
-FORMATS = ('json', 'obj', 'parquet')
+FORMATS = ('json', 'obj', 'parquet', 'dxf')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit, write the files, report."""
     from surfel_mapper.config.models import ModelsConfig
-    from surfel_mapper.io import model_files
+    from surfel_mapper.io.model_files import write_models
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.models import draw_models
 
@@ -85,8 +85,7 @@ def run(args: argparse.Namespace) -> int:
     )
     model = fit(points, config, viewpoint)
     args.output.mkdir(parents=True, exist_ok=True)
-    for name in args.formats:
-        getattr(model_files, f'write_{name}')(args.output / f'models.{name}', model)
+    write_models(args.output, model, args.formats)
     draw_models(args.output / 'models.png', points, model, viewpoint)
     content = figures(model, evaluate(model, points), len(points))
     print(json.dumps(content) if args.json else report(content))

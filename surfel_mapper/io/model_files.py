@@ -4,11 +4,13 @@
 Models in files: JSON with everything, Parquet with a row a primitive, OBJ with triangles.
 
 JSON is for people and scripts, Parquet for tables of many clouds, OBJ for CAD and viewers: each
-plane and surface is an object of its own there, and Gaussians are left out.
+plane and surface is an object of its own there, and Gaussians are left out. DXF is in dxf.py.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+import itertools
 import json
 from pathlib import Path
 from typing import Any
@@ -16,21 +18,67 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.io.dxf import write_dxf
 from surfel_mapper.io.files import replace_file
 from surfel_mapper.io.parquet import import_pyarrow
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
-from surfel_mapper.models.outlines import outline, triangles
+from surfel_mapper.models.outlines import outline
+from surfel_mapper.models.shapes import shape_of
 
 FORMAT, VERSION = 'surfel_mapper models', 1
 
 
-def write_json(path: str | Path, model: MultiModel) -> None:
+def write_models(
+    directory: Path,
+    model: MultiModel,
+    formats: Sequence[str],
+    versions: Mapping[int, int] | None = None,
+) -> list[Path]:
+    """
+    Write models as ``models`` in some formats: json, obj, parquet, dxf; return the files.
+
+    Parameters
+    ----------
+    directory : Path
+        Where to.
+    model : MultiModel
+        What to write.
+    formats : sequence of str
+        As what.
+    versions : mapping of int to int, optional
+        Of primitives that live, by id; in JSON and Parquet.
+
+    Raises
+    ------
+    FileFormatError
+        If a file cannot be written.
+    DependencyError
+        If pyarrow or ezdxf is needed and not installed.
+
+    """
+    paths = [directory / f'models.{name}' for name in formats]
+    for name, path in zip(formats, paths, strict=True):
+        if name == 'json':
+            write_json(path, model, versions)
+        elif name == 'parquet':
+            write_parquet(path, model, versions)
+        elif name == 'obj':
+            write_obj(path, model)
+        else:
+            write_dxf(path, model)
+    return paths
+
+
+def write_json(
+    path: str | Path, model: MultiModel, versions: Mapping[int, int] | None = None
+) -> None:
     """
     Write models as JSON, lengths in m.
 
     A patch: id, num_points, mean, R_patch_map (rows x, y, normal), rms_m, normal and offset_m of
     its plane, and outline, a list of rings. A surface besides: pitch_m, origin, degrees and
-    control of its spline. A Gaussian: id, num_points, mean, covariance.
+    control of its spline. A Gaussian: id, num_points, mean, covariance. Each has its version
+    besides, where versions are given.
 
     Raises
     ------
@@ -38,13 +86,19 @@ def write_json(path: str | Path, model: MultiModel) -> None:
         If the file cannot be written.
 
     """
+    primitives = {
+        'planes': [patch_content(plane) for plane in model.planes],
+        'surfaces': [surface_content(surface) for surface in model.surfaces],
+        'gaussians': gaussian_content(model.gaussians),
+    }
+    if versions is not None:
+        for primitive in itertools.chain(*primitives.values()):
+            primitive['version'] = versions[primitive['id']]
     content = {
         'format': FORMAT,
         'version': VERSION,
         'voxel_size_m': model.voxel_size_m,
-        'planes': [patch_content(plane) for plane in model.planes],
-        'surfaces': [surface_content(surface) for surface in model.surfaces],
-        'gaussians': gaussian_content(model.gaussians),
+        **primitives,
     }
     with replace_file(path) as file:
         file.write(json.dumps(content, allow_nan=False).encode())
@@ -93,7 +147,7 @@ def gaussian_content(gaussians: Gaussians) -> list[dict[str, Any]]:
 
 def columns(model: MultiModel) -> dict[str, npt.NDArray[Any]]:
     """
-    Return a row a primitive, in the order of their ids.
+    Return a row a primitive: planes, surfaces, Gaussians.
 
     id, kind, num_points, mean_x to mean_z, cov_xx to cov_zz, and for planes and surfaces the
     normal, offset_m, rms_m and area_m2; nan for Gaussians.
@@ -110,7 +164,7 @@ def columns(model: MultiModel) -> dict[str, npt.NDArray[Any]]:
     names = ('normal_x', 'normal_y', 'normal_z', 'offset_m', 'rms_m', 'area_m2')
     numbers = [patch.num_points for patch in patches]
     return {
-        'id': np.arange(len(mean), dtype=np.int64),
+        'id': np.concatenate([np.array([p.id for p in patches], np.int64), gaussians.id]),
         'kind': np.array(kinds + ['gaussian'] * len(gaussians), dtype=object),
         'num_points': np.concatenate([np.array(numbers, np.int64), gaussians.num_points]),
         **{f'mean_{axis}': mean[:, k] for k, axis in enumerate('xyz')},
@@ -127,9 +181,11 @@ PARTS_OF_AREA = 8
 """Areas are sums of squares of this part of a cell."""
 
 
-def write_parquet(path: str | Path, model: MultiModel) -> None:
+def write_parquet(
+    path: str | Path, model: MultiModel, versions: Mapping[int, int] | None = None
+) -> None:
     """
-    Write a row a primitive as Parquet; see columns.
+    Write a row a primitive as Parquet; see columns; and ``version``, where versions are given.
 
     Raises
     ------
@@ -140,8 +196,11 @@ def write_parquet(path: str | Path, model: MultiModel) -> None:
 
     """
     arrow, parquet = import_pyarrow()
+    table = columns(model)
+    if versions is not None:
+        table['version'] = np.array([versions[number] for number in table['id']], np.int64)
     with replace_file(path) as file:
-        parquet.write_table(arrow.table(columns(model)), file, compression='zstd')
+        parquet.write_table(arrow.table(table), file, compression='zstd')
 
 
 def write_obj(path: str | Path, model: MultiModel) -> None:
@@ -158,9 +217,9 @@ def write_obj(path: str | Path, model: MultiModel) -> None:
     with replace_file(path) as file:
         file.write(b'# surfel_mapper models, m\n')
         for patch in model.patches:
-            vertices, faces = triangles(patch)
-            kind = 'surface' if isinstance(patch, Surface) else 'plane'
+            shape = shape_of(patch)
+            kind = 'surface' if shape.is_curved else 'plane'
             file.write(f'o {kind}_{patch.id}\n'.encode())
-            np.savetxt(file, vertices, 'v %.6f %.6f %.6f')
-            np.savetxt(file, faces + begin, 'f %d %d %d')
-            begin += len(vertices)
+            np.savetxt(file, shape.vertices, 'v %.6f %.6f %.6f')
+            np.savetxt(file, shape.faces + begin, 'f %d %d %d')
+            begin += len(shape.vertices)

@@ -63,8 +63,10 @@ class PatchShape:
         Whose shape it is.
     rings : list of (M, 3) float64, m
         Its outline; see outlines.outline.
-    corners : (T, 3, 3) float64, m
-        Its triangles; those of a plane cover exactly what the rings enclose.
+    vertices : (V, 3) float64, m
+    faces : (T, 3) int64
+        Its triangles, facing along the normal; those of a plane cover exactly what the rings
+        enclose.
     low, high : (3,) float64, m
         Of the box around them in the frame of the patch.
     area_m2 : float
@@ -74,10 +76,16 @@ class PatchShape:
 
     patch: Plane
     rings: list[Array]
-    corners: Array
+    vertices: Array
+    faces: npt.NDArray[np.int64]
     low: Array
     high: Array
     area_m2: float
+
+    @property
+    def corners(self) -> Array:
+        """The corners of every triangle, (T, 3, 3) m."""
+        return self.vertices[self.faces]
 
     @property
     def is_curved(self) -> bool:
@@ -96,21 +104,23 @@ def shape_of(patch: Plane) -> PatchShape:
     rims = local_outline(patch)
     if isinstance(patch, Surface):
         vertices, faces = triangles(patch)
-        corners = vertices[faces]
     else:
-        flat = filled(rims)
-        corners = patch.lifted(flat.reshape(-1, 2)).reshape(-1, 3, 3)
+        corners = filled(rims).reshape(-1, 2)
+        places, number = np.unique(corners, axis=0, return_inverse=True)
+        vertices, faces = patch.lifted(places), number.reshape(-1, 3)
     rings = [patch.lifted(rim) for rim in rims]
-    local = patch.to_local(np.concatenate([corners.reshape(-1, 3), *rings]))
+    local = np.concatenate([patch.to_local(vertices), *map(patch.to_local, rings)])
+    low, high = local.min(axis=0), local.max(axis=0)
     if not isinstance(patch, Surface):
-        local[:, 2] = 0.0
+        low[2] = high[2] = 0.0  # but for rounding it is
     return PatchShape(
         patch=patch,
         rings=rings,
-        corners=corners,
-        low=local.min(axis=0),
-        high=local.max(axis=0),
-        area_m2=float(areas(corners).sum()),
+        vertices=vertices,
+        faces=faces,
+        low=low,
+        high=high,
+        area_m2=float(areas(vertices[faces]).sum()),
     )
 
 

@@ -34,6 +34,9 @@ def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
     assert all((tmp_path / 'out' / name).stat().st_size > 0 for name in FILES)
     assert main(['extract', *arguments, '--formats', 'json']) == 0
     assert 'planes' in capsys.readouterr().out
+    pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
+    assert main(['extract', *arguments, '--formats', 'dxf']) == 0
+    assert (tmp_path / 'out' / 'models.dxf').stat().st_size > 0
 
 
 def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import json
 
 import numpy as np
@@ -11,7 +12,7 @@ import pytest
 
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.io.model_files import write_json, write_obj, write_parquet
+from surfel_mapper.io.model_files import write_json, write_models, write_obj, write_parquet
 from surfel_mapper.models import fit
 from test.models.scenes import A, room, VIEW
 
@@ -59,6 +60,25 @@ def test_obj_has_an_object_for_every_patch_and_faces_within_its_vertices(model, 
             num_vertices += 1
         elif line.startswith('f '):
             assert all(1 <= int(n) <= num_vertices for n in line.split()[1:])
+
+
+def test_ids_and_versions_of_models_that_live_are_kept(model, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    live = replace(
+        model,
+        planes=[replace(plane, id=plane.id + 1000) for plane in model.planes],
+        gaussians=replace(model.gaussians, id=model.gaussians.id + 2000),
+    )
+    ids = [p.id for p in live.patches] + live.gaussians.id.tolist()
+    versions = {number: number % 7 for number in ids}
+    written = write_models(tmp_path, live, ('json', 'parquet'), versions)
+    assert [path.name for path in written] == ['models.json', 'models.parquet']
+    found = json.loads(written[0].read_text())
+    for kind in ('planes', 'surfaces', 'gaussians'):
+        assert all(item['version'] == item['id'] % 7 for item in found[kind])
+    table = parquet.read_table(written[1]).to_pydict()
+    assert table['id'] == ids
+    assert table['version'] == [number % 7 for number in ids]
 
 
 def test_models_of_nothing_are_written_too(tmp_path):
