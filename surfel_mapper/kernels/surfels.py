@@ -83,6 +83,31 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
                 eigenvalues[out, axis] = values[axis, i]
 
 
+@njit(cache=True, nogil=True, error_model='numpy')
+def derive_covariances(rows, chosen, voxel_size, bits, covariance):
+    """
+    Derive the covariances of the points of some rows of the slab.
+
+    rows, chosen, voxel_size, bits: as of derive_surfels
+    covariance  (K, 6) float64, out: xx xy xz yy yz zz, m^2
+    """
+    moments = np.empty((MOMENTS, CHUNK))
+    mean, scatter = np.empty((3, CHUNK)), np.empty((6, CHUNK))
+    num_points, voxel_index = np.empty(len(chosen), np.int64), np.empty((len(chosen), 3), np.int32)
+    many = 1 << max(EXACT_BITS - 2 * bits, 0)
+    unit = voxel_size / (1 << bits)
+    for start in range(0, len(chosen), CHUNK):
+        num = min(CHUNK, len(chosen) - start)
+        most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
+        center(moments, num, mean, scatter)
+        if most >= many:
+            center_exactly(rows, chosen[start : start + num], scatter)
+        for i in range(num):
+            scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
+            for pair in range(6):
+                covariance[start + i, pair] = scatter[pair, i] * scale
+
+
 @njit(cache=True, nogil=True)
 def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     """

@@ -56,10 +56,10 @@ class ChangeLog:
         """
         Return the rows changed after a version that hold at least so many points, each once.
 
-        None where the log does not reach back so far.
+        Those of 0 points have been emptied. None where the log does not reach back so far.
         """
         if version < self._start:
             return None
         entries = takewhile(lambda entry: entry[0] > version, reversed(self._entries))
-        parts = [rows_changed_at(slab, rows, at, max(min_points, 1)) for at, rows in entries]
+        parts = [rows_changed_at(slab, rows, at, min_points) for at, rows in entries]
         return np.concatenate(parts) if parts else np.empty(0, np.int32)

@@ -28,6 +28,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
+from surfel_mapper.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.change_log import ChangeLog
 from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.digest import digest_of
@@ -96,7 +97,7 @@ class SurfelMap:
     def _reset(self) -> None:
         self._table = VoxelTable(len(self._channel_names))
         self._changes = ChangeLog(self.version)
-        self._reported = self.version
+        self._reported = self.cleared_at = self.version
 
     def __len__(self) -> int:
         """Return the number of voxels."""
@@ -364,6 +365,28 @@ class SurfelMap:
         """Return the surfels of some rows, which ``find`` gave."""
         return self._derive(rows)
 
+    def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
+        """Return the covariances of the points of some rows, (K, 6): xx xy xz yy yz zz, m^2."""
+        found = np.empty((len(rows), 6))
+        bits = layout.BITS + self.level
+        derive_covariances(self._table.rows, rows, self.voxel_size_m, bits, found)
+        return found
+
+    def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
+        """Return the voxel keys of some rows, -1 for those that hold no points."""
+        slab = self._table.rows
+        keys = np.where(slab[rows, layout.COUNT] > 0, slab[rows, layout.KEY], -1)
+        return np.asarray(keys, np.int64)
+
+    def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
+        """
+        Return the rows whose voxels changed after a version, those emptied too, each once.
+
+        What was there before the map was cleared (``cleared_at``, a version) is not among them.
+        """
+        changed = self._changes.since(since, self._table.rows, 0)
+        return self._table.emptied_or_changed_after(since) if changed is None else changed
+
     def index(self, min_points: int = 1) -> SurfelIndex:
         """Return the surfels with at least so many points, to be asked by place: a snapshot."""
         return SurfelIndex(self.surfels(min_points), self.voxel_size_m, level=self.level)
@@ -382,7 +405,7 @@ class SurfelMap:
         """
         if since is None:
             since, self._reported = self._reported, self.version
-        changed = self._changes.since(since, self._table.rows, min_points)
+        changed = self._changes.since(since, self._table.rows, max(min_points, 1))
         if changed is None:
             changed = self._table.changed_after(since, min_points)
         return self._derive(changed)

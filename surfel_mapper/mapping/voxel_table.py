@@ -152,6 +152,10 @@ class VoxelTable:
         used = self._hash.rows_used
         return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
 
+    def emptied_or_changed_after(self, version: int) -> npt.NDArray[Any]:
+        """Return the rows changed after a version, those that hold no points any more too."""
+        return np.asarray(rows_changed_after(self.rows, self._hash.rows_used, version, 0))
+
     def keys_in_box(
         self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.int64]:

@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Voxels as pieces of surfaces: which are flat, which of them belong together, which lie on them.
+
+All arrays have a row for each row of the map's slab. A link of two flat neighbours is a bit of
+the one of lesser key: bit h of ``links`` says that the voxel h steps further on, whose row is in
+``partners``, goes on with the same surface. Links depend on the two voxels alone, so whatever
+order they change in, they are those of the map as it is.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.eigen_frames import eigen_frame
+from surfel_mapper.kernels.joining import agree
+
+NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
+"""What a voxel is: no points, too few, a piece of a surface, none."""
+
+LEAST_WIDTH = 0.04
+"""Of less variance across than along it is a line, whose normal says little."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def classify(chosen, count, covariance, rules, kind, axes):
+    """
+    Say what voxels are, and how far their points reach across the normal.
+
+    chosen      (K,) int32, rows; each holds points
+    count       (R,) int64
+    covariance  (R, 6) float64, m^2
+    rules       least points, most variance along the normal m^2, voxel size m
+    kind        (R,) uint8, out
+    axes        (R, 2, 3) float64, out: half edges of a square that has the same variance, m
+    """
+    matrix, vectors, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
+    longest = rules[2] * math.sqrt(0.5)
+    for row in chosen:
+        c = covariance[row]
+        matrix[0, 0], matrix[1, 1], matrix[2, 2] = c[0], c[3], c[5]
+        matrix[0, 1] = matrix[1, 0] = c[1]
+        matrix[0, 2] = matrix[2, 0] = c[2]
+        matrix[1, 2] = matrix[2, 1] = c[4]
+        eigen_frame(matrix, values, vectors)
+        wide = values[1] > LEAST_WIDTH * values[2]
+        if count[row] < rules[0]:
+            kind[row] = YOUNG
+        else:
+            kind[row] = FLAT if wide and values[0] < rules[1] else ROUGH
+        for k in range(2):
+            half = min(math.sqrt(3.0 * values[2 - k]), longest)
+            for j in range(3):
+                axes[row, k, j] = half * vectors[2 - k, j]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def joins(i, j, kind, position, normal, rules):
+    """Return whether two neighbours are pieces of one surface; see agree."""
+    if kind[i] != FLAT or kind[j] != FLAT:
+        return False
+    delta = position[i] - position[j]
+    if not delta[0] * delta[0] + delta[1] * delta[1] + delta[2] * delta[2] < rules[4]:
+        return False  # the index of a voxel at the end of the world has run over
+    return agree(normal[i], normal[j], delta, 1.0, rules)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def set_link(i, j, h, is_joined, links, partners, marks, marked, num):
+    """Set or clear one link; mark both rows where it was otherwise; return how many are marked."""
+    bit = np.uint64(1) << np.uint64(h)
+    was_joined = links[i] & bit != 0
+    if is_joined:
+        if was_joined and partners[i, h] == j:
+            return num
+        links[i] |= bit
+        partners[i, h] = j
+        num = mark(j, marks, marked, num)
+    elif was_joined:
+        links[i] &= ~bit
+    else:
+        return num
+    return mark(i, marks, marked, num)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def mark(row, marks, marked, num):
+    """Put a row into a list, once; return how many are in it."""
+    if not marks[row]:
+        marks[row] = True
+        marked[num] = row
+        num += 1
+    return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def cut_links(around, links, partners, marks, marked):
+    """
+    Clear the links of voxels to places that are empty now.
+
+    around  (G, H) int32, the rows of the voxels before each place, -1 where there is none
+    marks   (R,) bool, all False
+    marked  (R,) int32, out: rows of which some link has changed
+
+    Returns how many are marked.
+    """
+    num = 0
+    for i in range(len(around)):
+        for h in range(around.shape[1]):
+            if around[i, h] >= 0:
+                num = set_link(
+                    around[i, h], 0, h, False, links, partners, marks, marked, num
+                )
+    return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def link(chosen, around, state, rules, links, partners, marks, marked, num):
+    """
+    Set all links from and to some voxels anew.
+
+    chosen  (K,) int32, rows
+    around  (K, 2 H) int32, rows of the voxels after each, then of those before, -1 for none
+    state   kind (R,), position (R, 3), normal (R, 3)
+    rules   see agree, but for the fifth: square of the longest distance, m^2
+    num     how many rows are marked already
+
+    Returns how many are.
+    """
+    kind, position, normal = state
+    half = around.shape[1] // 2
+    for i in range(len(chosen)):
+        row = np.int64(chosen[i])
+        for h in range(half):
+            after, before = np.int64(around[i, h]), np.int64(around[i, half + h])
+            joined = after >= 0 and joins(row, after, kind, position, normal, rules)
+            num = set_link(row, after, h, joined, links, partners, marks, marked, num)
+            if before >= 0:
+                joined = joins(before, row, kind, position, normal, rules)
+                num = set_link(before, row, h, joined, links, partners, marks, marked, num)
+    return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def lie_on(chosen, around, state, covariance, rules, host):
+    """
+    Find the flat neighbour on whose plane a voxel lies that is not flat itself.
+
+    chosen      (K,) int32, rows
+    around      (K, A) int32, rows of their neighbours, -1 for none
+    state       kind (R,), position (R, 3), normal (R, 3)
+    covariance  (R, 6) float64, m^2
+    rules       largest distance m, most variance along the normal m^2, square of the longest
+                distance m^2
+    host        (K,) int32, out: the nearest plane's row, -1 for none
+    """
+    kind, position, normal = state
+    for i in range(len(chosen)):
+        row = np.int64(chosen[i])
+        best = rules[0]
+        host[i] = -1
+        c = covariance[row]
+        for other in around[i]:
+            if other < 0 or kind[other] != FLAT:
+                continue
+            x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]
+            delta = position[row] - position[other]
+            if not delta[0] * delta[0] + delta[1] * delta[1] + delta[2] * delta[2] < rules[2]:
+                continue
+            away = abs(x * delta[0] + y * delta[1] + z * delta[2])
+            along = x * x * c[0] + y * y * c[3] + z * z * c[5]
+            along += 2.0 * (x * y * c[1] + x * z * c[2] + y * z * c[4])
+            if away < best and along < rules[1]:
+                best = away
+                host[i] = other
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def spread(rows, position, axes, low, voxel_size, points):
+    """
+    Write nine points a voxel, three by three across it, none outside of it.
+
+    rows      (M,) int32
+    position  (R, 3), axes (R, 2, 3) float64
+    low       (M, 3) float64, lowest corner of each voxel, m
+    points    (9 M, 3) float64, out
+    """
+    at = 0
+    for i in range(len(rows)):
+        row = rows[i]
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                for j in range(3):
+                    value = position[row, j] + a * axes[row, 0, j] + b * axes[row, 1, j]
+                    points[at, j] = min(max(value, low[i, j]), low[i, j] + voxel_size)
+                at += 1
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def merge_moments(rows, starts, count, position, covariance, total, mean, merged):
+    """
+    Merge the moments of voxels, by the exact formula for two sets of points.
+
+    rows        (M,) int32; group k has those from starts[k] to starts[k + 1] - 1
+    count       (R,), position (R, 3), covariance (R, 6)
+    total       (K,) int64, out: points
+    mean        (K, 3) float64, out
+    merged      (K, 6) float64, out: covariance, xx xy xz yy yz zz
+    """
+    for k in range(len(starts) - 1):
+        first, points = rows[starts[k]], 0.0
+        sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
+        for i in range(starts[k], starts[k + 1]):
+            row = rows[i]
+            n = np.float64(count[row])
+            x, y, z = (position[row, 0] - position[first, 0],
+                       position[row, 1] - position[first, 1],
+                       position[row, 2] - position[first, 2])  # fmt: skip
+            points += n
+            sx, sy, sz = sx + n * x, sy + n * y, sz + n * z
+            xx += n * x * x + (n - 1.0) * covariance[row, 0]
+            xy += n * x * y + (n - 1.0) * covariance[row, 1]
+            xz += n * x * z + (n - 1.0) * covariance[row, 2]
+            yy += n * y * y + (n - 1.0) * covariance[row, 3]
+            yz += n * y * z + (n - 1.0) * covariance[row, 4]
+            zz += n * z * z + (n - 1.0) * covariance[row, 5]
+        mx, my, mz = sx / points, sy / points, sz / points
+        scale = 1.0 / max(points - 1.0, 1.0)
+        total[k] = np.int64(points)
+        mean[k, 0], mean[k, 1], mean[k, 2] = (position[first, 0] + mx, position[first, 1] + my,
+                                              position[first, 2] + mz)  # fmt: skip
+        merged[k, 0], merged[k, 1] = scale * (xx - sx * mx), scale * (xy - sx * my)
+        merged[k, 2], merged[k, 3] = scale * (xz - sx * mz), scale * (yy - sy * my)
+        merged[k, 4], merged[k, 5] = scale * (yz - sy * mz), scale * (zz - sz * mz)

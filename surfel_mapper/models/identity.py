@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which new patch is which old one: that with which it shares most voxels.
+
+The largest share is given first, of equal ones that of the lower id. A patch that gets none is
+new, and part of a split where its voxels had a patch before; an old one that gets none has been
+merged where its voxels have a patch now.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+Ids = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Matched:
+    """
+    Who is who.
+
+    Attributes
+    ----------
+    ids : list of int
+        Of the new patches, in their order.
+    created, removed : list of int
+        Ids that no old patch had, that no new patch has.
+    merged, split : list of (int, int)
+        Removed ids and those that most of their voxels went to; old ids and the created ones
+        that have most of their voxels from them.
+
+    """
+
+    ids: list[int]
+    created: list[int]
+    removed: list[int]
+    merged: list[tuple[int, int]]
+    split: list[tuple[int, int]]
+
+
+def match(old_ids: Ids, labels: Ids, starts: Ids, next_id: int) -> Matched:
+    """
+    Give ids to patches.
+
+    Parameters
+    ----------
+    old_ids : (O,) int64
+        Ids of the patches that may be among these, ascending.
+    labels : (M,) int64
+        The ids that their voxels had before; other ones do not count.
+    starts : (K + 1,) int64
+        First voxel of each patch, and M.
+    next_id : int
+        What the first one that is new is called.
+
+    """
+    num = len(starts) - 1
+    of_voxel = np.repeat(np.arange(num), np.diff(starts))
+    place = np.searchsorted(old_ids, labels)
+    known = place < len(old_ids)
+    known[known] = old_ids[place[known]] == labels[known]
+    pairs, shared = np.unique(place[known] * max(num, 1) + of_voxel[known], return_counts=True)
+    best = np.lexsort((pairs, -shared))
+    ids, heirs, origins = [-1] * num, dict.fromkeys(old_ids.tolist(), -1), [-1] * num
+    ranked = [divmod(pair, max(num, 1)) for pair in pairs[best].tolist()]
+    links = [(int(old_ids[old]), new) for old, new in ranked]
+    for old, new in links:
+        if ids[new] < 0 and heirs[old] < 0:
+            ids[new], heirs[old] = old, new
+    created: list[int] = []
+    for new in range(num):
+        if ids[new] < 0:
+            ids[new] = next_id + len(created)
+            created.append(ids[new])
+    removed = [old for old, new in heirs.items() if new < 0]
+    merged: dict[int, int] = {}
+    split: dict[int, int] = {}
+    for old, new in links:
+        if heirs[old] < 0:
+            merged.setdefault(old, ids[new])
+        if origins[new] < 0 and ids[new] >= next_id:
+            origins[new] = old
+            split[ids[new]] = old
+    pairs_split = sorted((old, new) for new, old in split.items() if heirs[old] >= 0)
+    return Matched(ids, created, removed, sorted(merged.items()), pairs_split)

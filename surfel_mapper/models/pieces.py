@@ -1,0 +1,340 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Pieces: what each voxel of a map is to the models, kept up to date.
+
+The arrays have a row for each row of the map's slab, so a voxel is found by the map's own hash
+table. Class, links and host of a voxel depend on the moments of it and its neighbours alone and
+are worked out anew whenever these change at all; so they are the same however the map came about.
+Whether a change is worth telling anyone is another question: see ``is_material``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.kernels.layout import INDEX_BITS
+from surfel_mapper.kernels.pieces import (
+    classify,
+    cut_links,
+    FLAT,
+    lie_on,
+    link,
+    NONE,
+)
+from surfel_mapper.mapping.moments import unpack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int32]
+
+LEAST_THICKNESS_M, THICKNESS_VOXELS = 0.02, 0.2
+MOVED, TURNED, GREW = 0.1, math.cos(math.radians(2.0)), 1.2
+"""A change is material if the mean moves by so much of the thickness, the normal turns farther, or
+there are so many times the points."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Change:
+    """
+    What changed in the pieces.
+
+    Attributes
+    ----------
+    num_voxels : int
+        Voxels that came, changed or went.
+    rows : (N,) int32
+        Those whose label may be another now, apart from what hangs together anew.
+    loose : (C,) int32
+        Components that may hang together otherwise than before.
+    touched : (C,) int32
+        Components of which some voxel, or one that lies on it, changed at all.
+    hosts : (H,) int32
+        Rows on which other voxels lie now.
+    gone : (G,) int32
+        Labels of voxels that have gone; those that have come back elsewhere are not among them.
+
+    """
+
+    num_voxels: int
+    rows: Rows
+    loose: Rows
+    touched: Rows
+    hosts: Rows
+    gone: Rows
+
+
+class Pieces:
+    """
+    The voxels of a map as pieces of surfaces.
+
+    Parameters
+    ----------
+    config : ModelsLayerConfig
+        Settings.
+    surfel_map : SurfelMap
+        What they follow.
+
+    Attributes
+    ----------
+    key : (R,) int64
+        Of the voxel in each row, -1 for none.
+    count, position, normal, eigenvalues, covariance, axes
+        What it holds; covariance xx xy xz yy yz zz; axes as in kernels/pieces.py.
+    kind, links, partners
+        See kernels/pieces.py.
+    host : (R,) int32
+        The flat neighbour that a voxel lies on which is not flat, -1 for none.
+    component : (R,) int32
+        What it hangs together with, by the row of the voxel of least key; -1 if not flat.
+    label : (R,) int32
+        Id of its primitive, -1 for none.
+    alone : (R,) bool
+        Whether that is a Gaussian, its own.
+    is_material : (R,) bool
+        Whether it has changed so that it matters.
+    places : (R,) int32
+        All -1, for kernels that need a number for each row.
+
+    """
+
+    def __init__(self, config: ModelsLayerConfig, surfel_map: SurfelMap) -> None:
+        """Begin with no voxels."""
+        size_m = surfel_map.voxel_size_m
+        self.map = surfel_map
+        self.thickness_m = config.flat_thickness_m or max(
+            LEAST_THICKNESS_M, THICKNESS_VOXELS * size_m
+        )
+        offset_m = max(self.thickness_m, 3.0 * config.noise_m)
+        self.limit_m = math.hypot(self.thickness_m, 6.0 * config.noise_m)
+        variance = (self.limit_m / 6.0) ** 2
+        far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # twice the diagonal, and some
+        self._class_rules = (float(config.min_points), variance, size_m)
+        self._link_rules = (
+            math.cos(math.radians(config.max_angle_deg)),
+            offset_m,
+            math.cos(math.radians(config.arc_angle_deg)),
+            0.5 * offset_m,
+            far_sq,
+        )
+        self._host_rules = (offset_m, variance, far_sq)
+        self._absorbs = config.absorb
+        self._steps = half_steps(config.reach_voxels)
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all voxels; the next change is the whole map."""
+        self._version = -1
+        none = np.empty(0, np.int32)
+        self.key = np.empty(0, np.int64)
+        self.count = np.empty(0, np.int64)
+        self.position, self.normal, self.eigenvalues = np.empty((3, 0, 3))
+        self.covariance, self.axes = np.empty((0, 6)), np.empty((0, 2, 3))
+        self.kind = np.empty(0, np.uint8)
+        self.links = np.empty(0, np.uint64)
+        self.partners = np.empty((0, len(self._steps)), np.int32)
+        self.host, self.component, self.label, self.places = (none,) * 4
+        self.alone = self.is_material = self._marks = np.empty(0, np.bool_)
+        self._told_position, self._told_normal = np.empty((2, 0, 3))
+        self._told_count = np.empty(0, np.int64)
+
+    def follow(self) -> Change:
+        """Take over what changed in the map since the last call."""
+        gone_keys, gone_rows = self._forgotten()
+        changed = self.map.rows_changed(self._version)
+        self._version = self.map.version
+        self._make_room(int(changed.max(initial=-1)) + 1)
+        new, old = self.map.keys_of(changed), self.key[changed]
+        left, here = changed[(old >= 0) & (old != new)], changed[new >= 0]
+        gone_keys = np.concatenate([gone_keys, old[(old >= 0) & (old != new)]])
+        gone_rows = np.concatenate([gone_rows, left])
+        loose = [self.component[gone_rows]]
+        gone = Gone(gone_keys, self.label[gone_rows], self.alone[gone_rows])
+        self._blank(gone_rows)
+        came = here[self.key[here] < 0]
+        self.key[here] = new[new >= 0]
+        gone.return_to(self, came)
+        was_flat = self.kind[here] == FLAT
+        self._measure(here)
+        is_flat = self.kind[here] == FLAT
+        turned = here[was_flat != is_flat]
+        loose.append(self.component[turned])
+        touched = self.component[here]
+        self.component[here[~is_flat]] = -1
+        around = np.concatenate([self._around(gone_keys), self._around(self.key[here])])
+        marked = self._linked(here, around, len(gone_keys))
+        loose.append(self.component[marked])
+        rehosted, old_hosts, new_hosts = self._rehosted(here, around)
+        hosts_of = [self.component[old_hosts[old_hosts >= 0]]]
+        return Change(
+            num_voxels=len(here) + len(gone_keys),
+            rows=np.concatenate([here, rehosted]),
+            loose=found(loose),
+            touched=found([touched, *hosts_of]),
+            hosts=new_hosts[new_hosts >= 0],
+            gone=gone.remaining,
+        )
+
+    def surfels(self) -> Surfels:
+        """Return all voxels as surfels, in the order of their rows."""
+        held = np.flatnonzero(self.key >= 0)
+        eigenvalues = self.eigenvalues[held]
+        e0, e1, e2 = eigenvalues.T
+        total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
+        return Surfels(
+            position=self.position[held],
+            normal=self.normal[held],
+            planarity=2.0 * (e1 - e0) / total,
+            curvature=e0 / total,
+            eigenvalues=eigenvalues,
+            num_points=self.count[held],
+            voxel_index=unpack_keys(self.key[held]),
+        )
+
+    def _forgotten(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
+        """Return keys and rows of all voxels where the map has been cleared since; else none."""
+        if self.map.cleared_at <= self._version or not len(self.key):
+            return np.empty(0, np.int64), np.empty(0, np.int32)
+        rows = np.flatnonzero(self.key >= 0).astype(np.int32)
+        keys = self.key[rows]
+        self.key[rows] = -1
+        return keys, rows
+
+    def _make_room(self, num_rows: int) -> None:
+        """Give the arrays so many rows."""
+        more = max(num_rows, 2 * len(self.key)) - len(self.key)
+        if num_rows <= len(self.key):
+            return
+        empty = {'key': -1, 'host': -1, 'component': -1, 'label': -1, 'places': -1}
+        for name, values in vars(self).items():
+            if isinstance(values, np.ndarray) and name != '_steps':
+                added = np.full((more, *values.shape[1:]), empty.get(name, 0), values.dtype)
+                setattr(self, name, np.concatenate([values, added]))
+
+    def _blank(self, rows: npt.NDArray[Any]) -> None:
+        """Forget the voxels of some rows."""
+        self.key[rows] = self.host[rows] = self.component[rows] = self.label[rows] = -1
+        self.kind[rows] = NONE
+        self.links[rows] = 0
+        self.alone[rows] = False
+        self._told_count[rows] = 0
+
+    def _measure(self, rows: Rows) -> None:
+        """Take over what voxels hold, classify them, and see what of it is material."""
+        before = self.kind[rows]
+        surfels = self.map.surfels_of(rows)
+        self.count[rows], self.position[rows] = surfels.num_points, surfels.position
+        self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
+        self.covariance[rows] = self.map.covariances_of(rows)
+        classify(rows, self.count, self.covariance, self._class_rules, self.kind, self.axes)
+        moved = ((surfels.position - self._told_position[rows]) ** 2).sum(axis=1)
+        cosine = np.einsum('ij,ij->i', surfels.normal, self._told_normal[rows])
+        told, count = self._told_count[rows], surfels.num_points
+        material = (
+            (before != self.kind[rows])
+            | (moved > (MOVED * self.thickness_m) ** 2)
+            | (cosine < TURNED)
+            | (count >= GREW * told)
+            | (told >= GREW * count)
+        )
+        self.is_material[:] = False
+        chosen = rows[material]
+        self.is_material[chosen] = True
+        self._told_count[chosen], self._told_position[chosen] = count[material], (
+            surfels.position[material]
+        )
+        self._told_normal[chosen] = surfels.normal[material]
+
+    def _around(self, keys: npt.NDArray[np.int64]) -> Rows:
+        """Return the rows of the voxels after each, then of those before, (K, 2 H)."""
+        steps = np.concatenate([self._steps, -self._steps])
+        found = self.map.find((keys[:, None] + steps).ravel())
+        return found.reshape(len(keys), len(steps))
+
+    def _linked(self, here: Rows, around: Rows, num_gone: int) -> Rows:
+        """Link voxels anew; return the rows of which some link has changed."""
+        half = len(self._steps)
+        marked = np.empty(len(self.key), np.int32)
+        num = cut_links(
+            around[:num_gone, half:], self.links, self.partners, self._marks, marked
+        )
+        state = (self.kind, self.position, self.normal)
+        num = link(
+            here, around[num_gone:], state, self._link_rules, self.links, self.partners,
+            self._marks, marked, num,
+        )  # fmt: skip
+        self._marks[marked[:num]] = False
+        return marked[:num]
+
+    def _rehosted(self, here: Rows, around: Rows) -> tuple[Rows, Rows, Rows]:
+        """Find on which flat neighbours voxels lie: rows, hosts before and now."""
+        if not self._absorbs:
+            none = np.empty(0, np.int32)
+            return none, none, none
+        near = np.zeros(len(self.key) + 1, np.bool_)
+        near[around] = True  # -1 is the last
+        near[here] = True
+        rows = np.flatnonzero(near[:-1] & (self.kind != FLAT) & (self.kind != NONE))
+        rows = rows.astype(np.int32)
+        before = self.host[rows]
+        hosts = np.empty(len(rows), np.int32)
+        state = (self.kind, self.position, self.normal)
+        lie_on(
+            rows, self._around(self.key[rows]), state, self.covariance, self._host_rules, hosts
+        )
+        flat = here[self.kind[here] == FLAT]
+        once = np.concatenate([self.host[flat], before])
+        self.host[flat] = -1
+        self.host[rows] = hosts
+        changed = (before != hosts) | self.is_material[rows]
+        return rows[changed], once, hosts[changed]
+
+
+@dataclass(slots=True, eq=False)
+class Gone:
+    """Voxels that have left their rows: keys, labels, whether alone."""
+
+    key: npt.NDArray[np.int64]
+    label: Rows
+    alone: npt.NDArray[np.bool_]
+
+    def return_to(self, pieces: Pieces, came: Rows) -> None:
+        """Give the labels of voxels that are in another row now to that row."""
+        if not len(self.key) or not len(came):
+            return
+        order = np.argsort(self.key)
+        place = np.minimum(np.searchsorted(self.key[order], pieces.key[came]), len(order) - 1)
+        back = order[place]
+        same = self.key[back] == pieces.key[came]
+        pieces.label[came[same]] = self.label[back[same]]
+        pieces.alone[came[same]] = self.alone[back[same]]
+        kept = np.ones(len(self.key), np.bool_)
+        kept[back[same]] = False
+        self.label, self.alone = self.label[kept], self.alone[kept]
+
+    @property
+    def remaining(self) -> Rows:
+        """Labels of Gaussians whose voxels are no more."""
+        return self.label[self.alone]
+
+
+def found(components: list[Rows]) -> Rows:
+    """Return the components among these, without -1, each once."""
+    every = np.unique(np.concatenate(components))
+    return every[every >= 0]
+
+
+def half_steps(reach: int) -> npt.NDArray[np.int64]:
+    """Return the keys' differences (H,) to the neighbours of greater key, up to so many away."""
+    offsets = [step for step in product(range(-reach, reach + 1), repeat=3) if step > (0, 0, 0)]
+    x, y, z = np.array(offsets, np.int64).T
+    steps: npt.NDArray[np.int64] = (x << (2 * INDEX_BITS)) + (y << INDEX_BITS) + z
+    return steps
