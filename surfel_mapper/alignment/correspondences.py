@@ -21,7 +21,6 @@ import math
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.mapping.surfels import Surfels
@@ -89,6 +88,8 @@ class Samples:
         ):
             if values is not None and (values.shape != shape or not np.isfinite(values).all()):
                 raise AlignmentError(f'samples: {name} is not {shape} and finite')
+        from scipy.spatial import cKDTree  # 0.4 s, which mapping without alignment need not pay
+
         self.tree = cKDTree(self.position)
 
     def __len__(self) -> int:
@@ -217,6 +218,8 @@ def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[i
     """
     if max_distance_m <= 0.0:
         return []
+    from scipy.spatial import cKDTree
+
     position = T_map_sensor[:, :3, 3]
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
     way_m = np.concatenate([[0.0], np.cumsum(steps)])

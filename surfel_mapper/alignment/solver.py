@@ -20,9 +20,6 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
 
 from surfel_mapper.alignment.angles import pcl_incidence, poses_of, skew, transforms
 from surfel_mapper.alignment.edge_terms import EdgeTerms
@@ -62,6 +59,9 @@ class Entries(NamedTuple):
 
 def components(num_vertices: int, ends: Ints) -> Ints:
     """Return a number for each vertex, (V,), equal where edges with these ends (E, 2) connect."""
+    from scipy.sparse import coo_array  # 0.4 s, which mapping without alignment need not pay
+    from scipy.sparse.csgraph import connected_components
+
     ones = np.ones(len(ends), np.int8)
     adjacency = coo_array((ones, (ends[:, 0], ends[:, 1])), shape=(num_vertices, num_vertices))
     return np.asarray(connected_components(adjacency, directed=False)[1], np.int64)
@@ -191,6 +191,9 @@ def _solve_blocks(
     blocks: Floats, rows: Ints, columns: Ints, right: Floats, *, symmetric: bool
 ) -> Floats:
     """Solve the system of blocks (B, 6, 6), those of one place added up, for right (F, 6)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.linalg import splu
+
     within = np.arange(6)
     i = np.broadcast_to(6 * rows[:, None, None] + within[:, None], blocks.shape)
     j = np.broadcast_to(6 * columns[:, None, None] + within, blocks.shape)

@@ -28,6 +28,7 @@ from surfel_mapper.cli.progress import progress, stopped_by_interrupt
 from surfel_mapper.cli.replay_files import (
     BAG,
     check_truth,
+    DXF,
     FORMATS,
     Mapped,
     pose_errors,
@@ -104,7 +105,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
     add(
         '--formats', type=formats, metavar='LIST',
-        help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply)',
+        help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply); dxf: of the models',
     )  # fmt: skip
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
@@ -141,7 +142,17 @@ def formats(text: str) -> tuple[str, ...]:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Map a recording and report."""
+    """Map one recording or many, and report."""
+    config = configured(args)
+    output = output_directory(args.bags[0], args.output)
+    requests = [request_of(args, bag) for bag in args.bags]
+    if replay_many.is_wanted(args):
+        return replay_many.run(args, config, requests, output)
+    return map_one(args, config, requests[0], output)
+
+
+def map_one(args: argparse.Namespace, config: Config, request: Request, output: Path) -> int:
+    """Map a recording in this process and report."""
     from surfel_mapper.io.heap import keep_freed_memory
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.replay import load_start, poses_now
@@ -149,13 +160,8 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.viz.history import History
 
     keep_freed_memory()  # the clouds: 2 ms less for each of 4 MB
-    config = configured(args)
-    output = output_directory(args.bags[0], args.output)
-    requests = [request_of(args, bag) for bag in args.bags]
-    if replay_many.is_wanted(args):
-        return replay_many.run(args, config, requests, output)
     formats_wanted = args.formats or ('ply',)
-    with open_recording(requests[0], config) as recording, ExitStack() as files:
+    with open_recording(request, config) as recording, ExitStack() as files:
         mapper = Mapper(recording.config)
         load_start(mapper)
         mapper.warm_up()
@@ -197,6 +203,7 @@ def run(args: argparse.Namespace) -> int:
 def configured(args: argparse.Namespace) -> Config:
     """Return the configuration that the arguments ask for."""
     from surfel_mapper.config import load_config
+    from surfel_mapper.errors import ConfigError
     from surfel_mapper.offline.replay import ALL_SCANS
 
     config = load_config(args.config)
@@ -204,6 +211,10 @@ def configured(args: argparse.Namespace) -> Config:
         config = config.replace({'filters': args.filters})
     if args.align:
         config = config.replace({'window.keep_points': True})
+    if DXF in (args.formats or ()) and not config.models.enabled:
+        raise ConfigError(
+            '--formats dxf: planes and surfaces, expected layers.models.enabled: true in --config'
+        )
     return config if args.window else config.replace(ALL_SCANS)
 
 

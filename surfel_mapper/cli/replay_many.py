@@ -59,12 +59,15 @@ def run(
     args: argparse.Namespace, config: Config, requests: Sequence[Request], output: Path
 ) -> int:
     """Map all recordings and report."""
-    from surfel_mapper.cluster.engines import engine
-    from surfel_mapper.cluster.running import map_bags
-    from surfel_mapper.cluster.shards import cut, shard_length_s
+    from surfel_mapper.cluster.engines import begin_workers, engine
 
     refuse_options(args)
     began = time.perf_counter()
+    if args.workers is not None and args.scheduler is None:
+        begin_workers()  # they load what they need while this process does the same
+    from surfel_mapper.cluster.running import map_bags
+    from surfel_mapper.cluster.shards import cut, shard_length_s
+
     lengths_s, cuts = surveyed(requests, config)
     recorded_s = sum(lengths_s)
     with engine(args.workers, args.scheduler) as running:

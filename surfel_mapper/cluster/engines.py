@@ -10,9 +10,12 @@ itself, and several attempts leave the same files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import logging
+import multiprocessing
+from multiprocessing import forkserver
+import os
 from typing import Any, Protocol, TypeVar
 
 from surfel_mapper.errors import ClusterError, DependencyError
@@ -26,6 +29,9 @@ CONNECT_S = 20
 LOSSES = 5
 """A task at which so many workers died is given up."""
 
+
+PRELOADED = ['distributed', 'surfel_mapper.cluster.preload']
+"""What local workers are forked with; each of them would load it for 2 s otherwise."""
 
 WORKER_ENVIRONMENT = {'MALLOC_ARENA_MAX': '1', 'OMP_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
 """
@@ -112,6 +118,36 @@ class OnDask:
             self._client.cancel(list(futures))
 
 
+def begin_workers() -> str:
+    """
+    Begin to load what local workers need; return by which method they are to be started.
+
+    That goes on in a process of its own, from which workers are forked when it is done. It ends
+    with this process, and until then lost workers are replaced at once.
+    """
+    if 'forkserver' not in multiprocessing.get_all_start_methods():
+        return 'spawn'
+    forkserver.set_forkserver_preload(PRELOADED)
+    with environment(WORKER_ENVIRONMENT):  # libraries read it when they are loaded
+        forkserver.ensure_running()
+    return 'forkserver'
+
+
+@contextmanager
+def environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set variables of the environment for the processes that are started meanwhile."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
 @contextmanager
 def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
     """
@@ -136,6 +172,7 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
     if workers is None and scheduler is None:
         yield InProcess()
         return
+    method = begin_workers() if scheduler is None else 'spawn'
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -149,6 +186,7 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
         'distributed.scheduler.allowed-failures': LOSSES,
         'distributed.comm.timeouts.connect': f'{CONNECT_S}s',
         'distributed.worker.profile.enabled': False,
+        'distributed.worker.multiprocessing-method': method,
         'distributed.nanny.pre-spawn-environ': WORKER_ENVIRONMENT,
     }
     with dask.config.set(settings):

@@ -30,8 +30,11 @@ from surfel_mapper.offline.recording import BagRecording, open_recording, Reques
 from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
-SHORTEST_S, LONGEST_S = 15.0, 60.0
+SHORTEST_S, LONGEST_S = 5.0, 60.0
 """Bounds of the length of a shard: what comes before each is read twice, what it maps is held."""
+
+SLACK = 0.02
+"""Shards may be longer by this share of their length, rather than be one more."""
 
 LEAD_S = 1.0
 """A worker begins to read so long before the oldest pose that it may need, at first."""
@@ -111,13 +114,18 @@ class ShardResult:
 
 
 def shard_length_s(recorded_s: float, num_workers: int) -> float:
-    """Return how long shards should be: two for every worker, within bounds."""
-    return min(max(recorded_s / (2 * num_workers), SHORTEST_S), LONGEST_S)
+    """
+    Return how long shards should be: as many for one worker as for any other, and few.
+
+    Three shards for two workers would leave one of them idle for a third of the time.
+    """
+    rounds = max(math.ceil(recorded_s / (num_workers * LONGEST_S)), 1)
+    return max(recorded_s / (rounds * num_workers), SHORTEST_S)
 
 
 def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
     """
-    Return the shards of a recording, of equal length and at most so long.
+    Return the shards of a recording, of equal length and hardly longer than wanted.
 
     Parameters
     ----------
@@ -127,7 +135,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
         The settings; all scans stay in the map, whatever they say of a window. Where they make
         a scan depend on all before it, the recording is one shard, and so is a folder of scans.
     shard_s : float
-        The longest that a shard may be.
+        How long a shard should be at most.
 
     Raises
     ------
@@ -147,7 +155,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
         if not isinstance(recording, BagRecording) or not may_be_cut(recording):
             return [whole]
         start_ns, stop_ns = clipped(recording)
-    number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s), 1)
+    number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s - SLACK), 1)
     bounds = [start_ns + (stop_ns - start_ns) * part // number for part in range(1, number)]
     lead_s = LEAD_S + config.input.reset_after_s + sweep_s(config)
     return [

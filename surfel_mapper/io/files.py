@@ -21,7 +21,7 @@ from surfel_mapper.errors import FileFormatError
 
 
 @contextmanager
-def replace_file(path: str | Path) -> Iterator[BinaryIO]:
+def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO]:
     """
     Give a binary file that becomes ``path`` at the end of the with-block, or vanishes on an error.
 
@@ -30,6 +30,8 @@ def replace_file(path: str | Path) -> Iterator[BinaryIO]:
     path : str or Path
         What is there is replaced; if it is a symbolic link, the file that it leads to. The
         directory must exist. The new file's permissions follow the umask.
+    lasting : bool
+        Whether to wait until the bytes are on the disk, which files of this run alone need not.
 
     Raises
     ------
@@ -50,7 +52,8 @@ def replace_file(path: str | Path) -> Iterator[BinaryIO]:
         with file:
             yield file
             file.flush()
-            os.fsync(file.fileno())
+            if lasting:
+                os.fsync(file.fileno())
         os.replace(temporary, target)
     except BaseException as error:
         temporary.unlink(missing_ok=True)

@@ -115,15 +115,15 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
     return surfel_map
 
 
-def attributes_of(surfel_map: SurfelMap) -> dict[str, Any]:
-    """Return what a file says of its map."""
+def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, Any]:
+    """Return what a file says of its map; the digest only where wanted."""
     return {
         'kind': KIND,
         'version': VERSION,
         'voxel_size_m': surfel_map.voxel_size_m,
         'level': surfel_map.level,
         'columns': surfel_map.columns,
-        'digest': surfel_map.digest(),
+        **({'digest': surfel_map.digest()} if digest else {}),
     }
 
 

@@ -19,11 +19,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import solveh_banded
-from scipy.sparse import csr_array
-from scipy.sparse.linalg import lsqr
 
-from surfel_mapper.kernels.splines import basis_at
+from surfel_mapper.kernels.splines import (
+    add_differences,
+    add_equations,
+    basis_at,
+    heights_at,
+)
 
 Array = npt.NDArray[np.float64]
 
@@ -108,8 +110,8 @@ class HeightField:
 
     def heights(self, xy: Array) -> Array:
         """Return z at (M, 2) x and y, m; beyond the grid, that of its end."""
-        rows, weights, _ = design(self, xy)
-        result: Array = np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
+        result = np.empty(len(xy))
+        heights_at(np.ascontiguousarray(xy), self.parts(), result)
         return result
 
     def slopes(self, xy: Array) -> Array:
@@ -119,6 +121,14 @@ class HeightField:
             rows, weights, unit = design(self, xy, along=axis)
             result[:, axis] = unit * np.einsum('ij,ij->i', self.control.ravel()[rows], weights)
         return result
+
+    def parts(self) -> tuple[Array, float, tuple[int, int], tuple[Array, Array], Array]:
+        """Return what the kernels take: origin, pitch, degrees, knots, control points."""
+        x, y = self.degrees
+        num_x, num_y = self.control.shape
+        both = knots(num_x - 2, x), knots(num_y - 2, y)
+        control = np.ascontiguousarray(self.control)
+        return np.ascontiguousarray(self.origin), self.pitch_m, self.degrees, both, control
 
     def greville(self) -> tuple[Array, Array]:
         """Return x (Nx + 2,) and y (Ny + 2,) of the control points of the same NURBS patch, m."""
@@ -202,6 +212,9 @@ def fit_lsqr(start: HeightField, xy: Array, z: Array) -> HeightField:
 
     Where it cannot pass through all, the sum of squares is least.
     """
+    from scipy.sparse import csr_array  # 0.4 s, which mapping without models need not pay
+    from scipy.sparse.linalg import lsqr
+
     rows, weights, _ = design(start, xy)
     shape = (len(xy), start.control.size)
     ends = np.arange(0, rows.size + 1, rows.shape[1])
@@ -228,49 +241,21 @@ def fit_pspline(
         Weight of the second differences, where the mean weight is 1.
 
     """
+    from scipy.linalg import solveh_banded
+
     if start.control.shape[1] > start.control.shape[0]:  # the band is as wide as the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
         return transposed(turned)
-    rows, weights, _ = design(start, xy)
     num_x, num_y = start.control.shape
-    reach = start.degrees[0] * num_y + start.degrees[1]
-    band = np.zeros((max(reach, 2 * num_y) + 1, num_x * num_y))
-    weight = weight / weight.mean()
-    products = (weights * weight[:, None])[:, :, None] * weights[:, None, :]
-    later = rows[:, None, :] - rows[:, :, None]
-    below = later >= 0
-    columns = np.broadcast_to(rows[:, :, None], later.shape)[below]
-    flat = later[below] * band.shape[1] + columns
-    band += np.bincount(flat, products[below], band.size).reshape(band.shape)
-    add_differences(band, start, smoothing)
-    band[0] += RIDGE
-    right = np.bincount(
-        rows.ravel(), (weights * (weight * z)[:, None]).ravel(), start.control.size
-    )
-    control = solveh_banded(band, right, lower=True, check_finite=False)
+    reach = max(start.degrees[0] * num_y + start.degrees[1], 2 * num_y)
+    band, right = np.zeros((num_x * num_y, reach + 1)), np.zeros(num_x * num_y)
+    add_equations(np.column_stack([xy, z]), weight / weight.mean(), start.parts(), band, right)
+    add_differences(*start.greville(), smoothing, band)
+    band[:, 0] += RIDGE
+    control = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
     return HeightField(
         start.pitch_m, start.origin, start.degrees, control.reshape(start.control.shape)
     )
-
-
-def add_differences(band: Array, field: HeightField, smoothing: float) -> None:
-    """
-    Add the squares of the second differences along both axes to a lower band, in place.
-
-    They are those at the Greville abscissae, which crowd at the ends, so planes cost nothing.
-    """
-    number = np.arange(field.control.size).reshape(field.control.shape)
-    for axis, place in enumerate(field.greville()):
-        step = field.control.shape[1] if axis == 0 else 1
-        apart = np.diff(place)
-        before, after = apart[:-1], apart[1:]
-        total = before + after
-        second = np.stack([2.0 * after / total, np.full(len(total), -2.0), 2.0 * before / total])
-        first = number.swapaxes(0, axis)[:-2]
-        for i in range(3):
-            for j in range(i, 3):
-                product = smoothing * second[i] * second[j]
-                band[(j - i) * step, first + i * step] += product[:, None]
 
 
 def transposed(field: HeightField) -> HeightField:

@@ -4,6 +4,7 @@
 
 import os
 import signal
+import sys
 
 import pytest
 
@@ -28,6 +29,12 @@ def die(_):
 
 def refuse(_):
     raise ClusterError('not this one')
+
+
+def what_is_there():
+    """Return whether a process was born with all that tasks need, and what its libraries read."""
+    modules = ('surfel_mapper.cluster.shards', 'surfel_mapper.kernels.moments')
+    return all(name in sys.modules for name in modules), os.environ.get('MALLOC_ARENA_MAX')
 
 
 def kill_one(running):
@@ -57,6 +64,19 @@ def test_every_task_is_answered_under_its_number(two_workers):
         answers = dict(running.run(squared, range(7)))
         assert answers == {number: number * number for number in range(7)}
     assert two_workers.num_workers == 2
+
+
+def test_workers_are_born_with_all_that_tasks_need(two_workers):
+    assert set(two_workers._client.run(what_is_there).values()) == {(True, '1')}
+
+
+def test_the_environment_is_left_as_it_was(monkeypatch):
+    monkeypatch.setenv('SURFEL_MAPPER_A', 'old')
+    monkeypatch.delenv('SURFEL_MAPPER_B', raising=False)
+    with engines.environment({'SURFEL_MAPPER_A': 'new', 'SURFEL_MAPPER_B': 'new'}):
+        assert os.environ['SURFEL_MAPPER_A'] == os.environ['SURFEL_MAPPER_B'] == 'new'
+    assert os.environ['SURFEL_MAPPER_A'] == 'old'
+    assert 'SURFEL_MAPPER_B' not in os.environ
 
 
 def test_two_workers_make_the_map_of_one_process(two_workers, case, tmp_path):

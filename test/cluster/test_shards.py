@@ -4,13 +4,20 @@
 
 from dataclasses import replace
 from itertools import pairwise
+import math
 
 import numpy as np
 import pytest
 
 from surfel_mapper.cluster.engines import InProcess
 from surfel_mapper.cluster.running import map_bags
-from surfel_mapper.cluster.shards import difference, map_shard
+from surfel_mapper.cluster.shards import (
+    difference,
+    LONGEST_S,
+    map_shard,
+    shard_length_s,
+    SHORTEST_S,
+)
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, MapError
 from surfel_mapper.io.parquet_tiles import dataset_digest
@@ -67,6 +74,22 @@ def test_a_lead_in_that_is_too_short_is_noticed_and_mended(tmp_path):
 
     assert mapped.repeated > 0
     assert mapped.map.digest == expected.map.digest()
+
+
+@pytest.mark.parametrize(
+    ('recorded_s', 'num_workers', 'shards'),
+    [(3.0, 2, 1), (7.0, 2, 2), (40.0, 2, 2), (121.0, 2, 4), (100.0, 3, 3), (3600.0, 1, 60)],
+)
+def test_every_worker_gets_as_many_shards_as_any_other(recorded_s, num_workers, shards):
+    length_s = shard_length_s(recorded_s, num_workers)
+    assert math.ceil(recorded_s / length_s - 1e-9) == shards
+    assert SHORTEST_S <= length_s <= LONGEST_S
+
+
+def test_bags_of_nearly_the_same_length_are_not_cut_for_what_they_differ(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    for shard_s, number in ((RECORDED_S * 0.995, 1), (RECORDED_S / 2 * 0.995, 2), (2.0, 3)):
+        assert len(shards_of(bag, config, shard_s)) == number
 
 
 def test_the_usual_lead_in_is_long_enough(tmp_path):

@@ -43,8 +43,9 @@ def dataset(directory, surfel_map):
     return directory / 'map'
 
 
-@pytest.mark.parametrize('columns', [(), ('intensity',)])
-def test_the_digest_of_a_dataset_is_that_of_the_map(tmp_path, columns):
+@pytest.mark.parametrize(('columns', 'rows_read'), [((), 1), ((), 900), (('intensity',), 10**6)])
+def test_the_digest_of_a_dataset_is_that_of_the_map(tmp_path, monkeypatch, columns, rows_read):
+    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', rows_read)
     surfel_map = scattered(columns=columns)
 
     directory = dataset(tmp_path, surfel_map)
