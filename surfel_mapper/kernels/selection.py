@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Move the points that stay together.
+Move the points that stay, or that belong together.
 
-Every value is written, and the place to write to moves on only past those that stay: without a
-branch that a mask of noise would mispredict.
+By a mask every value is written, and the place to write to moves on only past those that stay:
+without a branch that a mask of noise would mispredict.
 """
 
 from numba import njit
@@ -28,3 +28,20 @@ def compact(values, keep, out):
             out_row[k] = row[i]
             k += keep[i]
             i += 1
+
+
+@njit(cache=True, nogil=True)
+def copy_ranges(points, ranges, out):
+    """
+    Copy ranges of rows, one after the other.
+
+    points  (N, 3) float64
+    ranges  (K, 2) int64, first row of each, and the one after its last
+    out     (M, 3) float64, M the number of their rows
+    """
+    place = 0
+    for k in range(len(ranges)):
+        for i in range(ranges[k, 0], ranges[k, 1]):
+            for j in range(3):
+                out[place, j] = points[i, j]
+            place += 1

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
+from surfel_mapper.kernels.selection import copy_ranges
 from surfel_mapper.kernels.voxel_means import (
     finite_ends,
     give_labels,
@@ -156,25 +157,18 @@ def fitted_patches(
     kept = [members for members in surfaces if counts[members].sum() >= least]
     if not kept:
         return []
-    every = np.concatenate(kept)
     starts = np.concatenate([[0], np.cumsum([counts[members].sum() for members in kept])])
+    points = np.empty((starts[-1], 3))
+    copy_ranges(clusters.points, clusters.rows[np.concatenate(kept)], points)
     means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
     groups = Groups(
-        points=clusters.points[ranges(clusters.rows[every])],
+        points=points,
         starts=starts,
         normals=np.array([mean_normal(clusters, members) for members in kept]),
         thickness=thickness(means, config, viewpoint),
     )
     patches = patches_of(groups, config, viewpoint)
     return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
-
-
-def ranges(rows: Indices) -> Indices:
-    """Return the numbers in each of the ranges (K, 2), one after the other."""
-    lengths = rows[:, 1] - rows[:, 0]
-    ends = np.cumsum(lengths)
-    first: Indices = np.repeat(rows[:, 0] - (ends - lengths), lengths)
-    return first + np.arange(len(first))
 
 
 def assembled(

@@ -16,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.patches import describe, fill_cells, lay_grids
+from surfel_mapper.kernels.cells import fill_cells, lay_grids
+from surfel_mapper.kernels.patches import describe
 from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
 from surfel_mapper.models.clusters import is_paper
 from surfel_mapper.models.grid import Grid
@@ -58,7 +59,7 @@ class Groups:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """The cells of all patches, one row each; see kernels/patches.py."""
+    """The cells of all patches, one row each; see kernels/cells.py."""
 
     pitches: Array
     origins: Array

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.patches import fill_cells
+from surfel_mapper.kernels.cells import fill_cells
 from surfel_mapper.models import fit
 from test.models.scenes import A, room, sheet, VIEW
 
