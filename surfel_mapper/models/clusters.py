@@ -18,6 +18,7 @@ import numpy.typing as npt
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.kernels.clustering import bisect, NOISE_SPREAD
 from surfel_mapper.kernels.joining import components
+from surfel_mapper.models import folds
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -25,9 +26,6 @@ Indices = npt.NDArray[np.int64]
 FAR_GAP_VOXELS = 5.0
 NEAR_GAP_VOXELS = 3.0
 """Clusters join where their boxes are nearer than the first and their points than the second."""
-
-FOLD_PERCENTILE = 98.0
-MEANS_ITERATIONS = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,22 +172,5 @@ def folded(
     clusters: Clusters, members: Indices, config: ModelsConfig
 ) -> npt.NDArray[np.bool_] | None:
     """Return how to halve a surface (n,) bool, or None where it has one height everywhere."""
-    normals = clusters.frames[members, 2]
-    cosines = normals @ mean_normal(clusters, members)
     limit = math.cos(math.radians(config.fold_angle_deg))
-    if len(members) < 2 or cosines.min() >= limit:
-        return None
-    if np.percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
-        return None
-    centred = normals - normals.mean(axis=0)
-    axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    side: npt.NDArray[np.bool_] = centred @ axis > 0.0
-    for _ in range(MEANS_ITERATIONS):
-        if side.all() or not side.any():
-            return None
-        first, second = normals[side].mean(axis=0), normals[~side].mean(axis=0)
-        nearer = normals @ (first - second) > 0.5 * (first @ first - second @ second)
-        if (nearer == side).all():
-            break
-        side = nearer
-    return side if 0 < side.sum() < len(side) else None
+    return folds.folded(clusters.frames[members, 2], mean_normal(clusters, members), limit)
