@@ -18,8 +18,6 @@ from surfel_mapper.config import Config
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.errors import AlignmentError, CloudFormatError, MapError
 from surfel_mapper.geometry import Transform
-from surfel_mapper.mapping.channels import CHANNELS
-from surfel_mapper.mapping.reducer import NARROW_COUNT
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
@@ -29,6 +27,7 @@ from surfel_mapper.pipeline.models_layer import ModelsLayer
 from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
 from surfel_mapper.pipeline.reduction import moments_at
+from surfel_mapper.pipeline.reduction import warm_up as warm_up_reduction
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
@@ -133,17 +132,7 @@ class Inserter:
         self.preparation.warm_up()
         if self._config.window.keep_points:
             self.aligner.warm_up()
-        for dtype in (np.float32, np.float64):
-            surfel_map = SurfelMap(self._config.map.voxel_size_m, columns=self._config.map.columns)
-            one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
-            moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
-            surfel_map.surfels_changed(since=0)
-            surfel_map.remove(moments)
-            many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
-            surfel_map.remove(many)
-        surfel_map.digest()
-        if self._config.publish.levels:
-            surfel_map.coarsen(1).surfels()
+        warm_up_reduction(self._config)
         if self.tsdf is not None:
             self.tsdf.warm_up()
         if self.models is not None:

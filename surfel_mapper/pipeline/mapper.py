@@ -7,11 +7,13 @@ Node and replay drive this one class and only carry messages in and results out,
 map is the same to the bit. Time is the stamps of the data alone, never the clock: a scan waits
 for its pose until newer data is more than ``pose.max_wait_s`` ahead of it, which a bag replayed
 at any speed does alike.
+
+(Longer than other files: most of it is the description of what users call. The work is done in
+scan_queue, posed_scans, inserter and what these lead to.)
 """
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 import logging
@@ -24,13 +26,7 @@ from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.depth import SceneImage
 from surfel_mapper.deskew import point_times
-from surfel_mapper.errors import (
-    CloudFormatError,
-    ConfigError,
-    MapError,
-    PoseError,
-    PoseNotYetError,
-)
+from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.mapping.channels import missing_columns
@@ -39,17 +35,13 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.inserter import Inserter
+from surfel_mapper.pipeline.posed_scans import PosedScans
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
-
-PosedScan = tuple[Scan, Transform]
-"""A scan and its T_fixed_sensor."""
-
-CLEARED = 'the map was cleared'
 
 _log = logging.getLogger(__name__)
 
@@ -76,9 +68,10 @@ class Mapper:
         self.counters = Counters()
         self._drops = Drops(self.counters)
         self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
-        self._ready: deque[PosedScan] = deque()
         self._poses = ScanPoses(self.config, self._drops)
         self._inserter = Inserter(self.config, self._poses, self.counters, self._drops)
+        images = self._inserter.preparation.images
+        self._posed = PosedScans(self.config, self._queue, self._poses, images, self._drops)
         self.transforms = self._poses.transforms
         self.registered = self._poses.registered
         self.map = self._inserter.map
@@ -214,42 +207,14 @@ class Mapper:
             the same to the bit. Call it once without at the end.
 
         """
-        while (found := self._next_ready(keeps_last=more_follows)) is not None:
-            if (update := self._insert(*found)) is not None:
-                yield update
-
-    def _next_ready(self, *, keeps_last: bool) -> PosedScan | None:
-        """Return the next scan to be mapped, or begin with the last and keep it."""
         looks_ahead = self._inserter.looks_ahead
-        while len(self._ready) < 1 + looks_ahead:
-            found = self._next_posed()
-            if found is None:
-                break
-            self._ready.append(found)
-        if keeps_last and looks_ahead and len(self._ready) == 1:
-            self._inserter.begin(*self._ready[0])
-            return None
-        return self._ready.popleft() if self._ready else None
-
-    def _next_posed(self) -> PosedScan | None:
-        """Take the next scan whose pose is there from the queue; drop those that get none."""
-        while (scan := self._queue.first) is not None:
-            waited_s = (self._now_ns() - scan.end_ns) / 1e9
-            may_wait = waited_s <= self.config.pose.max_wait_s
-            if may_wait and self._inserter.preparation.images.is_waiting(scan):
-                return None
-            try:
-                pose = self._poses.of(scan, self._queue.second)
-            except PoseNotYetError as error:
-                if may_wait:
-                    return None
-                reason = f'no pose within {waited_s:.3f} s: {error}'
-            except PoseError as error:
-                reason = str(error)
-            else:
-                return self._queue.pop(), pose
-            self._drops.scan(self._queue.pop(), 'no_pose', reason)
-        return None
+        keeps = int(more_follows and looks_ahead)
+        while self._posed.take(1 + looks_ahead) > keeps:
+            update = self._insert(*self._posed.pop())
+            if update is not None:
+                yield update
+        if self._posed.first is not None:
+            self._inserter.begin(*self._posed.first)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> None:
         """
@@ -285,10 +250,7 @@ class Mapper:
 
     def clear(self) -> None:
         """Forget all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
-        for scan, _ in self._ready:
-            self._drops.scan(scan, 'cleared', CLEARED)
-        self._ready.clear()
-        self._queue.drop_all('cleared', CLEARED)
+        self._posed.drop_all('cleared', 'the map was cleared')
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
@@ -405,7 +367,7 @@ class Mapper:
                 )
         self._inserter.reconfigure(config)
         self._poses.reconfigure(config)
-        self.config = config
+        self.config = self._posed.config = config
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
@@ -445,12 +407,6 @@ class Mapper:
         if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
             self.transforms.clear()  # else the scan would be mapped where the robot was then
 
-    def _now_ns(self) -> int:
-        """Return the newest stamp of all data seen."""
-        stamps = (self._queue.newest_ns, self.transforms.newest_ns)
-        return max(stamp for stamp in stamps if stamp is not None)
-
     def _insert(self, scan: Scan, pose: Transform) -> Update | None:
         """Map a scan whose pose is there; None where it is left out."""
-        following = self._ready[0] if self._ready else None
-        return self._inserter.insert(scan, pose, following)
+        return self._inserter.insert(scan, pose, following=self._posed.first)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scans to the exact moments that enter the map and the window."""
+"""Scans to the exact moments that enter the map and the window, and that leave it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
+from surfel_mapper.mapping.channels import CHANNELS
 from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.reducer import within
+from surfel_mapper.mapping.reducer import NARROW_COUNT, within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.scan import Scan
@@ -50,3 +51,18 @@ def moments_at(
 def origin(T_map_sensor: Transform, config: Config) -> Transform | None:
     """Return where the sensor is; None where that is unknown, and normals stay unturned."""
     return None if config.pose.source == 'identity' else T_map_sensor[:3, 3]
+
+
+def warm_up(config: Config) -> None:
+    """Compile what adds, removes and derives, for points of every type and sums of every size."""
+    for dtype in (np.float32, np.float64):
+        surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+        one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
+        moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
+        surfel_map.surfels_changed(since=0)
+        surfel_map.remove(moments)
+        many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
+        surfel_map.remove(many)
+    surfel_map.digest()
+    if config.publish.levels:
+        surfel_map.coarsen(1).surfels()
