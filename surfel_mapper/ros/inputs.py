@@ -5,13 +5,14 @@ What the node subscribes to: clouds or depth images, and the poses that ``pose.s
 
 Callbacks pass messages on to the mapping thread and do nothing else, so that nothing waits in
 the middleware: where a queue of messages is full there, the oldest is overwritten and nobody is
-told. What the middleware does tell, that messages were lost on the way, is counted.
+told. What the middleware does tell, that messages were lost on the way, is counted. Clouds and
+poses are taken as bytes and read in place: rclpy makes objects of them in ten times the time,
+and passes over those that it cannot read in silence.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-import copy
 from functools import partial
 import time
 from typing import Any
@@ -19,16 +20,13 @@ from typing import Any
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
-from rclpy.exceptions import ParameterException
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
-from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
-from rclpy.subscription import Subscription
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from surfel_mapper.config import Config
 from surfel_mapper.depth import SceneImage
-from surfel_mapper.errors import CloudFormatError, ConfigError, DependencyError
+from surfel_mapper.errors import CloudFormatError, DependencyError, PoseError
 from surfel_mapper.io.depth_image import (
     camera_info_topic,
     CameraImage,
@@ -36,8 +34,11 @@ from surfel_mapper.io.depth_image import (
     DepthImages,
     warm_up,
 )
-from surfel_mapper.io.pose_messages import ODOMETRY, POSE, poses_in, TF
+from surfel_mapper.io.pose_messages import ODOMETRY, POSE, TF
+from surfel_mapper.io.raw_cloud import parse_cloud
+from surfel_mapper.io.raw_pose import raw_poses
 from surfel_mapper.io.scene_image import SceneImages
+from surfel_mapper.ros.intake import Intake
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.scan import Scan
 
@@ -57,13 +58,7 @@ STATIC_TRANSFORMS = QoSProfile(
     durability=DurabilityPolicy.TRANSIENT_LOCAL,
 )
 
-OVERRIDABLE = (
-    QoSPolicyKind.HISTORY,
-    QoSPolicyKind.DEPTH,
-    QoSPolicyKind.RELIABILITY,
-    QoSPolicyKind.DURABILITY,
-)
-"""What a user may set of a subscription, in ``qos_overrides``."""
+STATIC_TOPIC = '/tf_static'
 
 LARGE_BYTES = 500_000
 """Messages from here on do not fit into the shared memory that Fast DDS has by default."""
@@ -81,6 +76,8 @@ class Inputs:
         Its stages input, pose and frames.
     thread : MappingThread
         Takes what comes in.
+    on_failure : callable
+        Called in the thread that takes messages with an error that nobody foresaw.
 
     Attributes
     ----------
@@ -91,7 +88,13 @@ class Inputs:
 
     """
 
-    def __init__(self, node: Node, config: Config, thread: MappingThread) -> None:
+    def __init__(
+        self,
+        node: Node,
+        config: Config,
+        thread: MappingThread,
+        on_failure: Callable[[BaseException], None],
+    ) -> None:
         """Prepare; ``subscribe`` subscribes."""
         names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
         self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
@@ -103,7 +106,7 @@ class Inputs:
         self._node = node
         self._config = config
         self._thread = thread
-        self._subscriptions: list[Subscription] = []
+        self._intake = Intake(node, on_failure)
 
     def subscribe(self) -> None:
         """
@@ -119,15 +122,14 @@ class Inputs:
         """
         self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         source = self._config.pose.source
-        on_pose = partial(self._on_pose, source)
         if source == ODOMETRY:
-            self._subscribe(Odometry, 'odom', on_pose, POSES)
+            self._subscribe_poses(Odometry, 'odom', POSES)
         elif source == POSE:
-            self._subscribe(PoseStamped, 'pose', on_pose, POSES)
+            self._subscribe_poses(PoseStamped, 'pose', POSES)
         elif source == TF:
             message = transform_message()
-            self._subscribe(message, '/tf_static', self._on_static, STATIC_TRANSFORMS)
-            self._subscribe(message, '/tf', on_pose, TRANSFORMS)
+            self._subscribe_poses(message, STATIC_TOPIC, STATIC_TRANSFORMS)
+            self._subscribe_poses(message, '/tf', TRANSFORMS)
         if source in (ODOMETRY, POSE, 'registration') and not self._config.frames.base_to_sensor:
             self._subscribe_static()
         if self._config.input.kind == 'depth':
@@ -136,16 +138,15 @@ class Inputs:
             self._subscribe_clouds(topic)
         for kind, name in self._config.tsdf.image_topics.items():
             self._subscribe_images(kind, self._node.resolve_topic_name(name))
+        self._intake.start()
 
     def unsubscribe(self) -> None:
         """Take no more messages."""
-        for subscription in self._subscriptions:
-            self._node.destroy_subscription(subscription)
-        self._subscriptions.clear()
+        self._intake.stop()
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
-        return [self._node.resolve_topic_name(found.topic) for found in self._subscriptions]
+        return self._intake.topics()
 
     def loss(self) -> str:
         """Return how many clouds were lost on the way and what to do about it, or nothing."""
@@ -175,21 +176,22 @@ class Inputs:
     def _subscribe_clouds(self, topic: str) -> None:
         """Subscribe to one sensor."""
         lost = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
+        subscribe = partial(self._intake.subscribe, qos=CLOUDS)
         if self._config.input.kind == 'cloud':
-            self._subscribe(PointCloud2, topic, partial(self._on_cloud, topic), CLOUDS, lost)
+            on_cloud = partial(self._on_cloud, topic)
+            subscribe(PointCloud2, topic, on_cloud, events=lost, raw=True)
             return
-        self._subscribe(
-            CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic), CLOUDS
-        )
-        self._subscribe(Image, topic, partial(self._on_image, topic), CLOUDS, lost)
+        subscribe(CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic))
+        subscribe(Image, topic, partial(self._on_image, topic), events=lost)
 
     def _subscribe_images(self, kind: str, topic: str) -> None:
         """Subscribe to images of colours or labels, and to the calibration where needed."""
+        subscribe = partial(self._intake.subscribe, qos=CLOUDS)
         if self._scenes.needs_cameras:
             on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
-            self._subscribe(CameraInfo, camera_info_topic(topic), on_info, CLOUDS)
+            subscribe(CameraInfo, camera_info_topic(topic), on_info)
         on_image = partial(self._on_scene, partial(self._scenes.add_image, kind, topic))
-        self._subscribe(Image, topic, on_image, CLOUDS)
+        subscribe(Image, topic, on_image)
 
     def _on_scene(self, take: Callable[[Any], list[SceneImage]], msg: Any) -> None:
         try:
@@ -208,42 +210,28 @@ class Inputs:
                 f'{self._config.frames.base}, or set frames.base_to_sensor'
             )
             return
-        self._subscribe(message, '/tf_static', self._on_static, STATIC_TRANSFORMS)
+        self._subscribe_poses(message, STATIC_TOPIC, STATIC_TRANSFORMS)
 
-    def _subscribe(
-        self,
-        message: Any,
-        topic: str,
-        callback: Callable[[Any], None],
-        qos: QoSProfile,
-        events: SubscriptionEventCallbacks | None = None,
-    ) -> None:
-        """Subscribe, with a quality of service that the user may override."""
+    def _subscribe_poses(self, message: Any, topic: str, qos: QoSProfile) -> None:
+        """Subscribe to poses or transforms."""
+        kind = TF if qos in (TRANSFORMS, STATIC_TRANSFORMS) else self._config.pose.source
+        on_pose = partial(self._on_pose, kind, topic)
+        self._intake.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
+
+    def _on_cloud(self, topic: str, raw: bytes) -> None:
+        self._hear(topic, len(raw))
         try:
-            subscription = self._node.create_subscription(
-                message,
-                topic,
-                callback,
-                copy.copy(qos),  # rclpy enters the overrides in what it is given
-                event_callbacks=events,
-                qos_overriding_options=QoSOverridingOptions(policy_kinds=OVERRIDABLE),
-            )
-        except (ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-            name = self._node.resolve_topic_name(topic)
-            raise ConfigError(f'qos_overrides.{name}.subscription: {error}') from error
-        self._subscriptions.append(subscription)
+            self._thread.put_cloud(parse_cloud(raw, topic=topic), topic)
+        except CloudFormatError as error:
+            self._thread.refuse_cloud(topic, str(error))
 
-    def _on_cloud(self, topic: str, msg: PointCloud2) -> None:
-        self._hear(topic, msg)
-        self._thread.put_cloud(msg, topic)
-
-    def _hear(self, topic: str, msg: Any) -> None:
+    def _hear(self, topic: str, num_bytes: int) -> None:
         """Remember that a topic lives, and how large its messages are."""
         self._heard_s[topic] = time.monotonic()
-        self._largest_bytes = max(self._largest_bytes, len(msg.data))
+        self._largest_bytes = max(self._largest_bytes, num_bytes)
 
     def _on_image(self, topic: str, msg: Image) -> None:
-        self._hear(topic, msg)
+        self._hear(topic, len(msg.data))
         self._put_images(topic, self._images.add_image(topic, msg))
 
     def _on_camera_info(self, topic: str, msg: CameraInfo) -> None:
@@ -256,11 +244,13 @@ class Inputs:
         for image in images:
             self._thread.put_cloud(image.msg, topic, partial(decode_image, image))
 
-    def _on_pose(self, kind: str, msg: Any) -> None:
-        self._thread.put_poses(poses_in(kind, msg, self._config.frames.base))
-
-    def _on_static(self, msg: Any) -> None:
-        self._thread.put_poses(poses_in(TF, msg, self._config.frames.base), static=True)
+    def _on_pose(self, kind: str, topic: str, raw: bytes) -> None:
+        try:
+            poses = raw_poses(kind, raw, self._config.frames.base, topic)
+        except PoseError as error:
+            self._thread.refuse_pose(str(error))
+        else:
+            self._thread.put_poses(poses, static=topic == STATIC_TOPIC)
 
     def _on_lost(self, topic: str, event: QoSMessageLostInfo) -> None:
         self.lost[topic] = event.total_count

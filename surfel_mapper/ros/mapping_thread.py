@@ -29,6 +29,8 @@ from surfel_mapper.scan import Scan
 MAX_POSES = 10_000
 """Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
 
+TOO_FAST = f'clouds come faster than they can be mapped; {REMEDIES["overload"]}'
+
 Result = TypeVar('Result')
 
 
@@ -38,6 +40,25 @@ class Cloud(NamedTuple):
     msg: Any
     topic: str
     decode: Callable[[Any, str], Scan]
+
+
+class LostCloud(NamedTuple):
+    """What a cloud that never gets to the mapper is counted as; see Mapper.refuse_clouds."""
+
+    cause: str
+    topic: str
+    reason: str
+    frame_id: str = ''
+
+
+class LostPose(NamedTuple):
+    """The same of a pose; see Mapper.ignore_message."""
+
+    cause: str
+    reason: str
+
+
+TOO_MANY_POSES = LostPose('overload', 'poses dropped: too many wait to be taken')
 
 
 class Call(NamedTuple):
@@ -80,8 +101,7 @@ class MappingThread:
         self._images: deque[SceneImage] = deque(maxlen=MAX_IMAGES)
         self._work: deque[Cloud | Call] = deque()
         self._num_clouds = 0
-        self._clouds_lost: Counter[tuple[str, str]] = Counter()
-        self._poses_lost = 0
+        self._lost: Counter[LostCloud | LostPose] = Counter()
         self._stopping = False
         self._thread = threading.Thread()
 
@@ -106,8 +126,16 @@ class MappingThread:
             self._poses.extend((pose, static) for pose in poses)
             while len(self._poses) > MAX_POSES:
                 self._poses.popleft()
-                self._poses_lost += 1
+                self._lost[TOO_MANY_POSES] += 1
             self._changed.notify()
+
+    def refuse_pose(self, reason: str) -> None:
+        """Count a message of poses that cannot be read."""
+        self._lose(LostPose('bad_pose', reason))
+
+    def refuse_cloud(self, topic: str, reason: str) -> None:
+        """Count a cloud that cannot be read."""
+        self._lose(LostCloud('bad_cloud', topic, reason))
 
     def put_image(self, image: SceneImage) -> None:
         """Queue an image of colours or labels; like poses, they overtake clouds."""
@@ -126,7 +154,9 @@ class MappingThread:
                 oldest = next(item for item in self._work if isinstance(item, Cloud))
                 self._work.remove(oldest)
                 self._num_clouds -= 1
-                self._clouds_lost[oldest.topic, oldest.msg.header.frame_id] += 1
+                frame_id = oldest.msg.header.frame_id
+                reason = f'in frame {frame_id!r}, {TOO_FAST}'
+                self._lost[LostCloud('overload', oldest.topic, reason, frame_id)] += 1
             self._changed.notify()
 
     @property
@@ -174,18 +204,15 @@ class MappingThread:
     def _step(self, on_update: Callable[[Update], None]) -> bool:
         """Wait for something to do and do it; false at the end."""
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._stopping or self._poses or self._images or self._work
-            )
-            if not (self._poses or self._images or self._work):
+            self._changed.wait_for(lambda: self._stopping or self._has_input())
+            if not self._has_input():
                 return False
             poses, self._poses = self._poses, deque()
             images = [self._images.popleft() for _ in range(len(self._images))]
             item = self._work.popleft() if self._work else None
             self._num_clouds -= isinstance(item, Cloud)
-            clouds_lost, self._clouds_lost = self._clouds_lost, Counter()
-            poses_lost, self._poses_lost = self._poses_lost, 0
-        self._count_lost(clouds_lost, poses_lost)
+            lost, self._lost = self._lost, Counter()
+        self._count(lost)
         for pose, static in poses:
             self._mapper.add_pose(*pose, static=static)
         for image in images:
@@ -198,16 +225,24 @@ class MappingThread:
             on_update(update)
         return True
 
-    def _count_lost(self, clouds: Counter[tuple[str, str]], poses: int) -> None:
-        """Enter in the counts what the queue had to drop."""
-        if poses:
-            self._mapper.ignore_message('overload', f'{poses} poses dropped: too many wait', poses)
-        for (topic, frame_id), number in clouds.items():
-            reason = (
-                f'in frame {frame_id!r}, clouds come faster than they can be mapped; '
-                f'{REMEDIES["overload"]}'
-            )
-            self._mapper.refuse_clouds('overload', topic, reason, number, frame_id)
+    def _has_input(self) -> bool:
+        """Return whether there is something to do; called with the lock."""
+        return bool(self._poses or self._images or self._work or self._lost)
+
+    def _lose(self, lost: LostCloud | LostPose) -> None:
+        with self._changed:
+            self._lost[lost] += 1
+            self._changed.notify()
+
+    def _count(self, lost: Counter[LostCloud | LostPose]) -> None:
+        """Enter in the counts what does not get to the mapper."""
+        for what, number in lost.items():
+            if isinstance(what, LostPose):
+                self._mapper.ignore_message(what.cause, what.reason, number)
+            else:
+                self._mapper.refuse_clouds(
+                    what.cause, what.topic, what.reason, number, what.frame_id
+                )
 
     def _add(self, cloud: Cloud) -> None:
         """Decode a cloud and give it to the mapper; a bad one is counted."""

@@ -223,23 +223,24 @@ def inputs_of(config):
         resolve_topic_name=lambda name: f'/{name}',
         get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
     )
-    return Inputs(node, config, SimpleNamespace(put_cloud=lambda *_: None))
+    thread = SimpleNamespace(refuse_cloud=lambda *_: None)
+    return Inputs(node, config, thread, on_failure=None)
 
 
 def test_of_several_lidars_the_one_that_is_silent_is_known():
     inputs = inputs_of(Config.from_mapping({'input.topics': ['front', 'rear']}))
     before = time.monotonic()
-    inputs._on_cloud('/front', SimpleNamespace(data=b''))
+    inputs._on_cloud('/front', b'')
     topic, heard_s = inputs.most_silent
     assert topic == '/rear'
     assert heard_s <= before
-    inputs._on_cloud('/rear', SimpleNamespace(data=b''))
+    inputs._on_cloud('/rear', b'')
     assert inputs.most_silent[0] == '/front'
 
 
 def inputs_that_lost(size):
     inputs = inputs_of(Config())
-    inputs._on_cloud('/points', SimpleNamespace(data=bytes(size)))
+    inputs._on_cloud('/points', bytes(size))
     inputs._on_lost('/points', SimpleNamespace(total_count=5))
     return inputs
 

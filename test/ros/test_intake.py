@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The thread that takes messages: poses before clouds, bytes that are none, events, its end."""
+
+from __future__ import annotations
+
+import threading
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.serialization import serialize_message
+from std_msgs.msg import Int32, String
+
+from surfel_mapper.ros.intake import Intake
+from test.ros.live import cloud, odometry, RELIABLE, room, START_NS
+
+pytestmark = pytest.mark.timeout(120)
+
+ARGUMENTS = (
+    '--ros-args',
+    *('-p', 'pose.source:=odometry'),
+    *('-p', 'frames.base_to_sensor:=[0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]'),
+    *('-p', 'publish.diagnostics_rate_hz:=20.0'),
+    *RELIABLE,
+)
+PERIOD_NS = 100_000_000
+NUM_CLOUDS = 18
+"""Fewer than the node lets wait, so that none is dropped as too many."""
+
+ALL = QoSProfile(depth=1000)
+
+
+@pytest.mark.parametrize('rate_hz', [100, 200])
+def test_of_a_burst_of_clouds_none_lacks_its_pose(start, peer, rate_hz):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points', depth=1000)
+    step_ns = 10**9 // rate_hz
+    for number in range(NUM_CLOUDS):
+        first_ns = START_NS + number * PERIOD_NS
+        for stamp_ns in range(first_ns, first_ns + PERIOD_NS, step_ns):
+            peer.publish('/odom', odometry(stamp_ns, (1e-9 * (stamp_ns - START_NS), 0.0, 0.0)))
+        if number:  # between two poses, both sent before it
+            peer.publish('/points', cloud(first_ns - step_ns // 2, room(seed=number)))
+
+    _, values = peer.diagnosis({'scans.received': NUM_CLOUDS - 1, 'queue': 0, 'waiting': 0})
+    assert [key for key in values if key.startswith('scans.dropped')] == [], node.output
+    assert values['scans.mapped'] == str(NUM_CLOUDS - 1)
+
+
+def test_bytes_that_are_no_message_are_counted_and_the_good_ones_between_them_mapped(start, peer):
+    node = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    for number in range(3):
+        stamp_ns = START_NS + number * PERIOD_NS
+        pose, points = odometry(stamp_ns, (0.0, 0.0, 0.0)), cloud(stamp_ns, room(seed=number))
+        peer.publish('/odom', pose)
+        peer.publish('/points', points)
+        peer.publish('/odom', bytes(serialize_message(pose))[:60])
+        peer.publish('/points', bytes(serialize_message(points)).replace(b'lidar', b'li\xffar'))
+
+    expected = {
+        'scans.mapped': 3,
+        'scans.dropped.bad_cloud': 3,
+        'messages_ignored.bad_pose': 3,
+    }
+    peer.diagnosis(expected)
+    assert 'bytes that are no whole PointCloud2' in node.output
+    assert '60 bytes that are no message of odometry' in node.output
+
+
+class Bench:
+    """An intake in the node of a peer, what it took, and its failures."""
+
+    def __init__(self, peer):
+        self.taken = []
+        self.failures = []
+        self.intake = Intake(peer.node, self.failures.append)
+
+    def take(self, message):
+        self.taken.append(message.data)
+
+
+@pytest.fixture
+def bench(peer):
+    bench = Bench(peer)
+    yield bench
+    bench.intake.stop()
+
+
+def published(peer, topic, kind, values, qos=ALL):
+    """Publish messages to somebody who has subscribed."""
+    publisher = peer.node.create_publisher(kind, topic, qos)
+    peer.spin_until(publisher.get_subscription_count)
+    peer.spin_for(0.3)
+    for value in values:
+        publisher.publish(kind(data=value))
+    peer.spin_for(0.3)
+
+
+def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
+    bench.intake.subscribe(String, 'others', bench.take, ALL)
+    bench.intake.subscribe(Int32, 'eager', bench.take, ALL, eager=True)
+    published(peer, 'others', String, ['a', 'b', 'c'])
+    published(peer, 'eager', Int32, range(100))
+
+    bench.intake.start()
+
+    peer.spin_until(lambda: len(bench.taken) == 103)
+    assert bench.taken == [*range(100), 'a', 'b', 'c']
+    assert bench.intake.topics() == ['/eager', '/others']
+
+
+def test_what_the_middleware_reports_is_heard(peer, bench):
+    reports = []
+    events = SubscriptionEventCallbacks(incompatible_qos=reports.append)
+    bench.intake.subscribe(String, 'others', bench.take, ALL, events=events)
+    bench.intake.start()
+
+    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+    peer.node.create_publisher(String, 'others', best_effort)
+
+    peer.spin_until(lambda: reports)
+    assert reports[0].total_count == 1
+
+
+def test_an_error_of_a_callback_ends_the_thread_and_is_handed_on(peer, bench):
+    error = RuntimeError('nobody foresaw it')
+
+    def fail(message):
+        raise error
+
+    bench.intake.subscribe(String, 'others', fail, ALL)
+    bench.intake.start()
+    published(peer, 'others', String, ['a'])
+
+    peer.spin_until(lambda: bench.failures)
+    assert bench.failures == [error]
+
+
+def test_it_can_be_stopped_at_any_time_and_started_again(peer, bench):
+    bench.intake.stop()
+    for _ in range(3):
+        bench.intake.subscribe(String, 'others', bench.take, ALL)
+        bench.intake.start()
+        bench.intake.stop()
+        assert bench.intake.topics() == []
+        assert 'intake' not in [thread.name for thread in threading.enumerate()]
+    assert not peer.node.count_subscribers('others')
