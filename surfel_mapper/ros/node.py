@@ -144,6 +144,8 @@ class MapperNode(LifecycleNodeMixin, Node):
         except BaseException:
             self._withdraw()
             raise
+        if self._config != self._session.config:  # changed meanwhile: compiling takes a while
+            self._session.reconfigure(self._config)
         self._diagnostics.watch(self._session)
 
     def _activate(self) -> None:
@@ -236,4 +238,4 @@ class MapperNode(LifecycleNodeMixin, Node):
         if config != self._config:
             self._config = config
             if self._session is not None:
-                self._session.reconfigure(config, is_active=self.state == 'active')
+                self._session.reconfigure(config)

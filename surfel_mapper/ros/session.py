@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from concurrent.futures import CancelledError
 from contextlib import suppress
+import threading
 import time
 
 from rclpy.node import Node
@@ -67,12 +68,14 @@ class Session:
         log.info('compiling kernels: a moment, or half a minute the first time')
         self.mapper.warm_up()
         self.thread = MappingThread(self.mapper, inbox.fail)
-        self.inputs = Inputs(node, config, self.thread)
+        self.inputs = Inputs(node, config, self.thread, inbox.fail)
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.control = Control(node, self.mapper, self.thread, self.outputs)
         log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
+        self._changing = threading.Lock()  # transitions and settings come from two threads
+        self._is_active = False
         self.thread.start(self._on_update)
 
     def activate(self) -> None:
@@ -82,20 +85,25 @@ class Session:
         except SurfelMapperError:
             self.inputs.unsubscribe()
             raise
-        self.outputs.start_timers(self.config)
+        with self._changing:
+            self._is_active = True
+            self.outputs.start_timers(self.config)
 
     def deactivate(self) -> None:
         """Take no more messages and, when those that came are mapped, publish no more."""
         self.inputs.unsubscribe()
-        self.outputs.stop_timers()
+        with self._changing:
+            self._is_active = False
+            self.outputs.stop_timers()
         with suppress(CancelledError):  # the thread may have failed, which the inbox tells
             self.thread.call(lambda: None).result()
 
-    def reconfigure(self, config: Config, *, is_active: bool) -> None:
+    def reconfigure(self, config: Config) -> None:
         """Put new settings to work, from the next scan on."""
-        self.config = config
-        if is_active:
-            self.outputs.start_timers(config)
+        with self._changing:
+            self.config = config
+            if self._is_active:
+                self.outputs.start_timers(config)
         self.thread.post(self._reconfigure)
 
     def close(self, *, save: bool) -> None:

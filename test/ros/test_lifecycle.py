@@ -17,6 +17,10 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.io.map_state import load_map
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.ros.context import context
+from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.ros.running import executing
 from test.ros.live import LATCHED, NODE, RVIZ
 from test.ros.test_node import ARGUMENTS, drive, mapped, send
 
@@ -122,6 +126,29 @@ def test_settings_that_are_changed_before_configure_hold_after_it(start, peer):
     peer.advertise('/odom', '/points')
     send(peer, drive(3))
     _, values = peer.diagnosis({'scans.mapped': 3})
+    assert values['window_scans'] == '2'
+
+
+def test_settings_that_are_changed_while_kernels_compile_hold_after_it(
+    compiled, peer, monkeypatch
+):
+    answers = []
+
+    def compile_until_set(mapper):
+        changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
+        answers.extend(peer.result(changed).results)
+
+    monkeypatch.setattr(Mapper, 'warm_up', compile_until_set)
+    with context(ARGUMENTS):
+        node = MapperNode()
+        with executing(node):
+            node.start()
+            peer.advertise('/odom', '/points')
+            send(peer, drive(3))
+            _, values = peer.diagnosis({'scans.mapped': 3})
+            node.end()
+        node.destroy_node()
+    assert answers[0].successful
     assert values['window_scans'] == '2'
 
 
