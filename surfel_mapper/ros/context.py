@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+import os
 
 import rclpy
 from rclpy.signals import SignalHandlerOptions
@@ -31,15 +32,26 @@ def context(ros_args: Sequence[str]) -> Iterator[None]:
     Raises
     ------
     ConfigError
-        If rclpy refuses an argument, or the file of parameters.
+        If rclpy refuses an argument, the file of parameters, or to go without security.
 
     """
     try:
         rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
     except RuntimeError as error:
-        reason = str(error).partition(', at /')[0]
-        raise ConfigError(f'arguments after --ros-args: {reason}') from error
+        raise ConfigError(f'arguments after --ros-args: {reason(error)}') from error
     try:
         yield
     finally:
         rclpy.try_shutdown()
+
+
+def reason(error: RuntimeError) -> str:
+    """Return why ROS refuses to start; what it says of security is not enough to go by."""
+    said = str(error).partition(', at /')[0]
+    if os.environ.get('ROS_SECURITY_ENABLE') != 'true':
+        return said
+    keystore = os.environ.get('ROS_SECURITY_KEYSTORE')
+    return (
+        f'{said}. ROS_SECURITY_ENABLE is true: ROS_SECURITY_KEYSTORE ({keystore}) has to hold the '
+        'enclave of the node, and the middleware to be one that is built with security'
+    )

@@ -14,9 +14,11 @@ from contextlib import contextmanager
 import threading
 
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation
 
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.io.heap import keep_freed_memory
-from surfel_mapper.ros.context import context
+from surfel_mapper.ros.context import context, reason
 from surfel_mapper.ros.logs import logging_to
 from surfel_mapper.ros.node import MapperNode
 from surfel_mapper.ros.signals import Signals
@@ -41,12 +43,20 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
     """
     keep_freed_memory()
     with context(ros_args):
-        node = MapperNode()
+        node = made()
         try:
             with logging_to(node.get_logger()), executing(node):
                 live(node, signals)
         finally:
             node.destroy_node()
+
+
+def made() -> MapperNode:
+    """Make the node; a middleware that cannot go as securely as it is told to refuses here."""
+    try:
+        return MapperNode()
+    except rclpy_implementation.RCLError as error:
+        raise ConfigError(f'ROS cannot make the node: {reason(error)}') from error
 
 
 def live(node: MapperNode, signals: Signals) -> None:
