@@ -77,9 +77,14 @@ def components(points, starts, means, values, frames, scales, rules, parent):
     lengths = np.empty(1024)
     found = 0
     delta = np.empty(3)
+    least_plane, least_arc = rules[0] - 1e-12, rules[2] - 1e-12
     for i in range(number):
         parent[i] = i
+        nx, ny, nz = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
         for j in range(i):
+            cosine = nx * frames[j, 2, 0] + ny * frames[j, 2, 1] + nz * frames[j, 2, 2]
+            if abs(cosine) <= least_plane and cosine <= least_arc:  # most pairs: no need of more
+                continue
             length = 0.0
             for k in range(3):
                 delta[k] = means[i, k] - means[j, k]
@@ -120,28 +125,22 @@ def touch(points, rows_i, rows_j, box_i, box_j, near):
         if box_i[0, j] - near > box_j[1, j] or box_j[0, j] - near > box_i[1, j]:
             return False
     near_sq = near * near
-    inner = np.empty(rows_j[1] - rows_j[0], np.int64)
+    inner = np.empty((rows_j[1] - rows_j[0], 3))
     num_inner = 0
+    x0, y0, z0 = box_i[0, 0] - near, box_i[0, 1] - near, box_i[0, 2] - near
+    x1, y1, z1 = box_i[1, 0] + near, box_i[1, 1] + near, box_i[1, 2] + near
     for i in range(rows_j[0], rows_j[1]):
-        if within(points[i], box_i, near):
-            inner[num_inner] = i
-            num_inner += 1
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        inner[num_inner, 0], inner[num_inner, 1], inner[num_inner, 2] = x, y, z
+        num_inner += (x0 <= x) & (x <= x1) & (y0 <= y) & (y <= y1) & (z0 <= z) & (z <= z1)
+    x0, y0, z0 = box_j[0, 0] - near, box_j[0, 1] - near, box_j[0, 2] - near
+    x1, y1, z1 = box_j[1, 0] + near, box_j[1, 1] + near, box_j[1, 2] + near
     for i in range(rows_i[0], rows_i[1]):
-        if not within(points[i], box_j, near):
+        px, py, pz = points[i, 0], points[i, 1], points[i, 2]
+        if px < x0 or px > x1 or py < y0 or py > y1 or pz < z0 or pz > z1:
             continue
-        for at in range(num_inner):
-            k = inner[at]
-            x, y, z = (points[i, 0] - points[k, 0], points[i, 1] - points[k, 1],
-                       points[i, 2] - points[k, 2])  # fmt: skip
+        for k in range(num_inner):
+            x, y, z = px - inner[k, 0], py - inner[k, 1], pz - inner[k, 2]
             if x * x + y * y + z * z < near_sq:
                 return True
     return False
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def within(point, box, margin):
-    """Return whether a point is in a box (2, 3), widened."""
-    for j in range(3):
-        if point[j] < box[0, j] - margin or point[j] > box[1, j] + margin:
-            return False
-    return True
