@@ -11,6 +11,7 @@ scan at 0.2 m takes 1.6 times as long.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import ClassVar
 
 from surfel_mapper.config.settings import setting, Stage
@@ -176,6 +177,14 @@ class TsdfConfig(Stage):
     mesh_min_weight: float = setting(
         1e-4, 'The mesh uses voxels of at least this weight.', low=0.0, high=1e9
     )
+    mesh_max_step_voxels: float = setting(
+        0.0,
+        'The mesh has no cube in which distances of neighbours differ by more through the surface, '
+        'in voxels: free space beside the shadow of a thing; 0: no such limit. For to_plane: the '
+        'truncation and 1.25 voxels.',
+        low=0.0,
+        high=1e3,
+    )
     threads: int = setting(0, 'Threads; 0: as many as there are cores.', low=0, high=1024)
 
     def check(self, stage: str) -> None:
@@ -237,6 +246,11 @@ class TsdfConfig(Stage):
     def reach_behind_m(self) -> float:
         """How far behind a surface voxels change."""
         return self.truncation_m + self.extra_distance_m
+
+    @property
+    def mesh_max_step_m(self) -> float:
+        """By how much distances of neighbouring voxels may differ in the mesh; inf: any."""
+        return self.mesh_max_step_voxels * self.voxel_size_m or math.inf
 
     @property
     def votes_per_voxel(self) -> int:

@@ -10,6 +10,9 @@ the surface has no cracks, in ambiguous cases neither. Corner c of a cube lies a
 (c & 1, c >> 1 & 1, c >> 2). Edge e = 3 c + axis begins at corner c and is named for the voxel
 there, which makes vertices of different cubes the same.
 
+A cube may be refused for being torn: where the field is free on one side of an edge and deep
+behind a surface on the other, nothing was seen between, it is where the shadow of a thing ends.
+
 Source: Lorensen and Cline 1987; the rule for ambiguous faces keeps inside corners apart.
 """
 
@@ -109,8 +112,13 @@ def pad(neighbours, side, values, missing, padded):
 
 
 @njit(cache=True, nogil=True)
-def cube_case(distance, weight, i, j, k, min_weight):
-    """Return the case of a cube; -1 where a corner was not observed well enough."""
+def cube_case(distance, weight, i, j, k, limits):
+    """
+    Return the case of a cube; -1 where a corner was not observed well enough or it is torn.
+
+    limits  (least weight of a corner, largest step along an edge through the surface in m)
+    """
+    min_weight, max_step_m = limits
     case = 0
     for corner in range(8):
         x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
@@ -118,16 +126,27 @@ def cube_case(distance, weight, i, j, k, min_weight):
             return -1
         if distance[z, y, x] < 0.0:
             case |= 1 << corner
+    if 0 < case < 255 and max_step_m < np.inf:
+        for corner in range(8):
+            x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
+            for axis in range(3):
+                other = corner | 1 << axis
+                if other == corner or (case >> corner & 1) == (case >> other & 1):
+                    continue
+                end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
+                if abs(end - distance[z, y, x]) > max_step_m:
+                    return -1
     return case
 
 
 @njit(cache=True, nogil=True)
-def count_triangles(neighbours, side, field, min_weight, counts):
+def count_triangles(neighbours, side, field, limits, counts):
     """
     Count the triangles of every block.
 
     neighbours  (K, 8) int64
     field       (R, 2, N) float32, distance and weight
+    limits      of cubes, see cube_case
     counts      (K,) int64, out
     """
     distance = np.empty((side + 1, side + 1, side + 1), np.float32)
@@ -139,13 +158,13 @@ def count_triangles(neighbours, side, field, min_weight, counts):
         for k in range(side):
             for j in range(side):
                 for i in range(side):
-                    case = cube_case(distance, weight, i, j, k, min_weight)
+                    case = cube_case(distance, weight, i, j, k, limits)
                     if case > 0:
                         counts[block] += NUM_TRIANGLES[case]
 
 
 @njit(cache=True, nogil=True)
-def march(neighbours, index, side, field, min_weight, starts, edges, places):
+def march(neighbours, index, side, field, limits, starts, edges, places):
     """
     Write the triangles of every block, each corner as the edge it is on and the place there.
 
@@ -164,7 +183,7 @@ def march(neighbours, index, side, field, min_weight, starts, edges, places):
         for k in range(side):
             for j in range(side):
                 for i in range(side):
-                    case = cube_case(distance, weight, i, j, k, min_weight)
+                    case = cube_case(distance, weight, i, j, k, limits)
                     if case <= 0:
                         continue
                     for triangle in range(NUM_TRIANGLES[case]):

@@ -150,14 +150,15 @@ class Mesher:
     def _marched(self, rows: Int64) -> list[BlockMesh]:
         """Return the meshes of blocks."""
         blocks, config = self._blocks, self._blocks.config
-        side, min_weight = config.voxels_per_side, config.mesh_min_weight
+        side = config.voxels_per_side
+        limits = config.mesh_min_weight, config.mesh_max_step_m
         index, neighbours = blocks.index(rows), blocks.neighbours(rows)
         counts = np.empty(len(rows), np.int64)
-        count_triangles(neighbours, side, blocks.field, min_weight, counts)
+        count_triangles(neighbours, side, blocks.field, limits, counts)
         ends = np.cumsum(counts)
         num = int(ends[-1]) if len(ends) else 0
         edges, places = np.empty((num, 3, 4), np.int64), np.empty((num, 3))
-        march(neighbours, index, side, blocks.field, min_weight, ends - counts, edges, places)
+        march(neighbours, index, side, blocks.field, limits, ends - counts, edges, places)
 
         block = np.repeat(np.arange(len(rows)), 3 * counts)
         flat = edges.reshape(-1, 4)

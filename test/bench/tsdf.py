@@ -198,7 +198,13 @@ def street_cases(options: Options, scans: int) -> list[Case]:
             truth=near,
             peers=(VDBFUSION,),
             settings={},
-            ours=dict(distance='to_plane', weight_mode='constant', mesh_min_weight=0.2),
+            ours=dict(
+                distance='to_plane',
+                weight_mode='constant',
+                max_ray_offset_voxels=0.4,
+                mesh_min_weight=0.2,
+                mesh_max_step_voxels=4.25,
+            ),
         )
         for carve in (False, True)
     ]

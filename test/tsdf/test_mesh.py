@@ -23,11 +23,10 @@ SIDE = 4
 FACE_EDGES = [{edge_between(face[i], face[i - 1]) for i in range(4)} for face in FACES]
 
 
-def blocks_of(distance, first=(0, 0, 0), weight=1.0, color=None):
+def blocks_of(distance, first=(0, 0, 0), weight=1.0, color=None, **settings):
     """Return a map whose voxels from block first on hold a field, (x, y, z), in m."""
-    blocks = BlockMap(
-        TsdfConfig(voxel_size_m=VOXEL_M, voxels_per_side=SIDE, color=color is not None)
-    )
+    sizes = dict(voxel_size_m=VOXEL_M, voxels_per_side=SIDE)
+    blocks = BlockMap(TsdfConfig(**sizes, color=color is not None, **settings))
     write(blocks, distance, first, weight, color)
     return blocks
 
@@ -189,6 +188,23 @@ def test_voxels_that_were_not_observed_well_enough_have_no_surface(weight):
     assert len(mesh)
     assert mesh.vertices[:, 0].max() <= 0.75
     assert len(mesh_of(blocks_of(distance, weight=0.0))) == 0
+
+
+def test_free_space_beside_a_shadow_has_no_surface_between_them():
+    # Behind a wall at x = 0.4 the field falls to -0.25 m, in the shadow of the wall's half y < 0.4;
+    # beside the shadow it is free, +0.3 m.
+    places = centers((8, 8, 8))
+    wall = np.clip(0.42 - places[..., 0], -0.25, 0.3)
+    distance = np.where(places[..., 1] < 0.4, wall, 0.3)
+    torn = mesh_of(blocks_of(distance))
+    whole = mesh_of(blocks_of(distance, mesh_max_step_voxels=4.25))
+    assert torn.vertices[:, 0].max() == pytest.approx(0.75)
+    assert whole.vertices[:, 0].max() <= 0.65  # as deep as 1.25 voxels and the cube's edge
+    in_front = np.isclose(torn.vertices[:, 0], 0.42)
+    assert in_front.sum() == np.isclose(whole.vertices[:, 0], 0.42).sum() > 20
+    assert as_triangles(mesh_of(blocks_of(distance, mesh_max_step_voxels=5.6))) == as_triangles(
+        torn
+    )
 
 
 def test_without_blocks_there_is_no_mesh():
