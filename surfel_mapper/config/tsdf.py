@@ -179,7 +179,7 @@ class TsdfConfig(Stage):
     )
     mesh_max_step_voxels: float = setting(
         0.0,
-        'The mesh has no cube in which distances of neighbours differ by more through the surface, '
+        'The mesh has no cube where distances of neighbours differ by more through the surface, '
         'in voxels: free space beside the shadow of a thing; 0: no such limit. For to_plane: the '
         'truncation and 1.25 voxels.',
         low=0.0,

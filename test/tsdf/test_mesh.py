@@ -191,7 +191,7 @@ def test_voxels_that_were_not_observed_well_enough_have_no_surface(weight):
 
 
 def test_free_space_beside_a_shadow_has_no_surface_between_them():
-    # Behind a wall at x = 0.4 the field falls to -0.25 m, in the shadow of the wall's half y < 0.4;
+    # Behind a wall at x = 0.42 the field falls to -0.25 m, in the shadow of its half y < 0.4;
     # beside the shadow it is free, +0.3 m.
     places = centers((8, 8, 8))
     wall = np.clip(0.42 - places[..., 0], -0.25, 0.3)
