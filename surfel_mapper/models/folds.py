@@ -7,10 +7,11 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.folds import halve_normals
+
 Array = npt.NDArray[np.float64]
 
 FOLD_PERCENTILE = 98.0
-MEANS_ITERATIONS = 20
 
 
 def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
@@ -30,17 +31,15 @@ def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] |
     cosines = normals @ mean
     if len(normals) < 2 or cosines.min() >= limit:
         return None
-    if np.percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
+    if percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
         return None
-    centred = normals - normals.mean(axis=0)
-    axis = np.linalg.eigh(centred.T @ centred)[1][:, -1]
-    side: npt.NDArray[np.bool_] = centred @ axis > 0.0
-    for _ in range(MEANS_ITERATIONS):
-        if side.all() or not side.any():
-            return None
-        first, second = normals[side].mean(axis=0), normals[~side].mean(axis=0)
-        nearer = normals @ (first - second) > 0.5 * (first @ first - second @ second)
-        if (nearer == side).all():
-            break
-        side = nearer
-    return side if 0 < side.sum() < len(side) else None
+    side = np.empty(len(normals), np.bool_)
+    return side if halve_normals(normals, side) else None
+
+
+def percentile(values: Array, share: float) -> float:
+    """Return a percentile as numpy does, which takes ten times as long for a few values."""
+    ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
+    low = int(place)
+    high = min(low + 1, len(values) - 1)
+    return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
