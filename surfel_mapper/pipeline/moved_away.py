@@ -4,8 +4,8 @@
 Voxels that later scans see through: what was there has moved away.
 
 Every scan is turned into a range image, and the voxels of the map are looked up in it. One whose
-rays end behind it gains a count, one that is seen or hit again loses all. A map that has a
-window forgets what moved anyway; this is for windows longer than things stand still.
+rays end behind it, or met nothing, gains a count; one that is seen or hit again loses all. A map
+that has a window forgets what moved anyway; this is for windows longer than things stand still.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from surfel_mapper.config import DynamicConfig, TsdfConfig
 from surfel_mapper.geometry import inverse
 from surfel_mapper.kernels.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.pipeline.sensor_models import SensorModels
+from surfel_mapper.pipeline.sensor_models import measured, SensorModels
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.range_image import from_points
 
@@ -103,7 +103,8 @@ class MovedAway:
     ) -> npt.NDArray[np.int8]:
         """Return what a scan says of each voxel."""
         sensor = self._sensors.of(scan)
-        image = from_points(sensor, scan.points).range_m
+        image = from_points(sensor, measured(scan, sensor.max_range_m)).range_m
+        image = np.minimum(image, np.float32(sensor.max_range_m))  # beyond it nothing is known
         T = inverse(T_map_sensor)
         centers = (unpack_keys(keys).astype(np.float64) + 0.5) * self._voxel_size_m
         x, y, z = (centers @ T[:3, :3].T + T[:3, 3]).astype(np.float32).T.copy()

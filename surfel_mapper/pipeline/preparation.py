@@ -155,7 +155,7 @@ class Preparation:
         if times is not None:
             scan = self._poses.deskewed(scan, times)
             laps.end('deskew')
-        if self._config.tsdf.enabled:
+        if self._config.tsdf.enabled or self._config.dynamic.clear:
             scan = self._with_surroundings(scan)
             laps.end('images')
         filtered: Scan | None = scan
@@ -194,7 +194,7 @@ class Preparation:
         return replace(prepared, T_map_sensor=T_map_sensor, alignment=alignment)
 
     def _with_surroundings(self, scan: Scan) -> Scan:
-        """Return a scan with what the TSDF wants beside its points, before any is left out."""
+        """Return a scan with what layers want beside its points, before any is left out."""
         if scan.free is None:
             scan = replace(scan, free=free_directions(scan))
         try:

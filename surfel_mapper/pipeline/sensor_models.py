@@ -1,8 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera or lidar each scan came from."""
+"""Which camera or lidar each scan came from, and what it measured: points, and free rays."""
 
 from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.scan import Scan
@@ -52,3 +57,11 @@ class SensorModels:
                 **ranges,
             )
         return self._lidars[scan.frame_id]
+
+
+def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
+    """Return the points of a scan, then one beyond the range along each ray that met nothing."""
+    if scan.free is None:
+        return scan.points
+    beyond = 2.0 * max_range_m * scan.free
+    return np.concatenate([scan.points, beyond.astype(scan.points.dtype)])

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.mapping.window import Eviction, WindowedScan
-from surfel_mapper.pipeline.sensor_models import SensorModels
+from surfel_mapper.pipeline.sensor_models import measured, SensorModels
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrated, Integrator
@@ -128,17 +128,15 @@ class TsdfLayer:
 
     def _range_image(self, scan: Scan) -> RangeImage:
         """Return what the sensor of a scan measured: its points, and where it found nothing."""
-        columns, points = scan.columns, scan.points
-        sensor = self._sensors.of(scan)
+        columns, sensor = scan.columns, self._sensors.of(scan)
+        points = measured(scan, sensor.max_range_m)
+        num_free = len(points) - len(scan)
         colors = colors_of(scan) if self.config.color else None
         labels = columns.get('label') if self.config.semantics != 'none' else None
-        if scan.free is not None:
-            beyond = 2.0 * self.config.max_range_m * scan.free
-            points = np.concatenate([points, beyond.astype(points.dtype)])
-            if colors is not None:
-                colors = np.pad(colors, ((0, len(beyond)), (0, 0)))
-            if labels is not None:
-                labels = np.pad(labels, (0, len(beyond)), constant_values=-1)
+        if colors is not None:
+            colors = np.pad(colors, ((0, num_free), (0, 0)))
+        if labels is not None:
+            labels = np.pad(labels, (0, num_free), constant_values=-1)
         return from_points(sensor, points, colors=colors, labels=labels)
 
     def _settle(self, windowed: WindowedScan) -> None:

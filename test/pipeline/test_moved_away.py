@@ -7,6 +7,7 @@ The room and the box are simulated anew for every scan, so that the truth is kno
 """
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -39,8 +40,12 @@ def ranges_to_box(origin, directions, middle, half):
     return np.where((enters < leaves) & (enters > 0.0), enters, np.inf), leaves
 
 
-def scan_of(number, has_box=True):
-    """Return what a lidar in the middle sees, and where the box is."""
+def scan_of(number, has_box=True, missing_wall=None):
+    """
+    Return what a lidar in the middle sees, and where the box is.
+
+    In place of a missing wall, that behind the box, points are what is said.
+    """
     origin = np.array([0.02 * number, 0.0, 0.0])
     box = np.array([-5.0 + 10.0 * number / SCANS, 3.0, -1.0])
     directions = LIDAR.directions.reshape(-1, 3).astype(np.float64)
@@ -49,16 +54,20 @@ def scan_of(number, has_box=True):
     ranges = np.minimum(walls, nearest) if has_box else walls
     rng = np.random.default_rng(number)
     points = directions * (ranges + rng.normal(scale=0.01, size=len(ranges)))[:, None]
+    if missing_wall is not None:
+        behind = (origin + directions * walls[:, None])[:, 1] > ROOM_M[1] - 1e-6
+        points[behind & (ranges == walls)] = missing_wall
     scan = Scan(
         points=points.astype(np.float32),
         stamp_ns=(number + 1) * S,
         frame_id='lidar',
         columns={'ring': RING},
+        msg=SimpleNamespace(height=64, width=512),
     )
     return scan, origin, box
 
 
-def driven(**settings):
+def driven(missing_wall=None, **settings):
     """Return a mapper that has seen the box pass."""
     mapper = Mapper(
         Config.from_mapping(
@@ -74,7 +83,7 @@ def driven(**settings):
     )
     updates = []
     for number in range(SCANS):
-        scan, origin, _ = scan_of(number)
+        scan, origin, _ = scan_of(number, missing_wall=missing_wall)
         mapper.add_pose('odom', 'lidar', scan.stamp_ns, origin, (0.0, 0.0, 0.0, 1.0))
         mapper.add_scan(scan)
         updates += mapper.insert_ready()
@@ -112,6 +121,30 @@ def test_where_the_box_was_is_cleared_and_the_room_stays(with_clearing):
     assert mapper.summary()['cleared_voxels'] == mapper.counters.cleared_voxels > 200
     assert without.counters.cleared_voxels == 0
     assert updates[-1].milliseconds['clear'] > 0.0
+
+
+def test_rays_that_met_nothing_clear_and_missing_ones_do_not():
+    without, _ = driven(np.inf)
+    clearing, _ = driven(np.inf, **{'dynamic.clear': True})
+    silent, _ = driven(np.nan, **{'dynamic.clear': True})
+    assert len(ghosts(without)) > 200
+    assert len(ghosts(clearing)) <= 0.02 * len(ghosts(without))
+    assert len(ghosts(silent)) >= 0.3 * len(ghosts(without))
+    assert len(walls(clearing)) >= 0.995 * len(walls(without))
+
+
+def test_beyond_the_range_of_the_sensor_nothing_is_known():
+    count = MovedAway(
+        DynamicConfig(clear=True, min_scans=1), SIZE_M, SensorModels(TsdfConfig(max_range_m=2.0))
+    )
+    near, far = (6, 2, 0), INSIDE  # 1.7 and 3.3 m away; what is seen is 6 m away and more
+    assert look(count, EMPTY_ROOM, [near, far]) == []
+    count = MovedAway(
+        DynamicConfig(clear=True, min_scans=1, margin_m=0.1),
+        SIZE_M,
+        SensorModels(TsdfConfig(max_range_m=2.0)),
+    )
+    assert look(count, EMPTY_ROOM, [near, far]) == [near]
 
 
 def test_what_is_cleared_is_said_and_gone(with_clearing):
