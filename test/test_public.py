@@ -7,6 +7,7 @@ from __future__ import annotations
 import ast
 import inspect
 from pathlib import Path
+import re
 import subprocess
 import sys
 
@@ -51,9 +52,35 @@ def test_every_public_name_is_there_listed_and_the_same_each_time(name):
     assert name in dir(surfel_mapper)
 
 
-@pytest.mark.parametrize('name', sorted(set(surfel_mapper.__all__) - {'__version__'}))
-def test_every_public_name_says_what_it_is(name):
-    assert inspect.getdoc(getattr(surfel_mapper, name))
+def members():
+    """Yield every public name, and those of public classes, with what carries its docstring."""
+    for name in sorted(set(surfel_mapper.__all__) - {'__version__'}):
+        value = getattr(surfel_mapper, name)
+        yield name, value
+        for of_class, member in vars(value).items() if inspect.isclass(value) else ():
+            member = member.fget if isinstance(member, property) else member
+            member = getattr(member, '__func__', member)
+            if inspect.isfunction(member) and not of_class.startswith('_'):
+                yield f'{name}.{of_class}', member
+
+
+@pytest.mark.parametrize(('name', 'member'), members())
+def test_every_public_name_says_what_it_is(name, member):
+    assert inspect.getdoc(member), name
+
+
+@pytest.mark.parametrize(('name', 'member'), members())
+def test_what_takes_or_returns_an_array_states_a_shape(name, member):
+    if inspect.isfunction(member):
+        types = inspect.get_annotations(member).values()
+        arrays = [each for each in types if re.match(r'Array|ArrayLike|npt\.', str(each))]
+        assert not arrays or re.search(r'\([A-Z\d]\w*,|\bshape\b', inspect.getdoc(member)), name
+
+
+@pytest.mark.parametrize(('name', 'member'), members())
+def test_what_raises_says_so(name, member):
+    if inspect.isfunction(member) and re.search(r'^ +raise ', inspect.getsource(member), re.M):
+        assert re.search(r'Raises\n-{6}|\b[Rr]aises?\b', inspect.getdoc(member)), name
 
 
 def test_an_unknown_name_is_refused_by_name():

@@ -102,7 +102,7 @@ class ScanMoments:
         return int(self.view.dtype == np.int64)
 
     def select(self, voxels: slice | npt.NDArray[Any]) -> ScanMoments:
-        """Return the moments of some voxels: a slice, a mask or row numbers."""
+        """Return the moments of some voxels: a slice, a mask (K,) bool or row numbers."""
         names = ('key', 'count', 'total', 'product', 'view', 'channels')
         return replace(self, **{name: getattr(self, name)[voxels] for name in names})
 

@@ -353,34 +353,34 @@ class SurfelMap:
         return len(self._table.changed_after(-1, min_points))
 
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
-        """Return the keys of the voxels with at least so many points, in no stated order."""
+        """Return the keys of the voxels with at least so many points, (K,), in no stated order."""
         rows = self._table.changed_after(-1, min_points)
         return np.asarray(self._table.rows[rows, layout.KEY])
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-        """Return the row of each voxel key, -1 for none; rows hold until the map changes."""
+        """Return the row of each voxel key (K,), -1 for none; rows hold until the map changes."""
         return self._table.find(key)
 
     def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
-        """Return the surfels of some rows, which ``find`` gave."""
+        """Return the surfels of some rows (K,), which ``find`` gave."""
         return self._derive(rows)
 
     def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-        """Return the covariances of the points of some rows, (K, 6): xx xy xz yy yz zz, m^2."""
+        """Return the covariances of the points of rows (K,), (K, 6): xx xy xz yy yz zz, m^2."""
         found = np.empty((len(rows), 6))
         bits = layout.BITS + self.level
         derive_covariances(self._table.rows, rows, self.voxel_size_m, bits, found)
         return found
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-        """Return the voxel keys of some rows, -1 for those that hold no points."""
+        """Return the voxel keys of some rows (K,), -1 for those that hold no points."""
         slab = self._table.rows
         keys = np.where(slab[rows, layout.COUNT] > 0, slab[rows, layout.KEY], -1)
         return np.asarray(keys, np.int64)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
         """
-        Return the rows whose voxels changed after a version, those emptied too, each once.
+        Return the rows (K,) whose voxels changed after a version, emptied ones too, each once.
 
         What was there before the map was cleared (``cleared_at``, a version) is not among them.
         """
