@@ -7,6 +7,8 @@ Runs of consecutive points in one voxel are sorted by its key, by radix and stab
 that order. Nothing is looked up in a table of hashes, which with noise misses the caches for
 every point: 300,000 points in 96,000 voxels take a third of the time. The points of a voxel are
 summed in the order that they have, so the means are the same to the bit.
+
+A run is one int64: the key of its voxel, its first row, and its length less one in LENGTH_BITS.
 """
 
 import math
@@ -14,15 +16,19 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.moments import CHUNK, find_runs
+from surfel_mapper.kernels.moments import find_runs
 from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.voxel_grid import find_keys
 
 DIGIT_BITS = 11
 """Most bits that are sorted by in one pass: so many counts stay in the nearest cache."""
 
-AHEAD = 12
-"""So many runs ahead their points are asked for; the rows of these twice as far ahead."""
+LENGTH_BITS = 7
+CHUNK = 1 << LENGTH_BITS
+"""Points worked on at once, in which runs end."""
+
+AHEAD = 16
+"""So many runs ahead their points are asked for."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -49,20 +55,17 @@ def finite_ends(points, ends):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def voxel_runs(points, size, shift, base, bits, keys, runs):
+def voxel_keys(points, size, shift, base, bits, keys):
     """
-    Find runs of finite points in one voxel; return how many.
+    Find the voxel of every point.
 
     points                   (N, 3) float32 or float64, m
     size, shift, base, bits  see group_points
-    keys                     (N,) int64, out: key of each run
-    runs                     (N, 2) int32, out: first row of each, and the one after its last
+    keys                     (N,) int64, out; -1 for what is not finite
     """
-    own_keys, starts = np.empty(CHUNK, np.int64), np.empty(CHUNK + 1, np.int32)
     xyz = np.empty((3, CHUNK))
-    number = 0
     for start in range(0, len(points), CHUNK):
-        own = points[start : start + CHUNK]
+        own, own_keys = points[start : start + CHUNK], keys[start : start + CHUNK]
         x, y, z = xyz[0, : len(own)], xyz[1, : len(own)], xyz[2, : len(own)]
         for i in range(len(own)):
             x[i], y[i], z[i] = own[i, 0], own[i, 1], own[i, 2]
@@ -70,38 +73,60 @@ def voxel_runs(points, size, shift, base, bits, keys, runs):
         for i in range(len(own)):
             finite = abs(x[i]) < np.inf and abs(y[i]) < np.inf and abs(z[i]) < np.inf
             own_keys[i] = own_keys[i] if finite else -1
-        found = find_runs(own_keys, len(own), starts)
-        for run in range(found):
-            keys[number] = own_keys[starts[run]]
-            runs[number, 0], runs[number, 1] = start + starts[run], start + starts[run + 1]
-            number += keys[number] >= 0
+
+
+@njit(cache=True, nogil=True)
+def voxel_runs(keys, to_key):
+    """
+    Turn keys into runs, in place; return how many.
+
+    keys    (N,) int64, -1 leaves a point out; out: runs, (R,) of them
+    to_key  bits of rows and lengths, as row_bits says
+    """
+    starts = np.empty(CHUNK + 1, np.int32)
+    number = 0
+    for start in range(0, len(keys), CHUNK):
+        own = keys[start : start + CHUNK]
+        found = find_runs(own, len(own), starts)
+        for k in range(found):
+            key, first, length = own[starts[k]], start + starts[k], starts[k + 1] - starts[k]
+            keys[number] = key << to_key | first << LENGTH_BITS | (length - 1)
+            number += key >= 0
     return number
 
 
 @njit(cache=True, nogil=True)
-def sorted_runs(keys, key_bits, run_bits):
-    """
-    Return runs sorted by their keys, equal ones in order: (R,) int64, key << run_bits | run.
+def row_bits(number):
+    """Return how many bits of a run the rows of so many points take, with lengths."""
+    bits = LENGTH_BITS
+    while number > 0:
+        number >>= 1
+        bits += 1
+    return bits
 
-    keys      (R,) int64, not negative; is used up
-    key_bits  that the largest key needs, at most 63 together with
-    run_bits  that the number of the last run needs
+
+@njit(cache=True, nogil=True)
+def sorted_runs(runs, key_bits, to_key):
+    """
+    Return runs sorted by their keys, equal ones in order.
+
+    runs      (R,) int64, is used up
+    key_bits  that the largest key needs
+    to_key    bits of rows and lengths
     """
     passes = max(-(-key_bits // DIGIT_BITS), 1)
     width = -(-key_bits // passes)
     mask = np.uint64((1 << width) - 1)
     places = np.empty((1 << width) + 1, np.uint32)
-    before, after = keys, np.empty_like(keys)
-    for i in range(len(keys)):
-        keys[i] = keys[i] << run_bits | i
+    before, after = runs, np.empty_like(runs)
     for number in range(passes):
-        shift = np.uint64(run_bits + number * width)
+        shift = np.uint64(to_key + number * width)
         places[:] = 0
-        for i in range(len(keys)):
+        for i in range(len(runs)):
             places[(np.uint64(before[i]) >> shift & mask) + np.uint64(1)] += np.uint32(1)
         for digit in range(1, len(places)):
             places[digit] += places[digit - 1]
-        for i in range(len(keys)):
+        for i in range(len(runs)):
             digit = np.uint64(before[i]) >> shift & mask
             place = places[digit]
             places[digit] = place + np.uint32(1)
@@ -111,52 +136,58 @@ def sorted_runs(keys, key_bits, run_bits):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mean_runs(points, runs, ordered, run_bits, means, voxels):
+def mean_runs(points, runs, to_key, means):
     """
     Find the mean of the points in each voxel; return how many voxels there are.
 
-    points    (N, 3) float32 or float64, m
-    runs      (R, 2) int32, of voxel_runs
-    ordered   (R,) int64, of sorted_runs, as is run_bits
-    means     (R, 3) float64, out
-    voxels    (R,) int32, out: voxel of each run
+    points  (N, 3) float32 or float64, m
+    runs    (R,) int64, sorted
+    to_key  bits of rows and lengths
+    means   (R, 3) float64, out
     """
-    flat, flat_runs = points.ravel(), runs.ravel()
-    mask = (np.int64(1) << run_bits) - 1
-    voxel, place = 0, 0
-    while place < len(ordered):
-        key = ordered[place] >> run_bits
-        sx = sy = sz = 0.0
-        count = 0
-        while place < len(ordered) and ordered[place] >> run_bits == key:
-            if place + 2 * AHEAD < len(ordered):
-                prefetch(flat_runs, 2 * (ordered[place + 2 * AHEAD] & mask))
-                prefetch(flat, 3 * np.int64(runs[ordered[place + AHEAD] & mask, 0]))
-            run = ordered[place] & mask
-            begin, end = np.uint32(runs[run, 0]), np.uint32(runs[run, 1])
-            for i in range(begin, end):
-                sx += np.float64(points[i, 0])
-                sy += np.float64(points[i, 1])
-                sz += np.float64(points[i, 2])
-            count += end - begin
-            voxels[run] = voxel
-            place += 1
+    flat = points.ravel()
+    row_mask, length_mask = (np.int64(1) << to_key) - 1, CHUNK - 1
+    voxel, previous = -1, np.int64(-1)
+    sx = sy = sz = count = 0.0
+    for place in range(len(runs)):
+        if place + AHEAD < len(runs):
+            prefetch(flat, 3 * ((runs[place + AHEAD] & row_mask) >> LENGTH_BITS))
+        key = runs[place] >> to_key
+        first = np.uint32((runs[place] & row_mask) >> LENGTH_BITS)
+        length = np.uint32((runs[place] & length_mask) + 1)
+        if key != previous:
+            if voxel >= 0:
+                means[voxel, 0], means[voxel, 1] = sx / count, sy / count
+                means[voxel, 2] = sz / count
+            sx = sy = sz = count = 0.0
+            voxel += 1
+            previous = key
+        for i in range(first, first + length):
+            sx += np.float64(points[i, 0])
+            sy += np.float64(points[i, 1])
+            sz += np.float64(points[i, 2])
+        count += length
+    if voxel >= 0:
         means[voxel, 0], means[voxel, 1], means[voxel, 2] = sx / count, sy / count, sz / count
-        voxel += 1
-    return voxel
+    return voxel + 1
 
 
 @njit(cache=True, nogil=True)
-def give_labels(runs, voxels, labels, found):
+def give_labels(runs, to_key, labels, found):
     """
     Give every point the label of its voxel.
 
-    runs    (R, 2) int32, of voxel_runs
-    voxels  (R,) int32, of mean_runs
+    runs    (R,) int64, sorted
+    to_key  bits of rows and lengths
     labels  (M,) int32, of the voxels
     found   (N,) int32, out in these runs
     """
-    for run in range(len(voxels)):
-        label = labels[voxels[run]]
-        for i in range(runs[run, 0], runs[run, 1]):
-            found[i] = label
+    row_mask, length_mask = (np.int64(1) << to_key) - 1, CHUNK - 1
+    voxel, previous = -1, np.int64(-1)
+    for run in runs:
+        key = run >> to_key
+        voxel += key != previous
+        previous = key
+        first = np.uint32((run & row_mask) >> LENGTH_BITS)
+        for i in range(first, first + np.uint32((run & length_mask) + 1)):
+            found[i] = labels[voxel]

@@ -28,7 +28,9 @@ from surfel_mapper.kernels.voxel_means import (
     finite_ends,
     give_labels,
     mean_runs,
+    row_bits,
     sorted_runs,
+    voxel_keys,
     voxel_runs,
 )
 from surfel_mapper.models.clusters import (
@@ -85,7 +87,7 @@ def fit(
     if view.shape != (3,) or not np.isfinite(view).all():
         raise ModelError(f'viewpoint: {viewpoint!r}, expected three finite numbers')
     laps = [perf_counter()]
-    thinned = thin(np.ascontiguousarray(points.reshape(-1, 3)), config.voxel_size_m)
+    thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
     laps.append(perf_counter())
     clusters = clusters_of(thinned.means, config, view)
     laps.append(perf_counter())
@@ -110,42 +112,41 @@ class Thinned:
     ----------
     means : (M, 3) float64, m
         Means of the points, in the order of the voxels.
-    runs : (R, 2) int32
-        First row of each run of finite points in one voxel, and the one after its last.
-    voxels : (R,) int32
-        Which of the means that of each run is.
+    runs : (R,) int64
+        Which rows of the cloud are in which voxel; see kernels/voxel_means.py.
     num_points : int
         All points, finite or not.
 
     """
 
     means: Array
-    runs: npt.NDArray[np.int32]
-    voxels: npt.NDArray[np.int32]
+    runs: Indices
     num_points: int
 
     def spread(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels for all points from those of the means, -1 where they are not finite."""
         found = np.full(self.num_points, -1, np.int32)
-        give_labels(self.runs, self.voxels, labels, found)
+        give_labels(self.runs, row_bits(self.num_points), labels, found)
         return found
 
 
 def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     """Return the means of the points (N, 3) in each voxel."""
-    ends, runs = np.empty((2, 3)), np.empty((len(points), 2), np.int32)
+    points, ends = np.ascontiguousarray(points), np.empty((2, 3))
     if not finite_ends(points, ends):
-        return Thinned(np.empty((0, 3)), runs[:0], np.empty(0, np.int32), len(points))
+        return Thinned(np.empty((0, 3)), np.empty(0, np.int64), len(points))
     grid = VoxelGrid.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
-    keys = np.empty(len(points), np.int64)
-    num = voxel_runs(points, grid.size, grid.shift, grid.base, grid.bits, keys, runs)
-    keys, runs, key_bits, run_bits = keys[:num], runs[:num], int(grid.bits.sum()), num.bit_length()
-    if key_bits + run_bits > 63:
-        keys, key_bits = np.unique(keys, return_inverse=True)[1], run_bits
-    ordered = sorted_runs(keys, key_bits, run_bits)
-    means, voxels = np.empty((num, 3)), np.empty(num, np.int32)
-    num_voxels = mean_runs(points, runs, ordered, run_bits, means, voxels)
-    return Thinned(means[:num_voxels], runs, voxels, len(points))
+    keys, to_key = np.empty(len(points), np.int64), row_bits(len(points))
+    voxel_keys(points, grid.size, grid.shift, grid.base, grid.bits, keys)
+    key_bits = int(grid.bits.sum())
+    if key_bits + to_key > 63:  # far more voxels than points: number those that hold any
+        held = keys >= 0
+        keys[held] = np.unique(keys[held], return_inverse=True)[1]
+        key_bits = len(points).bit_length()
+    num = voxel_runs(keys, to_key)
+    runs = sorted_runs(keys[:num], key_bits, to_key)
+    means = np.empty((num, 3))
+    return Thinned(means[: mean_runs(points, runs, to_key, means)], runs, len(points))
 
 
 def fitted_patches(
