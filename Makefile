@@ -7,6 +7,7 @@
 
 PYTHON ?= python3
 PYTEST_ARGS ?=
+TEST_PROCESSES ?= 2
 FUZZ_SECONDS ?= 60
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
@@ -30,8 +31,10 @@ DOCS_STAMP := $(VENV)/.docs-$(KIND)
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
 
+# Nodes are tested one after the other in one process, everything else in the other; see
+# test/conftest.py. TEST_PROCESSES=0 runs all in one.
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -q --durations=5 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadgroup --durations=5 $(PYTEST_ARGS)
 
 # Compiled code reads past the end of an array in silence. Compiled anew with checks it cannot;
 # the cache is thrown away, because cached kernels keep the setting they were compiled with.

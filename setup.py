@@ -39,7 +39,7 @@ ROS = [
 ]
 
 FORMATS = [
-    'pyarrow>=14',  # maps as Parquet
+    'pyarrow>=14.0.1',  # maps as Parquet; 14.0.0 runs what a file tells it to, CVE-2023-47248
     'ezdxf>=1.1',  # planes and surfaces as DXF, for CAD
     'python-neo-lzf>=0.3',  # scans in compressed PCD files
 ]
@@ -47,7 +47,7 @@ FORMATS = [
 CLUSTER = [
     'dask>=2024.4',  # bags on many processes and machines
     'distributed>=2024.4',  # likewise: its scheduler and workers
-    'pyarrow>=14',  # the tiles of a map as Parquet
+    'pyarrow>=14.0.1',  # the tiles of a map as Parquet
 ]
 
 VIEWER = [
@@ -61,6 +61,7 @@ TEST = [
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
     'pytest-timeout>=2.2',  # a test that hangs names itself
+    'pytest-xdist>=3.6',  # two processes: those of ROS wait, those of the others calculate
     'hypothesis>=6.98',  # random sequences of adds and removes
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise

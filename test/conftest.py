@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What the tests share: the folder of real data, and hypothesis without chance or clock."""
+"""
+What the tests share.
+
+The folder of real data, hypothesis without chance or clock, and which tests stay together where
+several processes run them.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +18,16 @@ import pytest
 # The same examples in every run; the first call of a kernel compiles it, which no deadline allows.
 settings.register_profile('repeatable', derandomize=True, deadline=None)
 settings.load_profile('repeatable')
+
+HERE = Path(__file__).parent
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Keep together what shares a node, or hears the nodes of others: all of ROS; else a file."""
+    for item in items:
+        path = item.path.relative_to(HERE)
+        group = path.parts[0] if path.parts[0] == 'ros' else path.as_posix()
+        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope='session')
