@@ -143,7 +143,7 @@ def test_imports_only_its_own_folder_and_lower_levels(module):
         ('errors.py', 'numpy'),
         ('mapping/surfel_map.py', 'surfel_mapper.pipeline.Mapper'),
         ('mapping/window.py', 'surfel_mapper.filters.chain'),
-        ('poses.py', 'surfel_mapper.deskew'),
+        ('poses/edge.py', 'surfel_mapper.deskew'),
         ('pipeline.py', 'numba'),
         ('io/ply.py', 'rosbags.highlevel'),
         ('cli/node.py', 'rclpy.node'),

@@ -9,7 +9,7 @@ matrices from the root to each of two frames and solves for what lies between, w
 
 import math
 
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
@@ -363,6 +363,23 @@ def test_what_is_no_rigid_transform_is_refused_and_changes_nothing(add, pose, na
         add(buffer, 'odom', 'base', pose)
 
     assert 'frames seen: none' in not_yet(buffer, 'odom', 'base', EPOCH)
+
+
+@given(st.integers(0, 2**32), st.sampled_from([0.0, 1e-7, 3e-7, 1e-6, 3e-6, 0.1, 1.0]))
+def test_what_counts_as_a_rotation_is_what_numpy_says(seed, skew):
+    rng = np.random.default_rng(seed)
+    pose = some_pose(seed)
+    pose[:3, :3] += skew * rng.uniform(-1.0, 1.0, (3, 3))
+    pose[:3, :3] *= rng.choice([1.0, 1.0, -1.0])
+    R = pose[:3, :3]
+    far = np.abs(R @ R.T - np.eye(3)).max()
+    assume(abs(far - 1e-6) > 1e-12)
+
+    if far < 1e-6 and np.linalg.det(R) > 0.0:
+        TransformBuffer().add('odom', 'base', 1, pose)
+    else:
+        with pytest.raises(PoseError, match='not a rotation'):
+            TransformBuffer().add('odom', 'base', 1, pose)
 
 
 @pytest.mark.parametrize('value', [-1.0, math.nan, math.inf])

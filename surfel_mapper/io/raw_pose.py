@@ -21,18 +21,22 @@ SMALLEST_TRANSFORM_BYTES = 72
 """A transform takes at least this much, so their number can be checked before the loop."""
 
 
-def raw_poses(kind: str, raw: bytes, base: str, topic: str) -> list[StampedPose]:
+def raw_poses(
+    kind: str, raw: bytes | memoryview, base: str, topic: str, *, ros1: bool = False
+) -> list[StampedPose]:
     """
-    Return the poses in a serialised message of ROS 2.
+    Return the poses in a serialised message.
 
     Parameters
     ----------
     kind, base : str
         As ``poses_in`` takes them.
-    raw : bytes
-        The message as CDR, in either byte order.
+    raw : bytes or memoryview
+        The message: CDR in either byte order, or as ROS 1 writes it.
     topic : str
         Named in errors.
+    ros1 : bool
+        Whether ROS 1 wrote it.
 
     Raises
     ------
@@ -41,7 +45,7 @@ def raw_poses(kind: str, raw: bytes, base: str, topic: str) -> list[StampedPose]
 
     """
     try:
-        return list(read_poses(kind, Cursor(raw, ros1=False), base))
+        return list(read_poses(kind, Cursor(raw, ros1=ros1), base))
     except (struct.error, ValueError) as error:
         raise PoseError(
             f'{topic}: {len(raw)} bytes that are no message of {kind}: {error}'

@@ -14,10 +14,10 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from surfel_mapper.errors import BagError, CloudFormatError
+from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.io.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import PoseTopics
 from surfel_mapper.offline.span import Span, WHOLE
 
@@ -223,13 +223,13 @@ def add_camera_info(
 
 
 def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
-    """Decode a message of poses and enter them; a bad one is counted."""
+    """Enter the poses of a message; one that cannot be read is counted."""
+    kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
     try:
-        decoded = reader.decode(message)
-    except BagError as error:
+        poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
+    except PoseError as error:
         mapper.ignore_message('bad_message', f'pose ignored: {error}')
         return
-    kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
-    for pose in poses_in(kind, decoded, base):
+    for pose in poses:
         if topics.path is None or pose.child != base:  # whose pose is in the file
             mapper.add_pose(*pose, static=message.topic in topics.static)

@@ -20,7 +20,8 @@ from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.io.bag import BagMessage, BagReader
 from surfel_mapper.io.bag_topics import CLOUD, ODOMETRY, POSE, TF, Topic
-from surfel_mapper.io.pose_messages import frame_name, poses_in, stamp_ns, StampedPose
+from surfel_mapper.io.pose_messages import frame_name, stamp_ns, StampedPose
+from surfel_mapper.io.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import static_topics
 from surfel_mapper.poses import TransformBuffer
 
@@ -140,7 +141,7 @@ def survey(reader: BagReader, on_message: Callable[[], object] = lambda: None) -
     for message in reader.messages(surveyed_topics(reader)):
         try:
             frames = note_message(found, reader, message)
-        except (BagError, CloudFormatError):
+        except (BagError, CloudFormatError, PoseError):
             found.undecodable += 1
             frames = []
         found.topics[message.topic].add(message.record_ns, frames)
@@ -155,12 +156,13 @@ def surveyed_topics(reader: BagReader) -> list[str]:
 
 def note_message(found: Survey, reader: BagReader, message: BagMessage) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
-    decoded = reader.decode(message)
     if message.type == CLOUD:
+        decoded = reader.decode(message)
         frame = frame_name(decoded.header.frame_id)
         found.stamps.setdefault((message.topic, frame), []).append(stamp_ns(decoded.header))
         return [frame]
-    poses = list(poses_in(SOURCES[message.type], decoded, DEFAULTS.frames.base))
+    kind, base = SOURCES[message.type], DEFAULTS.frames.base
+    poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
     if message.topic in static_topics(reader.topics):
         found.static += poses
     else:

@@ -27,7 +27,7 @@ from surfel_mapper.io.bag import BagReader
 from surfel_mapper.io.bag_topics import CLOUD
 from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.io.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.replay import replay as replay_bag
@@ -109,12 +109,10 @@ def decode(bag: Path, config: Path) -> None:
     """Read them and make scans and poses of them."""
     with BagReader(bag) as reader:
         for message in reader.messages({POINTS, ODOMETRY}):
-            decoded = reader.decode(message)
             if message.type == CLOUD:
-                to_scan(decoded)
+                to_scan(reader.decode(message))
             else:
-                for _ in poses_in('odometry', decoded, 'base_link'):
-                    pass
+                raw_poses('odometry', message.raw, 'base_link', message.topic)
 
 
 def replay(bag: Path, config: Path) -> None:

@@ -12,7 +12,6 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from surfel_mapper import poses
 from surfel_mapper.config import load_config, TsdfConfig
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError, PoseError
 from surfel_mapper.filters.chain import Chain
@@ -23,6 +22,7 @@ from surfel_mapper.io.bag_files import files_of
 from surfel_mapper.io.map_state import load_map, save_map
 from surfel_mapper.io.state import load_state, save_state
 from surfel_mapper.io.tsdf_state import load_tsdf
+from surfel_mapper.poses import buffer as buffer_module
 from test.fuzz import corpus
 from test.io import recorded
 
@@ -210,8 +210,8 @@ def test_a_map_without_a_name_is_refused_as_any_other_place(tmp_path):
 
 
 def test_ever_new_transforms_do_not_fill_the_buffer(monkeypatch):
-    monkeypatch.setattr(poses, 'MAX_EDGES', 3)
-    buffer = poses.TransformBuffer()
+    monkeypatch.setattr(buffer_module, 'MAX_EDGES', 3)
+    buffer = buffer_module.TransformBuffer()
     for number in range(3):
         buffer.add('odom', f'frame{number}', 1, np.eye(4))
     with pytest.raises(PoseError, match='no more are taken'):

@@ -9,7 +9,7 @@ import pytest
 from surfel_mapper.errors import PoseError
 from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.io.raw_pose import raw_poses
-from test.io.recorded import Entries, ROS2
+from test.io.recorded import Entries, ROS1, ROS2
 
 STAMP_NS = 1_700_000_000_123_456_789
 XYZ = (1.5, -2.25, 0.125)
@@ -40,6 +40,22 @@ def test_bytes_give_the_poses_of_the_message(values, little_endian):
         raw = bytes(ROS2.serialize_cdr(message, name, little_endian=little_endian))
         expected = list(poses_in(kind, message, 'base_link'))
         assert raw_poses(kind, raw, 'base_link', '/topic') == expected
+
+
+@pytest.mark.parametrize('parent', ['odom', '/a', 'lidar_front'])
+def test_bytes_of_ros1_give_the_poses_of_the_message(parent):
+    entries = Entries(ROS1)
+    for frame in (parent, 'b'):
+        entries.transform('/tf', STAMP_NS, frame, 'base_link', XYZ)
+    entries[0][3].transforms.extend(entries.pop()[3].transforms)
+    entries.odometry('/odom', STAMP_NS, XYZ)
+    entries[-1][3].header.frame_id = parent
+    entries.pose_stamped('/pose', STAMP_NS, XYZ)
+
+    for kind, (_, name, _, message) in zip(('tf', 'odometry', 'pose'), entries, strict=True):
+        raw = memoryview(bytes(ROS1.serialize_ros1(message, name)))
+        expected = list(poses_in(kind, message, 'base_link'))
+        assert raw_poses(kind, raw, 'base_link', '/topic', ros1=True) == expected
 
 
 def serialised(kind):

@@ -18,68 +18,19 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 import math
 
 import numpy as np
-import numpy.typing as npt
 
 from surfel_mapper.errors import PoseError, PoseNotYetError
-from surfel_mapper.geometry import compose, interpolate, inverse, Transform
-
-NS_PER_S = 1_000_000_000
-
-MAX_SKEW = 1e-6
-"""R R^T of a transform differs from the identity by no more; float32 gives some 1e-7."""
+from surfel_mapper.geometry import compose, inverse, Transform
+from surfel_mapper.poses.edge import Edge, NS_PER_S, rigid, seconds
 
 MAX_EDGES = 10_000
 """Trees of robots have some hundred; ever new names shall fill no memory."""
 
 MAX_NAMES = 12
 """So many frames are named in a message."""
-
-
-@dataclass(slots=True, eq=False)
-class _Edge:
-    """The transforms of one child frame in its parent, by ascending stamp; one where static."""
-
-    parent: str
-    child: str
-    is_static: bool
-    stamps: list[int] = field(default_factory=list)
-    transforms: list[Transform] = field(default_factory=list)
-
-    def __str__(self) -> str:
-        if self.is_static:
-            return f'{self.parent} -> {self.child} (static)'
-        oldest, newest = _seconds(self.stamps[0]), _seconds(self.stamps[-1])
-        return f'{self.parent} -> {self.child} (held from {oldest} to {newest} s)'
-
-    def insert(self, stamp_ns: int, T_parent_child: Transform) -> None:
-        """Put a transform where its stamp belongs, in the place of one of the same stamp."""
-        row = bisect_left(self.stamps, stamp_ns)
-        if row < len(self.stamps) and self.stamps[row] == stamp_ns:
-            self.transforms[row] = T_parent_child
-        else:
-            self.stamps.insert(row, stamp_ns)
-            self.transforms.insert(row, T_parent_child)
-
-    def forget_before(self, stamp_ns: int) -> None:
-        """Drop the transforms older than a stamp."""
-        row = bisect_left(self.stamps, stamp_ns)
-        del self.stamps[:row], self.transforms[:row]
-
-    def at(self, stamp_ns: int) -> Transform:
-        """Return the transform at a stamp within those held."""
-        if self.is_static:
-            return self.transforms[0]
-        row = bisect_left(self.stamps, stamp_ns)
-        newer = self.stamps[row]
-        if newer == stamp_ns:
-            return self.transforms[row]
-        older = self.stamps[row - 1]
-        alpha = (stamp_ns - older) / (newer - older)
-        return interpolate(self.transforms[row - 1], self.transforms[row], alpha)
 
 
 class TransformBuffer:
@@ -108,7 +59,7 @@ class TransformBuffer:
                 raise ValueError(f'{name}: {value}, expected zero or more seconds, finite')
         self._history_ns = round(history_s * NS_PER_S)
         self._reset_after_ns = round(reset_after_s * NS_PER_S)
-        self._edges: dict[str, _Edge] = {}
+        self._edges: dict[str, Edge] = {}
 
     @property
     def newest_ns(self) -> int | None:
@@ -137,8 +88,10 @@ class TransformBuffer:
             is unchanged then.
 
         """
-        edge = self._edge(parent, child, is_static=False)
-        transform = _rigid(parent, child, T_parent_child)
+        edge = self._edges.get(child)
+        if edge is None or edge.is_static or edge.parent != parent:
+            edge = self._edge(parent, child, is_static=False)
+        transform = rigid(parent, child, T_parent_child)
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
             edge.stamps.clear()
             edge.transforms.clear()
@@ -149,7 +102,7 @@ class TransformBuffer:
     def add_static(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Set the transform of an edge for all time, in the place of an earlier one; see add."""
         edge = self._edge(parent, child, is_static=True)
-        edge.transforms = [_rigid(parent, child, T_parent_child)]
+        edge.transforms = [rigid(parent, child, T_parent_child)]
         self._edges[child] = edge
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
@@ -173,7 +126,7 @@ class TransformBuffer:
             If the stamp is before the oldest transform held of an edge between them.
 
         """
-        asked = f'{target} <- {source} at {_seconds(stamp_ns)} s'
+        asked = f'{target} <- {source} at {seconds(stamp_ns)} s'
         up, down = list(self._edges_above(source)), list(self._edges_above(target))
         # Both lists end at the root; what they share at the end cancels.
         while up and down and up[-1] is down[-1]:
@@ -224,7 +177,7 @@ class TransformBuffer:
         """Forget the dynamic edges; static ones stay."""
         self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}
 
-    def _edge(self, parent: str, child: str, *, is_static: bool) -> _Edge:
+    def _edge(self, parent: str, child: str, *, is_static: bool) -> Edge:
         """Return the edge of a child, a new one if there is none; refuse what is no tree."""
         name = f'transform {parent!r} -> {child!r}'
         if not parent or not child:
@@ -240,7 +193,7 @@ class TransformBuffer:
                 raise PoseError(f'{name}: closes the loop {loop}')
             if len(self._edges) >= MAX_EDGES:
                 raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
-            return _Edge(parent, child, is_static)
+            return Edge(parent, child, is_static)
         if edge.parent != parent:
             raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')
         if edge.is_static != is_static:
@@ -248,7 +201,7 @@ class TransformBuffer:
             raise PoseError(f'{name}: known as {found}, a {came} transform came')
         return edge
 
-    def _edges_above(self, frame: str) -> Iterator[_Edge]:
+    def _edges_above(self, frame: str) -> Iterator[Edge]:
         """Yield the edges from a frame up to the root of its tree."""
         edge = self._edges.get(frame)
         while edge is not None:
@@ -265,7 +218,7 @@ class TransformBuffer:
         return f'no transforms lead from one to the other yet; frames seen: {names}'
 
 
-def _check_held(asked: str, edges: list[_Edge], stamp_ns: int) -> None:
+def _check_held(asked: str, edges: list[Edge], stamp_ns: int) -> None:
     """Raise if a dynamic edge does not reach to a stamp; too old weighs more than too new."""
     dynamic = [edge for edge in edges if not edge.is_static]
     for edge in dynamic:
@@ -281,37 +234,10 @@ def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:
     return stamps[bisect_left(stamps, start_ns) : bisect_right(stamps, end_ns)]
 
 
-def _chained(edges: list[_Edge], stamp_ns: int) -> Transform | None:
+def _chained(edges: list[Edge], stamp_ns: int) -> Transform | None:
     """Return the product of edges that lead upwards, from the lowest on; None without any."""
     product: Transform | None = None
     for edge in edges:
         T_parent_child = edge.at(stamp_ns)
         product = T_parent_child if product is None else compose(T_parent_child, product)
     return product
-
-
-def _rigid(parent: str, child: str, T_parent_child: Transform) -> Transform:
-    """Return a copy of a transform, or raise PoseError if it is not rigid."""
-    transform = np.array(T_parent_child, dtype=np.float64)
-    name = f'transform {parent!r} -> {child!r}'
-    if transform.shape != (4, 4):
-        raise PoseError(f'{name}: shape {transform.shape}, expected (4, 4)')
-    if not np.isfinite(transform).all():
-        raise PoseError(f'{name}: not finite, {transform[:3].tolist()}')
-    if not _is_rotation(transform[:3, :3]) or transform[3].tolist() != [0, 0, 0, 1]:
-        raise PoseError(f'{name}: not a rotation and a translation, {transform.tolist()}')
-    return transform
-
-
-def _is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
-    """Return whether a finite (3, 3) matrix is orthogonal but for rounding, and no mirror."""
-    if np.abs(matrix).max() > 2.0:
-        return False  # and its square may overflow
-    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(skew <= MAX_SKEW and np.linalg.det(matrix) > 0.0)
-
-
-def _seconds(stamp_ns: int) -> str:
-    """Return a stamp in seconds with all its digits."""
-    whole, rest = divmod(abs(stamp_ns), NS_PER_S)
-    return f'{"-" if stamp_ns < 0 else ""}{whole}.{rest:09d}'

@@ -1,0 +1,7 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The tree of coordinate frames over time."""
+
+from surfel_mapper.poses.buffer import TransformBuffer
+
+__all__ = ['TransformBuffer']
