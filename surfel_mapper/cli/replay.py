@@ -105,7 +105,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
     add(
         '--formats', type=formats, metavar='LIST',
-        help=f'of the map, with a comma between each: {", ".join(FORMATS)} (ply); dxf: of the models',
+        help=f'of the map (dxf: of its models), with a comma between: {", ".join(FORMATS)} (ply)',
     )  # fmt: skip
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
@@ -176,6 +176,8 @@ def map_one(args: argparse.Namespace, config: Config, request: Request, output: 
         replay_s = time.perf_counter() - start
         refuse_empty(recording, mapper, was_stopped)
         aligned = {'alignment': mapper.align().summary()} if args.align else {}
+        if mapper.models is not None:
+            mapper.models.update()  # they follow at a period of their own, and no alignment
         mapped.poses = poses_now(mapper, mapped.stamps_ns, mapped.poses)
         if bag:
             bag.finish()

@@ -16,21 +16,27 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from surfel_mapper.models.live import LiveModels
     from surfel_mapper.pipeline import Mapper, Update
     from surfel_mapper.viz.history import History
 
 BAG = 'bag'
 """Written while mapping, and so not here: a bag of normals in the directory ``normals``."""
 
+DXF = 'dxf'
+"""Of planes and surfaces, where ``layers.models.enabled``."""
+
 FORMATS = {
     'ply': 'map.ply',
     'pcd': 'map.pcd',
     'parquet': 'map.parquet',
     'npz': 'map.npz',
+    DXF: 'models.dxf',
     BAG: 'normals',
 }
 """What the map is written as, and where: npz and parquet are exact, to be loaded again."""
 
+MODELS_PICTURE = 'models.png'
 
 SAME_TIME_NS = 10_000_000
 """Poses of a scan and of the truth at most so far apart are of one time."""
@@ -78,17 +84,26 @@ def write_files(
     """Write the map in some formats, picture, report and summary; return what is there."""
     from surfel_mapper.io.files import replace_file
     from surfel_mapper.io.ply import write_mesh
+    from surfel_mapper.models.shapes import Shapes
+    from surfel_mapper.viz.models import page_mesh
+    from surfel_mapper.viz.models_section import models_section
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper)
-    mesh = None
+    layers, sections = {}, []
     if mapper.tsdf is not None:
         mapper.tsdf.finish(mapper.window)
-        mesh = mapper.tsdf.mesh()
-        write_mesh(output / 'mesh.ply', mesh)
+        layers['mesh'] = mapper.tsdf.mesh()
+        write_mesh(output / 'mesh.ply', layers['mesh'])
+    if mapper.models is not None:
+        write_live_models(output, formats, mapper.models)
+        model = mapper.models.model
+        shapes = Shapes().of(model, mapper.models.versions)
+        layers['models'] = page_mesh(shapes, model.gaussians)
+        sections.append(models_section(model, shapes, output / MODELS_PICTURE))
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (
@@ -97,7 +112,7 @@ def write_files(
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
     draw_map(surfels, picture, title, trajectory=mapped.positions)
-    write_report(page, title, summary, surfels, history, picture, mesh)
+    write_report(page, title, summary, surfels, history, picture, layers, sections)
     with replace_file(figures) as file:
         file.write((json.dumps(summary, indent=2) + '\n').encode())
     return [*(output / FORMATS[name] for name in formats), picture, page, figures]
@@ -116,6 +131,20 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
         parquet.write_map(path, mapper.map)
     elif name == 'npz':
         map_state.save_map(path, mapper.map, mapper.window)
+
+
+def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) -> None:
+    """Write models as JSON and OBJ, in what other formats are asked for, and their picture."""
+    from surfel_mapper.io.model_files import write_models
+    from surfel_mapper.models.surfel_points import above, surfel_points
+    from surfel_mapper.viz.models import draw_models
+
+    wanted = ['json', 'obj', *(name for name in ('parquet', DXF) if name in formats)]
+    write_models(output, models.model, wanted, models.versions)
+    surfels = models.surfels
+    points = surfel_points(surfels, models.model.voxel_size_m)
+    title = f'{len(surfels)} voxels'
+    draw_models(output / MODELS_PICTURE, points, models.model, above(surfels), title)
 
 
 def check_truth(truth: Path) -> None:

@@ -74,7 +74,7 @@ def primitive_columns(
 def patch_row(shape: PatchShape) -> list[float]:
     """Return the columns FLOATS of a patch."""
     patch = shape.patch
-    turn = Rotation.from_matrix(patch.R_patch_map.T).as_quat()
+    (turn,) = quaternions(patch.R_patch_map.T[None])
     plane = (*patch.normal, patch.offset_m)
     return [*shape.middle, *plane, *turn, *(shape.high - shape.low), shape.area_m2, patch.rms_m]
 
@@ -84,10 +84,17 @@ def gaussian_rows(gaussians: Gaussians) -> npt.NDArray[np.float64]:
     rows = np.full((len(gaussians), len(FLOATS)), np.nan)
     R_map_axes, half = ellipsoid_frames(gaussians)
     rows[:, :3] = gaussians.mean
-    if len(gaussians):  # scipy refuses to turn nothing into nothing
-        rows[:, 7:11] = Rotation.from_matrix(R_map_axes).as_quat()
+    rows[:, 7:11] = quaternions(R_map_axes)
     rows[:, 11:14] = 2.0 * half
     return rows
+
+
+def quaternions(R: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return rotations (K, 3, 3) as quaternions xyzw (K, 4)."""
+    if not len(R):  # older scipys refuse none
+        return np.empty((0, 4))
+    found: npt.NDArray[np.float64] = Rotation.from_matrix(R).as_quat()
+    return found
 
 
 def surfel_primitive_columns(surfels: Surfels, model: MultiModel) -> Columns:

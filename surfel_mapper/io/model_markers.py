@@ -30,7 +30,7 @@ from surfel_mapper.io.cdr import (
     TRIANGLE_LIST,
 )
 from surfel_mapper.io.mesh_marker import shade
-from surfel_mapper.models.shapes import ellipsoids
+from surfel_mapper.models.shapes import ellipsoid_corners, FACES
 
 if TYPE_CHECKING:
     from surfel_mapper.models.multi_model import Gaussians
@@ -92,7 +92,8 @@ def model_markers(
     for shape in shapes:
         markers += patch_markers(shape, voxel_size_m, partial(make, action=ADD))
     if len(gaussians):
-        drawn = ellipsoids(most_points(gaussians, MAX_GAUSSIANS)).reshape(-1, 3, 3)
+        corners = ellipsoid_corners(most_points(gaussians, MAX_GAUSSIANS))
+        drawn = corners[:, FACES].reshape(-1, 3, 3)
         markers.append(
             make(
                 ns='gaussians', id=0, type=TRIANGLE_LIST, action=ADD,

@@ -3,8 +3,8 @@
 """
 Outlines and triangles of patches, for those who draw or measure them.
 
-Both come from the same mask of what is covered, cells cut into smaller squares: its rim, with the
-steps taken off, and two triangles for every square.
+Both come from masks of what is covered, cells cut into smaller squares: the rim of one, with the
+steps taken off, and two triangles for every square of the other.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from surfel_mapper.models.multi_model import Plane
 Array = npt.NDArray[np.float64]
 
 PARTS = 4
-"""A cell is cut into so many squares along either side."""
+"""A cell is cut into so many squares along either side for its outline."""
+
+PARTS_OF_SURFACE = 2
+"""And so many for its triangles: a spline bends little within half a cell."""
 
 TOLERANCE = 0.75
 """An outline is this near to the rim of the mask, in squares."""
@@ -45,8 +48,8 @@ def local_outline(patch: Plane) -> list[Array]:
 
 def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
     """Return vertices (V, 3) m and triangles (T, 3) of a patch, facing along its normal."""
-    side_m = patch.grid.pitch_m / PARTS
-    squares = np.argwhere(patch.grid.mask(PARTS))
+    side_m = patch.grid.pitch_m / PARTS_OF_SURFACE
+    squares = np.argwhere(patch.grid.mask(PARTS_OF_SURFACE))
     steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
     corners = (squares[:, None] + steps).reshape(-1, 2)
     places, number = np.unique(corners, axis=0, return_inverse=True)

@@ -149,9 +149,8 @@ def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
     return R_map_axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))
 
 
-def ellipsoids(gaussians: Gaussians) -> Array:
-    """Return triangles (G, 20, 3, 3), m, whose corners lie on the ellipsoids of Gaussians."""
+def ellipsoid_corners(gaussians: Gaussians) -> Array:
+    """Return places (G, 12, 3) on the ellipsoids of Gaussians, m: the corners of FACES."""
     R_map_axes, half = ellipsoid_frames(gaussians)
-    corners = CORNERS * half[:, None] @ np.swapaxes(R_map_axes, 1, 2) + gaussians.mean[:, None]
-    found: Array = corners[:, FACES]
-    return found
+    corners: Array = CORNERS * half[:, None] @ np.swapaxes(R_map_axes, 1, 2)
+    return corners + gaussians.mean[:, None]

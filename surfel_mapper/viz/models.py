@@ -1,15 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-models.png: a cloud, and beside it what the models that stand for it make of it.
+Models in pictures: models.png, and the triangles of the 3D views.
 
-Both are seen from where the sensor was, without perspective, painted from far to near. Every
-plane and surface has a colour of its own; what is drawn from Gaussians is grey.
+models.png has a cloud, and beside it what the models that stand for it make of it. Both are seen
+from where the sensor was, without perspective, painted from far to near. Every plane and surface
+has a colour of its own; Gaussians are grey.
 """
 
 from __future__ import annotations
 
-import colorsys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +19,29 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.io.files import replace_file
-from surfel_mapper.models.multi_model import MultiModel
+from surfel_mapper.io.model_markers import GREY, most_points, primitive_colors
+from surfel_mapper.models.multi_model import Gaussians, MultiModel
+from surfel_mapper.models.shapes import CORNERS, ellipsoid_corners, FACES, PatchShape
+from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+from surfel_mapper.viz.mesh import MAX_TRIANGLES
 
 Array = npt.NDArray[np.float64]
 
-GREY = (0.62, 0.62, 0.62)
-GOLDEN = 0.618033988749895
-"""Hues this far apart never come close to one another again soon."""
-
 MOST_POINTS = 120_000
 """Of a larger cloud only every so many point is drawn."""
+
+MOST_OF_GAUSSIAN = 50
+"""So many points of each Gaussian are drawn at most: a voxel of a map may have thousands."""
 
 WIDTH_INCH, HEIGHT_INCH, DPI = 13.0, 6.0, 120
 
 
 def draw_models(
-    path: str | Path, points: npt.NDArray[Any], model: MultiModel, viewpoint: Array
+    path: str | Path,
+    points: npt.NDArray[Any],
+    model: MultiModel,
+    viewpoint: Array,
+    title: str = '',
 ) -> None:
     """
     Draw a cloud and its models as a PNG file, written whole or not at all.
@@ -47,6 +56,8 @@ def draw_models(
         Its models.
     viewpoint : (3,) float64, m
         Where they are seen from.
+    title : str
+        Of the cloud; without it, how many points it has.
 
     Raises
     ------
@@ -60,17 +71,17 @@ def draw_models(
     cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
     cloud = cloud[:: max(len(cloud) // MOST_POINTS, 1)]
     parts = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
-    colors = [colorsys.hsv_to_rgb(k * GOLDEN % 1.0, 0.75, 0.9) for k in range(len(parts))]
-    parts.append(model.gaussians.samples())
-    colors.append(GREY)
+    colors = np.concatenate([primitive_colors([p.id for p in model.patches]), [GREY]])
+    few = np.minimum(model.gaussians.num_points, MOST_OF_GAUSSIAN)
+    parts.append(replace(model.gaussians, num_points=few).samples())
     made = np.concatenate(parts)
-    painted = np.repeat(np.array(colors), [len(part) for part in parts], axis=0)
+    painted = np.repeat(colors, [len(part) for part in parts], axis=0)
     R = view_axes(cloud, viewpoint)
     figure = Figure(figsize=(WIDTH_INCH, HEIGHT_INCH), dpi=DPI, layout='constrained')
     FigureCanvasAgg(figure)
     axes = figure.subplots(1, 2, sharex=True, sharey=True)
     titles = (
-        f'{len(points)} points',
+        title or f'{len(points)} points',
         f'{len(model.planes)} planes, {len(model.surfaces)} surfaces, '
         f'{len(model.gaussians)} Gaussians: {model.size_bytes} bytes',
     )
@@ -85,6 +96,37 @@ def draw_models(
         ax.set_axis_off()
     with replace_file(path) as file:
         figure.savefig(file, format='png')
+
+
+def models_mesh(shapes: Sequence[PatchShape], gaussians: Gaussians | None = None) -> Mesh:
+    """Return planes and surfaces, and ellipsoids of Gaussians, as one mesh in their colours."""
+    vertices, faces = [shape.vertices for shape in shapes], [shape.faces for shape in shapes]
+    colors = [*primitive_colors([shape.patch.id for shape in shapes])]
+    if gaussians is not None:
+        begins = len(CORNERS) * np.arange(len(gaussians))
+        vertices.append(ellipsoid_corners(gaussians).reshape(-1, 3))
+        faces.append((FACES + begins[:, None, None]).reshape(-1, 3))
+        colors.append(np.array(GREY))
+    if not vertices:
+        return EMPTY
+    begins = np.cumsum([0, *map(len, vertices)])[:-1]
+    moved = [part + begin for part, begin in zip(faces, begins, strict=True)]
+    painted = np.repeat(np.array(colors), [len(part) for part in vertices], axis=0)
+    return Mesh(
+        vertices=np.concatenate(vertices),
+        triangles=np.concatenate(moved).astype(np.int32),
+        colors=np.rint(255.0 * painted).astype(np.uint8),
+    )
+
+
+def page_mesh(shapes: Sequence[PatchShape], gaussians: Gaussians) -> Mesh:
+    """
+    Return the mesh of models for a page: as many Gaussians, those of most points, as fit beside.
+
+    A mesh of more triangles would be made smaller by merging vertices, which mixes colours.
+    """
+    room = max(MAX_TRIANGLES - sum(len(shape.faces) for shape in shapes), 0)
+    return models_mesh(shapes, most_points(gaussians, room // len(FACES)))
 
 
 def shaded(depth: Array) -> Array:

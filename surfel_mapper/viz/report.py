@@ -9,7 +9,7 @@ else. Names in bags are anyone's: all text is escaped.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 import json
@@ -39,7 +39,8 @@ def write_report(
     surfels: Surfels,
     history: History | None = None,
     picture: str | Path | None = None,
-    mesh: Mesh | None = None,
+    layers: Mapping[str, Mesh] | None = None,
+    sections: Sequence[str] = (),
 ) -> None:
     """
     Write a report, whole or not at all.
@@ -59,8 +60,11 @@ def write_report(
         What happened scan by scan; without it there are no plots over time.
     picture : str or Path, optional
         A PNG file, for browsers that cannot draw in 3D.
-    mesh : Mesh, optional
-        The surface of the TSDF, to be shown in the place of the surfels.
+    layers : mapping of str to Mesh, optional
+        What can be shown in the place of the surfels, by its name: ``mesh``, that of the TSDF,
+        and ``models``.
+    sections : sequence of str
+        What else is said, as HTML, below the map.
 
     Raises
     ------
@@ -73,7 +77,8 @@ def write_report(
     parts = [
         f'<h1>{escape(title)}</h1><p class="about">{escape(about(summary))}</p>',
         figures(summary, history),
-        turning_view(valid, history.trajectory, summary, picture, mesh),
+        turning_view(valid, history.trajectory, summary, picture, layers or {}),
+        *sections,
         plots(valid, summary, history),
         pose_errors_table(summary.get('pose_errors')),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',

@@ -4,7 +4,7 @@
 The map to turn around in report.html: its data, and the elements that page/view.js draws into.
 
 Data for the script is JSON in which no tag can begin. A surfel takes 12 bytes, 1.6 MB of text for
-the 100,000 shown at most; the mesh of the TSDF takes up to 4 MB more.
+the 100,000 shown at most; the mesh of the TSDF and the models take up to 4 MB more each.
 """
 
 from __future__ import annotations
@@ -39,9 +39,10 @@ def turning_view(
     trajectory: Array,
     summary: Mapping[str, Any],
     picture: str | Path | None,
-    mesh: Mesh | None,
+    layers: Mapping[str, Mesh],
 ) -> str:
-    """Return the 3D view with its data."""
+    """Return the 3D view with its data; layers can be shown in the place of the surfels."""
+    layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
     note = 'Drag to turn, with shift to move, wheel to zoom.'
     mixed = np.random.default_rng(0).permutation(len(shown))  # while it turns, the first are drawn
@@ -49,12 +50,13 @@ def turning_view(
     if len(mixed) > MAX_SHOWN:
         note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
     choice = ''
-    if mesh is not None and len(mesh):
-        kinds = '<option>surfels</option><option>mesh</option>'
+    if layers:
+        kinds = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
         choice = f'<label>show <select id="shown">{kinds}</select></label>'
+    for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES:
-            note += f' The mesh of {len(mesh):,} triangles is made smaller.'
-    data = json.dumps(view_data(shown, trajectory, mesh)).replace('<', '\\u003c')
+            note += f' {len(mesh):,} triangles of the {name} are made fewer.'
+    data = json.dumps(view_data(shown, trajectory, layers)).replace('<', '\\u003c')
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
@@ -82,16 +84,16 @@ def within_sight(surfels: Surfels) -> Surfels:
 
 
 def view_data(
-    surfels: Surfels, trajectory: Array, mesh: Mesh | None = None
+    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]
 ) -> dict[str, Any]:
     """Return what page/view.js needs: everything about the middle of the map, in metres."""
     from matplotlib import colormaps
 
     low, high = np.zeros(3), np.ones(3)
-    if not len(surfels) and mesh is not None and len(mesh):
-        low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
-    if len(surfels):
-        low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
+    places = [surfels.position] if len(surfels) else [mesh.vertices for mesh in layers.values()]
+    if places:
+        seen = np.concatenate(places)
+        low, high = seen.min(axis=0), seen.max(axis=0)
     size = np.maximum(high - low, 1e-3)
     radius = 0.5 * SPREAD * sides_m(surfels)
     largest = float(radius.max(initial=1e-3))
@@ -108,7 +110,7 @@ def view_data(
         'ramp': encoded(ramp.astype(np.uint8)),
         'size': [float(side) for side in size],
         'largest': largest,
-        **({'mesh': mesh_data(mesh, low, size)} if mesh is not None and len(mesh) else {}),
+        'layers': [mesh_data(mesh, low, size) for mesh in layers.values()],
         'heights': [f'{low[2]:.3g} m', f'{high[2]:.3g} m'],
     }
 

@@ -17,12 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.io.model_cloud import quaternions
+from surfel_mapper.io.model_markers import GREY, primitive_colors
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.shapes import ellipsoid_frames, Shapes
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.mesh import vertex_normals
+from surfel_mapper.viz.models import models_mesh
 from surfel_mapper.viz.picture import sides_m, SPREAD
 
 if TYPE_CHECKING:
+    from surfel_mapper.models.live import LiveModels
     from surfel_mapper.pipeline import Mapper, Update
 
 NEW = 0.25
@@ -60,6 +65,7 @@ class Viewer:
         """Open the file or the window."""
         self._mapper = mapper
         self._rerun = import_rerun()
+        self._shapes = Shapes()
         self._positions: list[npt.NDArray[np.float64]] = []
         self._logged_voxels = self._removed = 0
         self._stream: Any = self._rerun.RecordingStream('surfel_mapper')
@@ -110,18 +116,44 @@ class Viewer:
         return np.array([*self._positions[::step], self._positions[-1]])
 
     def _log_map(self) -> None:
-        """Log all surfels, and the mesh of the TSDF where there is one."""
+        """Log all surfels, and the layers that there are."""
         mapper = self._mapper
         self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
         self._logged_voxels, self._removed = mapper.map.num_voxels, 0
         if mapper.tsdf is not None:
-            self._log_mesh(mapper.tsdf.mesh())
+            self._log_mesh('map/mesh', mapper.tsdf.mesh())
+        if mapper.models is not None:
+            self._log_models(mapper.models)
 
-    def _log_mesh(self, mesh: Mesh) -> None:
-        """Log the surface of the TSDF, in its colours where it has any."""
+    def _log_models(self, models: LiveModels) -> None:
+        """Log planes and surfaces, their outlines with their ids, and Gaussians as ellipsoids."""
+        rerun, gaussians = self._rerun, models.model.gaussians
+        shapes = self._shapes.of(models.model, models.versions)
+        self._stream.log('map/models', rerun.Clear(recursive=True))
+        self._log_mesh('map/models/patches', models_mesh(shapes))
+        rings = [(shape.patch.id, ring) for shape in shapes for ring in shape.rings]
+        outlines = rerun.LineStrips3D(
+            [np.concatenate([ring, ring[:1]]) for _, ring in rings],
+            colors=primitive_colors([number for number, _ in rings]),
+            labels=[str(number) for number, _ in rings],
+            show_labels=False,
+        )
+        self._stream.log('map/models/outlines', outlines)
+        R_map_axes, half = ellipsoid_frames(gaussians)
+        ellipsoids = rerun.Ellipsoids3D(
+            centers=gaussians.mean,
+            half_sizes=half,
+            quaternions=quaternions(R_map_axes),
+            colors=[GREY] * len(gaussians),
+            fill_mode='solid',
+        )
+        self._stream.log('map/models/gaussians', ellipsoids)
+
+    def _log_mesh(self, name: str, mesh: Mesh) -> None:
+        """Log a mesh, in its colours where it has any."""
         if len(mesh):
             self._stream.log(
-                'map/mesh',
+                name,
                 self._rerun.Mesh3D(
                     vertex_positions=mesh.vertices.astype(np.float32),
                     triangle_indices=mesh.triangles.astype(np.uint32),

@@ -12,8 +12,8 @@ from surfel_mapper.models import fit
 from surfel_mapper.models.multi_model import Gaussians
 from surfel_mapper.models.shapes import (
     CORNERS,
+    ellipsoid_corners,
     ellipsoid_frames,
-    ellipsoids,
     FACES,
     shape_of,
     Shapes,
@@ -116,10 +116,10 @@ def test_corners_of_an_ellipsoid_are_two_sigma_from_its_mean():
     rng = np.random.default_rng(6)
     factor = rng.normal(size=(4, 3, 3))
     found = gaussians(*(factor @ np.swapaxes(factor, 1, 2)))
-    corners = ellipsoids(found).reshape(4, 60, 3) - found.mean[:, None]
+    corners = ellipsoid_corners(found) - found.mean[:, None]
     for covariance, offsets in zip(found.covariance, corners, strict=True):
         mahalanobis = np.einsum('ni,ij,nj->n', offsets, np.linalg.inv(covariance), offsets)
-        assert np.sqrt(mahalanobis) == pytest.approx(np.full(60, SIGMAS))
+        assert np.sqrt(mahalanobis) == pytest.approx(np.full(12, SIGMAS))
 
 
 def test_axes_of_an_ellipsoid_are_those_of_its_covariance():
@@ -131,10 +131,10 @@ def test_axes_of_an_ellipsoid_are_those_of_its_covariance():
 
 
 def test_gaussians_without_extent_and_none_at_all_have_ellipsoids_too():
-    found = ellipsoids(gaussians(np.zeros((3, 3)), np.diag([0.0, 0.0, 4.0])))
-    assert np.array_equal(found[0], np.tile([0.0, 1.0, 2.0], (20, 3, 1)))
+    found = ellipsoid_corners(gaussians(np.zeros((3, 3)), np.diag([0.0, 0.0, 4.0])))
+    assert np.array_equal(found[0], np.tile([0.0, 1.0, 2.0], (12, 1)))
     # the corners of the icosahedron nearest to an axis are 0.851 of it away from the middle
     along = found[1] - [3.0, 4.0, 5.0]
     assert np.abs(along[..., :2]).max() == 0.0
     assert 0.85 * 2 * SIGMAS < np.abs(along[..., 2]).max() <= 2 * SIGMAS
-    assert ellipsoids(gaussians()).shape == (0, 20, 3, 3)
+    assert ellipsoid_corners(gaussians()).shape == (0, 12, 3)

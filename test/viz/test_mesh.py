@@ -66,7 +66,8 @@ def test_a_reduced_mesh_keeps_shape_and_colours(most):
 def page(tmp_path, mesh):
     mapper, history = mapped(3)
     path = tmp_path / 'report.html'
-    write_report(path, 'street', mapper.summary(), plane(20), history, mesh=mesh)
+    layers = {} if mesh is None else {'mesh': mesh}
+    write_report(path, 'street', mapper.summary(), plane(20), history, layers=layers)
     text = path.read_text(encoding='utf-8')
     parsed = Parsed(text)
     return len(text), parsed, json.loads(parsed.one('script', id='map'))
@@ -77,9 +78,10 @@ def test_the_page_holds_the_mesh_where_it_is(tmp_path):
     size, _, data = page(tmp_path, mesh)
     surfels = plane(20)
     low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
-    rows = np.frombuffer(base64.b64decode(data['mesh']['vertices']), VERTEX)
-    triangles = np.frombuffer(base64.b64decode(data['mesh']['triangles']), '<u4').reshape(-1, 3)
-    reach = np.array(data['mesh']['reach'])
+    (layer,) = data['layers']
+    rows = np.frombuffer(base64.b64decode(layer['vertices']), VERTEX)
+    triangles = np.frombuffer(base64.b64decode(layer['triangles']), '<u4').reshape(-1, 3)
+    reach = np.array(layer['reach'])
     places = 0.5 * (low + high) + (2.0 * rows['place'] / 65535.0 - 1.0) * reach
     assert triangles.max() == len(rows) - 1
     distance = np.linalg.norm(places - [5.0, 5.0, 5.1], axis=1)
@@ -90,12 +92,12 @@ def test_the_page_holds_the_mesh_where_it_is(tmp_path):
 def test_a_large_mesh_makes_no_large_page(tmp_path):
     size, parsed, data = page(tmp_path, sphere(300, 20.0, (5.0, 5.0, 5.0)))
     assert size < 8_000_000
-    assert len(base64.b64decode(data['mesh']['triangles'])) <= 12 * MAX_TRIANGLES
+    assert len(base64.b64decode(data['layers'][0]['triangles'])) <= 12 * MAX_TRIANGLES
     assert 'shown' in [attributes.get('id') for _, attributes in parsed.tags]
 
 
 def test_without_a_mesh_there_is_nothing_to_choose(tmp_path):
     for mesh in (None, EMPTY):
         _, parsed, data = page(tmp_path, mesh)
-        assert 'mesh' not in data
+        assert data['layers'] == []
         assert 'shown' not in [attributes.get('id') for _, attributes in parsed.tags]

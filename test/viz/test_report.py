@@ -44,11 +44,12 @@ class Parsed(HTMLParser):
         return found
 
 
-def report(tmp_path, drawn=None, title='street', mesh=None, **summary):
+def report(tmp_path, drawn=None, title='street', layers=None, sections=(), **summary):
     mapper, history = mapped(3)
     surfels = mapper.map.surfels(2) if drawn is None else drawn
     path = tmp_path / 'report.html'
-    write_report(path, title, {**mapper.summary(), **summary}, surfels, history, mesh=mesh)
+    summary = {**mapper.summary(), **summary}
+    write_report(path, title, summary, surfels, history, layers=layers, sections=sections)
     return Parsed(path.read_text(encoding='utf-8'))
 
 

@@ -121,7 +121,7 @@ def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
 
 
 def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):
-    report(tmp_path, plane(30), mesh=sphere(40, 3.0, (7.5, 7.5, 5.0)))
+    report(tmp_path, plane(30), layers={'mesh': sphere(40, 3.0, (7.5, 7.5, 5.0))})
     complaints, page = [], browser.new_page(viewport={'width': 900, 'height': 800})
     page.on('console', lambda message: complaints.append(message.text))
     page.on('pageerror', lambda error: complaints.append(str(error)))

@@ -10,8 +10,8 @@
 // where there is no graphics card. The picture is drawn only when something has changed, and
 // while it moves with so few surfels, larger ones, that a frame takes no longer than SLOW_MS;
 // they come in random order, so the first are as good as any.
-// In the place of the surfels the mesh of a TSDF can be shown, where there is one: 16 bytes a vertex
-// (place, colour, normal), drawn whole, and lit from where the eye is.
+// In the place of the surfels the mesh of a TSDF or the models can be shown, where there are any: 16
+// bytes a vertex (place, colour, normal), drawn whole, and lit from where the eye is.
 // The view has z up; it turns about a point that panning moves.
 'use strict';
 
@@ -139,28 +139,31 @@
   buffer(path);
   attribute(line, 'place', 3, gl.FLOAT, false, 0, 0);
 
-  const mesh = data.mesh ? program(MESH_VERTEX, FRAGMENT) : null;
-  const meshArrays = gl.createVertexArray();
-  let wedges = null;
-  if (mesh) {
-    gl.bindVertexArray(meshArrays);
-    buffer(bytes(data.mesh.vertices));
+  const mesh = data.layers.length ? program(MESH_VERTEX, FRAGMENT) : null;
+  const layers = data.layers.map((layer) => {
+    const arrays = gl.createVertexArray();
+    gl.bindVertexArray(arrays);
+    buffer(bytes(layer.vertices));
     attribute(mesh, 'place', 3, gl.UNSIGNED_SHORT, true, 16, 0);
     attribute(mesh, 'paint', 3, gl.UNSIGNED_BYTE, true, 16, 8);
     attribute(mesh, 'normal', 3, gl.BYTE, true, 16, 12);
-    wedges = new Uint32Array(bytes(data.mesh.triangles).buffer);
+    const wedges = new Uint32Array(bytes(layer.triangles).buffer);
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, wedges, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    document.getElementById('shown').addEventListener('change', () => {
+    return { arrays, reach: layer.reach, count: wedges.length };
+  });
+  const shown = document.getElementById('shown');
+  const layerShown = () => (shown ? layers[shown.selectedIndex - 1] : undefined);
+  if (shown) {
+    shown.addEventListener('change', () => {
       for (const part of ['colouring', 'hide']) {
-        document.getElementById(part).closest('label').hidden = showsMesh();
+        document.getElementById(part).closest('label').hidden = Boolean(layerShown());
       }
-      document.querySelector('.scale').style.display = showsMesh() ? 'none' : '';
+      document.querySelector('.scale').style.display = layerShown() ? 'none' : '';
       redraw();
     });
   }
-  const showsMesh = () => mesh !== null && document.getElementById('shown').selectedIndex === 1;
 
   const ramp = bytes(data.ramp);
   gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -247,7 +250,7 @@
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
     const eye = eyeOf();
     const matrix = camera(eye);
-    if (showsMesh()) drawMesh(matrix, eye);
+    if (layerShown()) drawMesh(layerShown(), matrix, eye);
     else drawDiscs(drawn, matrix, eye);
     gl.useProgram(line);
     gl.bindVertexArray(lineArrays);
@@ -255,13 +258,13 @@
     gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
   }
 
-  function drawMesh(matrix, eye) {
+  function drawMesh(layer, matrix, eye) {
     gl.useProgram(mesh);
-    gl.bindVertexArray(meshArrays);
+    gl.bindVertexArray(layer.arrays);
     gl.uniformMatrix4fv(gl.getUniformLocation(mesh, 'camera'), false, matrix);
-    gl.uniform3f(gl.getUniformLocation(mesh, 'reach'), ...data.mesh.reach);
+    gl.uniform3f(gl.getUniformLocation(mesh, 'reach'), ...layer.reach);
     gl.uniform3f(gl.getUniformLocation(mesh, 'eye'), ...eye);
-    gl.drawElements(gl.TRIANGLES, wedges.length, gl.UNSIGNED_INT, 0);
+    gl.drawElements(gl.TRIANGLES, layer.count, gl.UNSIGNED_INT, 0);
   }
 
   function drawDiscs(drawn, matrix, eye) {

@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models on pages and in viewers: their triangles and colours, and what the report says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.io.model_markers import GREY, primitive_colors
+from surfel_mapper.models import fit
+from surfel_mapper.models.filling import areas
+from surfel_mapper.models.shapes import shape_of
+from surfel_mapper.viz import models as viz_models
+from surfel_mapper.viz.models import draw_models, models_mesh, page_mesh
+from surfel_mapper.viz.models_section import models_section, MOST_ROWS
+from test.models.scenes import A, room, VIEW
+from test.viz.test_report import plane, report
+
+
+@pytest.fixture(scope='module')
+def seen():
+    model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
+    return model, [shape_of(patch) for patch in model.patches]
+
+
+def test_the_mesh_of_models_has_their_areas_in_their_colours(seen):
+    model, shapes = seen
+    mesh = models_mesh(shapes, model.gaussians)
+    corners, colors = mesh.vertices[mesh.triangles], mesh.colors[mesh.triangles[:, 0]]
+    for shape in shapes:
+        own = np.rint(255 * primitive_colors([shape.patch.id])[0])
+        area = areas(corners[(colors == own).all(axis=1)]).sum()
+        assert area == pytest.approx(shape.area_m2)
+    assert (colors == np.rint(255 * np.array(GREY))).all(axis=1).sum() == 20 * len(model.gaussians)
+    assert len(models_mesh(shapes)) == len(mesh) - 20 * len(model.gaussians)
+    assert len(models_mesh([])) == 0
+
+
+def test_a_page_gets_the_gaussians_that_fit_beside_the_patches(seen, monkeypatch):
+    model, shapes = seen
+    faces = sum(len(shape.faces) for shape in shapes)
+    monkeypatch.setattr(viz_models, 'MAX_TRIANGLES', faces + 20 * 3 + 19)
+    assert len(page_mesh(shapes, model.gaussians)) == faces + 20 * 3
+    monkeypatch.setattr(viz_models, 'MAX_TRIANGLES', 10)
+    assert len(page_mesh(shapes, model.gaussians)) == faces
+
+
+def test_the_section_names_every_patch_with_its_numbers(seen):
+    model, shapes = seen
+    text = models_section(model, shapes)
+    for shape in shapes:
+        kind = 'surface' if shape.is_curved else 'plane'
+        assert f'<td>{shape.patch.id}</td><td>{kind}</td>' in text
+        assert f'>{shape.area_m2:.2f}</td>' in text
+    # planes and surfaces hold the points that they are labelled with
+    share = 100.0 * np.mean(model.labels < len(shapes))
+    assert f'<dd>{share:.1f} %</dd>' in text
+    assert f'<dt>Gaussians</dt><dd>{len(model.gaussians)}</dd>' in text
+
+
+def test_of_many_patches_the_largest_are_named(seen):
+    model, shapes = seen
+    many = [
+        replace(shape, patch=replace(shape.patch, id=100 * k + shape.patch.id))
+        for k in range(5)
+        for shape in shapes
+    ]
+    text = models_section(model, many)
+    assert text.count('class="swatch"') == MOST_ROWS < len(many)
+    assert f'The largest {MOST_ROWS} of {len(many)}.' in text
+
+
+def test_models_of_nothing_are_a_section_too():
+    text = models_section(fit(np.empty((0, 3))), [])
+    assert '<dt>planes</dt><dd>0</dd>' in text
+    assert '<table>' not in text
+
+
+def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
+    model, shapes = seen
+    picture = tmp_path / 'models.png'
+    draw_models(picture, room(160, 120)[0], model, VIEW, 'voxels')
+    section = models_section(model, shapes, picture)
+    mesh = page_mesh(shapes, model.gaussians)
+    parsed = report(tmp_path, plane(20), layers={'models': mesh}, sections=[section])
+    assert any(text == 'models' for tag, _, text in parsed.text if tag == 'option')
+    assert [a['src'][:22] for _, a in parsed.tags if a.get('class') == 'models'] == [
+        'data:image/png;base64,'
+    ]
