@@ -89,6 +89,22 @@ def test_what_is_dangerous_is_found(source):
     assert dangers(source)
 
 
+MENDED = {
+    'numpy': '1.22',  # CVE-2021-41495, -41496, -33430, -34141
+    'scipy': '1.10',  # CVE-2023-25399, -29824
+    'PyYAML': '5.4',  # CVE-2020-14343
+    'pyarrow': '14.0.1',  # CVE-2023-47248: a Parquet file ran what it said
+    'dask': '2021.10',  # CVE-2021-42343
+    'distributed': '2021.10',  # CVE-2021-42343
+}
+"""
+The first version without what is known of those before it and concerns what we use.
+
+Known, and of no concern here: tqdm before 4.66.3, in its command line; pyarrow before 23.0.1, in
+its IPC format.
+"""
+
+
 def requirements():
     """Return all requirements in setup.py: what stands in its lists, by their names."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
@@ -106,6 +122,20 @@ def test_every_dependency_has_a_lower_bound():
     assert len(found) > 15
     unbound = [name for name in found if not re.match(r'[\w.\[\]-]+>=\d', name)]
     assert unbound == []
+
+
+@pytest.mark.parametrize('name', MENDED)
+def test_no_lower_bound_allows_a_version_that_is_known_to_be_vulnerable(name):
+    found = [text for text in requirements() if re.match(rf'{name}>=', text)]
+    assert found
+    for text in found:
+        bound = re.match(r'[\d.]+', text.partition('>=')[2]).group()
+        assert numbers(bound) >= numbers(MENDED[name])
+
+
+def numbers(version):
+    """Return the numbers of a version, which compare as versions do."""
+    return [int(number) for number in version.split('.')]
 
 
 @pytest.mark.parametrize('name', ['', '.', '..', '.x', 'a/b', '/etc/x', 'a\\b', 'a\0b', '../a'])
