@@ -10,6 +10,7 @@ sorts them by record time as an index does, and says at which byte the file ends
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -49,7 +50,7 @@ class Place(NamedTuple):
     size: int
 
 
-class ScannedFile:
+class ScannedFile(ABC):
     """
     What rosbags' readers have, of a file without an index.
 
@@ -110,13 +111,13 @@ class ScannedFile:
         """Close the file."""
         self._file.close()
 
+    @abstractmethod
     def _scan(self) -> Iterator[Entry]:
         """Yield the messages in the order of the file; note connections, and where it is cut."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _read(self, place: Any) -> bytes:
         """Return the bytes of a message."""
-        raise NotImplementedError
 
     def _at(self, start: int, size: int) -> bytes:
         """Return bytes of the file; fewer at its end."""

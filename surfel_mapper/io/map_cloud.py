@@ -17,7 +17,8 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.appended import appended
-from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns, surfel_columns, UINT32
+from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns, UINT32
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments
 from surfel_mapper.mapping.surfels import Surfels
 

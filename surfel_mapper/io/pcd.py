@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.io.files import replace_file
-from surfel_mapper.io.pointcloud2 import surfel_columns
+from surfel_mapper.io.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 import math
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,9 +26,6 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.pose_messages import frame_name
 from surfel_mapper.scan import Scan
-
-if TYPE_CHECKING:
-    from surfel_mapper.mapping.surfels import Surfels
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
@@ -285,32 +282,3 @@ def field_of(name: str, layout: np.dtype[Any]) -> Field:
     dtype, offset = layout.fields[name][:2]
     count = dtype.shape[0] if dtype.shape else 1
     return Field(name, offset, DATATYPES[dtype.base.newbyteorder('=')], count)
-
-
-def surfel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
-    """
-    Return the columns of ~/normals and ~/changed: float32, and uint32 for num_points.
-
-    Where the map has them, the mean intensity and, packed as RViz draws it, the mean colour.
-    """
-    values = {
-        **dict(zip('xyz', surfels.position.T, strict=True)),
-        **dict(zip(('normal_x', 'normal_y', 'normal_z'), surfels.normal.T, strict=True)),
-        'curvature': surfels.curvature,
-        'planarity': surfels.planarity,
-    }
-    columns: dict[str, npt.NDArray[Any]] = {k: v.astype(np.float32) for k, v in values.items()}
-    columns['num_points'] = surfels.num_points.astype(np.uint32)
-    if 'intensity' in surfels.channels:
-        columns['intensity'] = surfels.channels['intensity'].astype(np.float32)
-    if 'red' in surfels.channels:
-        columns['rgb'] = packed_rgb(surfels)
-    return columns
-
-
-def packed_rgb(surfels: Surfels) -> npt.NDArray[np.float32]:
-    """Return the mean colours as three bytes of a float32 each: red, green and blue last."""
-    red, green, blue = (
-        np.rint(surfels.channels[name]).astype(np.uint32) for name in ('red', 'green', 'blue')
-    )
-    return ((red << 16) | (green << 8) | blue).view(np.float32)

@@ -15,7 +15,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from surfel_mapper.io.bag_writer import BagWriter
-from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
+from surfel_mapper.io.pointcloud2 import from_columns
+from surfel_mapper.io.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels

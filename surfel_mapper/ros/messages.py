@@ -17,7 +17,8 @@ from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns, surfel_columns
+from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns
+from surfel_mapper.io.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.cost_grid import CostGrid

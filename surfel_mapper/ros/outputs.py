@@ -31,8 +31,9 @@ from surfel_mapper.config import Config
 from surfel_mapper.io.cdr import marker_array
 from surfel_mapper.io.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.io.markers import disc_colors, surfel_markers
-from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns
+from surfel_mapper.io.pointcloud2 import from_columns
 from surfel_mapper.io.scan_normals import scan_with_normals
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.traversability import traversability

@@ -27,8 +27,9 @@ from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.map_cloud import moment_cloud
 from surfel_mapper.io.markers import disc_colors, surfel_markers
 from surfel_mapper.io.mirror import MapMirror
-from surfel_mapper.io.pointcloud2 import from_columns, surfel_columns, to_scan
+from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.io.scan_normals import scan_with_normals
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR

@@ -19,7 +19,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.io.pointcloud2 import Field, from_columns, surfel_columns, to_scan
+from surfel_mapper.io.pointcloud2 import Field, from_columns, to_scan
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.io.examples import make_surfels
 

@@ -23,8 +23,9 @@ from visualization_msgs.msg import MarkerArray
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
 from surfel_mapper.io.ply import read_points
-from surfel_mapper.io.pointcloud2 import surfel_columns, to_scan
+from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.pipeline import Mapper
 from test.ros.live import (
     cloud,
