@@ -142,7 +142,8 @@ def parts_of_map(source: str | Path, work: Path) -> list[dict[Tile, Part]]:
     file = path / FILE if path.is_dir() else path
     if not file.is_file():
         raise FileFormatError(
-            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, {FILE}, or a Parquet file'
+            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, or the {FILE} of '
+            'surfel-mapper replay --formats parquet'
         )
     return [
         write_shard(work / f'piece-{number}.parquet', piece)
