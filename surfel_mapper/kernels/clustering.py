@@ -86,10 +86,10 @@ def bisect(points, viewpoint, rules, moved, order, rows, flat, means, values, fr
         middle = high
         if not is_flat and high - low >= max(rules[3], 4.0):
             parts = share[low:high]
-            split_means(x, y, z, mean, value, frame, parts, scratch)
+            middle = high - split_means(x, y, z, mean, value, frame, parts, scratch)
             if high - low <= rules[2]:
                 split_mixture(x, y, z, mean, parts)
-            middle = high - count_beyond(parts)
+                middle = high - count_beyond(parts)
         if middle - low < 2 or high - middle < 2:
             for i in range(low, high):
                 for j in range(3):

@@ -75,9 +75,9 @@ def num_outliers(x, y, z, mean, value, frame):
 @njit(cache=True, nogil=True, error_model='numpy')
 def split_means(x, y, z, mean, value, frame, share, scratch):
     """
-    Put each point on the side of the nearer of two means, which begin on the long axis.
+    Put each point on the side of the nearer of two means; return how many on that of the second.
 
-    The means of many points follow from every so many of them.
+    They begin on the long axis. The means of many points follow from every so many of them.
 
     x, y, z  (n,) float64
     share    (n,) float64, out: 1 on the side of the second mean, else 0
@@ -105,7 +105,7 @@ def split_means(x, y, z, mean, value, frame, share, scratch):
             centre[1, j] = sums[j] / second
             centre[0, j] = (total[j] - sums[j]) / (number - second)
     between(centre, plane)
-    take_sides(x, y, z, plane, mean, share)
+    return take_sides(x, y, z, plane, mean, share)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -151,14 +151,18 @@ def between(centre, plane):
         plane[3] += 0.5 * (centre[1, j] ** 2 - centre[0, j] ** 2)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
 def take_sides(x, y, z, plane, mean, share):
-    """Write 1 for the points beyond a plane through places relative to a mean, else 0."""
+    """Write 1 for points beyond a plane in coordinates about a mean, else 0; return how many."""
     px, py, pz, offset = plane[0], plane[1], plane[2], plane[3]
     mx, my, mz = mean[0], mean[1], mean[2]
+    number = 0.0
     for i in range(len(x)):
         u, v, w = x[i] - mx, y[i] - my, z[i] - mz
-        share[i] = 1.0 if (u * px + v * py) + w * pz > offset else 0.0
+        beyond = 1.0 if (u * px + v * py) + w * pz > offset else 0.0
+        share[i] = beyond
+        number += beyond
+    return np.int64(number)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -45,3 +45,18 @@ def copy_ranges(points, ranges, out):
             for j in range(3):
                 out[place, j] = points[i, j]
             place += 1
+
+
+@njit(cache=True, nogil=True)
+def number_ranges(ranges, numbers, order, out):
+    """
+    Give every item the number of its range, where it was before they were put in order.
+
+    ranges   (K, 2) int64, first place of each, and the one after its last
+    numbers  (K,) int64
+    order    (M,) int64, where each was
+    out      (M,) int32, out
+    """
+    for k in range(len(ranges)):
+        for i in range(ranges[k, 0], ranges[k, 1]):
+            out[order[i]] = numbers[k]

@@ -23,7 +23,7 @@ import numpy.typing as npt
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
-from surfel_mapper.kernels.selection import copy_ranges
+from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.kernels.voxel_means import (
     finite_ends,
     give_labels,
@@ -186,7 +186,7 @@ def assembled(
     rest = np.flatnonzero(of_cluster < 0)
     of_cluster[rest] = len(numbered) + np.arange(len(rest))
     labels = np.empty(len(clusters.points), np.int32)
-    labels[clusters.order] = np.repeat(of_cluster, clusters.num_points)
+    number_ranges(clusters.rows, of_cluster, clusters.order, labels)
     model = MultiModel(
         planes=numbered[: len(planes)],
         surfaces=[patch for patch in numbered if isinstance(patch, Surface)],

@@ -1,0 +1,100 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""How a cluster is halved: 2-means and the mixture of two Gaussians against slow twins."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+from surfel_mapper.kernels.halving import (
+    cluster_moments,
+    MEANS_ITERATIONS,
+    MEANS_SAMPLE,
+    num_outliers,
+    SETTLED_SHARE,
+    split_means,
+)
+from surfel_mapper.kernels.mixture import ITERATIONS, SETTLED, split_mixture
+
+
+def two_sheets(number, seed):
+    """Return points (3, n) on two sheets that meet at an angle, far from the origin."""
+    rng = np.random.default_rng(seed)
+    u, v = rng.uniform(-0.5, 0.5, (2, number))
+    bent = np.where(u > 0.1, 0.7 * (u - 0.1), 0.0)
+    points = np.stack([u, 0.6 * v, bent + 0.004 * rng.standard_normal(number)])
+    return points + np.array([[40.0], [-7.0], [3.0]])
+
+
+def frame_of(points):
+    values, vectors = np.linalg.eigh(np.cov(points))
+    return points.mean(axis=1), values, np.ascontiguousarray(vectors.T[::-1])
+
+
+@pytest.mark.parametrize('number', [1, 4, 150, 1001])
+def test_moments_are_those_of_numpy(number):
+    points = two_sheets(number, 1)
+    mean, scatter = np.empty(3), np.empty((3, 3))
+    cluster_moments(*points, mean, scatter)
+    centred = points - points.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(mean, points.mean(axis=1), rtol=1e-14)
+    np.testing.assert_allclose(scatter, centred @ centred.T, atol=1e-12 * number)
+
+
+def test_outliers_are_beyond_three_sigma():
+    points = two_sheets(800, 2)
+    mean, values, frame = frame_of(points)
+    away = points - mean[:, None]
+    distance_sq = (away * np.linalg.solve(np.cov(points), away)).sum(axis=0)
+    assert 0 < (distance_sq >= 9.0).sum() == num_outliers(*points, mean, values, frame)
+
+
+@pytest.mark.parametrize('number', [40, 700, 5 * MEANS_SAMPLE + 3])
+def test_two_means_are_those_of_lloyd_begun_on_the_long_axis(number):
+    points = two_sheets(number, 3)
+    mean, values, frame = frame_of(points)
+    share = np.empty(number)
+    second = split_means(*points, mean, values, frame, share, np.empty((4, MEANS_SAMPLE)))
+
+    sample = (points - mean[:, None])[:, :: 1 + number // MEANS_SAMPLE]
+    reach = np.sqrt(2.0 * values[2] / np.pi) * frame[0]
+    centres, before = np.stack([-reach, reach]), None
+    for _ in range(MEANS_ITERATIONS):
+        side = nearer_second(sample, centres)
+        if before is not None and (side != before).sum() < SETTLED_SHARE * sample.shape[1]:
+            break
+        centres = np.stack([sample[:, ~side].mean(axis=1), sample[:, side].mean(axis=1)])
+        before = side
+    expected = nearer_second(points - mean[:, None], centres)
+    np.testing.assert_array_equal(share, expected)
+    assert second == expected.sum()
+
+
+def nearer_second(points, centres):
+    first, second = (((points - c[:, None]) ** 2).sum(axis=0) for c in centres)
+    return second < first
+
+
+def test_the_mixture_is_that_of_expectation_maximisation():
+    points = two_sheets(180, 4)
+    mean = points.mean(axis=1)
+    share = (points[0] > np.median(points[0])).astype(np.float64)
+    expected = share.copy()
+    split_mixture(*points, mean, share)
+
+    away = (points - mean[:, None]).T
+    for _ in range(ITERATIONS):
+        densities = []
+        for weights in (1.0 - expected, expected):
+            total = weights.sum()
+            centre = weights @ away / total
+            covariance = np.cov(away.T, aweights=weights, bias=True)
+            covariance += np.eye(3) * (1e-8 + 1e-4 * np.trace(covariance) / 3.0)
+            densities.append(total * multivariate_normal.pdf(away, centre, covariance))
+        new = densities[1] / (densities[0] + densities[1])
+        change, expected = np.abs(new - expected).max(), new
+        if change < SETTLED:
+            break
+    np.testing.assert_allclose(share, expected, atol=1e-7)
