@@ -10,6 +10,7 @@ and so is missing where the recorder was killed. Files compressed as a whole end
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from pathlib import Path
 import re
 from typing import Any
@@ -88,12 +89,18 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
     if not path.is_file():
         return None
     try:
-        content = read_yaml(path)
-        information = content['rosbag2_bagfile_information']
-        if not isinstance(information, Mapping):
-            raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
+        state = path.stat()
+        return information_in(path.absolute(), state.st_mtime_ns, state.st_size)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise damaged_metadata(path, error) from error
+
+
+@lru_cache(maxsize=16)
+def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
+    """Return what metadata.yaml says, read once: 10 ms each time that a bag is opened else."""
+    information = read_yaml(path)['rosbag2_bagfile_information']
+    if not isinstance(information, Mapping):
+        raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
     return information
 
 

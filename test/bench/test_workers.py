@@ -9,7 +9,7 @@ from surfel_mapper.offline.recording import Request
 from test.bench.offline import recorded
 from test.bench.options import Options
 from test.bench.street import Street
-from test.bench.workers import by, check_equal, in_one_process
+from test.bench.workers import by, check_equal, holds_from, in_one_process
 
 
 def test_one_process_and_tiles_make_the_same_map(tmp_path):
@@ -26,3 +26,17 @@ def test_one_process_and_tiles_make_the_same_map(tmp_path):
 def test_maps_that_differ_are_not_compared():
     with pytest.raises(RuntimeError, match='the maps differ'):
         check_equal({'a', 'b'})
+
+
+@pytest.mark.parametrize(('two_s', 'length_s'), [(5.0, 150.0), (7.0, None)])
+def test_how_long_recordings_have_to_be_follows_from_speed_and_start(two_s, length_s):
+    speed = [
+        {'who': 'one process', 'recorded_s': 100.0, 'seconds': 10.0},
+        {'who': 'two workers', 'recorded_s': 100.0, 'seconds': two_s},
+    ]
+    start = [
+        {'who': 'one process', 'seconds': 1.0},
+        {'who': 'two workers', 'seconds': 2.5},
+    ]
+    found = holds_from(speed, start)['recorded_s']
+    assert found == (length_s and pytest.approx(length_s))

@@ -1,13 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Bags with one process, one worker and two: speed, processor time, and memory for more input.
+Bags with one process and two workers: speed, start, and memory for more input.
 
-``speed``: four drives from one bag, several times; ``one process`` maps them without writing,
-workers end with a dataset of tiles and its digest. Their start is not counted, the kernels are
-loaded. They take turns and the fastest run of each counts. ``memory``: a quarter, a half and all
-of the drive, with shards of one quarter, in fresh processes; the most that any had. The digests
-of all ways are compared.
+``speed``: one bag, four times; ``one process`` maps them without writing, workers end with a
+dataset of tiles and its digest. Kernels are loaded. They take turns and the fastest run of each
+counts. ``start``: until a fresh process, or its workers, have loaded all that mapping needs.
+``holds from`` is the length of recordings from which on workers, their start included, are as
+fast as they have to be, by these figures. ``memory``: a quarter, a half and all of the drive, with
+shards of one quarter, in fresh processes; the most that any had. The digests of all ways are
+compared.
 """
 
 from __future__ import annotations
@@ -17,8 +19,10 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 import multiprocessing
 from pathlib import Path
+import subprocess
+import sys
 import tempfile
-from time import perf_counter, process_time
+from time import perf_counter, process_time, time
 
 from surfel_mapper.cluster.engines import Engine, engine
 from surfel_mapper.cluster.running import map_bags, Mapped
@@ -47,12 +51,24 @@ CONFIG = Config()
 BUDGET_RATIO = 1.6
 """Two workers have to be so many times as fast as one process at least."""
 
+STARTS = {
+    'one process': 'from surfel_mapper.pipeline import Mapper\nMapper().warm_up()\nsay()',
+    'two workers': (
+        'from surfel_mapper.cluster.engines import begin_workers, engine\nbegin_workers()\n'
+        'from surfel_mapper.cluster import running\nwith engine(workers=2):\n    say()'
+    ),
+}
+"""Programs that say when they are ready to map."""
+
+SAY = 'import sys, time\ndef say(): print(time.time() - float(sys.argv[1]))\n'
+
 
 def run(options: Options) -> list[Row]:
     """Return a row for every way and every amount of input."""
     options = replace(options, scans=LONGER * options.scans)
     bag = recorded(Street(options), options)
-    return [*speed_rows(bag), *memory_rows(bag)]
+    speed, start = speed_rows(bag), start_rows()
+    return [*speed, *start, holds_from(speed, start), *memory_rows(bag)]
 
 
 def speed_rows(bag: Path) -> list[Row]:
@@ -66,13 +82,11 @@ def speed_rows(bag: Path) -> list[Row]:
         found[name] = way()
         seconds.setdefault(name, []).append(perf_counter() - start)
 
-    with engine(workers=1) as one, engine(workers=2) as two:
-        for number in range(RUNS + 1):
+    with engine(workers=2) as two:
+        by(two, requests[:1])  # pyarrow and the file are loaded
+        for _ in range(RUNS):
             timed('two workers', lambda: by(two, requests))
             timed('one process', lambda: in_one_process(requests))
-            timed('one worker', lambda: by(one, requests))
-            if number == 0:
-                seconds.clear()  # the kernels were loaded
     check_equal({digest for digest, _, _ in found.values()})
     reference_s = min(seconds['one process'])
     return [
@@ -88,6 +102,29 @@ def speed_rows(bag: Path) -> list[Row]:
         }
         for name in sorted(seconds)
     ]
+
+
+def start_rows() -> list[Row]:
+    """Return how long each way takes to begin."""
+    rows: list[Row] = []
+    for name, program in STARTS.items():
+        seconds = []
+        for _ in range(RUNS):
+            command = [sys.executable, '-c', SAY + program, str(time())]
+            done = subprocess.run(command, capture_output=True, text=True, check=True)
+            seconds.append(float(done.stdout))
+        rows.append({'what': 'start', 'who': name, 'seconds': min(seconds)})
+    return rows
+
+
+def holds_from(speed: list[Row], start: list[Row]) -> Row:
+    """Return from which length of recordings on workers are fast enough, start included."""
+    start_s = {row['who']: row['seconds'] for row in start}
+    share = {row['who']: row['seconds'] / row['recorded_s'] for row in speed}
+    late_s = BUDGET_RATIO * start_s['two workers'] - start_s['one process']
+    gain = share['one process'] - BUDGET_RATIO * share['two workers']
+    length_s = max(late_s, 0.0) / gain if gain > 0.0 else None
+    return {'what': 'holds from', 'who': 'two workers', 'recorded_s': length_s}
 
 
 def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
