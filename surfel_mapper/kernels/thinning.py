@@ -76,3 +76,19 @@ def mark_seen(seen, limit, keys, table, marks, mark):
                 marks[row] = mark
                 num += 1
     return num
+
+
+@njit(cache=True, nogil=True)
+def keys_within(keys, limit, within):
+    """
+    List the keys whose hashes are at most a limit; return how many.
+
+    keys    (S,) int64
+    limit   uint64
+    within  (S,) int64, out
+    """
+    num = 0
+    for key in keys:
+        within[num] = key
+        num += mix(key) <= limit
+    return num

@@ -34,6 +34,7 @@ from surfel_mapper.io.markers import disc_colors, surfel_markers
 from surfel_mapper.io.pointcloud2 import from_columns
 from surfel_mapper.io.scan_normals import scan_with_normals
 from surfel_mapper.io.surfel_columns import surfel_columns
+from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.traversability import traversability
@@ -81,6 +82,7 @@ class Outputs:
         self._mapper = mapper
         self._thread = thread
         self._changes = Changes(mapper)
+        self._ages = Ages()
         self._alignment = AlignmentOutputs(node, mapper)
         self._tsdf = TsdfOutputs(node, mapper, mapper.tsdf, thread) if mapper.tsdf else None
         self._models: ModelOutputs | None = None
@@ -242,7 +244,7 @@ class Outputs:
         markers = surfel_markers(
             surfels,
             surfel_map.voxel_size_m,
-            disc_colors(config.publish.marker_color, surfels, self._mapper.window),
+            disc_colors(config.publish.marker_color, surfels, self._mapper.window, self._ages),
             stamp_ns=self._stamp_ns,
             frame_id=self._mapper.map_frame,
         )

@@ -35,6 +35,9 @@ RATE_HZ = 20.0
 RATES_HZ = (25.0, 30.0, 35.0, 40.0, 50.0, 60.0, 80.0)
 SECONDS, SECONDS_A_RATE, SECONDS_IDLE = 15.0, 6.0, 8.0
 TIMEOUT_S = 120.0
+SETTLE_S = 2.0
+"""From the last cloud until a node is idle: the full map goes out at 2 Hz, diagnostics at 1 Hz."""
+
 IDLE_BUDGET, WARM_BUDGET_S, COLD_BUDGET_S = 3.0, 5.0, 40.0
 BUDGET_VOXEL_M = 0.5
 LATENCY_BUDGET_MS = {'p50_ms': 40.0, 'p99_ms': 100.0}
@@ -92,7 +95,7 @@ def rates(options: Options, street: Street, size_m: float, scale: float) -> Iter
             yield {**row, 'voxel_m': size_m}
             if row['dropped']:
                 break
-        time.sleep(2.0)
+        time.sleep(SETTLE_S)
         row = {'what': 'idle', 'cpu_percent': node.cpu_percent(SECONDS_IDLE * scale)}
         yield {**row, 'voxel_m': size_m, 'budget_percent': IDLE_BUDGET}
 

@@ -30,6 +30,7 @@ from surfel_mapper.io.mirror import MapMirror
 from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.io.scan_normals import scan_with_normals
 from surfel_mapper.io.surfel_columns import surfel_columns
+from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
@@ -91,10 +92,11 @@ def mapped(options: Options) -> tuple[Mapper, Update]:
 
 def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
     """Return what draws, by colour."""
+    ages = Ages()
 
     def draw(kind: str) -> bytes:
         surfels = mapper.map.surfels(MIN_POINTS, DISCS)
-        colors = disc_colors(kind, surfels, mapper.window)
+        colors = disc_colors(kind, surfels, mapper.window, ages)
         return marker_array(
             surfel_markers(surfels, VOXEL_M, colors, stamp_ns=0, frame_id='odom')
         )
