@@ -300,8 +300,8 @@ class LiveModels:
             parts.append((rows, component))
         before = [self._patches.get(number) for number in chosen]
         fitted = self._fitter.fit(chosen, [rows for rows, _ in parts], before)
-        for (patch, origin), (rows, component) in zip(fitted, parts, strict=True):
-            self._patches[patch.id] = Tracked(patch, rows, component, origin)
+        for (patch, origin, field), (rows, component) in zip(fitted, parts, strict=True):
+            self._patches[patch.id] = Tracked(patch, rows, component, origin, field)
         return [number for number, known in zip(chosen, before, strict=True) if known is not None]
 
     def _count(self, created: list[int], changed: list[int], removed: list[int]) -> None:

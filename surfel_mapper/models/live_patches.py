@@ -22,9 +22,10 @@ from surfel_mapper.kernels.patches import describe
 from surfel_mapper.kernels.piece_groups import mean_normals
 from surfel_mapper.kernels.pieces import FLAT, merge_moments, spread
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.models.bspline import fit_pspline, HeightField, initial_field
+from surfel_mapper.models.bspline import HeightField
+from surfel_mapper.models.large_fields import fit_field, Fitted
 from surfel_mapper.models.multi_model import Plane, Surface
-from surfel_mapper.models.patches import Cells, cells_of, Groups, rms_across
+from surfel_mapper.models.patches import cells_of, Groups, rms_across
 from surfel_mapper.models.pieces import Pieces
 
 Array = npt.NDArray[np.float64]
@@ -39,9 +40,8 @@ STILL = 0.1
 """A frame stays while its rim would move by less than so much of the thickness of a plane."""
 
 STILL_RAD = math.radians(1.0)
-DEGREE = 3
-MOST_WORK = 2e7
-"""A spline that takes more multiplications has larger cells."""
+MOST_TURN_RAD = math.radians(45.0)
+"""Beyond this a frame is made anew; below, its x is kept."""
 
 
 @dataclass(slots=True, eq=False)
@@ -59,6 +59,8 @@ class Tracked:
         What its voxels hang together with.
     origin : (3,) float64, m
         Where the lattice of its grid is anchored.
+    fitted : Fitted, optional
+        The height field of a surface about there.
 
     """
 
@@ -66,6 +68,7 @@ class Tracked:
     rows: Rows
     component: int
     origin: Array
+    fitted: Fitted | None
 
 
 class PatchFitter:
@@ -90,9 +93,9 @@ class PatchFitter:
 
     def fit(
         self, ids: list[int], rows: list[Rows], before: list[Tracked | None]
-    ) -> list[tuple[Plane, Array]]:
+    ) -> list[tuple[Plane, Array, Fitted | None]]:
         """
-        Return patches, and where the lattices of their grids are anchored.
+        Return patches, where the lattices of their grids are anchored, and fields about there.
 
         Parameters
         ----------
@@ -109,32 +112,27 @@ class PatchFitter:
         pieces, every = self._pieces, np.concatenate(rows)
         starts = np.concatenate([[0], np.cumsum([len(part) for part in rows])])
         number, total = len(ids), np.empty(len(ids), np.int64)
-        means, merged = np.empty((number, 3)), np.empty((number, 6))
+        means, normals = np.empty((2, number, 3))
+        merged = np.empty((number, 6))
         merge_moments(
             every, starts, pieces.count, pieces.position, pieces.covariance, total, means, merged
         )
-        normals = np.empty((number, 3))
         mean_normals(every, starts, pieces.kind == FLAT, pieces.normal, normals)
-        points = self._points(every)
-        groups = Groups(points, POINTS * starts, normals, np.full(number, pieces.limit_m))
+        groups = Groups(
+            self._points(every), POINTS * starts, normals, np.full(number, pieces.limit_m)
+        )
         frames, curved = self._described(groups)
         covariances = symmetric(merged)
         frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
-        origins = means.copy()
-        for k, known in enumerate(before):
-            if known is not None and isinstance(known.patch, Surface) == curved[k]:
-                frames[k], origins[k] = self._steadied(
-                    known, frames[k], means[k], covariances[k]
-                )
+        origins, stays = self._steadied(before, frames, means, covariances, curved)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
-        local = np.empty_like(points)
+        local = np.empty_like(groups.points)
         cells = cells_of(
             groups, (origins, frames, pitches, local), 0.5 * self._size_m, snapped=True
         )
         found = []
         for k in range(number):
-            shift = frames[k] @ (means[k] - origins[k])
-            plane = Plane(
+            patch = Plane(
                 id=ids[k],
                 num_points=int(total[k]),
                 mean=means[k],
@@ -143,9 +141,16 @@ class PatchFitter:
                 rms_m=rms_across(covariances[k], frames[k, 2], int(total[k])),
                 grid=cells.grid(k),
             )
+            known, field = before[k], None
             if curved[k]:
-                plane = self._surface(plane, cells, k, origins[k], rows[k])
-            found.append((moved(plane, shift), origins[k]))
+                sums = cells.sums[cells.of(k)].reshape(*patch.grid.filled.shape, 4)
+                was = known.fitted if known is not None and stays[k] else None
+                field = fit_field(
+                    float(pitches[k]), patch.grid.origin, sums, self._smoothing, was
+                )
+                patch = self._surface(patch, field.field, origins[k], rows[k])
+            shift = frames[k] @ (means[k] - origins[k])
+            found.append((moved(patch, shift), origins[k], field))
         return found
 
     def _points(self, rows: Rows) -> Array:
@@ -169,40 +174,34 @@ class PatchFitter:
         return frames, curved
 
     def _steadied(
-        self, known: Tracked, frame: Array, mean: Array, covariance: Array
-    ) -> tuple[Array, Array]:
-        """Return frame and anchor: those that were, or as near as the new normal allows."""
-        was, normal = known.patch.R_patch_map, frame[2]
-        sine = float(np.linalg.norm(np.cross(was[2], normal)))
-        radius = 3.0 * math.sqrt(max(float(np.trace(covariance)), 0.0))
-        flipped = float(was[2] @ normal) < 0.0
-        still = sine < STILL_RAD and sine * radius < STILL * self._pieces.thickness_m
-        if isinstance(known.patch, Surface):  # its heights say where it is
-            still = sine < STILL_RAD
-        if still and not flipped:
-            return was, known.origin
-        along = was[0] - (was[0] @ normal) * normal
-        length = float(np.linalg.norm(along))
-        if length < 0.5 or flipped:
-            return frame, mean
-        x = along / length
-        anchor = known.origin - (normal @ (known.origin - mean)) * normal
-        return np.stack([x, np.cross(normal, x), normal]), anchor
+        self,
+        before: list[Tracked | None],
+        frames: Array,
+        means: Array,
+        covariances: Array,
+        curved: npt.NDArray[np.bool_],
+    ) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Return where patches are anchored, and which frames stay; frames change in place."""
+        origins, stays = means.copy(), np.zeros(len(means), np.bool_)
+        for k, known in enumerate(before):
+            if known is None or isinstance(known.patch, Surface) != curved[k]:
+                continue
+            was, normal = known.patch.R_patch_map, frames[k, 2]
+            if float(was[2] @ normal) < math.cos(MOST_TURN_RAD):
+                continue
+            sine = float(np.linalg.norm(np.cross(was[2], normal)))
+            radius = 3.0 * math.sqrt(max(float(np.trace(covariances[k])), 0.0))
+            # what a plane is off its points at the rim counts; a field says itself where it is
+            near = curved[k] or sine * radius < STILL * self._pieces.thickness_m
+            if sine < STILL_RAD and near:
+                frames[k], origins[k], stays[k] = was, known.origin, True
+            else:
+                frames[k] = turned(was[0], normal)
+                origins[k] = known.origin - (normal @ (known.origin - means[k])) * normal
+        return origins, stays
 
-    def _surface(
-        self, plane: Plane, cells: Cells, k: int, origin: Array, rows: Rows
-    ) -> Surface:
-        """Return the surface whose cells are those of patch k."""
-        sums = cells.sums[cells.of(k)]
-        used = sums[:, 3] > 0.0
-        means = np.zeros((len(sums), 3))
-        means[used] = sums[used, :3] / sums[used, 3:]
-        grid = plane.grid
-        heights = means[:, 2].reshape(grid.filled.shape)
-        start = initial_field(grid.pitch_m, grid.origin, heights, grid.filled, DEGREE)
-        spline = fit_pspline(
-            start, means[used, :2], means[used, 2], sums[used, 3], self._smoothing
-        )
+    def _surface(self, plane: Plane, spline: HeightField, origin: Array, rows: Rows) -> Surface:
+        """Return the surface of a field about an origin."""
         local = (self._pieces.position[rows] - origin) @ plane.R_patch_map.T
         error = local[:, 2] - spline.heights(local[:, :2])
         count = self._pieces.count[rows]
@@ -214,9 +213,16 @@ class PatchFitter:
             covariance=plane.covariance,
             R_patch_map=plane.R_patch_map,
             rms_m=math.sqrt(float(count @ across) / float(count.sum())),
-            grid=grid,
+            grid=plane.grid,
             spline=spline,
         )
+
+
+def turned(x: Array, normal: Array) -> Array:
+    """Return the frame (3, 3) of a normal whose x is as near to another as it can be."""
+    along = x - (x @ normal) * normal
+    along = along / np.linalg.norm(along)
+    return np.stack([along, np.cross(normal, along), normal])
 
 
 def symmetric(packed: Array) -> Array:

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Height fields that are fitted again and again: small ones at once, large ones where they changed.
+
+A cell whose mean height has moved by less than ``STILL_M`` keeps the one that it was fitted with.
+Control points farther than ``MARGIN`` cells from all others stay: a change dies out sooner. Where
+the knots lie depends on how many cells there are, so large grids grow by blocks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.kernels.relaxing import bends, equations, guess, mark_active, mark_near, relax
+from surfel_mapper.models.bspline import fit_pspline, HeightField, initial_field, RIDGE
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+MOST_AT_ONCE = 2e6
+"""Multiplications of a banded solve, about 1 ms, beyond which a field counts as large."""
+
+STILL_M = 1e-4
+TOLERANCE_M = 2e-5
+MARGIN = 5
+DEGREE = 3
+BLOCK = 16
+"""Cells along either side by which large grids grow."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fitted:
+    """
+    A field and what it was fitted to.
+
+    Attributes
+    ----------
+    field : HeightField
+        The result.
+    heights : (Nx, Ny) float64, m
+        Mean heights of the cells, nan where there was nothing.
+
+    """
+
+    field: HeightField
+    heights: Array
+
+
+def fit_field(
+    pitch_m: float,
+    origin: Array,
+    sums: Array,
+    smoothing: float,
+    before: Fitted | None,
+) -> Fitted:
+    """
+    Return the field through cells.
+
+    Parameters
+    ----------
+    pitch_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        Lowest corner of the grid.
+    sums : (Nx, Ny, 4) float64
+        Of x, y, z and number of the points in every cell.
+    smoothing : float
+        Weight of the second differences.
+    before : Fitted, optional
+        The field as it was, over cells of the same lattice.
+
+    """
+    size = (sums.shape[0] + 2) * (sums.shape[1] + 2)
+    is_large = size * (DEGREE * min(sums.shape)) ** 2 > MOST_AT_ONCE
+    if is_large:
+        origin, sums = in_blocks(pitch_m, origin, sums)
+    filled: Mask = sums[..., 3] > 0.0
+    means = sums[..., :3] / np.where(filled, sums[..., 3], 1.0)[..., None]
+    heights = np.where(filled, means[..., 2], np.nan)
+    start = initial_field(pitch_m, origin, means[..., 2], filled, DEGREE)
+    if not is_large:
+        xyz, number = means[filled], sums[..., 3][filled]
+        return Fitted(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, smoothing), heights)
+    known = np.zeros(start.control.shape, np.bool_)
+    known[1:-1, 1:-1] = touched = filled
+    if before is not None:
+        touched = taken_over(before, start, heights, known)
+        means[..., 2] = np.where(filled, heights, 0.0)
+    return Fitted(relaxed(start, means, filled, touched, known, smoothing), heights)
+
+
+def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]:
+    """Return origin and cells of a grid that begins and ends at a multiple of BLOCK cells."""
+    first = np.rint(origin / pitch_m).astype(np.int64)
+    low = first % BLOCK
+    high = -(first + sums.shape[:2]) % BLOCK
+    padding = [*zip(low, high, strict=True), (0, 0)]
+    lowest = (first - low).astype(np.float64) * pitch_m
+    return lowest, np.pad(sums, padding)
+
+
+def taken_over(before: Fitted, start: HeightField, heights: Array, known: Mask) -> Mask:
+    """
+    Copy what a field was into one to start from, and keep the heights that are still.
+
+    Returns
+    -------
+    (Nx, Ny) bool
+        Cells in which it cannot stay.
+
+    """
+    old = before.field
+    step = np.rint((old.origin - start.origin) / start.pitch_m).astype(np.int64)
+    new, was = overlap(start.control.shape, old.control.shape, step)
+    # beyond the cells that held something nothing was fitted
+    start.control[new] = np.where(known[new], start.control[new], 0.0)
+    valid = np.zeros(old.control.shape, np.bool_)
+    mark_active(~np.isnan(before.heights), old.parts(), valid)
+    start.control[new] = np.where(valid[was], old.control[was], start.control[new])
+    known[new] |= valid[was]
+    earlier = np.full(heights.shape, np.nan)
+    new, was = overlap(heights.shape, before.heights.shape, step)
+    earlier[new] = before.heights[was]
+    still = np.abs(heights - earlier) < STILL_M
+    heights[still] = earlier[still]
+    touched: Mask = ~(still | (np.isnan(heights) & np.isnan(earlier)))
+    if heights.shape != before.heights.shape or step.any():  # the knots have moved
+        touched = ~np.isnan(heights)
+    return touched
+
+
+def overlap(
+    new: tuple[int, ...], old: tuple[int, ...], step: npt.NDArray[np.int64]
+) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
+    """Return where two grids overlap, the old one so many cells further on, in either."""
+    low = [max(int(s), 0) for s in step]
+    high = [max(min(int(s) + o, n), a) for s, o, n, a in zip(step, old, new, low, strict=True)]
+    here = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
+    there = tuple(
+        slice(a - int(s), b - int(s)) for a, b, s in zip(low, high, step, strict=True)
+    )
+    return here, there
+
+
+def relaxed(
+    start: HeightField, means: Array, filled: Mask, touched: Mask, known: Mask, smoothing: float
+) -> HeightField:
+    """Return a large field, fitted near touched cells, from the one to start from."""
+    control = start.control
+    active, free = np.zeros(control.shape, np.bool_), np.zeros(control.shape, np.bool_)
+    mark_active(filled, start.parts(), active)
+    guess(control, known, active)
+    mark_near(touched, MARGIN, active, free)
+    xyz = means[filled]
+    first, values = np.empty((len(xyz), 3), np.int64), np.empty((len(xyz), 2, DEGREE + 1))
+    num = equations(xyz, start.parts(), free, first, values)
+    differences = []
+    for axis, places in enumerate(start.greville()):
+        at, second = np.empty(control.size, np.int64), np.empty((control.size, 3))
+        bent = bends(places, axis, active, free, at, second)
+        differences.append((control.shape[1] if axis == 0 else 1, at[:bent], second[:bent]))
+    rules = (smoothing, RIDGE, TOLERANCE_M)
+    relax(
+        first[:num], values[:num], np.ones(num), xyz[first[:num, 2], 2], start.degrees,
+        tuple(differences), rules, free, control,
+    )  # fmt: skip
+    return HeightField(start.pitch_m, start.origin, start.degrees, control)
