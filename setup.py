@@ -28,6 +28,7 @@ REQUIRED = [
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
     'matplotlib>=3.6',  # map.png
+    'pillow>=10',  # images packed as JPEG and PNG; a tenth of opencv, and matplotlib brings it
 ]
 
 # Jazzy from PyPI, for machines without a ROS of their own; never beside one from apt. The wheels

@@ -61,6 +61,7 @@ HOMES = {
     'llvmlite': 'kernels/',
     'lz4': 'io/bag',
     'lzf': 'io/pcd',
+    'PIL': 'io/compressed_image',
     'matplotlib': 'viz/',
     'nav_msgs': 'ros/',
     'numba': 'kernels/',

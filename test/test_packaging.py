@@ -20,7 +20,7 @@ import surfel_mapper
 ROOT = Path(__file__).parents[1]
 MANIFEST = ElementTree.parse(ROOT / 'package.xml').getroot()
 SETUP = (ROOT / 'setup.py').read_text(encoding='utf-8')
-APT_NAMES = {'pyyaml': 'yaml'}  # python3-yaml
+APT_NAMES = {'pyyaml': 'yaml', 'pillow': 'pil'}  # python3-yaml, python3-pil
 NO_RULE = {'numba'}  # no rosdep rule for Ubuntu 24.04
 
 

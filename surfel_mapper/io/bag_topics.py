@@ -17,6 +17,7 @@ from surfel_mapper.errors import BagError
 
 CLOUD = 'sensor_msgs/msg/PointCloud2'
 IMAGE = 'sensor_msgs/msg/Image'
+PACKED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 ODOMETRY = 'nav_msgs/msg/Odometry'
 POSE = 'geometry_msgs/msg/PoseStamped'
 TF = 'tf2_msgs/msg/TFMessage'
@@ -46,11 +47,23 @@ class Topics(list[Topic]):
         """Return how many messages some topics have by the index."""
         return sum(topic.count for topic in self if topic.name in names)
 
-    def of_type(self, type_: str) -> list[str]:
-        """Return the names of the topics of a type."""
-        return [topic.name for topic in self if topic.type == type_]
+    def of_type(self, *types: str) -> list[str]:
+        """Return the names of the topics of a type, or of one of some."""
+        return [topic.name for topic in self if topic.type in types]
 
-    def choose(self, type_: str, name: str | None = None, default: str | None = None) -> str:
+    def choose_image(self, name: str | None = None) -> str:
+        """Return the topic of images to read, as choose does; packed ones if named, or alone."""
+        packed = () if name is None and self.of_type(IMAGE) else (PACKED_IMAGE,)
+        return self.choose(IMAGE, name, or_else=packed)
+
+    def choose(
+        self,
+        type_: str,
+        name: str | None = None,
+        default: str | None = None,
+        *,
+        or_else: tuple[str, ...] = (),
+    ) -> str:
         """
         Return the topic to read: the one named, else the default, else the only one of its type.
 
@@ -62,6 +75,8 @@ class Topics(list[Topic]):
             What the user asked for.
         default : str, optional
             Taken where nothing was asked for and the bag has it.
+        or_else : tuple of str
+            Types that will do as well.
 
         Raises
         ------
@@ -69,7 +84,7 @@ class Topics(list[Topic]):
             If there is no such topic, it has another type, or there are several to choose from.
 
         """
-        found = self.of_type(type_)
+        found = self.of_type(type_, *or_else)
         short = type_.rpartition('/')[2]
         offers = f'{short} topics: {", ".join(found) or "none"}'
         if name is not None:

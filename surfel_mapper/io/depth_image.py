@@ -3,9 +3,10 @@
 """
 Depth images and camera calibrations out of messages, whichever library made them.
 
-sensor_msgs/Image with encoding 16UC1 (millimetres) or 32FC1 (metres), and the
-sensor_msgs/CameraInfo that drivers publish beside it as ``camera_info``. Like clouds, messages
-are read by the names of their attributes alone and checked before a pixel is read.
+sensor_msgs/Image with encoding 16UC1 (millimetres) or 32FC1 (metres), packed or not (see
+compressed_image.py), and the sensor_msgs/CameraInfo that drivers publish beside it as
+``camera_info``. Like clouds, messages are read by the names of their attributes alone and checked
+before a pixel is read.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy.typing as npt
 
 from surfel_mapper.depth import depth_points, free_rays, PinholeCamera
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.io.compressed_image import base_topic, unpacked
 from surfel_mapper.io.pointcloud2 import checked_stamp_ns
 from surfel_mapper.scan import Scan
 
@@ -73,7 +75,7 @@ class DepthImages:
 
 def camera_info_topic(image_topic: str) -> str:
     """Return where the calibration of an image topic is published: its neighbour camera_info."""
-    folder, slash, _ = image_topic.rpartition('/')
+    folder, slash, _ = base_topic(image_topic).rpartition('/')
     return f'{folder}{slash}camera_info'
 
 
@@ -129,11 +131,11 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
         the camera is not known.
 
     """
-    msg = image.msg
     if image.camera is None:
         raise CloudFormatError(
             f'{topic}: no calibration; does anybody publish {camera_info_topic(topic)}?'
         )
+    msg = unpacked(image.msg, topic, exact=True)
     stamp_ns, depth = checked_stamp_ns(msg.header.stamp, topic), depth_in(msg, topic)
     try:
         points = depth_points(depth, image.camera)

@@ -3,9 +3,10 @@
 """
 Images of colours and of labels out of messages, to be joined with scans.
 
-sensor_msgs/Image as cameras and segmentation networks publish them; compressed ones are not read.
-Those that belong to depth images fit them pixel by pixel and need no calibration; those that are
-beside a lidar wait for the first camera_info of their camera, as depth images do.
+sensor_msgs/Image as cameras and segmentation networks publish them, and what compressed_image.py
+unpacks, labels as PNG alone. Those that belong to depth images fit them pixel by pixel and need
+no calibration; those that are beside a lidar wait for the first camera_info of their camera, as
+depth images do.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.depth import COLOR, SceneImage
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.io.compressed_image import unpacked
 from surfel_mapper.io.depth_image import CameraImage, DepthImages, pixels_in
 from surfel_mapper.io.pointcloud2 import checked_stamp_ns
 from surfel_mapper.io.pose_messages import frame_name
@@ -102,7 +104,7 @@ def scene_image(kind: str, image: CameraImage, topic: str) -> SceneImage:
         If encoding, sizes and data do not fit together.
 
     """
-    msg = image.msg
+    msg = unpacked(image.msg, topic, exact=kind != COLOR)
     decode = colors_in if kind == COLOR else labels_in
     return SceneImage(
         kind=kind,

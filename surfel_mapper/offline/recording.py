@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 import math
 from pathlib import Path
 from typing import Any, Protocol, TYPE_CHECKING
@@ -19,7 +20,7 @@ from typing import Any, Protocol, TYPE_CHECKING
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError
 from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_topics import CLOUD, IMAGE
+from surfel_mapper.io.bag_topics import CLOUD
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.pose_topics import pose_topics, PoseTopics, static_topics
 from surfel_mapper.offline.replay import replay
@@ -157,10 +158,12 @@ class BagRecording:
         configured = [f'/{name.lstrip("/")}' for name in config.input.topics]
         named = [*request.topics] or [*request.mounts] or configured
         names: list[str | None] = [*named] or [None]
-        kind = CLOUD if config.input.kind == 'cloud' else IMAGE
-        self.topics = [reader.topics.choose(kind, name) for name in dict.fromkeys(names)]
+        choose: Callable[[str | None], str] = partial(reader.topics.choose, CLOUD)
+        if config.input.kind == 'depth':
+            choose = reader.topics.choose_image
+        self.topics = [choose(name) for name in dict.fromkeys(names)]
         for name in config.tsdf.image_topics.values():
-            reader.topics.choose(IMAGE, f'/{name.lstrip("/")}')
+            reader.topics.choose_image(f'/{name.lstrip("/")}')
         check_mounts(request, self.topics, config)
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})

@@ -22,11 +22,12 @@ from nav_msgs.msg import Odometry
 from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from surfel_mapper.config import Config
 from surfel_mapper.depth import SceneImage
 from surfel_mapper.errors import CloudFormatError, DependencyError, PoseError
+from surfel_mapper.io.compressed_image import is_packed
 from surfel_mapper.io.depth_image import (
     camera_info_topic,
     CameraImage,
@@ -182,7 +183,7 @@ class Inputs:
             subscribe(PointCloud2, topic, on_cloud, events=lost, raw=True)
             return
         subscribe(CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic))
-        subscribe(Image, topic, partial(self._on_image, topic), events=lost)
+        subscribe(image_message(topic), topic, partial(self._on_image, topic), events=lost)
 
     def _subscribe_images(self, kind: str, topic: str) -> None:
         """Subscribe to images of colours or labels, and to the calibration where needed."""
@@ -191,14 +192,14 @@ class Inputs:
             on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
             subscribe(CameraInfo, camera_info_topic(topic), on_info)
         on_image = partial(self._on_scene, partial(self._scenes.add_image, kind, topic))
-        subscribe(Image, topic, on_image)
+        subscribe(image_message(topic), topic, on_image)
 
     def _on_scene(self, take: Callable[[Any], list[SceneImage]], msg: Any) -> None:
         try:
             for image in take(msg):
                 self._thread.put_image(image)
         except CloudFormatError as error:
-            self._node.get_logger().error(str(error), throttle_duration_sec=10.0)
+            self._thread.refuse_image(str(error))
 
     def _subscribe_static(self) -> None:
         """Subscribe to how sensors are mounted, which odometry does not say."""
@@ -230,7 +231,7 @@ class Inputs:
         self._heard_s[topic] = time.monotonic()
         self._largest_bytes = max(self._largest_bytes, num_bytes)
 
-    def _on_image(self, topic: str, msg: Image) -> None:
+    def _on_image(self, topic: str, msg: Image | CompressedImage) -> None:
         self._hear(topic, len(msg.data))
         self._put_images(topic, self._images.add_image(topic, msg))
 
@@ -257,7 +258,12 @@ class Inputs:
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
 
 
-def decode_image(image: CameraImage, _: Image, topic: str) -> Scan:
+def image_message(topic: str) -> Any:
+    """Return the class of the images of a topic: packed ones have a name that says so."""
+    return CompressedImage if is_packed(topic) else Image
+
+
+def decode_image(image: CameraImage, _: Any, topic: str) -> Scan:
     """Return the scan of an image, as the mapping thread asks for it."""
     return depth_scan(image, topic)
 

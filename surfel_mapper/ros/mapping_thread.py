@@ -52,7 +52,7 @@ class LostCloud(NamedTuple):
 
 
 class LostPose(NamedTuple):
-    """The same of a pose; see Mapper.ignore_message."""
+    """The same of a pose or an image beside; see Mapper.ignore_message."""
 
     cause: str
     reason: str
@@ -132,6 +132,10 @@ class MappingThread:
     def refuse_pose(self, reason: str) -> None:
         """Count a message of poses that cannot be read."""
         self._lose(LostPose('bad_pose', reason))
+
+    def refuse_image(self, reason: str) -> None:
+        """Count an image of colours or labels, or its calibration, that cannot be read."""
+        self._lose(LostPose('bad_image', f'image ignored: {reason}'))
 
     def refuse_cloud(self, topic: str, reason: str) -> None:
         """Count a cloud that cannot be read."""

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+import io
 from pathlib import Path
 import struct
 import tempfile
@@ -37,6 +38,23 @@ def noise() -> list[bytes]:
     """Return bytes for harnesses that make choices of them."""
     rng = np.random.default_rng(3)
     return [b'', *(rng.bytes(size) for size in (40, 200, 600))]
+
+
+def packed_images() -> list[bytes]:
+    """Return small images packed as PNG and JPEG, behind a byte that says how."""
+    from PIL import Image
+
+    depth = np.arange(12, dtype=np.uint16).reshape(3, 4) * 900
+    color = np.random.default_rng(4).integers(0, 256, (8, 8, 3)).astype(np.uint8)
+    header = np.int32(0).tobytes() + np.array([1e4, -900.0], np.float32).tobytes()
+    ways = ((0, header, depth, 'PNG'), (1, header, depth, 'PNG'), (2, b'', color, 'JPEG'),
+            (2, b'', color, 'PNG'), (3, b'', color[..., 0].copy(), 'PNG'))  # fmt: skip
+    found = []
+    for way, before, pixels, kind in ways:
+        file = io.BytesIO()
+        Image.fromarray(pixels).save(file, kind)
+        found.append(bytes([way]) + before + file.getvalue())
+    return found
 
 
 def small_drive(store=recorded.ROS2) -> recorded.Entries:

@@ -23,6 +23,7 @@ HARNESSES = {
     'cloud_bytes': Harness(messages.cloud_bytes, corpus.clouds, 4000),
     'cloud_message': Harness(messages.cloud_message, corpus.noise, 4000),
     'depth_image': Harness(messages.depth_image, corpus.noise, 1500),
+    'packed_image': Harness(messages.packed_image, corpus.packed_images, 1500),
     'drive': Harness(messages.drive, corpus.noise, 200),
     'mcap': Harness(files.mcap, corpus.mcap, 80),
     'sqlite': Harness(files.sqlite, corpus.sqlite, 80),

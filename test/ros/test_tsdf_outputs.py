@@ -4,6 +4,8 @@
 
 from __future__ import annotations
 
+from array import array
+
 import numpy as np
 import pytest
 
@@ -11,13 +13,15 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import Marker
 
 from surfel_mapper.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import Lidar
-from test.ros.live import cloud, LATCHED, odometry, START_NS
+from test.io.test_compressed_image import packed, packed_depth
+from test.ros.live import cloud, LATCHED, odometry, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
+from test.ros.test_node import PERIOD_NS
 from test.ros.test_outputs import BASE, start_node
 
 pytestmark = pytest.mark.timeout(120)
@@ -89,6 +93,47 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
     peer.spin_until(lambda: meshes and meshes[-1].points)
     colors = np.array([(c.r, c.g, c.b) for c in meshes[-1].colors])
     np.testing.assert_allclose(colors, np.tile([200, 100, 0], (len(colors), 1)) / 255, atol=0.01)
+
+
+def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
+    depth_topic, info = '/cam/depth/compressedDepth', '/cam/camera_info'
+    color_topic = '/cam/color/compressed'
+    settings = {
+        'input.kind': 'depth',
+        'input.topics': [depth_topic],
+        'frames.base_to_sensor': OPTICAL,
+        'layers.tsdf.enabled': 'true',
+        'layers.tsdf.mesh_rate_hz': 10.0,
+        'layers.tsdf.color': 'true',
+        'layers.tsdf.color_topic': color_topic,
+    }
+    start('node', *arguments([], **settings))
+    kinds = {depth_topic: CompressedImage, info: CameraInfo, color_topic: CompressedImage}
+    peer.advertise('/odom', *kinds, kinds=kinds)
+    meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
+    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    depth = packed_depth(np.full((60, 80), 2000, np.uint16))
+    color = packed(np.full((60, 80, 3), (200, 100, 0), np.uint8), 'rgb8; jpeg compressed', 'JPEG')
+    peer.publish(info, camera_info(camera))
+    for number in range(2):
+        stamp_ns = START_NS + number * PERIOD_NS
+        peer.publish('/odom', odometry(stamp_ns, (0.0, 0.0, 0.0)))
+        for topic, image in ((color_topic, color), (depth_topic, depth)):
+            message = CompressedImage(format=image.format)
+            message.data = array('B', image.data[: len(image.data) // (1 + number)])
+            message.header.frame_id = 'camera'
+            stamp(message, stamp_ns)
+            peer.publish(topic, message)
+    peer.spin_until(lambda: meshes and meshes[-1].points)
+    colors = np.array([(c.r, c.g, c.b) for c in meshes[-1].colors])
+    np.testing.assert_allclose(colors, np.tile([200, 100, 0], (len(colors), 1)) / 255, atol=0.02)
+    peer.diagnosis(
+        {
+            'scans.mapped': 1,
+            'scans.dropped.bad_cloud': 1,
+            'messages_ignored.bad_image': 1,
+        }
+    )
 
 
 def test_rates_changed_while_running_hold_at_once(start, peer):
