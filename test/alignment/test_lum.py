@@ -1,10 +1,8 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LUM: the graph and what it refuses, convergence from afar, weights, and far from the origin."""
+"""LUM: convergence from afar, weights, and far from the origin."""
 
 from __future__ import annotations
-
-import itertools
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -13,44 +11,9 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from surfel_mapper.alignment import Graph, LUM
+from surfel_mapper.alignment import LUM
 from surfel_mapper.alignment.angles import poses_of, transforms
-from surfel_mapper.errors import AlignmentError
-
-
-def random_transforms(rng, num, angle_rad, reach_m=3.0):
-    """Return the origin and transforms turned by up to an angle about any axis."""
-    T = np.tile(np.eye(4), (num, 1, 1))
-    for v in range(1, num):
-        axis = rng.normal(size=3)
-        turn = axis / np.linalg.norm(axis) * angle_rad * rng.uniform(0.5, 1.0)
-        T[v, :3, :3] = Rotation.from_rotvec(turn).as_matrix()
-        T[v, :3, 3] = rng.uniform(-reach_m, reach_m, 3)
-    return T
-
-
-def make(rng, T, edges, *, sigma=0.01, num=60, offset=0.0, **settings):
-    """Return a LUM whose pairs see points about an offset from poses T, with noise."""
-    clouds = [[] for _ in T]
-    pairs = []
-    for ends in edges:
-        seen = rng.uniform(-5.0, 5.0, (num, 3)) + offset
-        rows = []
-        for v in ends:
-            local = (seen - T[v, :3, 3]) @ T[v, :3, :3]
-            rows.append(np.arange(num) + num * len(clouds[v]))
-            clouds[v].append(local + rng.normal(scale=sigma, size=seen.shape))
-        pairs.append(np.stack(rows, axis=1))
-    lum = LUM(**settings)
-    for parts in clouds:
-        lum.add_point_cloud(np.concatenate(parts))
-    for ends, rows in zip(edges, pairs, strict=True):
-        lum.set_correspondences(*ends, rows)
-    return lum
-
-
-def chain(num, loops=()):
-    return [*itertools.pairwise(range(num)), *loops]
+from test.alignment.scan_graphs import chain, make, random_transforms
 
 
 @pytest.mark.parametrize('angle_rad', [0.5, 1.5, 2.8])
@@ -269,97 +232,6 @@ def test_other_points_keep_their_pairs():
     np.testing.assert_allclose(lum.pose(1)[:3], expected[:3], atol=0.02)
 
 
-@pytest.fixture
-def pair():
-    lum = LUM()
-    for _ in range(2):
-        lum.add_point_cloud(np.eye(3))
-    lum.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]])
-    return lum
-
-
-@pytest.mark.parametrize(
-    ('refused', 'message'),
-    [
-        (lambda lum: lum.add_point_cloud(np.empty((0, 3))), 'vertex 2: no points'),
-        (lambda lum: lum.add_point_cloud([1.0, 2.0]), r'vertex 2: points of shape \(2,\)'),
-        (lambda lum: lum.add_point_cloud(np.eye(3), [0.0] * 5), 'vertex 2: pose'),
-        (lambda lum: lum.add_point_cloud(np.eye(3), [np.nan] * 6), 'vertex 2: pose'),
-        (lambda lum: lum.set_pose(0, [0.0] * 6), 'vertex 0 is the reference'),
-        (lambda lum: lum.set_pose(1, [np.inf] * 6), 'vertex 1: pose'),
-        (lambda lum: lum.set_pose(2, [0.0] * 6), 'no vertex 2 among 2'),
-        (lambda lum: lum.pose(-1), 'no vertex -1 among 2'),
-        (lambda lum: lum.set_correspondences(0, 5, [[0, 0]]), 'no vertex 5'),
-        (lambda lum: lum.set_correspondences(1, 1, [[0, 0]]), 'edge 1 -> 1: from a vertex to'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0, 3]]), 'names point 3 of vertex 1'),
-        (lambda lum: lum.set_correspondences(0, 1, [[-1, 0]]), 'names point -1 of vertex 0'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'whole numbers'),
-        (lambda lum: lum.set_correspondences(0, 1, [0, 1, 2]), r'pairs of shape \(3,\)'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], np.eye(3)), 'weights of shape'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.full((3, 3), np.nan)]),
-         'all finite'),
-        (lambda lum: lum.correspondences(1, 0), 'no edge 1 -> 0'),
-        (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
-        (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
-        (lambda lum: setattr(lum, 'convergence_threshold', np.nan), 'convergence_threshold nan'),
-        (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
-        (lambda _: LUM().compute(), '0 vertices'),
-    ],
-)  # fmt: skip
-def test_bad_input_is_refused_and_changes_nothing(pair, refused, message):
-    with pytest.raises(AlignmentError, match=message):
-        refused(pair)
-
-    assert pair.num_vertices == 2
-    np.testing.assert_array_equal(pair.correspondences(0, 1), [[0, 0], [1, 1], [2, 2]])
-    np.testing.assert_array_equal(pair.point_cloud(1), np.eye(3))
-    np.testing.assert_array_equal(pair.pose(1), np.zeros(6))
-
-
-def test_pairs_in_one_point_say_nothing(pair):
-    pair.set_correspondences(0, 1, [[0, 0]] * 5)
-
-    result = pair.compute()
-
-    assert result.dropped == {(0, 1): 'all its pairs lie in one point'}
-    assert result.unconnected == (1,)
-
-
-def test_weights_that_are_all_zero_say_nothing(pair):
-    pair.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]], np.zeros((3, 3, 3)))
-
-    assert pair.compute().dropped == {(0, 1): 'all its weights are zero'}
-
-
-def test_the_steps_of_pcl_know_no_weights(pair):
-    pair.jacobian = 'pcl'
-    pair.set_correspondences(0, 1, [[0, 0]] * 3, [np.eye(3)] * 3)
-
-    with pytest.raises(AlignmentError, match='weights'):
-        pair.compute()
-
-
-def test_the_steps_of_pcl_are_refused_where_they_are_singular():
-    rng = np.random.default_rng(16)
-    lum = make(rng, random_transforms(rng, 2, 0.3), [(0, 1)], jacobian='pcl')
-    lum.set_pose(1, [0.0, 0.0, 0.0, 0.0, np.pi / 2, 0.0])
-    before = lum.pose(1)
-
-    try:
-        lum.compute()
-    except AlignmentError:
-        np.testing.assert_array_equal(lum.pose(1), before)
-
-
-def test_a_first_pose_is_ignored_with_a_warning(caplog):
-    lum = LUM()
-
-    lum.add_point_cloud(np.eye(3), [1.0] * 6)
-
-    np.testing.assert_array_equal(lum.pose(0), np.zeros(6))
-    assert 'vertex 0' in caplog.text
-
-
 def test_a_long_chain_with_loops_is_solved():
     rng = np.random.default_rng(17)
     T = random_transforms(rng, 200, 0.2)
@@ -391,52 +263,3 @@ def test_at_a_pitch_of_a_quarter_turn_the_rotation_is_kept():
     found = poses_of(transforms(pose), near=pose)
 
     np.testing.assert_allclose(transforms(found), transforms(pose), atol=1e-14)
-
-
-def test_an_empty_graph_has_no_edges():
-    graph = Graph()
-
-    assert graph.ends.shape == (0, 2)
-    assert graph.poses.shape == (0, 6)
-
-
-def odd_points(rng):
-    """Return points on a line, in one point, in a plane, with nan, far away, or none of these."""
-    points = rng.normal(size=(rng.integers(1, 30), 3)) * 10.0 ** rng.integers(-8, 6)
-    kind = rng.integers(0, 6)
-    if kind == 0:
-        points[:, 1:] = 0.0
-    elif kind == 1:
-        points[:] = points[0]
-    elif kind == 2:
-        points[:, 2] = 0.0
-    elif kind == 3:
-        points[rng.random(len(points)) < 0.3] = np.nan
-    elif kind == 4:
-        points += 1e7
-    return points
-
-
-@pytest.mark.filterwarnings('error')
-@pytest.mark.parametrize('jacobian', ['exact', 'pcl'])
-def test_any_graph_ends_with_finite_poses_or_an_error_that_changes_nothing(jacobian):
-    for seed in range(150):
-        rng = np.random.default_rng(seed)
-        lum = LUM(max_iterations=4, jacobian=jacobian)
-        num = int(rng.integers(2, 7))
-        for v in range(num):
-            lum.add_point_cloud(odd_points(rng), rng.normal(size=6) if v else None)
-        for s, t in rng.integers(0, num, (rng.integers(0, 10), 2)).tolist():
-            if s == t:
-                continue
-            rows = [rng.integers(0, len(lum.point_cloud(v)), 12) for v in (s, t)]
-            weights = rng.normal(size=(12, 3, 1)) * 10.0 ** rng.integers(-6, 8)
-            planes = weights @ weights.swapaxes(1, 2)
-            some = planes if jacobian == 'exact' and rng.random() < 0.5 else None
-            lum.set_correspondences(s, t, np.stack(rows, axis=1), some)
-        before = lum.graph.poses
-        try:
-            lum.compute()
-        except AlignmentError:
-            np.testing.assert_array_equal(lum.graph.poses, before)
-        assert np.isfinite(lum.graph.poses).all()

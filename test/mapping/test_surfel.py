@@ -1,14 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-Surfel against exact rational arithmetic, on known shapes, and at its edges.
+"""Surfel against exact rational arithmetic, and on known shapes."""
 
-Tolerances. EPS = 2^-52. One step of float64 may be off by a few EPS of the largest scatter held
-on the way (removing leaves the rounding of what was there), and steps add up as a random walk of
-half an EPS each: ``rounding(steps)`` = (4 + sqrt(steps) / 2) EPS.
-"""
-
-import copy
 from fractions import Fraction
 
 from hypothesis import given
@@ -17,58 +10,19 @@ import numpy as np
 import pytest
 
 from surfel_mapper.mapping.surfel import Surfel
+from test.mapping.surfel_promises import (
+    assert_normal,
+    assert_promises,
+    EPS,
+    FAR_M,
+    POINT,
+    POINTS,
+    rounding,
+    trace,
+)
 from test.reference import exact_moments
 
 pytestmark = pytest.mark.filterwarnings('error')
-
-EPS = np.finfo(np.float64).eps
-UNIT = 16 * EPS  # LAPACK's eigenvectors: 8.5 EPS were found in 10^4 examples
-
-# The lattice of 2^-10 m: sums, and the shift to 10 km, are exact in float64.
-LATTICE = st.integers(-512, 512).map(lambda k: k / 1024)
-POINT = st.tuples(LATTICE, LATTICE, LATTICE).map(np.array)
-POINTS = st.lists(POINT, min_size=1, max_size=12).map(np.array)
-FAR_M = np.array([6000.0, -6400.0, 4800.0])
-
-
-def rounding(steps):
-    return (4.0 + np.sqrt(steps) / 2.0) * EPS
-
-
-def trace(surfel):
-    return surfel.sum_squares[[0, 3, 5]].sum()
-
-
-def assert_normal(normal, expected, tolerance):
-    """The sign of an eigenvector is free."""
-    assert np.linalg.norm(normal) == pytest.approx(1.0, abs=UNIT)
-    np.testing.assert_allclose(
-        normal * np.sign(normal @ expected), expected, rtol=0, atol=tolerance
-    )
-
-
-def assert_promises(surfel):
-    """What holds of every surfel whatsoever."""
-    n, values, vectors = surfel.num_points, surfel.eigenvalues(), surfel.eigenvectors()
-    assert surfel.empty == (n == 0)
-    assert np.isnan(surfel.mean()).all() == (n == 0)
-    assert np.isfinite(values).all()
-    assert (values >= 0.0).all()
-    assert (np.diff(values) >= 0.0).all()
-    if n < 2:
-        assert not values.any()
-        assert not surfel.covariance().any()
-    if values[2] == 0.0:
-        assert np.isnan(vectors).all()
-        assert np.isnan(surfel.normal()).all()
-        assert np.isnan(surfel.planarity())
-        assert np.isnan(surfel.curvature())
-    else:
-        np.testing.assert_allclose(vectors.T @ vectors, np.eye(3), rtol=0, atol=UNIT)
-        np.testing.assert_array_equal(surfel.normal(), vectors[:, 0])
-        assert (vectors.max(axis=0) >= -vectors.min(axis=0)).all()
-        assert 0.0 <= surfel.planarity() <= 1.0
-        assert 0.0 <= surfel.curvature() <= 1 / 3
 
 
 # Exact arithmetic
@@ -257,41 +211,6 @@ def test_a_line_and_a_repeated_point_are_known_after_others_were_removed(directi
     assert np.isnan(surfel.normal()).all()
 
 
-# Edges
-
-
-def test_a_new_surfel_holds_nothing():
-    surfel = Surfel()
-
-    assert_promises(surfel)
-    assert surfel.empty
-    np.testing.assert_array_equal(surfel.sum, np.zeros(3))
-    np.testing.assert_array_equal(surfel.sum_squares, np.zeros(6))
-
-
-@pytest.mark.parametrize('nothing', [Surfel(), np.empty((0, 3))], ids=['surfel', 'batch'])
-def test_adding_or_removing_nothing_changes_nothing(nothing):
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    surfel, expected = Surfel.from_points(points), Surfel.from_points(points)
-
-    surfel.add(nothing)
-    surfel.remove(nothing)
-
-    assert surfel == expected
-    assert Surfel() + nothing == Surfel() - nothing == Surfel()
-
-
-def test_removing_as_many_points_as_held_or_more_empties():
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    for removed in (points, np.concatenate([points, points]), Surfel.from_points(points)):
-        surfel = Surfel.from_points(points)
-        surfel.remove(removed)
-        assert surfel == Surfel()
-    surfel = Surfel()
-    surfel.remove(points[0])
-    assert surfel == Surfel()
-
-
 def test_removing_down_to_one_point_leaves_no_scatter():
     points = np.random.default_rng(1).normal(size=(9, 3)) + FAR_M
     surfel = Surfel.from_points(points)
@@ -313,101 +232,6 @@ def test_removing_what_was_never_added_gives_no_negative_eigenvalue():
     assert_promises(surfel)
 
 
-def test_clearing_empties_and_the_surfel_can_be_used_again():
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    surfel = Surfel.from_points(points)
-    surfel.clear()
-    assert surfel == Surfel()
-
-    surfel.add(points)
-    assert surfel == Surfel.from_points(points)
-
-
-def test_operators_are_adding_and_removing():
-    points = np.random.default_rng(1).normal(size=(2, 9, 3))
-    a, b = Surfel.from_points(points[0]), Surfel.from_points(points[1])
-    a_before, total = a.copy(), a.copy()
-    total += b
-
-    assert a + b == total
-    assert a == a_before
-    total -= b
-    assert (a + b) - b == total
-    assert a + points[1][0] == a + Surfel.from_points(points[1][0])
-    assert a - a == Surfel()
-    a += a
-    assert a.num_points == 18
-
-
-def test_equal_means_the_same_count_sum_and_scatter():
-    surfel = Surfel.from_stats([1.0, 2.0, 3.0], [6.0, 1.0, 2.0, 5.0, 3.0, 4.0], 4)
-
-    assert surfel == Surfel.from_stats([1.0, 2.0, 3.0], [6.0, 1.0, 2.0, 5.0, 3.0, 4.0], 4)
-    assert surfel != Surfel.from_stats([1.0, 2.0, 3.0], [6.0, 1.0, 2.0, 5.0, 3.0, 4.0], 5)
-    assert surfel != Surfel.from_stats([1.0, 2.5, 3.0], [6.0, 1.0, 2.0, 5.0, 3.0, 4.0], 4)
-    assert surfel != Surfel.from_stats([1.0, 2.0, 3.0], [6.0, 1.0, 2.0, 5.0, 3.0, 4.5], 4)
-    assert surfel != 'a surfel'
-    with pytest.raises(TypeError, match='unhashable'):
-        hash(surfel)
-
-
-@given(POINTS, st.sampled_from([1.0, 1 / 3, 1e5]))
-def test_the_statistics_of_a_surfel_make_an_equal_one(points, scale):
-    points = points * scale + FAR_M
-    surfel = Surfel.from_points(points)
-
-    again = Surfel.from_stats(surfel.sum, surfel.sum_squares, surfel.num_points)
-
-    assert again == surfel
-    tolerance = 2 * EPS * np.abs(points).max()  # the sum is rounded
-    np.testing.assert_allclose(again.mean(), surfel.mean(), rtol=0, atol=tolerance)
-
-
-def test_statistics_of_no_points_are_those_of_the_empty_surfel():
-    assert Surfel.from_stats([1.0, 2.0, 3.0], [1.0, 0.5, 0.25, 2.0, 0.125, 3.0], 0) == Surfel()
-
-
-def test_a_position_is_one_point_and_its_scatter_counts_once_others_come():
-    scatter = [[3.0, 0.5, 0.25], [9.0, 2.0, 0.125], [9.0, 9.0, 1.0]]
-    surfel = Surfel.from_position([1, 2, 3], scatter)
-
-    assert surfel.num_points == 1
-    assert surfel.sum.tolist() == [1, 2, 3]
-    assert surfel.sum_squares.tolist() == [3.0, 0.5, 0.25, 2.0, 0.125, 1.0]
-    assert_promises(surfel)
-    assert Surfel.from_position([1, 2, 3]) == Surfel.from_points([1, 2, 3])
-
-    surfel.add([1, 2, 3])
-    upper = np.triu(scatter)
-    np.testing.assert_array_equal(surfel.covariance(), upper + np.triu(upper, 1).T)
-
-
-def test_what_is_returned_may_be_written_to_and_copies_are_independent():
-    points = np.random.default_rng(1).normal(size=(9, 3))
-    surfel, expected = Surfel.from_points(points), Surfel.from_points(points)
-    points[:] = np.nan
-    copies = [surfel.copy(), copy.copy(surfel), copy.deepcopy(surfel)]
-
-    for array in (surfel.sum, surfel.sum_squares, surfel.mean(), surfel.normal()):
-        array[:] = np.nan
-    surfel.covariance()[:] = np.nan
-    assert surfel == expected
-    surfel.add([1, 2, 3])
-    assert copies == [expected] * 3
-
-    empty = Surfel()
-    empty.sum_squares[:] = np.nan
-    assert Surfel() == empty
-
-
-@pytest.mark.parametrize('dtype', [np.float32, np.int16, np.uint8])
-def test_points_of_other_types_are_widened(dtype):
-    points = np.arange(27, dtype=dtype).reshape(9, 3) ** 2
-
-    assert Surfel.from_points(points) == Surfel.from_points(points.astype(np.float64))
-    assert Surfel.from_points(points.tolist()) == Surfel.from_points(points)
-
-
 @pytest.mark.parametrize('scale', [1e99, 1e50, 1e-50, 1e-150])
 def test_very_large_and_very_small_shapes_are_shapes(scale):
     surfel = Surfel.from_points(grid([[2, 2, 1], [-2, 1, 2]]) * scale / 20)
@@ -418,71 +242,3 @@ def test_very_large_and_very_small_shapes_are_shapes(scale):
 
 def test_below_what_can_be_squared_points_count_as_equal():
     assert_promises(Surfel.from_points(grid([[2, 2, 1], [-2, 1, 2]]) * 1e-200))
-
-
-@pytest.mark.parametrize(
-    ('points', 'named'),
-    [
-        ([1.0, 2.0], r'shape \(2,\)'),
-        (5.0, r'shape \(\)'),
-        (np.zeros((4, 2)), r'shape \(4, 2\)'),
-        (np.zeros((2, 2, 3)), r'shape \(2, 2, 3\)'),
-        ([], r'shape \(0,\)'),
-        ([[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]], 'found nan'),
-        ([0.0, -np.inf, 0.0], 'found -inf'),
-        ([0.0, 2e100, 0.0], r'found 2e\+100'),
-        (['a', 'b', 'c'], 'dtype <U1'),
-        ([True, False, True], 'dtype bool'),
-        ([1j, 0, 0], 'dtype complex128'),
-        (None, 'dtype object'),
-    ],
-)
-def test_what_is_no_point_is_refused_and_changes_nothing(points, named):
-    surfel = Surfel.from_points(np.eye(3))
-
-    for change in (surfel.add, surfel.remove, Surfel.from_points):
-        with pytest.raises(ValueError, match=f'points: {named}'):
-            change(points)
-
-    assert surfel == Surfel.from_points(np.eye(3))
-
-
-@pytest.mark.parametrize(
-    ('stats', 'named'),
-    [
-        (([1.0, 2.0], np.zeros(6), 3), r'sum: shape \(2,\)'),
-        ((np.zeros(3), np.zeros((3, 3)), 3), r'sum_squares: shape \(3, 3\)'),
-        (([np.nan, 0.0, 0.0], np.zeros(6), 3), 'sum: found nan'),
-        ((np.zeros(3), np.full(6, np.inf), 3), 'sum_squares: found inf'),
-        ((np.zeros(3), np.zeros(6), -1), 'num_points: -1'),
-        ((np.zeros(3), np.zeros(6), 2**53 + 1), 'num_points: 9007199254740993'),
-    ],
-)
-def test_what_are_no_statistics_is_refused(stats, named):
-    with pytest.raises(ValueError, match=named):
-        Surfel.from_stats(*stats)
-
-
-@pytest.mark.parametrize(
-    ('arguments', 'named'),
-    [
-        (([1.0, 2.0],), r'position: shape \(2,\)'),
-        ((np.zeros((1, 3)),), r'position: shape \(1, 3\)'),
-        (([1.0, np.nan, 0.0],), 'position: found nan'),
-        ((np.zeros(3), np.zeros(6)), r'scatter: shape \(6,\)'),
-        ((np.zeros(3), np.full((3, 3), np.nan)), 'scatter: found nan'),
-    ],
-)
-def test_what_is_no_position_is_refused(arguments, named):
-    with pytest.raises(ValueError, match=named):
-        Surfel.from_position(*arguments)
-
-
-def test_a_number_of_points_that_is_no_whole_number_is_refused():
-    with pytest.raises(TypeError, match='integer'):
-        Surfel.from_stats(np.zeros(3), np.zeros(6), 3.0)
-
-
-def test_an_array_and_a_surfel_add_up_in_one_order_only():
-    with pytest.raises(TypeError, match='unsupported operand'):
-        np.zeros(3) + Surfel()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.mapping.surfel import Surfel
-from test.mapping.test_surfel import assert_normal, assert_promises, EPS, rounding, trace
+from test.mapping.surfel_promises import assert_normal, assert_promises, EPS, rounding, trace
 
 pytestmark = pytest.mark.filterwarnings('error')
 

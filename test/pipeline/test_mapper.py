@@ -1,91 +1,38 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Mapper: poses from every source, waiting in the time of the data, what is dropped and why.
+Mapper: poses from every source, settings and summaries.
 
 Every map is compared by digest with one made from the points and the poses alone. Whatever comes
 in, scans received = mapped + gated + dropped + waiting.
 """
 
-import logging
 from pathlib import Path
 import subprocess
 import sys
 
-from hypothesis import given, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from surfel_mapper.config import Config
-from surfel_mapper.counters import MOST_FRAMES, OTHERS
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, interpolate, pose_matrix
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.pipeline.scan_queue import MAX_FRAMES
-from surfel_mapper.scan import Scan
-from test import reference
+from test.pipeline.made_scans import (
+    add_pose,
+    assert_counts_add_up,
+    digest_of,
+    dropped,
+    insert,
+    LEVEL,
+    mapper_with,
+    MOUNTED,
+    S,
+    scan_at,
+    TURNED,
+)
 
 pytestmark = pytest.mark.filterwarnings('error')
-
-S = 10**9
-LEVEL = (0.0, 0.0, 0.0, 1.0)
-TURNED = (0.0, 0.0, 0.6, 0.8)
-MOUNTED = (0.3, -0.2, 1.5, 0.0, 0.1, 0.0, 0.99**0.5)
-
-
-def mapper_with(**changes):
-    """Return a mapper with some settings changed; odometry and a sensor at its base otherwise."""
-    changes = {name.replace('__', '.', 1): value for name, value in changes.items()}
-    defaults = {
-        'pose.source': 'odometry',
-        'frames.base_to_sensor': (0.0, 0.0, 0.0, *LEVEL),
-        'window.max_scans': 0,
-        'map.min_points': 1,
-    }
-    return Mapper(Config.from_mapping({**defaults, **changes}))
-
-
-def scan_at(stamp_s, frame_id='lidar', points=None):
-    """Return a scan; its points depend on the stamp alone."""
-    if points is None:
-        rng = np.random.default_rng(round(stamp_s * 1000))
-        points = rng.uniform([-3, -3, 1], [3, 3, 1.2], (40, 3)).astype(np.float32)
-    return Scan(points=np.asarray(points), stamp_ns=round(stamp_s * S), frame_id=frame_id)
-
-
-def add_pose(mapper, stamp_s, x=0.0, q_xyzw=LEVEL, parent='odom', child='base_link'):
-    mapper.add_pose(parent, child, round(stamp_s * S), (x, 0.0, 0.0), q_xyzw)
-
-
-def insert(mapper, *scans):
-    """Add scans and return the updates that they lead to."""
-    updates = []
-    for scan in scans:
-        mapper.add_scan(scan)
-        updates += mapper.insert_ready()
-    return updates
-
-
-def digest_of(*posed_scans):
-    """Return the digest of a map of scans at their poses, less what is within 0.1 m."""
-    surfel_map = SurfelMap(0.5)
-    for scan, pose in posed_scans:
-        moments = surfel_map.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1)
-        surfel_map.insert(moments)
-    return surfel_map.digest()
-
-
-def assert_counts_add_up(mapper, waiting=0):
-    counters = mapper.counters
-    dropped = sum(counters.dropped.values())
-    assert counters.received == counters.mapped + counters.gated + dropped + waiting
-
-
-def dropped(mapper):
-    return dict(mapper.counters.dropped)
 
 
 # Poses
@@ -179,368 +126,6 @@ def test_a_bad_pose_is_counted_and_changes_nothing(xyz, q_xyzw, parent, child):
     assert mapper.map.digest() == digest_of((scan, pose_matrix((2.0, 0, 0), LEVEL)))
 
 
-# Waiting
-
-
-def test_scans_wait_for_their_poses_and_keep_their_order():
-    mapper = mapper_with(pose__max_wait_s=5.0)
-    scans = [scan_at(1.0), scan_at(1.5), scan_at(2.0)]
-    assert insert(mapper, *scans) == []
-    assert_counts_add_up(mapper, waiting=3)
-    add_pose(mapper, 0.5, 0.5)
-    add_pose(mapper, 1.6, 1.6)
-    assert [update.stamp_ns for update in mapper.insert_ready()] == [S, 3 * S // 2]
-    assert_counts_add_up(mapper, waiting=1)
-    add_pose(mapper, 2.0, 2.0)
-    assert [update.stamp_ns for update in mapper.insert_ready()] == [2 * S]
-    assert dropped(mapper) == {}
-    assert_counts_add_up(mapper)
-
-
-def test_no_pose_is_extrapolated():
-    mapper = mapper_with()
-    add_pose(mapper, 1.0)
-    add_pose(mapper, 2.0)
-    assert insert(mapper, scan_at(0.999999999)) == []
-    assert dropped(mapper) == {'no_pose': 1}  # older than all: none will come
-    assert insert(mapper, scan_at(2.000000001)) == []
-    assert dropped(mapper) == {'no_pose': 1}  # newer than all: one may come
-    assert_counts_add_up(mapper, waiting=1)
-
-
-@pytest.mark.parametrize('newer', ['scan', 'pose of another frame'])
-def test_a_scan_is_dropped_once_newer_data_is_too_far_ahead(newer):
-    mapper = mapper_with(pose__max_wait_s=0.5)
-
-    def advance(stamp_s):
-        if newer == 'scan':
-            return insert(mapper, scan_at(stamp_s, 'camera'))
-        add_pose(mapper, stamp_s, parent='gripper', child='finger')
-        return list(mapper.insert_ready())
-
-    insert(mapper, scan_at(10.0))
-    assert advance(10.4) == advance(10.5) == []
-    assert dropped(mapper) == {}  # exactly as long as allowed
-    advance(10.500000001)
-    assert dropped(mapper) == {'no_pose': 1}
-    add_pose(mapper, 10.0)
-    add_pose(mapper, 11.0)
-    assert all(update.stamp_ns > 10 * S for update in mapper.insert_ready())
-
-
-def test_the_oldest_scan_is_dropped_when_too_many_wait():
-    mapper = mapper_with(pose__max_waiting_scans=3, pose__max_wait_s=100.0)
-    insert(mapper, *[scan_at(stamp_s) for stamp_s in range(1, 8)])
-    assert dropped(mapper) == {'queue_full': 4}
-    add_pose(mapper, 0.0)
-    add_pose(mapper, 9.0)
-    assert [update.stamp_ns // S for update in mapper.insert_ready()] == [5, 6, 7]
-    assert_counts_add_up(mapper)
-
-
-def test_at_the_end_of_the_input_waiting_scans_are_dropped():
-    mapper = mapper_with(pose__max_wait_s=100.0)
-    insert(mapper, scan_at(1.0), scan_at(2.0))
-    mapper.finish()
-    assert dropped(mapper) == {'no_pose': 2}
-    assert_counts_add_up(mapper)
-    mapper.finish()
-    assert dropped(mapper) == {'no_pose': 2}
-
-
-# Time
-
-
-def test_stamps_that_repeat_or_go_back_a_little_are_dropped():
-    mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
-    scans = [scan_at(stamp_s) for stamp_s in (5.0, 5.0, 4.9, 4.0, 5.1, 5.05)]
-    updates = insert(mapper, *scans)
-    assert [update.stamp_ns for update in updates] == [5 * S, 51 * S // 10]
-    assert dropped(mapper) == {'stamp_repeated': 1, 'stamp_back': 3}
-    assert mapper.counters.resets == 0
-    assert_counts_add_up(mapper)
-
-
-def test_stamps_of_several_sensors_are_in_order_each_for_itself():
-    mapper = mapper_with(pose__source='identity')
-    scans = [(5.0, 'a'), (4.8, 'b'), (4.9, 'b'), (5.0, 'b'), (5.1, 'a'), (4.95, 'b')]
-    updates = insert(mapper, *[scan_at(*scan) for scan in scans])
-    assert len(updates) == 5
-    assert dropped(mapper) == {'stamp_back': 1}
-
-
-def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
-    mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
-    insert(mapper, scan_at(5.0), scan_at(6.0))
-    later = [scan_at(4.999999999), scan_at(5.5)]
-    with caplog.at_level(logging.WARNING):
-        assert len(insert(mapper, *later)) == 2
-    assert 'time went back by 1.000 s' in caplog.text
-    assert 'lidar' in caplog.text
-    assert mapper.counters.resets == 1
-    assert len(mapper.window) == 2
-    expected = SurfelMap(0.5)
-    for scan in later:
-        expected.add(scan.points)
-    assert mapper.map.digest() == expected.digest()
-    assert_counts_add_up(mapper)
-
-
-def test_scans_that_wait_when_time_is_set_back_are_counted_as_cleared():
-    mapper = mapper_with(pose__max_wait_s=100.0)
-    insert(mapper, scan_at(50.0), scan_at(51.0), scan_at(1.0))
-    assert dropped(mapper) == {'cleared': 2}
-    assert_counts_add_up(mapper, waiting=1)
-
-
-def test_after_time_is_set_back_a_scan_never_gets_a_pose_of_before():
-    mapper = mapper_with(pose__max_wait_s=1.0)
-    for stamp_s in range(10):
-        add_pose(mapper, stamp_s, x=stamp_s)
-        insert(mapper, scan_at(stamp_s))
-
-    scan = scan_at(2.0)  # a simulation is reset, and the robot stands elsewhere
-    assert insert(mapper, scan) == []
-    add_pose(mapper, 1.9, x=100.0)
-    add_pose(mapper, 2.1, x=100.0)
-    (update,) = mapper.insert_ready()
-
-    assert update.T_fixed_sensor[0, 3] == 100.0
-    assert mapper.map.digest() == digest_of((scan, pose_matrix((100.0, 0, 0), LEVEL)))
-
-
-def test_poses_that_were_set_back_before_the_scans_are_kept():
-    mapper = mapper_with()
-    for stamp_s in range(10):
-        add_pose(mapper, stamp_s, x=stamp_s)
-        insert(mapper, scan_at(stamp_s))
-    add_pose(mapper, 1.5, x=100.0)
-    add_pose(mapper, 2.5, x=100.0)
-    (update,) = insert(mapper, scan_at(2.0))
-    assert update.T_fixed_sensor[0, 3] == 100.0
-
-
-def test_how_the_sensor_is_mounted_outlives_a_reset():
-    mapper = mapper_with(pose__source='tf', frames__base_to_sensor=())
-    mapper.add_pose('base_link', 'lidar', 0, (0.0, 0.0, 2.0), LEVEL, static=True)
-    add_pose(mapper, 50.0)
-    insert(mapper, scan_at(50.0), scan_at(3.0))
-    add_pose(mapper, 3.0, x=4.0)
-    (update,) = mapper.insert_ready()
-    assert update.T_fixed_sensor[:3, 3].tolist() == [4.0, 0.0, 2.0]
-
-
-# Bad scans
-
-
-def test_scans_without_a_frame_or_points_are_dropped():
-    mapper = mapper_with(pose__source='identity')
-    nothing = np.empty((0, 3), np.float32)
-    all_nan = np.full((9, 3), np.nan, np.float32)
-    far = np.full((9, 3), 1e30, np.float32)
-    updates = insert(
-        mapper,
-        scan_at(1.0, ''),
-        scan_at(2.0, points=nothing),
-        scan_at(3.0, points=all_nan),
-        scan_at(4.0, points=far),
-        scan_at(5.0),
-    )
-    assert len(updates) == 1
-    assert dropped(mapper) == {'empty_frame_id': 1, 'no_points': 1, 'no_valid_points': 2}
-    assert dict(mapper.counters.points_left_out) == {'not_finite': 9, 'beyond_map': 9}
-    assert_counts_add_up(mapper)
-
-
-def test_points_that_cannot_be_mapped_are_left_out_and_counted_and_the_others_mapped():
-    points = scan_at(1.0).points.copy()
-    points[[3, 9], 1] = np.nan
-    points[5] = np.inf
-    points[7] = [0.0, 3e38, 0.0]
-    points[8] = [6e5, 0.0, 0.0]
-    points[20] = [0.05, 0.0, 0.0]
-    points[21] = [0.0, 0.0, 60.0]
-    mapper = mapper_with(input__max_range_m=1e6)
-    add_pose(mapper, 1.0)
-    (update,) = insert(mapper, scan_at(1.0, points=points))
-    assert dict(mapper.counters.points_left_out) == {
-        'not_finite': 3, 'too_near': 1, 'too_far': 1, 'beyond_map': 1,
-    }  # fmt: skip
-    assert update.num_points == mapper.counters.points == mapper.map.num_points == 34
-    good = np.delete(points, [3, 9, 5, 7, 8, 20], axis=0)
-    assert mapper.map.digest() == digest_of((scan_at(1.0, points=good), np.eye(4)))
-
-
-def test_the_range_is_measured_from_the_sensor():
-    mapper = mapper_with(input__min_range_m=1.0, input__max_range_m=4.0)
-    add_pose(mapper, 1.0, x=1000.0)
-    points = np.array([[0.9, 0, 0], [1.0, 0, 0], [0, 4.0, 0], [0, 4.1, 0]])
-    (update,) = insert(mapper, scan_at(1.0, points=points))
-    assert update.num_points == 2
-    assert dict(mapper.counters.points_left_out) == {'too_near': 1, 'too_far': 1}
-
-
-def test_a_scan_that_the_map_refuses_is_dropped_and_the_next_one_mapped():
-    mapper = mapper_with(pose__source='identity')
-    crowd = np.ones((2**23 + 1, 3), np.float32, order='F')
-    assert insert(mapper, scan_at(1.0, points=crowd)) == []
-    assert dropped(mapper) == {'map_limit': 1}
-    assert mapper.map.num_points == 0
-    assert len(insert(mapper, scan_at(2.0))) == 1
-    assert_counts_add_up(mapper)
-
-
-def test_a_warning_names_the_cause_once_a_second_but_every_drop_is_counted(caplog):
-    mapper = mapper_with()
-    with caplog.at_level(logging.WARNING):
-        insert(mapper, *[scan_at(stamp_s, '') for stamp_s in range(20)])
-        insert(mapper, scan_at(1.0, points=np.empty((0, 3))))
-    texts = [record.getMessage() for record in caplog.records]
-    assert 1 <= sum('no frame_id' in text for text in texts) < 20
-    assert any("in frame 'lidar' dropped: it has no points" in text for text in texts)
-    assert dropped(mapper)['empty_frame_id'] == 20
-
-
-# What an update says
-
-
-def surfels_by_voxel(surfels):
-    names = ('position', 'normal', 'planarity', 'curvature', 'eigenvalues', 'num_points')
-    rows = zip(*(getattr(surfels, name).tolist() for name in names), strict=True)
-    voxels = map(tuple, surfels.voxel_index.tolist())
-    return {voxel: repr(row) for voxel, row in zip(voxels, rows, strict=True)}
-
-
-@pytest.mark.parametrize('min_points', [1, 3])
-def test_updates_keep_a_copy_of_the_map_up_to_date(min_points):
-    mapper = mapper_with(map__min_points=min_points, window__max_scans=5)
-    copy, moments = {}, {}
-    for stamp_s in range(20):
-        add_pose(mapper, stamp_s, x=0.4 * stamp_s)
-        scan = scan_at(stamp_s)
-        (update,) = insert(mapper, scan)
-        changed = surfels_by_voxel(update.changed)
-
-        pose = update.T_fixed_sensor
-        twins = [reference.scan_moments(scan.points, 0.5, pose[:3, 3], pose)]
-        reference.add_moments(moments, twins[0])
-        for eviction in update.evictions:
-            twins.append(reference.as_twin(eviction.scan.moments))
-            reference.add_moments(moments, twins[-1], -1)
-        touched = set().union(*twins)
-        assert set(changed) == {v for v in touched if moments.get(v, [0])[0] >= min_points}
-
-        for voxel in map(tuple, update.removed_voxel_index.tolist()):
-            assert moments.get(voxel, [0])[0] < min_points
-            copy.pop(voxel, None)
-        copy.update(changed)
-        assert copy == surfels_by_voxel(mapper.map.surfels(min_points))
-    assert mapper.map.digest() == reference.digest(moments, 0.5)
-    assert dict(mapper.counters.evicted) == {'max_scans': 15}
-
-
-def test_normals_of_an_update_are_those_of_the_exact_twin():
-    mapper = mapper_with(map__min_points=8)
-    rng = np.random.default_rng(1)
-    compared = 0
-    for stamp_s in range(4):
-        add_pose(mapper, stamp_s, x=0.1 * stamp_s, q_xyzw=TURNED)
-        points = rng.uniform([-3, -3, -1], [3, 3, -0.9], (900, 3))
-        (update,) = insert(mapper, scan_at(stamp_s, points=points))
-    twins = reference.as_twin(mapper.map.moments())
-    for voxel, normal in zip(
-        map(tuple, update.changed.voxel_index.tolist()), update.changed.normal, strict=True
-    ):
-        twin = reference.surfel(voxel, twins[voxel], 0.5)
-        e0, e1, e2 = twin['eigenvalues']
-        if e1 - e0 > 1e-4 * e2 and twin['towards'] > 1e-6:
-            compared += 1
-            assert np.linalg.norm(normal - twin['normal']) <= 1e-6
-    assert compared > 100
-
-
-def test_every_stage_is_timed():
-    mapper = mapper_with(pose__source='identity')
-    (update,) = insert(mapper, scan_at(1.0))
-    assert list(update.milliseconds) == ['reduce', 'insert', 'normals', 'total']
-    parts = [update.milliseconds[name] for name in ('reduce', 'insert', 'normals')]
-    assert min(parts) >= 0.0
-    assert sum(parts) == pytest.approx(update.milliseconds['total'])
-    assert set(mapper.summary()['milliseconds']) == set(update.milliseconds)
-
-
-# Window and gate
-
-
-@pytest.mark.parametrize(
-    ('limits', 'left'),
-    [
-        ({'window__max_scans': 4}, 4),
-        ({'window__max_age_s': 2.5}, 3),
-        ({'window__max_distance_m': 1.3}, 3),
-        ({'window__max_bytes': 1}, 1),
-        ({'map__max_voxels': 1}, 1),
-        ({'window__max_scans': 4, 'window__max_age_s': 1.5}, 2),
-    ],
-)
-def test_the_limits_of_the_configuration_hold(limits, left):
-    mapper = mapper_with(**limits)
-    for stamp_s in range(9):
-        add_pose(mapper, stamp_s, x=0.5 * stamp_s)
-        insert(mapper, scan_at(stamp_s))
-    assert len(mapper.window) == left
-    scans = [scan_at(stamp_s) for stamp_s in range(9 - left, 9)]
-    poses = [pose_matrix((0.5 * s, 0, 0), LEVEL) for s in range(9 - left, 9)]
-    assert mapper.map.digest() == digest_of(*zip(scans, poses, strict=True))
-    assert sum(mapper.counters.evicted.values()) == 9 - left
-    assert set(mapper.counters.evicted) <= {name.split('__')[1] for name in limits}
-
-
-def test_points_are_kept_where_asked():
-    for keep in (False, True):
-        mapper = mapper_with(pose__source='identity', window__keep_points=keep)
-        scan = scan_at(1.0)
-        insert(mapper, scan)
-        (windowed,) = mapper.window
-        assert (windowed.points is not None) == keep
-        if keep:
-            assert (windowed.points == scan.points).all()
-
-
-def drive_gated(**gate):
-    """Return which of 13 scans are mapped: x rises by 0.25 m to 1.5 m, then a turn by 10 deg."""
-    mapper = mapper_with(**gate)
-    mapped = []
-    for number in range(13):
-        angle = np.radians(10.0 * max(number - 6, 0)) / 2.0
-        q = (0.0, 0.0, np.sin(angle), np.cos(angle))
-        add_pose(mapper, number, x=0.25 * min(number, 6), q_xyzw=q)
-        mapped += [update.stamp_ns // S for update in insert(mapper, scan_at(number))]
-    assert mapper.counters.gated == 13 - len(mapped)
-    assert_counts_add_up(mapper)
-    return mapped
-
-
-def test_the_motion_gate_leaves_out_scans_taken_while_standing_still():
-    assert drive_gated() == list(range(13))
-    assert drive_gated(window__gate_distance_m=0.5) == [0, 2, 4, 6]
-    assert drive_gated(window__gate_angle_deg=25.0) == [0, 9, 12]
-    both = drive_gated(window__gate_distance_m=0.7, window__gate_angle_deg=15.0)
-    assert both == [0, 3, 6, 8, 10, 12]
-    assert drive_gated(window__gate_distance_m=100.0) == [0]
-
-
-def test_the_motion_gate_looks_back_to_the_last_scan_mapped():
-    mapper = mapper_with(window__gate_distance_m=1.0)
-    for number in range(20):  # 0.3 m a scan: each alone would be too little
-        add_pose(mapper, number, x=0.3 * number)
-        insert(mapper, scan_at(number))
-    assert mapper.counters.mapped == 5
-    mapper.clear()
-    add_pose(mapper, 30.0, x=6.0)
-    assert len(insert(mapper, scan_at(30.0))) == 1  # nothing to look back to
-
-
 # While it runs
 
 
@@ -632,20 +217,6 @@ def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
     assert_counts_add_up(mapper)
 
 
-def test_frame_names_without_end_are_refused_and_do_not_pile_up():
-    mapper = mapper_with(pose__source='identity')
-    for number in range(MAX_FRAMES + MOST_FRAMES + 50):
-        insert(mapper, scan_at(1.0 + number, frame_id=f'lidar_{number}'))
-    assert mapper.counters.mapped == MAX_FRAMES
-    assert dropped(mapper) == {'too_many_frames': MOST_FRAMES + 50}
-    by_frame = mapper.counters.dropped_by_frame
-    assert len(by_frame) == MOST_FRAMES + 1
-    assert by_frame[OTHERS]['too_many_frames'] == 50
-    insert(mapper, scan_at(1e4, frame_id='lidar_0'))  # those known go on
-    assert mapper.counters.mapped == MAX_FRAMES + 1
-    assert_counts_add_up(mapper)
-
-
 COMPILED_BEFORE_THE_FIRST_SCAN = """
 import importlib, pkgutil
 import numpy as np
@@ -694,53 +265,3 @@ def test_after_the_warm_up_nothing_is_compiled_any_more():
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == '{}\n'
-
-
-# Anything in any order
-
-BAD = {
-    'no frame': ('',),
-    'no points': ('lidar', np.empty((0, 3))),
-    'nan': ('lidar', np.full((3, 3), np.nan)),
-    'far': ('lidar', np.full((3, 3), 1e20)),
-}
-EVENT = st.one_of(
-    st.tuples(st.just('scan'), st.sampled_from([0.1, 0.2, 0.0, -0.3, -2.0, 0.7, 3.0])),
-    st.tuples(st.just('pose'), st.sampled_from([0.0, 0.1, -0.1, 0.5, -5.0])),
-    st.tuples(st.just('bad scan'), st.sampled_from(list(BAD))),
-    st.tuples(st.sampled_from(['insert', 'insert', 'insert', 'clear']), st.none()),
-)
-
-
-@settings(max_examples=150)
-@given(st.lists(EVENT, max_size=40), st.integers(0, 3), st.sampled_from([0.0, 0.3]))
-def test_whatever_comes_in_the_counts_add_up_and_the_map_is_its_window(events, limit, gate_m):
-    mapper = mapper_with(
-        window__max_scans=limit + 1, window__gate_distance_m=gate_m, pose__max_waiting_scans=4
-    )
-    now_s, updates = 10.0, 0
-    for kind, value in events:
-        if kind == 'scan':
-            now_s += value
-            mapper.add_scan(scan_at(now_s))
-        elif kind == 'pose':
-            add_pose(mapper, now_s + value, x=0.2 * now_s)
-        elif kind == 'bad scan':
-            now_s += 0.05
-            mapper.add_scan(scan_at(now_s, *BAD[value]))
-        elif kind == 'clear':
-            mapper.clear()
-        else:
-            updates += len(list(mapper.insert_ready()))
-    counters = mapper.counters
-    waiting = counters.received - counters.mapped - counters.gated - sum(dropped(mapper).values())
-    assert 0 <= waiting <= 4
-    assert updates == counters.mapped
-    alone = SurfelMap(0.5)
-    for scan in mapper.window:
-        alone.insert(scan.moments)
-    assert mapper.map.digest() == alone.digest()
-    before = sum(dropped(mapper).values())
-    mapper.finish()
-    assert sum(dropped(mapper).values()) == before + waiting
-    assert_counts_add_up(mapper)

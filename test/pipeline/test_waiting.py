@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Mapper: scans wait for poses in the time of the data, and time may be set back."""
+
+import logging
+
+import pytest
+
+from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.pipeline.made_scans import (
+    add_pose,
+    assert_counts_add_up,
+    digest_of,
+    dropped,
+    insert,
+    LEVEL,
+    mapper_with,
+    S,
+    scan_at,
+)
+
+pytestmark = pytest.mark.filterwarnings('error')
+
+
+# Waiting
+
+
+def test_scans_wait_for_their_poses_and_keep_their_order():
+    mapper = mapper_with(pose__max_wait_s=5.0)
+    scans = [scan_at(1.0), scan_at(1.5), scan_at(2.0)]
+    assert insert(mapper, *scans) == []
+    assert_counts_add_up(mapper, waiting=3)
+    add_pose(mapper, 0.5, 0.5)
+    add_pose(mapper, 1.6, 1.6)
+    assert [update.stamp_ns for update in mapper.insert_ready()] == [S, 3 * S // 2]
+    assert_counts_add_up(mapper, waiting=1)
+    add_pose(mapper, 2.0, 2.0)
+    assert [update.stamp_ns for update in mapper.insert_ready()] == [2 * S]
+    assert dropped(mapper) == {}
+    assert_counts_add_up(mapper)
+
+
+def test_no_pose_is_extrapolated():
+    mapper = mapper_with()
+    add_pose(mapper, 1.0)
+    add_pose(mapper, 2.0)
+    assert insert(mapper, scan_at(0.999999999)) == []
+    assert dropped(mapper) == {'no_pose': 1}  # older than all: none will come
+    assert insert(mapper, scan_at(2.000000001)) == []
+    assert dropped(mapper) == {'no_pose': 1}  # newer than all: one may come
+    assert_counts_add_up(mapper, waiting=1)
+
+
+@pytest.mark.parametrize('newer', ['scan', 'pose of another frame'])
+def test_a_scan_is_dropped_once_newer_data_is_too_far_ahead(newer):
+    mapper = mapper_with(pose__max_wait_s=0.5)
+
+    def advance(stamp_s):
+        if newer == 'scan':
+            return insert(mapper, scan_at(stamp_s, 'camera'))
+        add_pose(mapper, stamp_s, parent='gripper', child='finger')
+        return list(mapper.insert_ready())
+
+    insert(mapper, scan_at(10.0))
+    assert advance(10.4) == advance(10.5) == []
+    assert dropped(mapper) == {}  # exactly as long as allowed
+    advance(10.500000001)
+    assert dropped(mapper) == {'no_pose': 1}
+    add_pose(mapper, 10.0)
+    add_pose(mapper, 11.0)
+    assert all(update.stamp_ns > 10 * S for update in mapper.insert_ready())
+
+
+def test_the_oldest_scan_is_dropped_when_too_many_wait():
+    mapper = mapper_with(pose__max_waiting_scans=3, pose__max_wait_s=100.0)
+    insert(mapper, *[scan_at(stamp_s) for stamp_s in range(1, 8)])
+    assert dropped(mapper) == {'queue_full': 4}
+    add_pose(mapper, 0.0)
+    add_pose(mapper, 9.0)
+    assert [update.stamp_ns // S for update in mapper.insert_ready()] == [5, 6, 7]
+    assert_counts_add_up(mapper)
+
+
+def test_at_the_end_of_the_input_waiting_scans_are_dropped():
+    mapper = mapper_with(pose__max_wait_s=100.0)
+    insert(mapper, scan_at(1.0), scan_at(2.0))
+    mapper.finish()
+    assert dropped(mapper) == {'no_pose': 2}
+    assert_counts_add_up(mapper)
+    mapper.finish()
+    assert dropped(mapper) == {'no_pose': 2}
+
+
+# Time
+
+
+def test_stamps_that_repeat_or_go_back_a_little_are_dropped():
+    mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
+    scans = [scan_at(stamp_s) for stamp_s in (5.0, 5.0, 4.9, 4.0, 5.1, 5.05)]
+    updates = insert(mapper, *scans)
+    assert [update.stamp_ns for update in updates] == [5 * S, 51 * S // 10]
+    assert dropped(mapper) == {'stamp_repeated': 1, 'stamp_back': 3}
+    assert mapper.counters.resets == 0
+    assert_counts_add_up(mapper)
+
+
+def test_stamps_of_several_sensors_are_in_order_each_for_itself():
+    mapper = mapper_with(pose__source='identity')
+    scans = [(5.0, 'a'), (4.8, 'b'), (4.9, 'b'), (5.0, 'b'), (5.1, 'a'), (4.95, 'b')]
+    updates = insert(mapper, *[scan_at(*scan) for scan in scans])
+    assert len(updates) == 5
+    assert dropped(mapper) == {'stamp_back': 1}
+
+
+def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
+    mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
+    insert(mapper, scan_at(5.0), scan_at(6.0))
+    later = [scan_at(4.999999999), scan_at(5.5)]
+    with caplog.at_level(logging.WARNING):
+        assert len(insert(mapper, *later)) == 2
+    assert 'time went back by 1.000 s' in caplog.text
+    assert 'lidar' in caplog.text
+    assert mapper.counters.resets == 1
+    assert len(mapper.window) == 2
+    expected = SurfelMap(0.5)
+    for scan in later:
+        expected.add(scan.points)
+    assert mapper.map.digest() == expected.digest()
+    assert_counts_add_up(mapper)
+
+
+def test_scans_that_wait_when_time_is_set_back_are_counted_as_cleared():
+    mapper = mapper_with(pose__max_wait_s=100.0)
+    insert(mapper, scan_at(50.0), scan_at(51.0), scan_at(1.0))
+    assert dropped(mapper) == {'cleared': 2}
+    assert_counts_add_up(mapper, waiting=1)
+
+
+def test_after_time_is_set_back_a_scan_never_gets_a_pose_of_before():
+    mapper = mapper_with(pose__max_wait_s=1.0)
+    for stamp_s in range(10):
+        add_pose(mapper, stamp_s, x=stamp_s)
+        insert(mapper, scan_at(stamp_s))
+
+    scan = scan_at(2.0)  # a simulation is reset, and the robot stands elsewhere
+    assert insert(mapper, scan) == []
+    add_pose(mapper, 1.9, x=100.0)
+    add_pose(mapper, 2.1, x=100.0)
+    (update,) = mapper.insert_ready()
+
+    assert update.T_fixed_sensor[0, 3] == 100.0
+    assert mapper.map.digest() == digest_of((scan, pose_matrix((100.0, 0, 0), LEVEL)))
+
+
+def test_poses_that_were_set_back_before_the_scans_are_kept():
+    mapper = mapper_with()
+    for stamp_s in range(10):
+        add_pose(mapper, stamp_s, x=stamp_s)
+        insert(mapper, scan_at(stamp_s))
+    add_pose(mapper, 1.5, x=100.0)
+    add_pose(mapper, 2.5, x=100.0)
+    (update,) = insert(mapper, scan_at(2.0))
+    assert update.T_fixed_sensor[0, 3] == 100.0
+
+
+def test_how_the_sensor_is_mounted_outlives_a_reset():
+    mapper = mapper_with(pose__source='tf', frames__base_to_sensor=())
+    mapper.add_pose('base_link', 'lidar', 0, (0.0, 0.0, 2.0), LEVEL, static=True)
+    add_pose(mapper, 50.0)
+    insert(mapper, scan_at(50.0), scan_at(3.0))
+    add_pose(mapper, 3.0, x=4.0)
+    (update,) = mapper.insert_ready()
+    assert update.T_fixed_sensor[:3, 3].tolist() == [4.0, 0.0, 2.0]
