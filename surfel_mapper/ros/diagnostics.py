@@ -196,11 +196,12 @@ def latency(session: Session, percentile: float) -> float | None:
 
 
 def process_bytes() -> int:
-    """Return the memory that the process has resident."""
-    statm = Path('/proc/self/statm')
-    if statm.exists():
-        return int(statm.read_text().split()[1]) * resource.getpagesize()
-    return 0  # no Linux
+    """Return the memory that the process has resident; 0 where nobody tells."""
+    try:
+        pages = Path('/proc/self/statm').read_text(encoding='ascii').split()[1]
+    except OSError:
+        return 0  # no Linux, or no file descriptor left
+    return int(pages) * resource.getpagesize()
 
 
 def diagnostics(

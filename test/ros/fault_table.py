@@ -1,7 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The table of faults in docs/faults.md, made from the tests: ``python -m test.ros.fault_table``.
+The table of faults in docs/faults.md and what is counted there, made from the tests.
+
+``python -m test.ros.fault_table`` writes both.
 
 Each test of a fault states, where it stands, what happens, what is counted and what is lost; it
 then holds the node to it.
@@ -12,7 +14,10 @@ from __future__ import annotations
 from collections.abc import Callable
 import importlib
 from pathlib import Path
+import re
 from typing import NamedTuple
+
+from test.fuzz.harnesses import HARNESSES
 
 PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
 MODULES = ('test.ros.test_faults_input', 'test.ros.test_faults_files')
@@ -46,14 +51,26 @@ def table() -> str:
     return '\n'.join([BEGIN, *rows, END])
 
 
+def figures() -> dict[str, int]:
+    """Return what is counted, by the beginnings of the rows that state it."""
+    tried = sum(len(harness.corpus()) + harness.number for harness in HARNESSES.values())
+    return {
+        '| inputs of the tests, the same in every run |': tried,
+        '| faults, each a row below and a test |': len(FAULTS),
+    }
+
+
 def page_with(rows: str) -> str:
-    """Return the page with other rows."""
+    """Return the page with other rows, and with the figures of today."""
     text = PAGE.read_text(encoding='utf-8')
     before, _, rest = text.partition(BEGIN)
-    return before + rows + rest.partition(END)[2]
+    text = before + rows + rest.partition(END)[2]
+    for row, number in figures().items():
+        text = re.sub(rf'(?<=^{re.escape(row)} )[\d,]+', f'{number:,}', text, flags=re.MULTILINE)
+    return text
 
 
 if __name__ == '__main__':
     from test.ros import fault_table  # where the tests have entered theirs
 
-    PAGE.write_text(page_with(fault_table.table()), encoding='utf-8')
+    PAGE.write_text(fault_table.page_with(fault_table.table()), encoding='utf-8')

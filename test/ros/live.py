@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from array import array
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import signal
@@ -63,6 +64,11 @@ class Process:
 
     def is_running(self):
         return self._process.poll() is None
+
+    def check(self):
+        """Check that it goes on, and that nothing was raised in it."""
+        assert self.is_running(), self.output
+        assert 'Traceback' not in self.output, self.output
 
     def wait_for_output(self, text, timeout_s=TIMEOUT_S):
         end = time.monotonic() + timeout_s
@@ -166,6 +172,18 @@ class Peer:
 
         self.spin_until(is_as_expected, what=lambda: f'no {expected}, but {values}')
         return reports[-1].status[0], values
+
+
+@contextmanager
+def node_and_peer(folder, *arguments):
+    """Give a node that saves into a folder and a peer of it, in a with-block."""
+    node = Process(['node', *arguments, '-p', f'output.directory:={folder}'], folder.parent)
+    peer = Peer()
+    try:
+        yield node, peer
+    finally:
+        peer.close()
+        node.kill()
 
 
 def odometry(stamp_ns, xyz, parent='odom', child='base_link'):

@@ -14,8 +14,8 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import cloud, NODE, odometry, room, stamp, START_NS
-from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
 
 TOPICS = {
     'normals': 'sensor_msgs/msg/PointCloud2',

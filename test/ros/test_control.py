@@ -21,8 +21,8 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
 from surfel_mapper.ros.control import Control, MAX_WAITING
 from surfel_mapper.ros.mapping_thread import MappingThread
+from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import NODE, odometry, stamp, START_NS
-from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
 
 ANSWERS = LoadMap.Response
 SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))

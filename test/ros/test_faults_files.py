@@ -18,6 +18,7 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
 from surfel_mapper.cli.replay_files import Mapped, write_files
@@ -28,9 +29,9 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.saving import save_map
 from surfel_mapper.scan import Scan
 from surfel_mapper.viz.history import History
+from test.ros.driving import ARGUMENTS, drive, send
 from test.ros.fault_table import fault
-from test.ros.live import NODE, Peer, Process, ROOT
-from test.ros.test_node import ARGUMENTS, drive, send
+from test.ros.live import NODE, node_and_peer, ROOT
 
 
 def mapper_of(num_scans, folder):
@@ -166,16 +167,12 @@ def disk(tmp_path):
 
 @pytest.fixture(scope='module')
 def running(compiled, tmp_path_factory):
-    folder = tmp_path_factory.mktemp('files')
-    maps = folder / 'maps'
-    node = Process(['node', *ARGUMENTS, '-p', f'output.directory:={maps}'], folder)
-    peer = Peer()
-    peer.advertise('/odom', '/points')
-    send(peer, drive(3))
-    peer.diagnosis({'scans.mapped': 3})
-    yield node, peer, maps
-    peer.close()
-    node.kill()
+    maps = tmp_path_factory.mktemp('files') / 'maps'
+    with node_and_peer(maps, *ARGUMENTS) as (node, peer):
+        peer.advertise('/odom', '/points')
+        send(peer, drive(3))
+        peer.diagnosis({'scans.mapped': 3})
+        yield node, peer, maps
 
 
 def saves(peer):
@@ -186,8 +183,7 @@ def saves(peer):
 
 def goes_on(node, peer):
     """Check that a node works as before."""
-    assert node.is_running()
-    assert 'Traceback' not in node.output
+    node.check()
     _, values = peer.diagnosis()
     assert values['scans.mapped'] == values['scans.received'] == '3'
 
@@ -253,12 +249,16 @@ def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
     client = peer.node.create_client(Trigger, f'{NODE}/save_map')
     peer.spin_until(client.service_is_ready)
     assert peer.result(client.call_async(Trigger.Request())).success
+    reports = peer.collect(DiagnosticArray, '/diagnostics')
+    peer.spin_until(lambda: reports)
     before = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     used = {int(path.name) for path in Path(f'/proc/{pid}/fd').iterdir()}
     first_free = next(number for number in itertools.count() if number not in used)
     resource.prlimit(pid, resource.RLIMIT_NOFILE, (first_free, before[1]))
     try:
         answer = peer.result(client.call_async(Trigger.Request()))
+        reports.clear()
+        peer.spin_until(lambda: len(reports) > 3, what=lambda: node.output)
     finally:
         resource.prlimit(pid, resource.RLIMIT_NOFILE, before)
     assert not answer.success

@@ -23,9 +23,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 
+from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.fault_table import fault, PAGE, page_with, table
-from test.ros.live import cloud, NODE, odometry, Peer, Process, room, ROOT, START_NS, TIMEOUT_S
-from test.ros.test_node import ARGUMENTS, drive, mapped, PERIOD_NS, send
+from test.ros.live import cloud, NODE, node_and_peer, odometry, Peer, room, ROOT, START_NS
 
 SECOND_NS = 10**9
 
@@ -88,8 +88,7 @@ class Stream:
         dropped = {k: v for k, v in grown.items() if k.startswith('scans.dropped.') and v}
         assert dropped == {k: v for k, v in wanted.items() if k.startswith('scans.dropped.') and v}
         assert grown['scans.received'] == grown['scans.mapped'] + sum(dropped.values())
-        assert self.node.is_running()
-        assert 'Traceback' not in self.node.output
+        self.node.check()
 
     def settle(self):
         """Wait until every cloud that came is accounted for, and none comes any more."""
@@ -106,19 +105,14 @@ class Stream:
             return is_whole and time.monotonic() - last[1] > 1.0
 
         self.peer.spin_until(is_settled, what=lambda: str(self.grown()))
-        assert self.node.is_running()
-        assert 'Traceback' not in self.node.output
+        self.node.check()
         return self.grown()
 
 
 @pytest.fixture(scope='module')
 def running(compiled, tmp_path_factory):
-    folder = tmp_path_factory.mktemp('faults')
-    node = Process(['node', *ARGUMENTS, '-p', f'output.directory:={folder}'], folder)
-    peer = Peer()
-    yield Stream(node, peer)
-    peer.close()
-    node.kill()
+    with node_and_peer(tmp_path_factory.mktemp('faults') / 'maps', *ARGUMENTS) as pair:
+        yield Stream(*pair)
 
 
 @pytest.fixture
@@ -151,9 +145,7 @@ def test_a_publisher_that_was_killed_is_heard_again(stream):
         before = stream.grown().get('scans.mapped', 0)
         command = [sys.executable, '-c', SENDER, str(stream.step(200 * SECOND_NS))]
         with subprocess.Popen(command, cwd=ROOT) as sender:
-            stream.peer.spin_until(
-                lambda b=before: stream.grown()['scans.mapped'] >= b + 5, TIMEOUT_S
-            )
+            stream.peer.spin_until(lambda b=before: stream.grown()['scans.mapped'] >= b + 5)
             sender.send_signal(signal.SIGKILL)
     stream.step(200 * SECOND_NS)
     grown = stream.settle()

@@ -21,62 +21,18 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.config import Config
 from surfel_mapper.io.ply import read_points
 from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.io.surfel_columns import surfel_columns
-from surfel_mapper.pipeline import Mapper
+from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import (
     cloud,
     LATCHED,
     odometry,
-    RELIABLE,
     room,
     RVIZ,
     START_NS,
 )
-
-PERIOD_NS = 100_000_000
-SETTINGS = {
-    'pose.source': 'odometry',
-    'frames.base_to_sensor': [0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
-    'window.max_scans': 3,
-    'publish.normals_rate_hz': 20.0,
-    'publish.markers_rate_hz': 20.0,
-    'publish.diagnostics_rate_hz': 20.0,
-}
-ARGUMENTS = [
-    '--ros-args',
-    *(item for name, value in SETTINGS.items() for item in ('-p', f'{name}:={value}')),
-    *RELIABLE,
-]
-
-
-def drive(num_scans):
-    """Return clouds with their poses: a sensor that moves through a room."""
-    stamps = [START_NS + i * PERIOD_NS for i in range(num_scans)]
-    poses = [odometry(stamp_ns, (0.2 * i, 0.0, 0.0)) for i, stamp_ns in enumerate(stamps)]
-    return list(zip([cloud(s, room(seed=i)) for i, s in enumerate(stamps)], poses, strict=True))
-
-
-def mapped(messages):
-    """Return the updates of a Mapper fed with the same messages, and the Mapper."""
-    mapper = Mapper(Config.from_mapping(SETTINGS))
-    updates = []
-    for points, pose in messages:
-        for found in poses_in('odometry', pose, 'base_link'):
-            mapper.add_pose(*found)
-        mapper.add_scan(to_scan(points))
-        updates += mapper.insert_ready()
-    return updates, mapper
-
-
-def send(peer, messages):
-    for points, pose in messages:
-        time.sleep(0.02)  # the queue of a topic holds 20
-        peer.publish('/odom', pose)
-        peer.publish('/points', points)
 
 
 def assert_equal_columns(message, surfels):

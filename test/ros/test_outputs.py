@@ -18,63 +18,19 @@ from scipy.spatial import cKDTree
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from surfel_mapper import MapMirror, Mapper
-from surfel_mapper.config import Config
+from surfel_mapper import MapMirror
 from surfel_mapper.io.markers import normal_colors, SEGMENTS, shades
 from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.io.scan_normals import ADDED
 from surfel_mapper.mapping.moments import pack_keys
 from test.io.test_scan_normals import cloud as odd_cloud
-from test.ros.live import cloud, LATCHED, odometry, RELIABLE, room, RVIZ, START_NS
+from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
+from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 
 pytestmark = pytest.mark.timeout(120)
 
-PERIOD_NS = 100_000_000
 MANY = QoSProfile(depth=200)
 BASE = '/surfel_mapper'
-SETTINGS = {
-    'pose.source': 'odometry',
-    'frames.base_to_sensor': [0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
-    'window.max_scans': 3,
-    'publish.normals_rate_hz': 20.0,
-    'publish.markers_rate_hz': 20.0,
-    'publish.diagnostics_rate_hz': 20.0,
-}
-
-
-def arguments(**changes):
-    settings = {**SETTINGS, **changes}
-    pairs = [('-p', f'{name}:={value}') for name, value in settings.items()]
-    return ['--ros-args', *(item for pair in pairs for item in pair), *RELIABLE]
-
-
-def drive(num_scans, first=0):
-    """Return clouds with their poses: a sensor that moves through a room."""
-    numbers = range(first, first + num_scans)
-    stamps = [START_NS + i * PERIOD_NS for i in numbers]
-    return [
-        (cloud(stamp_ns, room(seed=i)), odometry(stamp_ns, (0.4 * i, 0.0, 0.0)))
-        for i, stamp_ns in zip(numbers, stamps, strict=True)
-    ]
-
-
-def send(peer, messages):
-    for points, pose in messages:
-        peer.spin_for(0.03)  # the queue of a topic holds 20
-        peer.publish('/odom', pose)
-        peer.publish('/points', points)
-
-
-def mapped(messages, **changes):
-    """Return a Mapper fed with the same messages."""
-    mapper = Mapper(Config.from_mapping({**SETTINGS, **changes}))
-    for points, pose in messages:
-        for found in poses_in('odometry', pose, 'base_link'):
-            mapper.add_pose(*found)
-        mapper.add_scan(to_scan(points))
-        list(mapper.insert_ready())
-    return mapper
 
 
 def stamp_of(message):
@@ -154,7 +110,7 @@ def test_what_changed_less_what_was_removed_is_the_map(start, peer):
             index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
             assert {tuple(row) for row in index.tolist()} == voxels(gone)
         known = (known | voxels(now)) - voxels(gone)
-    surfels = mapped(messages).map.surfels(5)
+    surfels = mapped(messages)[1].map.surfels(5)
     expected = {tuple(row) for row in np.floor(surfels.position.astype('f4') / 0.5).tolist()}
     assert known == expected
     assert peer.call('clear').success
@@ -174,7 +130,7 @@ def test_the_full_map_comes_on_request(start, peer):
 
     answer = peer.call('publish_normals')
 
-    number = len(mapped(messages).map.surfels(5))
+    number = len(mapped(messages)[1].map.surfels(5))
     assert (answer.success, answer.message) == (True, f'{number} surfels published')
     peer.spin_until(lambda: normals)
     assert normals[0].width == number
@@ -188,7 +144,7 @@ def test_coarser_maps_come_where_they_are_asked_for(start, peer):
     clouds = [peer.collect(PointCloud2, f'{BASE}/level_{n}/normals', LATCHED) for n in (1, 2)]
     messages = drive(4)
     send(peer, messages)
-    surfel_map = mapped(messages).map
+    surfel_map = mapped(messages)[1].map
     peer.diagnosis({'scans.mapped': 4})
     for level, received in enumerate(clouds, 1):
         surfels = surfel_map.coarsen(level).surfels(3)
@@ -238,7 +194,7 @@ def test_the_scan_comes_back_with_normals_and_every_field(start, peer):
     assert list(again.columns) == [*given.columns, *ADDED]
     for name, values in given.columns.items():
         np.testing.assert_array_equal(again.columns[name], values)
-    mapper = mapped([*messages[:3], (sent, messages[3][1])])
+    mapper = mapped([*messages[:3], (sent, messages[3][1])])[1]
     pose = mapper.window.newest.T_map_sensor
     surfels = mapper.map.surfels(5)
     rows = mapper.map.index(5)
@@ -278,7 +234,7 @@ def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(
     start_node(start, peer, **{'publish.marker_color': 'normal'})
     messages = drive(3)
     send(peer, messages)
-    surfels = mapped(messages).map.surfels(5)
+    surfels = mapped(messages)[1].map.surfels(5)
     markers = peer.collect(MarkerArray, f'{BASE}/markers', RVIZ)
     peer.spin_until(lambda: markers and len(markers[-1].markers[1].points) == 2 * len(surfels))
 
@@ -332,7 +288,7 @@ def test_keys_of_a_message_are_those_of_the_map(start, peer):
     normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
     messages = drive(2)
     send(peer, messages)
-    expected = mapped(messages).map.moments().key
+    expected = mapped(messages)[1].map.moments().key
     peer.spin_until(lambda: normals and normals[-1].width == len(expected))
     columns = to_scan(normals[-1]).columns
     index = np.stack([columns[f'voxel_{axis}'] for axis in 'xyz'], axis=1)
