@@ -21,8 +21,8 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.node import MapperNode
 from surfel_mapper.ros.running import executing
+from test.ros.driving import ARGUMENTS, drive, mapped, send
 from test.ros.live import LATCHED, NODE, RVIZ
-from test.ros.test_node import ARGUMENTS, drive, mapped, send
 
 STATES = ('unconfigured', 'inactive', 'active', 'finalized')
 WAITING = [*ARGUMENTS, '-p', 'autostart:=false']
