@@ -28,7 +28,8 @@ def compiled(domain, tmp_path_factory):
     """Run a node until its kernels are compiled, which takes longer than any test waits."""
     from test.ros.live import Process
 
-    arguments = ['node', '--ros-args', '-p', 'pose.source:=identity']
+    layers = ['-p', 'layers.models.enabled:=true']
+    arguments = ['node', '--ros-args', '-p', 'pose.source:=identity', *layers]
     node = Process(arguments, tmp_path_factory.mktemp('compiling'))
     try:
         node.wait_for_output('ready:', COMPILING_S)

@@ -11,20 +11,20 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from test.ros.driving import ARGUMENTS
 from test.ros.live import NODE
-from test.ros.test_node import ARGUMENTS
 
 POLICY = Path(__file__).parents[2] / 'launch_configs' / 'sros2_policy.xml'
 
 EVERYTHING = [
     *('-p', 'window.keep_points:=true', '-p', 'align.every_scans:=5'),
-    *('-p', 'layers.tsdf.enabled:=true'),
+    *('-p', 'layers.tsdf.enabled:=true', '-p', 'layers.models.enabled:=true'),
 ]
 
 SOURCES = {'pose', 'depth', 'camera_info', 'tf', 'tf_static', 'clock', 'initialpose'}
 """Read in other configurations than that of the test."""
 
-OUTPUTS = {'tf', '~/odometry', '~/track', '~/planes', *(f'~/level_{n}/normals' for n in (1, 2, 3))}
+OUTPUTS = {'tf', '~/odometry', '~/track', *(f'~/level_{n}/normals' for n in (1, 2, 3))}
 """Written in other configurations."""
 
 

@@ -1,0 +1,323 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+What a node publishes of the models of its map, seen over DDS.
+
+Expected values come from a mapper that is fed the same messages here, and from the scene.
+"""
+
+from __future__ import annotations
+
+from geometry_msgs.msg import PolygonInstanceStamped
+import numpy as np
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from surfel_mapper import Mapper
+from surfel_mapper.config import Config
+from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.models.multi_model import Surface
+from test.ros.live import cloud, LATCHED, NODE, odometry, RELIABLE, RVIZ, START_NS
+
+pytestmark = pytest.mark.timeout(180)
+
+ALL_OUTLINES = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base_to_sensor': [0.1, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0],
+    'window.max_scans': 2,
+    'layers.models.enabled': True,
+    'layers.models.extract_period_s': 0.0,
+    'publish.diagnostics_rate_hz': 20.0,
+}
+PERIOD_NS = 100_000_000
+TOPICS = {
+    'planes': (MarkerArray, LATCHED),
+    'primitives': (PointCloud2, LATCHED),
+    'surfel_primitives': (PointCloud2, LATCHED),
+    'outlines': (PolygonInstanceStamped, ALL_OUTLINES),
+}
+FLOOR_Z, WALL_Y, PILLAR = -0.9, 3.2, (-2.0, -1.5)
+
+
+def scene(seed, *, wall=True):
+    """Return points on a floor with a hole of 2 m by 2 m, on a wall, on a pillar and in a bush."""
+    rng = np.random.default_rng(seed)
+    floor = rng.uniform((-4.0, -4.0, FLOOR_Z), (4.0, 3.0, FLOOR_Z), (12_000, 3))
+    floor = floor[(np.abs(floor[:, :2] - [1.5, 0.5]) > 1.0).any(axis=1)]
+    upright = rng.uniform((-4.0, WALL_Y, -0.4), (4.0, WALL_Y, 2.4), (5000 * wall, 3))
+    turn = rng.uniform(0.0, 2.0 * np.pi, 9000)
+    pillar = np.stack([1.5 * np.cos(turn), 1.5 * np.sin(turn), rng.uniform(-0.5, 2.4, 9000)], 1)
+    bush = rng.uniform((3.0, -3.6, 0.1), (3.4, -3.1, 1.4), (600, 3))
+    return np.concatenate([floor, upright, np.array([*PILLAR, 0.0]) + pillar, bush])
+
+
+def drive(*walls):
+    """Return clouds with the pose of a sensor that stays; each says whether the wall is there."""
+    stamps = [START_NS + k * PERIOD_NS for k in range(len(walls))]
+    return [
+        (cloud(stamp_ns, scene(k, wall=wall)), odometry(stamp_ns, (0.0, 0.0, 0.0)))
+        for k, (stamp_ns, wall) in enumerate(zip(stamps, walls, strict=True))
+    ]
+
+
+def start_node(start, peer):
+    pairs = [('-p', f'{name}:={str(value).lower()}') for name, value in SETTINGS.items()]
+    start('node', '--ros-args', *(item for pair in pairs for item in pair), *RELIABLE)
+    peer.advertise('/odom', '/points')
+
+
+def send(peer, messages):
+    for points, pose in messages:
+        peer.publish('/odom', pose)
+        peer.publish('/points', points)
+
+
+def models_of(messages):
+    """Return the models of a mapper without ROS after some messages."""
+    mapper = Mapper(Config.from_mapping(SETTINGS))
+    for points, pose in messages:
+        for found in poses_in('odometry', pose, 'base_link'):
+            mapper.add_pose(*found)
+        mapper.add_scan(to_scan(points))
+        list(mapper.insert_ready())
+    return mapper.models
+
+
+def stamp_of(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+
+
+class Picture:
+    """What a viewer shows after some messages."""
+
+    def __init__(self, messages):
+        self.shown = {}
+        for message in messages:
+            for marker in message.markers:
+                if marker.action == Marker.DELETEALL:
+                    self.shown.clear()
+                elif marker.action == Marker.DELETE:
+                    self.shown.pop((marker.ns, marker.id), None)
+                else:
+                    self.shown[marker.ns, marker.id] = marker
+
+    def ids(self, ns):
+        return sorted(number for name, number in self.shown if name == ns)
+
+    def area(self, ns, number):
+        a, b, c = points_of(self.shown[ns, number].points).reshape(-1, 3, 3).transpose(1, 0, 2)
+        return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+def points_of(points):
+    return np.array([(p.x, p.y, p.z) for p in points]).reshape(-1, 3)
+
+
+def ring_area(ring, normal):
+    """Return the area within a ring (M, 3) seen against a normal, holes taken off."""
+    after = np.roll(ring, -1, axis=0)
+    return 0.5 * float(np.cross(ring, after).sum(axis=0) @ normal)
+
+
+def collect(peer, qos=None):
+    return {
+        name: peer.collect(kind, f'{NODE}/{name}', qos or usual)
+        for name, (kind, usual) in TOPICS.items()
+    }
+
+
+def wait_for(peer, found, stamp_ns, names=TOPICS):
+    """Spin until the newest message of each topic has a stamp."""
+
+    def stamps():
+        return {
+            name: stamp_of(found[name][-1].markers[-1] if name == 'planes' else found[name][-1])
+            for name in names
+            if found[name]
+        }
+
+    peer.spin_until(
+        lambda: len(stamps()) == len(names) and min(stamps().values()) >= stamp_ns,
+        what=lambda: f'{stamps()}, expected {stamp_ns}',
+    )
+    peer.spin_for(0.5)
+
+
+def outlines_in(messages):
+    """Return the rings that a client knows after some messages, by id."""
+    known = {}
+    for message in messages:
+        ring = points_of(message.polygon.polygon.points)
+        known.pop(message.polygon.id, None)
+        if len(ring):
+            known[message.polygon.id] = ring
+    return known
+
+
+def test_what_is_published_is_what_a_mapper_without_ros_finds(start, peer):
+    start_node(start, peer)
+    found = collect(peer)
+    peer.spin_for(0.5)
+    messages = drive(True, True, True)
+    send(peer, messages)
+    wait_for(peer, found, START_NS + 2 * PERIOD_NS)
+    models = models_of(messages)
+    model = models.model
+    assert len(model.planes) >= 2
+    assert model.surfaces
+    assert len(model.gaussians)
+
+    check_primitives(to_scan(found['primitives'][-1]), model, models.versions)
+    check_picture(Picture(found['planes']), model)
+    check_outlines(outlines_in(found['outlines']), Picture(found['planes']), model)
+    check_surfels(to_scan(found['surfel_primitives'][-1]), models)
+    assert {m.header.frame_id for name in ('primitives', 'outlines') for m in found[name]} == {
+        'odom'
+    }
+
+
+def check_primitives(rows, model, versions):
+    column = rows.columns
+    ids = [*(patch.id for patch in model.patches), *model.gaussians.id.tolist()]
+    assert column['id'].tolist() == ids
+    assert column['version'].tolist() == [versions[number] for number in ids]
+    kinds = [0] * len(model.planes) + [1] * len(model.surfaces) + [2] * len(model.gaussians)
+    assert column['kind'].tolist() == kinds
+    for k, patch in enumerate(model.patches):
+        normal = np.array([column[f'normal_{axis}'][k] for axis in 'xyz'])
+        assert normal == pytest.approx(patch.normal, abs=1e-6)
+        assert column['d'][k] == pytest.approx(-patch.normal @ patch.mean, abs=1e-5)
+        assert column['rms'][k] == pytest.approx(patch.rms_m, abs=1e-6)
+        assert column['num_points'][k] == patch.num_points
+    means = rows.points[len(model.patches) :]
+    assert means == pytest.approx(model.gaussians.mean, abs=1e-5)
+    floor = np.argmax(column['num_points'])
+    sensor_z = 0.5  # on the robot
+    assert column['d'][floor] == pytest.approx(-FLOOR_Z - sensor_z, abs=1e-5)
+    # 8 m by 7 m less 2 m by 2 m; voxels of 0.5 m at the rim count as far as points are in them
+    assert column['area'][floor] == pytest.approx(52.0, abs=0.25 * (30.0 + 8.0))
+    # the box lies around that, turned as the points are spread
+    thickness, width, length = sorted(column[f'extent_{axis}'][floor] for axis in 'xyz')
+    assert thickness == 0.0
+    assert 6.7 < width <= length < np.hypot(7.0, 8.0) + 0.5
+    assert rows.points[floor] == pytest.approx([0.1, -0.5, FLOOR_Z + sensor_z], abs=0.3)
+
+
+def check_picture(picture, model):
+    assert picture.ids('planes') == sorted(plane.id for plane in model.planes)
+    assert picture.ids('surfaces') == sorted(surface.id for surface in model.surfaces)
+    patches = sorted(patch.id for patch in model.patches)
+    assert picture.ids('ids') == picture.ids('outlines') == patches
+    assert picture.ids('gaussians') == [0]
+    for plane in model.planes:
+        fill = picture.shown['planes', plane.id]
+        assert fill.type == Marker.TRIANGLE_LIST
+        away = points_of(fill.points) @ plane.normal + plane.offset_m
+        assert np.abs(away).max() < 1e-9
+        assert picture.area('planes', plane.id) == pytest.approx(
+            plane.grid.area_m2(), abs=0.1 + 0.1 * plane.grid.area_m2()
+        )
+        assert picture.shown['ids', plane.id].text == str(plane.id)
+    balls = points_of(picture.shown['gaussians', 0].points).reshape(len(model.gaussians), 60, 3)
+    covariance = model.gaussians.covariance
+    for mean, spread, corners in zip(model.gaussians.mean, covariance, balls, strict=True):
+        offset = corners - mean
+        along = np.linalg.eigh(spread)[1][:, 2]
+        sigma = np.sqrt(along @ spread @ along)
+        assert 1.7 * sigma < np.abs(offset @ along).max() <= 2.0 * sigma * (1 + 1e-9)
+
+
+def check_outlines(outlines, picture, model):
+    assert sorted(outlines) == sorted(patch.id for patch in model.patches)
+    for patch in model.patches:
+        if not isinstance(patch, Surface):
+            area = ring_area(outlines[patch.id], patch.normal)
+            assert area == pytest.approx(picture.area('planes', patch.id), rel=1e-3)
+
+
+def check_surfels(rows, models):
+    surfels, labels = models.surfels, models.model.labels
+    assert len(rows) == len(labels) == len(surfels)
+    assert np.array_equal(rows.columns['primitive'], labels)
+    assert np.array_equal(rows.points, surfels.position.astype(np.float32))
+    gaussian = np.isin(labels, models.model.gaussians.id)
+    assert np.array_equal(rows.columns['kind'] == 2, gaussian)
+    assert np.array_equal(rows.columns['kind'] == 255, labels == -1)
+
+
+def test_what_is_no_more_is_deleted(start, peer):
+    start_node(start, peer)
+    found = collect(peer)
+    peer.spin_for(0.5)
+    messages = drive(True, True, False, False)
+    send(peer, messages[:2])
+    wait_for(peer, found, START_NS + PERIOD_NS)
+    (wall,) = [p.id for p in models_of(messages[:2]).model.planes if abs(p.normal[1]) > 0.9]
+    assert wall in Picture(found['planes']).ids('planes')
+    assert wall in outlines_in(found['outlines'])
+    send(peer, messages[2:])  # and the two with the wall leave the window
+    wait_for(peer, found, START_NS + 3 * PERIOD_NS, ('planes', 'primitives'))
+    left = sorted(patch.id for patch in models_of(messages).model.patches)
+    assert wall not in left
+    picture = Picture(found['planes'])
+    assert sorted(picture.ids('planes') + picture.ids('surfaces')) == left
+    assert picture.ids('outlines') == picture.ids('ids') == left
+    assert sorted(outlines_in(found['outlines'])) == left
+    assert wall not in to_scan(found['primitives'][-1]).columns['id']
+    peer.call('clear')
+    peer.spin_until(lambda: not Picture(found['planes']).shown)
+    peer.spin_until(lambda: not outlines_in(found['outlines']))
+    peer.spin_until(lambda: found['primitives'][-1].width == 0)
+
+
+@pytest.mark.parametrize('qos', [None, RVIZ], ids=['latched', 'volatile'])
+def test_who_comes_late_gets_everything_without_another_scan(start, peer, qos):
+    start_node(start, peer)
+    messages = drive(True, True)
+    send(peer, messages)
+    peer.diagnosis({'scans.mapped': 2})
+    expected = sorted(patch.id for patch in models_of(messages).model.patches)
+    for _ in range(2):  # the second while others read
+        found = collect(peer, qos)
+        wait_for(peer, found, START_NS + PERIOD_NS)
+        picture = Picture(found['planes'])
+        assert sorted(picture.ids('planes') + picture.ids('surfaces')) == expected
+        assert sorted(outlines_in(found['outlines'])) == expected
+        assert expected == to_scan(found['primitives'][-1]).columns['id'][: len(expected)].tolist()
+
+
+def test_a_late_reader_does_not_learn_of_outlines_that_went_while_nobody_read(start, peer):
+    start_node(start, peer)
+    first = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
+    peer.spin_for(0.5)
+    messages = drive(True, True, False, False)
+    send(peer, messages[:2])
+    peer.spin_until(lambda: first and stamp_of(first[-1]) == START_NS + PERIOD_NS)
+    peer.spin_for(0.3)
+    (subscription,) = [s for s in peer.node.subscriptions if s.topic_name.endswith('outlines')]
+    peer.node.destroy_subscription(subscription)
+    peer.spin_for(0.5)
+    send(peer, messages[2:])
+    peer.diagnosis({'scans.mapped': 4})
+    late = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
+    expected = sorted(patch.id for patch in models_of(messages).model.patches)
+    peer.spin_until(lambda: sorted(outlines_in(late)) == expected, what=lambda: str(expected))
+
+
+def test_nothing_is_made_while_nobody_reads(start, peer):
+    start_node(start, peer)
+    send(peer, drive(True, True, True))
+    _, values = peer.diagnosis({'scans.mapped': 3})
+    for name in TOPICS:
+        assert values[f'published_hz.{NODE}/{name}'] == '0.0'
+    found = peer.collect(PointCloud2, f'{NODE}/primitives', LATCHED)
+    peer.spin_until(lambda: found)
+    peer.spin_for(0.3)
+    assert len(found) == 1
