@@ -30,7 +30,7 @@ LOSSES = 5
 """A task at which so many workers died is given up."""
 
 
-PRELOADED = ['distributed', 'surfel_mapper.cluster.preload']
+PRELOADED = ['surfel_mapper.cluster.preload', 'distributed']
 """What local workers are forked with; each of them would load it for 2 s otherwise."""
 
 WORKER_ENVIRONMENT = {'MALLOC_ARENA_MAX': '1', 'OMP_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}

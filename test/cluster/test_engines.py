@@ -32,9 +32,13 @@ def refuse(_):
 
 
 def what_is_there():
-    """Return whether a process was born with all that tasks need, and what its libraries read."""
+    """Return whether all that tasks need is loaded, Ctrl-C ignored, and what libraries read."""
     modules = ('surfel_mapper.cluster.shards', 'surfel_mapper.kernels.moments')
-    return all(name in sys.modules for name in modules), os.environ.get('MALLOC_ARENA_MAX')
+    return (
+        all(name in sys.modules for name in modules),
+        signal.getsignal(signal.SIGINT) is signal.SIG_IGN,
+        os.environ.get('MALLOC_ARENA_MAX'),
+    )
 
 
 def kill_one(running):
@@ -67,7 +71,7 @@ def test_every_task_is_answered_under_its_number(two_workers):
 
 
 def test_workers_are_born_with_all_that_tasks_need(two_workers):
-    assert set(two_workers._client.run(what_is_there).values()) == {(True, '1')}
+    assert set(two_workers._client.run(what_is_there).values()) == {(True, True, '1')}
 
 
 def test_the_environment_is_left_as_it_was(monkeypatch):
