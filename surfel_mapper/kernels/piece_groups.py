@@ -34,13 +34,13 @@ def rows_of_groups(group, flags, loose, rows):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def hang_together(rows, links, partners, places, parent):
+def hang_together(rows, links, around, places, parent):
     """
     Find which voxels are linked, by whatever way through the others.
 
     rows      (M,) int32
     links     (R,) uint64
-    partners  (R, H) int32
+    around    (R, 2 H) int32
     places    (R,) int32, all -1; as before afterwards
     parent    (M,) int64, out: the first of those that hang together
     """
@@ -51,7 +51,7 @@ def hang_together(rows, links, partners, places, parent):
         bits, h = links[rows[i]], 0
         while bits:
             if bits & np.uint64(1):
-                j = places[partners[rows[i], h]]
+                j = places[around[rows[i], h]]
                 if j >= 0:
                     one, other = find_root(parent, i), find_root(parent, np.int64(j))
                     parent[max(one, other)] = min(one, other)

@@ -4,9 +4,10 @@
 Voxels as pieces of surfaces: which are flat, which of them belong together, which lie on them.
 
 All arrays have a row for each row of the map's slab. A link of two flat neighbours is a bit of
-the one of lesser key: bit h of ``links`` says that the voxel h steps further on, whose row is in
-``partners``, goes on with the same surface. Links depend on the two voxels alone, so whatever
-order they change in, they are those of the map as it is.
+the one of lesser key: bit h of ``links`` says that the voxel in place h of ``around`` goes on
+with the same surface. Links depend on the two voxels alone, so whatever
+order they change in, they are those of the map as it is. Row r of ``around`` has the rows of all
+neighbours, so that only voxels that come need the hash table.
 """
 
 import math
@@ -57,6 +58,40 @@ def classify(chosen, count, covariance, rules, kind, axes):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def tell(rows, before, count, position, normal, kind, told, rules, material):
+    """
+    See which changes matter since they were told last, and take note of those.
+
+    rows      (K,) int32
+    before    (K,) uint8, the kinds that they were
+    told      count (R,), position (R, 3), normal (R, 3) as last told, in place
+    rules     square of the distance m^2, cosine, factor of the count
+    material  (R,) bool, all False; out
+    """
+    told_count, told_position, told_normal = told
+    for i in range(len(rows)):
+        row = rows[i]
+        away = cosine = 0.0
+        for j in range(3):
+            delta = position[row, j] - told_position[row, j]
+            away += delta * delta
+            cosine += normal[row, j] * told_normal[row, j]
+        more, less = count[row], told_count[row]
+        if more < less:
+            more, less = less, more
+        if (
+            before[i] != kind[row]
+            or away > rules[0]
+            or cosine < rules[1]
+            or more >= rules[2] * less
+        ):
+            material[row] = True
+            told_count[row] = count[row]
+            for j in range(3):
+                told_position[row, j], told_normal[row, j] = position[row, j], normal[row, j]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def joins(i, j, kind, position, normal, rules):
     """Return whether two neighbours are pieces of one surface; see agree."""
     if kind[i] != FLAT or kind[j] != FLAT:
@@ -68,21 +103,13 @@ def joins(i, j, kind, position, normal, rules):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def set_link(i, j, h, is_joined, links, partners, marks, marked, num):
+def set_link(i, j, h, is_joined, links, marks, marked, num):
     """Set or clear one link; mark both rows where it was otherwise; return how many are marked."""
     bit = np.uint64(1) << np.uint64(h)
-    was_joined = links[i] & bit != 0
-    if is_joined:
-        if was_joined and partners[i, h] == j:
-            return num
-        links[i] |= bit
-        partners[i, h] = j
-        num = mark(j, marks, marked, num)
-    elif was_joined:
-        links[i] &= ~bit
-    else:
+    if is_joined == (links[i] & bit != 0):
         return num
-    return mark(i, marks, marked, num)
+    links[i] ^= bit
+    return mark(i, marks, marked, mark(j, marks, marked, num))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -96,36 +123,62 @@ def mark(row, marks, marked, num):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def cut_links(around, links, partners, marks, marked):
+def leave(gone, around, links, marks, marked):
     """
-    Clear the links of voxels to places that are empty now.
+    Take voxels out of the lists of their neighbours, and all their links.
 
-    around  (G, H) int32, the rows of the voxels before each place, -1 where there is none
+    gone    (G,) int32, rows
+    around  (R, 2 H) int32, rows of the voxels after each, then of those before, -1 for none
+    links   (R,) uint64
     marks   (R,) bool, all False
     marked  (R,) int32, out: rows of which some link has changed
 
     Returns how many are marked.
     """
-    num = 0
-    for i in range(len(around)):
-        for h in range(around.shape[1]):
-            if around[i, h] >= 0:
-                num = set_link(
-                    around[i, h], 0, h, False, links, partners, marks, marked, num
-                )
+    num, half = 0, around.shape[1] // 2
+    for i in range(len(gone)):
+        row = gone[i]
+        for h in range(2 * half):
+            other = around[row, h]
+            if other < 0:
+                continue
+            around[other, (h + half) % (2 * half)] = -1
+            around[row, h] = -1
+            if h >= half:
+                num = set_link(other, row, h - half, False, links, marks, marked, num)
+        links[row] = 0
     return num
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def link(chosen, around, state, rules, links, partners, marks, marked, num):
+def enter(came, found, around):
+    """
+    Put voxels into the lists of their neighbours.
+
+    came    (C,) int32, rows
+    found   (C, 2 H) int32, rows of their neighbours, -1 for none
+    around  (R, 2 H) int32, in place
+    """
+    half = around.shape[1] // 2
+    for i in range(len(came)):
+        for h in range(2 * half):
+            other = found[i, h]
+            around[came[i], h] = other
+            if other >= 0:
+                around[other, (h + half) % (2 * half)] = came[i]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def link(chosen, is_chosen, around, state, rules, links, marks, marked, num):
     """
     Set all links from and to some voxels anew.
 
-    chosen  (K,) int32, rows
-    around  (K, 2 H) int32, rows of the voxels after each, then of those before, -1 for none
-    state   kind (R,), position (R, 3), normal (R, 3)
-    rules   see agree, but for the fifth: square of the longest distance, m^2
-    num     how many rows are marked already
+    chosen     (K,) int32, rows
+    is_chosen  (R,) bool, whether a row is one of them
+    around     (R, 2 H) int32
+    state      kind (R,), position (R, 3), normal (R, 3)
+    rules      see agree, but for the fifth: square of the longest distance, m^2
+    num        how many rows are marked already
 
     Returns how many are.
     """
@@ -133,13 +186,20 @@ def link(chosen, around, state, rules, links, partners, marks, marked, num):
     half = around.shape[1] // 2
     for i in range(len(chosen)):
         row = np.int64(chosen[i])
+        if kind[row] != FLAT and links[row] != 0:
+            for h in range(half):
+                if around[row, h] >= 0:
+                    num = set_link(
+                        row, np.int64(around[row, h]), h, False, links, marks, marked, num
+                    )
         for h in range(half):
-            after, before = np.int64(around[i, h]), np.int64(around[i, half + h])
-            joined = after >= 0 and joins(row, after, kind, position, normal, rules)
-            num = set_link(row, after, h, joined, links, partners, marks, marked, num)
-            if before >= 0:
+            after, before = np.int64(around[row, h]), np.int64(around[row, half + h])
+            if after >= 0 and kind[row] == FLAT:
+                joined = joins(row, after, kind, position, normal, rules)
+                num = set_link(row, after, h, joined, links, marks, marked, num)
+            if before >= 0 and not is_chosen[before] and kind[before] == FLAT:
                 joined = joins(before, row, kind, position, normal, rules)
-                num = set_link(before, row, h, joined, links, partners, marks, marked, num)
+                num = set_link(before, row, h, joined, links, marks, marked, num)
     return num
 
 
@@ -149,7 +209,7 @@ def lie_on(chosen, around, state, covariance, rules, host):
     Find the flat neighbour on whose plane a voxel lies that is not flat itself.
 
     chosen      (K,) int32, rows
-    around      (K, A) int32, rows of their neighbours, -1 for none
+    around      (R, A) int32, rows of the neighbours of each, -1 for none
     state       kind (R,), position (R, 3), normal (R, 3)
     covariance  (R, 6) float64, m^2
     rules       largest distance m, most variance along the normal m^2, square of the longest
@@ -162,7 +222,8 @@ def lie_on(chosen, around, state, covariance, rules, host):
         best = rules[0]
         host[i] = -1
         c = covariance[row]
-        for other in around[i]:
+        for h in range(around.shape[1]):
+            other = around[row, h]
             if other < 0 or kind[other] != FLAT:
                 continue
             x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]

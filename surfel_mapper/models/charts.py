@@ -124,6 +124,6 @@ def stacked(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.bool_
 def connected(pieces: Pieces, rows: Rows) -> list[Rows]:
     """Return which of some rows hang together, each part in their order."""
     parent = np.empty(len(rows), np.int64)
-    hang_together(rows, pieces.links, pieces.partners, pieces.places, parent)
+    hang_together(rows, pieces.links, pieces.around, pieces.places, parent)
     order = np.argsort(parent, kind='stable')
     return np.split(rows[order], np.flatnonzero(np.diff(parent[order])) + 1)

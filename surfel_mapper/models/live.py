@@ -215,7 +215,7 @@ class LiveModels:
         single = (pieces.kind == FLAT) & (pieces.component < 0)
         apart = rows[: rows_of_groups(pieces.component, flags, single, rows)].copy()
         parent = np.empty(len(apart), np.int64)
-        hang_together(apart, pieces.links, pieces.partners, pieces.places, parent)
+        hang_together(apart, pieces.links, pieces.around, pieces.places, parent)
         name_components(apart, parent, pieces.key, pieces.component)
         flags[:] = False
         flags[change.touched] = True

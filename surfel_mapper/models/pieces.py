@@ -23,11 +23,13 @@ from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.kernels.pieces import (
     classify,
-    cut_links,
+    enter,
     FLAT,
+    leave,
     lie_on,
     link,
     NONE,
+    tell,
 )
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -89,7 +91,7 @@ class Pieces:
         Of the voxel in each row, -1 for none.
     count, position, normal, eigenvalues, covariance, axes
         What it holds; covariance xx xy xz yy yz zz; axes as in kernels/pieces.py.
-    kind, links, partners
+    kind, links, around
         See kernels/pieces.py.
     host : (R,) int32
         The flat neighbour that a voxel lies on which is not flat, -1 for none.
@@ -126,8 +128,10 @@ class Pieces:
             far_sq,
         )
         self._host_rules = (offset_m, variance, far_sq)
+        self._tell_rules = ((MOVED * self.thickness_m) ** 2, TURNED, GREW)
         self._absorbs = config.absorb
-        self._steps = half_steps(config.reach_voxels)
+        steps = half_steps(config.reach_voxels)
+        self._steps = np.concatenate([steps, -steps])
         self.clear()
 
     def clear(self) -> None:
@@ -140,45 +144,52 @@ class Pieces:
         self.covariance, self.axes = np.empty((0, 6)), np.empty((0, 2, 3))
         self.kind = np.empty(0, np.uint8)
         self.links = np.empty(0, np.uint64)
-        self.partners = np.empty((0, len(self._steps)), np.int32)
+        self.around = np.empty((0, len(self._steps)), np.int32)
         self.host, self.component, self.label, self.places = (none,) * 4
-        self.alone = self.is_material = self._marks = np.empty(0, np.bool_)
+        self.alone = self.is_material = np.empty(0, np.bool_)
+        self._marks = self._is_here = np.empty(0, np.bool_)
         self._told_position, self._told_normal = np.empty((2, 0, 3))
         self._told_count = np.empty(0, np.int64)
 
     def follow(self) -> Change:
         """Take over what changed in the map since the last call."""
-        gone_keys, gone_rows = self._forgotten()
+        forgotten = self._forgotten()
         changed = self.map.rows_changed(self._version)
         self._version = self.map.version
         self._make_room(int(changed.max(initial=-1)) + 1)
         new, old = self.map.keys_of(changed), self.key[changed]
         left, here = changed[(old >= 0) & (old != new)], changed[new >= 0]
-        gone_keys = np.concatenate([gone_keys, old[(old >= 0) & (old != new)]])
-        gone_rows = np.concatenate([gone_rows, left])
-        loose = [self.component[gone_rows]]
-        gone = Gone(gone_keys, self.label[gone_rows], self.alone[gone_rows])
-        self._blank(gone_rows)
+        gone = forgotten.joined(self._gone(left))
+        loose = [gone.component]
+        near = self.around[left]
+        marked = np.empty(len(self.key), np.int32)
+        num = leave(left, self.around, self.links, self._marks, marked)
+        self._blank(left)
         came = here[self.key[here] < 0]
         self.key[here] = new[new >= 0]
         gone.return_to(self, came)
+        keys = (self.key[came][:, None] + self._steps).ravel()
+        enter(came, self.map.find(keys).reshape(len(came), len(self._steps)), self.around)
         was_flat = self.kind[here] == FLAT
         self._measure(here)
         is_flat = self.kind[here] == FLAT
-        turned = here[was_flat != is_flat]
-        loose.append(self.component[turned])
+        loose.append(self.component[here[was_flat != is_flat]])
         touched = self.component[here]
         self.component[here[~is_flat]] = -1
-        around = np.concatenate([self._around(gone_keys), self._around(self.key[here])])
-        marked = self._linked(here, around, len(gone_keys))
-        loose.append(self.component[marked])
-        rehosted, old_hosts, new_hosts = self._rehosted(here, around)
-        hosts_of = [self.component[old_hosts[old_hosts >= 0]]]
+        self._is_here[here] = True
+        state = (self.kind, self.position, self.normal)
+        num = link(
+            here, self._is_here, self.around, state, self._link_rules, self.links, self._marks,
+            marked, num,
+        )  # fmt: skip
+        self._is_here[here] = self._marks[marked[:num]] = False
+        loose.append(self.component[marked[:num]])
+        rehosted, old_hosts, new_hosts = self._rehosted(here, near)
         return Change(
-            num_voxels=len(here) + len(gone_keys),
+            num_voxels=len(here) + len(gone.key),
             rows=np.concatenate([here, rehosted]),
             loose=found(loose),
-            touched=found([touched, *hosts_of]),
+            touched=found([touched, self.component[old_hosts[old_hosts >= 0]]]),
             hosts=new_hosts[new_hosts >= 0],
             gone=gone.remaining,
         )
@@ -199,21 +210,27 @@ class Pieces:
             voxel_index=unpack_keys(self.key[held]),
         )
 
-    def _forgotten(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[Any]]:
-        """Return keys and rows of all voxels where the map has been cleared since; else none."""
-        if self.map.cleared_at <= self._version or not len(self.key):
-            return np.empty(0, np.int64), np.empty(0, np.int32)
-        rows = np.flatnonzero(self.key >= 0).astype(np.int32)
-        keys = self.key[rows]
-        self.key[rows] = -1
-        return keys, rows
+    def _forgotten(self) -> Gone:
+        """Forget all voxels where the map has been cleared since, and return them; else none."""
+        rows = np.flatnonzero(self.key >= 0)
+        if self.map.cleared_at <= self._version:
+            rows = rows[:0]
+        forgotten = self._gone(rows)
+        if len(rows):
+            self._blank(rows)
+            self.links[:] = 0
+            self.around[:] = -1
+        return forgotten
+
+    def _gone(self, rows: npt.NDArray[Any]) -> Gone:
+        return Gone(self.key[rows], self.label[rows], self.alone[rows], self.component[rows])
 
     def _make_room(self, num_rows: int) -> None:
         """Give the arrays so many rows."""
         more = max(num_rows, 2 * len(self.key)) - len(self.key)
         if num_rows <= len(self.key):
             return
-        empty = {'key': -1, 'host': -1, 'component': -1, 'label': -1, 'places': -1}
+        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'places', 'around'), -1)
         for name, values in vars(self).items():
             if isinstance(values, np.ndarray) and name != '_steps':
                 added = np.full((more, *values.shape[1:]), empty.get(name, 0), values.dtype)
@@ -223,7 +240,6 @@ class Pieces:
         """Forget the voxels of some rows."""
         self.key[rows] = self.host[rows] = self.component[rows] = self.label[rows] = -1
         self.kind[rows] = NONE
-        self.links[rows] = 0
         self.alone[rows] = False
         self._told_count[rows] = 0
 
@@ -235,76 +251,48 @@ class Pieces:
         self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
         self.covariance[rows] = self.map.covariances_of(rows)
         classify(rows, self.count, self.covariance, self._class_rules, self.kind, self.axes)
-        moved = ((surfels.position - self._told_position[rows]) ** 2).sum(axis=1)
-        cosine = np.einsum('ij,ij->i', surfels.normal, self._told_normal[rows])
-        told, count = self._told_count[rows], surfels.num_points
-        material = (
-            (before != self.kind[rows])
-            | (moved > (MOVED * self.thickness_m) ** 2)
-            | (cosine < TURNED)
-            | (count >= GREW * told)
-            | (told >= GREW * count)
-        )
         self.is_material[:] = False
-        chosen = rows[material]
-        self.is_material[chosen] = True
-        self._told_count[chosen], self._told_position[chosen] = count[material], (
-            surfels.position[material]
-        )
-        self._told_normal[chosen] = surfels.normal[material]
-
-    def _around(self, keys: npt.NDArray[np.int64]) -> Rows:
-        """Return the rows of the voxels after each, then of those before, (K, 2 H)."""
-        steps = np.concatenate([self._steps, -self._steps])
-        found = self.map.find((keys[:, None] + steps).ravel())
-        return found.reshape(len(keys), len(steps))
-
-    def _linked(self, here: Rows, around: Rows, num_gone: int) -> Rows:
-        """Link voxels anew; return the rows of which some link has changed."""
-        half = len(self._steps)
-        marked = np.empty(len(self.key), np.int32)
-        num = cut_links(
-            around[:num_gone, half:], self.links, self.partners, self._marks, marked
-        )
-        state = (self.kind, self.position, self.normal)
-        num = link(
-            here, around[num_gone:], state, self._link_rules, self.links, self.partners,
-            self._marks, marked, num,
+        told = (self._told_count, self._told_position, self._told_normal)
+        tell(
+            rows, before, self.count, self.position, self.normal, self.kind, told,
+            self._tell_rules, self.is_material,
         )  # fmt: skip
-        self._marks[marked[:num]] = False
-        return marked[:num]
 
-    def _rehosted(self, here: Rows, around: Rows) -> tuple[Rows, Rows, Rows]:
+    def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows]:
         """Find on which flat neighbours voxels lie: rows, hosts before and now."""
         if not self._absorbs:
             none = np.empty(0, np.int32)
             return none, none, none
         near = np.zeros(len(self.key) + 1, np.bool_)
-        near[around] = True  # -1 is the last
+        near[emptied] = near[self.around[here]] = True  # -1 is the last
         near[here] = True
         rows = np.flatnonzero(near[:-1] & (self.kind != FLAT) & (self.kind != NONE))
         rows = rows.astype(np.int32)
         before = self.host[rows]
         hosts = np.empty(len(rows), np.int32)
         state = (self.kind, self.position, self.normal)
-        lie_on(
-            rows, self._around(self.key[rows]), state, self.covariance, self._host_rules, hosts
-        )
+        lie_on(rows, self.around, state, self.covariance, self._host_rules, hosts)
         flat = here[self.kind[here] == FLAT]
-        once = np.concatenate([self.host[flat], before])
+        changed = (before != hosts) | self.is_material[rows]
+        once = np.concatenate([self.host[flat], before[changed]])
         self.host[flat] = -1
         self.host[rows] = hosts
-        changed = (before != hosts) | self.is_material[rows]
         return rows[changed], once, hosts[changed]
 
 
 @dataclass(slots=True, eq=False)
 class Gone:
-    """Voxels that have left their rows: keys, labels, whether alone."""
+    """Voxels that have left their rows: keys, labels, whether alone, components."""
 
     key: npt.NDArray[np.int64]
     label: Rows
     alone: npt.NDArray[np.bool_]
+    component: Rows
+
+    def joined(self, other: Gone) -> Gone:
+        """Return these and others."""
+        names = ('key', 'label', 'alone', 'component')
+        return Gone(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
 
     def return_to(self, pieces: Pieces, came: Rows) -> None:
         """Give the labels of voxels that are in another row now to that row."""
