@@ -15,6 +15,7 @@ import argparse
 import time
 
 import rclpy
+from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
@@ -46,7 +47,7 @@ def main() -> None:
             if time.monotonic() > next_s and mirror.is_complete and mirror.stamp_ns != shown_ns:
                 next_s, shown_ns = time.monotonic() + 1.0, mirror.stamp_ns
                 show(mirror)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ExternalShutdownException):  # Ctrl-C, or a request to end
         pass
     finally:
         node.destroy_node()

@@ -5,9 +5,10 @@ Surfel against 53 golden programs of adding, removing and merging, whose exact r
 
 The inputs are float32 or float64 as stored; the results to reproduce (``ref_*``) were computed
 exactly and rounded, their eigenvalues by an iterative solver. With ``rounding`` of the scatter's
-entries as in test_surfel.py, eigenvalues may differ by that (Weyl) and 4 EPS of the trace for two
-solvers, planarity by 7 times that over the trace, a normal by 3 times that over the gap e1 - e0
-(Davis and Kahan). Of fewer than two points and of equal points the promises of Surfel hold.
+entries as in surfel_promises.py, eigenvalues may differ by that (Weyl) and 4 EPS of the trace for
+two solvers, planarity by 7 times that over the trace, a normal by 3 times that over the gap
+e1 - e0 (Davis and Kahan). Of fewer than two points and of equal points the promises of Surfel
+hold.
 """
 
 import json
