@@ -25,18 +25,23 @@ LAUNCH_FILE = FOLDER / 'mapper.launch.py'
 PRESETS = ('spinning_lidar', 'solid_state_lidar', 'indoor_depth_camera')
 OUTPUT_TOPICS = {
     f'/surfel_mapper/{name}'
-    for name in ('normals', 'changed', 'removed', 'scan_normals', 'markers', 'grid')
+    for name in (
+        *('normals', 'changed', 'removed', 'scan_normals', 'markers', 'grid'),
+        *('planes', 'primitives', 'outlines', 'surfel_primitives'),
+    )
 }
 INPUT_TOPICS = {'/points'}
 
 
 class Argument:
+
     def __init__(self, name, *, default_value, description, choices=None):
         self.name, self.default, self.choices = name, default_value, choices
         self.description = description
 
 
 class Configuration:
+
     def __init__(self, name):
         self._name = name
 
@@ -45,11 +50,13 @@ class Configuration:
 
 
 class Function:
+
     def __init__(self, *, function):
         self.function = function
 
 
 class Started:
+
     def __init__(self, **given):
         self.__dict__.update(given)
 
@@ -144,7 +151,8 @@ def test_the_view_of_rviz_shows_topics_of_the_node():
     topics = {display['Topic']['Value'] for display in displays if 'Topic' in display}
     assert topics <= OUTPUT_TOPICS | INPUT_TOPICS
     assert {'/surfel_mapper/markers', '/surfel_mapper/normals'} <= topics
-    latched = {'/surfel_mapper/markers', '/surfel_mapper/normals', '/surfel_mapper/grid'}
+    names = ('markers', 'normals', 'grid', 'planes', 'surfel_primitives')
+    latched = {f'/surfel_mapper/{name}' for name in names}
     for display in displays:
         if 'Topic' in display:
             durability = display['Topic']['Durability Policy']

@@ -57,8 +57,7 @@ def primitive_columns(
         Of all of them, by id.
 
     """
-    rows = [patch_row(shape) for shape in shapes]
-    floats = np.concatenate([np.array(rows).reshape(-1, len(FLOATS)), gaussian_rows(gaussians)])
+    floats = np.concatenate([patch_rows(shapes), gaussian_rows(gaussians)])
     ids = [*(shape.patch.id for shape in shapes), *gaussians.id.tolist()]
     numbers = [*(shape.patch.num_points for shape in shapes), *gaussians.num_points.tolist()]
     kinds = [SURFACE if shape.is_curved else PLANE for shape in shapes]
@@ -71,12 +70,16 @@ def primitive_columns(
     }
 
 
-def patch_row(shape: PatchShape) -> list[float]:
-    """Return the columns FLOATS of a patch."""
-    patch = shape.patch
-    (turn,) = quaternions(patch.R_patch_map.T[None])
-    plane = (*patch.normal, patch.offset_m)
-    return [*shape.middle, *plane, *turn, *(shape.high - shape.low), shape.area_m2, patch.rms_m]
+def patch_rows(shapes: Sequence[PatchShape]) -> npt.NDArray[np.float64]:
+    """Return the columns FLOATS (K, 16) of patches."""
+    rows = np.empty((len(shapes), len(FLOATS)))
+    R_map_patch = np.array([shape.patch.R_patch_map.T for shape in shapes]).reshape(-1, 3, 3)
+    rows[:, 7:11] = quaternions(R_map_patch)
+    for row, shape in zip(rows, shapes, strict=True):
+        patch = shape.patch
+        row[:7] = (*shape.middle, *patch.normal, patch.offset_m)
+        row[11:] = (*(shape.high - shape.low), shape.area_m2, patch.rms_m)
+    return rows
 
 
 def gaussian_rows(gaussians: Gaussians) -> npt.NDArray[np.float64]:
