@@ -18,7 +18,6 @@ from contextlib import ExitStack
 from functools import partial
 import json
 import math
-import os
 from pathlib import Path
 import time
 from typing import TYPE_CHECKING
@@ -31,6 +30,7 @@ from surfel_mapper.cli.replay_files import (
     DXF,
     FORMATS,
     Mapped,
+    output_directory,
     pose_errors,
     write_files,
 )
@@ -235,21 +235,6 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         duration_s=args.duration,
         every=args.every,
     )
-
-
-def output_directory(bag: Path, wanted: Path | None) -> Path:
-    """Return where to write; refuse what cannot be a directory before the work begins."""
-    from surfel_mapper.errors import FileFormatError
-
-    name = bag.resolve().stem if bag.is_file() else bag.resolve().name
-    directory = wanted or Path(f'{name}_surfels')
-    absolute = directory.absolute()
-    nearest = next(path for path in (absolute, *absolute.parents) if path.exists())
-    if not nearest.is_dir():
-        raise FileFormatError(f'{directory}: {nearest} is a file, expected a directory')
-    if not os.access(nearest, os.W_OK):
-        raise FileFormatError(f'{directory}: no permission to write in {nearest}')
-    return directory
 
 
 def viewers(

@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 import json
 import logging
+import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -42,6 +43,21 @@ SAME_TIME_NS = 10_000_000
 """Poses of a scan and of the truth at most so far apart are of one time."""
 
 _log = logging.getLogger(__name__)
+
+
+def output_directory(bag: Path, wanted: Path | None) -> Path:
+    """Return where to write; refuse what cannot be a directory before the work begins."""
+    from surfel_mapper.errors import FileFormatError
+
+    name = bag.resolve().stem if bag.is_file() else bag.resolve().name
+    directory = wanted or Path(f'{name}_surfels')
+    absolute = directory.absolute()
+    nearest = next(path for path in (absolute, *absolute.parents) if path.exists())
+    if not nearest.is_dir():
+        raise FileFormatError(f'{directory}: {nearest} is a file, expected a directory')
+    if not os.access(nearest, os.W_OK):
+        raise FileFormatError(f'{directory}: no permission to write in {nearest}')
+    return directory
 
 
 class Mapped:

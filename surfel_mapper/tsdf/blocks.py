@@ -3,20 +3,8 @@
 """
 BlockMap: the voxels of a TSDF in cubes of M x M x M, found by hash.
 
-Block (a, b, c) spans from (a, b, c) * M * voxel_size_m to the next. Voxel (i, j, k) of it has the
-number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
-((a, b, c) * M + (i, j, k) + 0.5) * voxel_size_m. Row r of every array belongs to one block:
-
-    head    (R, 4) int64       key, version, stamp of the last change; see kernels/blocks.py
-    field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
-                               it; weight, 0 where a voxel was never observed
-    color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
-    votes   (R, V, N) float32  for labels, see kernels/tsdf_labels.py; V depends on the semantics
-    stamps  (R, 2, N) int64    first and last stamp, ns; 0 where a voxel was never observed
-
-color, votes and stamps have no rows where the configuration does not ask for them. All are slabs
-that grow in place, so an array is good until blocks are added and must not be kept. Rows are
-reused: one that is not in use is zero but for its head.
+Blocks stand in the rows of arrays, see block_arrays.py, which a hash table knows. A row is reused
+when its block has left; one that is not in use is zero but for its head.
 
 ``version`` counts the changes of the map; whoever follows them keeps the version that he has seen
 and asks ``changed_since`` for the rows. A block changed after the last ``clear_updated`` is
@@ -35,7 +23,6 @@ from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.blocks import (
     find_blocks,
     FREE,
-    HEAD,
     NEW,
     place_blocks,
     remove_blocks,
@@ -44,15 +31,13 @@ from surfel_mapper.kernels.blocks import (
 )
 from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
 from surfel_mapper.mapping.hash_table import HashTable
-from surfel_mapper.mapping.slab import Slab
-from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks, some
+from surfel_mapper.tsdf.block_arrays import BlockArrays
+from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks
 
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
-FIRST_ROWS = 128
-"""Rows to begin with; any slab of so many is whole pages."""
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries."""
 
@@ -60,7 +45,7 @@ UPPER = np.array([(n & 1, n >> 1 & 1, n >> 2) for n in range(8)])
 """The block itself and the seven beside and above it that hold the far corners of its cubes."""
 
 
-class BlockMap:
+class BlockMap(BlockArrays):
     """
     Blocks of voxels with distance, weight and what else the configuration asks for.
 
@@ -80,26 +65,11 @@ class BlockMap:
 
     def __init__(self, config: TsdfConfig) -> None:
         """Make an empty map."""
-        self.config = config
+        super().__init__(config)
         self.version = 0
         self._settled = 0
-        voxels = self.voxels_per_block
-        widths = {  # in int64
-            'head': HEAD,
-            'field': voxels,
-            'color': 2 * voxels * config.color,
-            'votes': config.votes_per_voxel * voxels // 2,
-            'stamps': 2 * voxels * config.tracking,
-        }
-        self._slabs = {name: Slab(FIRST_ROWS, width) for name, width in widths.items() if width}
-        self._row_bytes = 8 * sum(widths.values())
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
-
-    @property
-    def voxels_per_block(self) -> int:
-        """N, the number of voxels in a block."""
-        return self.config.voxels_per_side**3
 
     @property
     def num_blocks(self) -> int:
@@ -110,43 +80,6 @@ class BlockMap:
     def nbytes(self) -> int:
         """Bytes in use for blocks and their hash table."""
         return self._hash.rows_used * self._row_bytes + self._hash.nbytes
-
-    @property
-    def head(self) -> Int64:
-        """Key, version and stamp of each row, (R, 4); only until the map grows."""
-        return self._slabs['head'].array[:, :HEAD]
-
-    @property
-    def field(self) -> Float32:
-        """Distance and weight, (R, 2, N); only until the map grows."""
-        return self._floats('field', 2)
-
-    @property
-    def distance(self) -> Float32:
-        """Signed distances, (R, N) m, a view of field."""
-        return self.field[:, 0]
-
-    @property
-    def weight(self) -> Float32:
-        """Weights, (R, N), 0 where never observed, a view of field."""
-        return self.field[:, 1]
-
-    @property
-    def color(self) -> Float32:
-        """Colours and their weights, (R, 4, N), or no rows."""
-        return self._floats('color', 4)
-
-    @property
-    def votes(self) -> Float32:
-        """Votes for labels, (R, V, N), or no rows."""
-        return self._floats('votes', self.config.votes_per_voxel)
-
-    @property
-    def stamps(self) -> Int64:
-        """First and last stamps, (R, 2, N) ns, or no rows."""
-        if 'stamps' not in self._slabs:
-            return np.empty((0, 2, self.voxels_per_block), np.int64)
-        return self._slabs['stamps'].array.reshape(-1, 2, self.voxels_per_block)
 
     @property
     def lookup(self) -> tuple[Any, ...]:
@@ -272,21 +205,14 @@ class BlockMap:
     def remove(self, rows: Int64) -> Blocks:
         """Remove blocks and return what they held."""
         removed = self.copied(rows)
-        for name, slab in self._slabs.items():
-            if name != 'head':
-                slab.array[rows] = 0
+        self._wipe(rows)
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return removed
 
     def copied(self, rows: Int64) -> Blocks:
         """Return a copy of what blocks hold."""
         return Blocks(
-            index=self.index(rows),
-            stamp_ns=self.head[rows, STAMP],
-            field=some(self.field, rows),
-            color=some(self.color, rows),
-            votes=some(self.votes, rows),
-            stamps=some(self.stamps, rows),
+            index=self.index(rows), stamp_ns=self.head[rows, STAMP], **self._copied(rows)
         )
 
     def insert(self, blocks: Blocks) -> None:
@@ -307,24 +233,14 @@ class BlockMap:
             )
         self.touch(rows, 0)
         self.head[rows, STAMP] = blocks.stamp_ns
-        for name in self._slabs.keys() - {'head'}:
-            getattr(self, name)[rows] = getattr(blocks, name)
-
-    def _floats(self, name: str, width: int) -> Float32:
-        if name not in self._slabs:
-            return np.empty((0, width, self.voxels_per_block), np.float32)
-        flat = self._slabs[name].array.view(np.float32)
-        return flat.reshape(-1, width, self.voxels_per_block)
+        self._write(rows, blocks)
 
     def _used_head(self) -> Int64:
         return self.head[: self._hash.rows_used]
 
     def _make_room(self) -> None:
         """Enlarge what kept place_blocks from placing a block."""
-        num_rows = len(self.head)
-        if not self._hash.lacks_row(num_rows):
+        if self._hash.lacks_row(len(self.head)):
+            self._grow()
+        else:
             self._hash.grow()
-            return
-        for slab in reversed(self._slabs.values()):  # the head, which says how many, last
-            if len(slab.array) < 2 * num_rows:
-                slab.grow(2 * num_rows)
