@@ -11,9 +11,7 @@ from surfel_mapper.kernels.folds import halve_normals
 
 Array = npt.NDArray[np.float64]
 
-OUTLIERS = 0.02
-"""A surface is no fold where no more than this share of it turns too far."""
-
+FOLD_PERCENTILE = 98.0
 
 
 def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
