@@ -35,8 +35,6 @@ from surfel_mapper.tsdf.block_arrays import BlockArrays
 from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks
 
 Int64 = npt.NDArray[np.int64]
-Float32 = npt.NDArray[np.float32]
-Float64 = npt.NDArray[np.float64]
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries."""
