@@ -15,6 +15,8 @@ import numpy as np
 
 from surfel_mapper.kernels.splines import nonzero, parameter
 
+MOST_STEPS = 200
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def mark_active(filled, field, active):
@@ -95,23 +97,29 @@ def equations(xyz, field, free, first, values):
     List the heights that depend on free control points.
 
     xyz     (M, 3) float64, m
-    field   see heights_at
-    first   (M, 3) int64, out: first control point along x and y, row of xyz
-    values  (M, 2, W) float64, out: the splines along x and y
+    field   see heights_at; degrees are 3
+    free    (Nx + 2, Ny + 2) bool
+    first   (M, 2) int64, out: first control point, counted y within x; row of xyz
+    values  (M, 2, 4) float64, out: the splines along x and y
 
     Returns how many there are.
     """
-    origin, pitch, degrees, knots, control = field
-    lower = np.empty(max(degrees[0], degrees[1]) + 1)
-    width_x, width_y = (control.shape[0] - 1) * pitch, (control.shape[1] - 1) * pitch
+    origin, pitch, _, knots, control = field
+    lower = np.empty(4)
+    num_y = control.shape[1]
+    width_x, width_y = (control.shape[0] - 1) * pitch, (num_y - 1) * pitch
     num = 0
     for i in range(len(xyz)):
         u = parameter(xyz[i, 0], origin[0], pitch, width_x)
         v = parameter(xyz[i, 1], origin[1], pitch, width_y)
-        x = nonzero(u, knots[0], degrees[0], values[num, 0], lower)
-        y = nonzero(v, knots[1], degrees[1], values[num, 1], lower)
-        if free[x : x + degrees[0] + 1, y : y + degrees[1] + 1].any():
-            first[num, 0], first[num, 1], first[num, 2] = x, y, i
+        x = nonzero(u, knots[0], 3, values[num, 0], lower)
+        y = nonzero(v, knots[1], 3, values[num, 1], lower)
+        some = False
+        for j in range(4):
+            for k in range(4):
+                some |= free[x + j, y + k]
+        if some:
+            first[num, 0], first[num, 1] = x * num_y + y, i
             num += 1
     return num
 
@@ -122,23 +130,25 @@ def bends(places, axis, active, free, at, second):
     List the second differences along an axis among active control points, some of them free.
 
     places  (N,) float64, where the control points stand along the axis
-    at      (T,) int64, out: first of three control points, counted y within x
+    at      (T, 2) int64, out: first of three control points, and the step to the next
     second  (T, 3) float64, out: what they are multiplied by
 
     Returns how many there are.
     """
     num_x, num_y = active.shape
-    dx, dy = (1, 0) if axis == 0 else (0, 1)
+    dx = 1 - axis
     num = 0
     for i in range(num_x - 2 * dx):
-        for j in range(num_y - 2 * dy):
-            here, next_x, next_y = i if axis == 0 else j, i + dx, j + dy
-            if not (active[i, j] and active[next_x, next_y] and active[next_x + dx, next_y + dy]):
-                continue
-            if free[i, j] or free[next_x, next_y] or free[next_x + dx, next_y + dy]:
+        for j in range(num_y - 2 * axis):
+            every, some = True, False
+            for k in range(3):
+                every &= active[i + k * dx, j + k * axis]
+                some |= free[i + k * dx, j + k * axis]
+            if every and some:
+                here = i if axis == 0 else j
                 before = places[here + 1] - places[here]
                 after = places[here + 2] - places[here + 1]
-                at[num] = i * num_y + j
+                at[num, 0], at[num, 1] = i * num_y + j, num_y * dx + axis
                 second[num, 0] = 2.0 * after / (before + after)
                 second[num, 1] = -2.0
                 second[num, 2] = 2.0 * before / (before + after)
@@ -147,92 +157,95 @@ def bends(places, axis, active, free, at, second):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def multiply(first, values, weight, degrees, differences, smoothing, ridge, free, x, result):
+def multiply(first, values, num_y, at, second, smoothing, ridge, x, result):
     """
-    Multiply by the matrix of the normal equations, as far as the free control points go.
+    Multiply by the matrix of the normal equations.
 
-    first, values  of equations; weight (M,) of each
-    differences    for x and y: step from one control point to the next, at and second of bends
-    x, result      (Nx + 2, Ny + 2) float64
+    first, values, at, second: of equations and bends
+    num_y      control points along y
+    x, result  (n,) float64, of all control points
     """
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            result[i, j] = ridge * x[i, j]
+    for i in range(len(x)):
+        result[i] = ridge * x[i]
     for i in range(len(first)):
-        row, column = first[i, 0], first[i, 1]
-        height = 0.0
-        for j in range(degrees[0] + 1):
+        begin, height = first[i, 0], 0.0
+        for j in range(4):
+            row = begin + j * num_y
             along = 0.0
-            for k in range(degrees[1] + 1):
-                along += values[i, 1, k] * x[row + j, column + k]
+            for k in range(4):
+                along += values[i, 1, k] * x[row + k]
             height += values[i, 0, j] * along
-        height *= weight[i]
-        for j in range(degrees[0] + 1):
-            share = height * values[i, 0, j]
-            for k in range(degrees[1] + 1):
-                result[row + j, column + k] += share * values[i, 1, k]
-    flat, out = x.ravel(), result.ravel()
-    for step, at, second in differences:
-        for i in range(len(at)):
-            a = at[i]
-            bend = smoothing * (second[i, 0] * flat[a] + second[i, 1] * flat[a + step]
-                                + second[i, 2] * flat[a + 2 * step])  # fmt: skip
-            for j in range(3):
-                out[a + j * step] += bend * second[i, j]
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            if not free[i, j]:
-                result[i, j] = 0.0
+        for j in range(4):
+            row, share = begin + j * num_y, height * values[i, 0, j]
+            for k in range(4):
+                result[row + k] += share * values[i, 1, k]
+    for i in range(len(at)):
+        a, step = at[i, 0], at[i, 1]
+        bend = second[i, 0] * x[a] + second[i, 1] * x[a + step] + second[i, 2] * x[a + 2 * step]
+        bend *= smoothing
+        for j in range(3):
+            result[a + j * step] += bend * second[i, j]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def relax(first, values, weight, z, degrees, differences, rules, free, control):
-    """
-    Bring free control points to the least of the weighted squares, by conjugate gradients.
+def preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal):
+    """Write the diagonal (n,) of the matrix of multiply."""
+    for i in range(len(diagonal)):
+        diagonal[i] = ridge
+    for i in range(len(first)):
+        for j in range(4):
+            for k in range(4):
+                share = values[i, 0, j] * values[i, 1, k]
+                diagonal[first[i, 0] + j * num_y + k] += share * share
+    for i in range(len(at)):
+        for j in range(3):
+            diagonal[at[i, 0] + j * at[i, 1]] += smoothing * second[i, j] * second[i, j]
 
-    first, values, weight, differences: see multiply
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def relax(first, values, z, num_y, at, second, rules, free, control):
+    """
+    Bring free control points to the least of the squares, by conjugate gradients.
+
+    first, values, num_y, at, second: see multiply
     z        (M,) float64, m, of the equations
-    rules    smoothing; ridge; m: the last steps are shorter
-    control  (Nx + 2, Ny + 2) float64, m, in place
+    rules    smoothing; ridge; m: the last step is shorter than that everywhere
+    free     (F,) int64, numbers of the free control points
+    control  (n,) float64, m, in place
 
     Returns how many steps that took.
     """
     smoothing, ridge, tolerance = rules
-    shape = control.shape
-    product, residual, diagonal = np.empty(shape), np.zeros(shape), np.full(shape, ridge)
-    multiply(first, values, weight, degrees, differences, smoothing, ridge, free, control, product)
+    product, diagonal = np.empty(len(control)), np.empty(len(control))
+    residual, direction = np.zeros(len(control)), np.zeros(len(control))
+    multiply(first, values, num_y, at, second, smoothing, ridge, control, product)
+    preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal)
     for i in range(len(first)):
-        for j in range(degrees[0] + 1):
-            for k in range(degrees[1] + 1):
-                row, column = first[i, 0] + j, first[i, 1] + k
+        for j in range(4):
+            for k in range(4):
                 share = values[i, 0, j] * values[i, 1, k]
-                residual[row, column] += weight[i] * share * z[i]
-                diagonal[row, column] += weight[i] * share * share
-    flat = diagonal.ravel()
-    for step, at, second in differences:
-        for i in range(len(at)):
-            for j in range(3):
-                flat[at[i] + j * step] += smoothing * second[i, j] * second[i, j]
-    residual = np.where(free, residual - product, 0.0)
-    scaled = residual / diagonal
-    direction = scaled.copy()
-    energy = np.sum(residual * scaled)
+                residual[first[i, 0] + j * num_y + k] += share * z[i]
+    energy = 0.0
+    for f in free:
+        residual[f] -= product[f]
+        direction[f] = residual[f] / diagonal[f]
+        energy += residual[f] * direction[f]
     for step in range(MOST_STEPS):
-        multiply(
-            first, values, weight, degrees, differences, smoothing, ridge, free, direction, product
-        )
-        along = np.sum(direction * product)
+        multiply(first, values, num_y, at, second, smoothing, ridge, direction, product)
+        along = 0.0
+        for f in free:
+            along += direction[f] * product[f]
         if not along > 0.0:
             return step
-        length = energy / along
-        control += length * direction
-        if length * np.abs(direction).max() < tolerance:
+        length, longest, before = energy / along, 0.0, energy
+        energy = 0.0
+        for f in free:
+            control[f] += length * direction[f]
+            longest = max(longest, abs(length * direction[f]))
+            residual[f] -= length * product[f]
+            energy += residual[f] * residual[f] / diagonal[f]
+        if longest < tolerance:
             return step + 1
-        residual -= length * product
-        scaled = residual / diagonal
-        before, energy = energy, np.sum(residual * scaled)
-        direction = scaled + (energy / before) * direction
+        for f in free:
+            direction[f] = residual[f] / diagonal[f] + energy / before * direction[f]
     return MOST_STEPS
-
-
-MOST_STEPS = 200

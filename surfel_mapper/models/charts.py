@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.piece_groups import hang_together, mean_normals, suspects
-from surfel_mapper.models.folds import FOLD_PERCENTILE, folded
+from surfel_mapper.models.folds import FOLD_PERCENTILE, folded, percentile
 from surfel_mapper.models.pieces import Pieces
 
 Array = npt.NDArray[np.float64]
@@ -78,26 +78,21 @@ def cut(pieces: Pieces, members: Rows, limit: float, least: int) -> list[Rows]:
 
 def side_of(pieces: Pieces, part: Rows, limit: float) -> npt.NDArray[np.bool_] | None:
     """Return how to halve a part (n,) bool; None where it has one height everywhere."""
-    normals = alike(pieces.normal[part], limit)
-    total = normals.sum(axis=0)
-    length = float(np.linalg.norm(total))
-    mean: Array = total / length if length > 0.0 else total
+    normals = pieces.normal[part]
+    mean = unit(normals.sum(axis=0))
     side = folded(normals, mean, limit)
-    return stacked(pieces.position[part], mean, pieces.map.voxel_size_m) if side is None else side
+    if side is not None:
+        axis = np.linalg.eigh(normals.T @ normals)[1][:, -1]
+        if percentile(np.abs(normals @ axis), 100.0 - FOLD_PERCENTILE) < limit:
+            return side
+        mean = axis  # they are alike but for their signs: nobody saw these voxels from one side
+    return stacked(pieces.position[part], mean, pieces.map.voxel_size_m)
 
 
-def alike(normals: Array, limit: float) -> Array:
-    """
-    Return normals (n, 3) turned to one side where that makes them all alike.
-
-    Where nobody saw a voxel from one side alone, its normal may face to either.
-    """
-    axis = np.linalg.eigh(normals.T @ normals)[1][:, -1]
-    cosines = normals @ axis
-    if np.percentile(np.abs(cosines), 100.0 - FOLD_PERCENTILE) < limit:
-        return normals
-    turned: Array = normals * np.sign(cosines)[:, None]
-    return turned
+def unit(vector: Array) -> Array:
+    """Return a vector of length 1; 0 for 0."""
+    length = float(np.linalg.norm(vector))
+    return vector / length if length > 0.0 else vector
 
 
 def stacked(points: Array, normal: Array, size_m: float) -> npt.NDArray[np.bool_] | None:

@@ -24,8 +24,8 @@ Mask = npt.NDArray[np.bool_]
 MOST_AT_ONCE = 2e6
 """Multiplications of a banded solve, about 1 ms, beyond which a field counts as large."""
 
-STILL_M = 1e-4
-TOLERANCE_M = 2e-5
+STILL_M = 2e-4
+TOLERANCE_M = 5e-5
 MARGIN = 5
 DEGREE = 3
 BLOCK = 16
@@ -75,7 +75,7 @@ def fit_field(
 
     """
     size = (sums.shape[0] + 2) * (sums.shape[1] + 2)
-    is_large = size * (DEGREE * min(sums.shape)) ** 2 > MOST_AT_ONCE
+    is_large = size * (DEGREE * min(sums.shape[:2])) ** 2 > MOST_AT_ONCE
     if is_large:
         origin, sums = in_blocks(pitch_m, origin, sums)
     filled: Mask = sums[..., 3] > 0.0
@@ -156,16 +156,19 @@ def relaxed(
     guess(control, known, active)
     mark_near(touched, MARGIN, active, free)
     xyz = means[filled]
-    first, values = np.empty((len(xyz), 3), np.int64), np.empty((len(xyz), 2, DEGREE + 1))
+    first, values = np.empty((len(xyz), 2), np.int64), np.empty((len(xyz), 2, DEGREE + 1))
     num = equations(xyz, start.parts(), free, first, values)
-    differences = []
+    ats, seconds = [], []
     for axis, places in enumerate(start.greville()):
-        at, second = np.empty(control.size, np.int64), np.empty((control.size, 3))
+        at, second = np.empty((control.size, 2), np.int64), np.empty((control.size, 3))
         bent = bends(places, axis, active, free, at, second)
-        differences.append((control.shape[1] if axis == 0 else 1, at[:bent], second[:bent]))
-    rules = (smoothing, RIDGE, TOLERANCE_M)
+        ats.append(at[:bent])
+        seconds.append(second[:bent])
+    flat = control.ravel()
     relax(
-        first[:num], values[:num], np.ones(num), xyz[first[:num, 2], 2], start.degrees,
-        tuple(differences), rules, free, control,
+        first[:num], values[:num], xyz[first[:num, 1], 2], control.shape[1],
+        np.concatenate(ats), np.concatenate(seconds), (smoothing, RIDGE, TOLERANCE_M),
+        np.flatnonzero(free), flat,
     )  # fmt: skip
-    return HeightField(start.pitch_m, start.origin, start.degrees, control)
+    field = flat.reshape(control.shape)
+    return HeightField(start.pitch_m, start.origin, start.degrees, field)

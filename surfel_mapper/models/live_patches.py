@@ -183,21 +183,28 @@ class PatchFitter:
     ) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return where patches are anchored, and which frames stay; frames change in place."""
         origins, stays = means.copy(), np.zeros(len(means), np.bool_)
-        for k, known in enumerate(before):
-            if known is None or isinstance(known.patch, Surface) != curved[k]:
-                continue
-            was, normal = known.patch.R_patch_map, frames[k, 2]
-            if float(was[2] @ normal) < math.cos(MOST_TURN_RAD):
-                continue
-            sine = float(np.linalg.norm(np.cross(was[2], normal)))
-            radius = 3.0 * math.sqrt(max(float(np.trace(covariances[k])), 0.0))
-            # what a plane is off its points at the rim counts; a field says itself where it is
-            near = curved[k] or sine * radius < STILL * self._pieces.thickness_m
-            if sine < STILL_RAD and near:
-                frames[k], origins[k], stays[k] = was, known.origin, True
-            else:
-                frames[k] = turned(was[0], normal)
-                origins[k] = known.origin - (normal @ (known.origin - means[k])) * normal
+        known = {
+            k: tracked
+            for k, tracked in enumerate(before)
+            if tracked is not None and isinstance(tracked.patch, Surface) == curved[k]
+        }
+        if not known:
+            return origins, stays
+        rows = np.array(list(known))
+        was = np.array([tracked.patch.R_patch_map for tracked in known.values()])
+        anchors = np.array([tracked.origin for tracked in known.values()])
+        normals = frames[rows, 2]
+        turn = np.linalg.norm(was[:, 2] - normals, axis=1)
+        radius = 3.0 * np.sqrt(np.trace(covariances[rows], axis1=1, axis2=2))
+        # what a plane is off its points at the rim counts; a field says itself where it is
+        near = curved[rows] | (turn * radius < STILL * self._pieces.thickness_m)
+        still = (turn < STILL_RAD) & near
+        frames[rows[still]], origins[rows[still]] = was[still], anchors[still]
+        stays[rows] = still
+        turns = ~still & (turn < MOST_TURN_RAD)
+        frames[rows[turns]] = turned(was[turns, 0], normals[turns])
+        height = np.einsum('ij,ij->i', anchors - means[rows], normals)
+        origins[rows[turns]] = (anchors - height[:, None] * normals)[turns]
         return origins, stays
 
     def _surface(self, plane: Plane, spline: HeightField, origin: Array, rows: Rows) -> Surface:
@@ -218,11 +225,11 @@ class PatchFitter:
         )
 
 
-def turned(x: Array, normal: Array) -> Array:
-    """Return the frame (3, 3) of a normal whose x is as near to another as it can be."""
-    along = x - (x @ normal) * normal
-    along = along / np.linalg.norm(along)
-    return np.stack([along, np.cross(normal, along), normal])
+def turned(x: Array, normals: Array) -> Array:
+    """Return the frames (K, 3, 3) of normals whose x are as near to others as they can be."""
+    along = x - np.einsum('ij,ij->i', x, normals)[:, None] * normals
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return np.stack([along, np.cross(normals, along), normals], axis=1)
 
 
 def symmetric(packed: Array) -> Array:
