@@ -15,6 +15,11 @@ import sys
 import numpy as np
 import pytest
 
+QUIET = """
+import numpy as np
+np.seterr(all='ignore')  # hashes overflow and 0 / 0 is nan on purpose, as compiled
+"""
+
 
 def compiled(kernel, *arguments):
     return kernel(*arguments)
@@ -25,12 +30,30 @@ def interpreted(kernel, *arguments):
         return getattr(kernel, 'py_func', kernel)(*arguments)
 
 
-def printed(program, *arguments, compiled):
+def printed_alike(program):
+    """Return what a program prints; it has to be the same compiled and interpreted."""
+    text = printed(program, is_compiled=True)
+    assert text == printed(program, is_compiled=False)
+    return text
+
+
+def saved_alike(program, folder, **tolerance):
+    """Return the arrays that a program saves to the file it is given, alike in both ways."""
+    paths = folder / 'compiled.npz', folder / 'interpreted.npz'
+    text = printed(program, paths[0], is_compiled=True)
+    assert text == printed(program, paths[1], is_compiled=False)
+    arrays = [list(np.load(path).values()) for path in paths]
+    for one, other in zip(*arrays, strict=True):
+        np.testing.assert_allclose(one, other, **tolerance)
+    return arrays[0]
+
+
+def printed(program, *arguments, is_compiled):
     """Return what a program prints with its kernels compiled or interpreted."""
     done = subprocess.run(
-        [sys.executable, '-c', program, *map(str, arguments)],
+        [sys.executable, '-c', QUIET + program, *map(str, arguments)],
         cwd=Path(__file__).parents[2],
-        env={**os.environ, 'NUMBA_DISABLE_JIT': '0' if compiled else '1'},
+        env={**os.environ, 'NUMBA_DISABLE_JIT': '0' if is_compiled else '1'},
         capture_output=True,
         text=True,
         check=False,
