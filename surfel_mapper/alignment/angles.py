@@ -19,7 +19,7 @@ TURN = 2.0 * np.pi
 
 
 def transforms(poses: Floats) -> Floats:
-    """Return the transforms (V, 4, 4) of poses (V, 6)."""
+    """Return the transforms, (V, 4, 4), of poses, (V, 6)."""
     sines, cosines = np.sin(poses[:, 3:]), np.cos(poses[:, 3:])
     (sr, sp, sy), (cr, cp, cy) = sines.T, cosines.T
     result = np.zeros((len(poses), 4, 4))

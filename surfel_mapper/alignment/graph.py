@@ -92,7 +92,7 @@ class Graph:
                 edge.moments = None
 
     def pose(self, vertex: int) -> Floats:
-        """Return the pose (6,) of a vertex; a copy."""
+        """Return the pose of a vertex, (6,); a copy."""
         return np.array(self._poses[self._known(vertex)])
 
     def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:

@@ -158,7 +158,7 @@ class LUM:
         self.graph.set_points(vertex, points)
 
     def pose(self, vertex: int) -> Floats:
-        """Return the pose (6,) of a vertex."""
+        """Return the pose of a vertex, (6,)."""
         return self.graph.pose(vertex)
 
     def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:

@@ -38,6 +38,7 @@ from surfel_mapper.mapping.surfels import Surfels
 SAMPLE = 100_000
 """About so many surfels are sent back for pictures."""
 
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TiledMap:
     """

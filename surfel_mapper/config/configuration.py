@@ -110,8 +110,8 @@ class Config:
             place = stages.setdefault(declared.stage, {}) if declared.stage else of_no_stage
             place[declared.key] = value
         made = {
-            declared.name: declared.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
-            for stage, declared in stage_fields().items()
+            part.name: part.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
+            for stage, part in stage_fields().items()
         }
         return cls(**made, **of_no_stage)
 
@@ -195,5 +195,3 @@ def ros_parameters(content: Any) -> dict[str, Any]:
             settings.update(flatten({name: value}))
     for_node = ('use_sim_time', 'qos_overrides.')
     return {name: value for name, value in settings.items() if not name.startswith(for_node)}
-
-

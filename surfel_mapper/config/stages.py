@@ -289,5 +289,3 @@ class OutputConfig(Stage):
                 f'{stage}.map_name: {name!r}, expected a plain file name: '
                 'not empty, no leading dot, no slash'
             )
-
-

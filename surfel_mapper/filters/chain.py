@@ -176,7 +176,6 @@ class Chain:
             steps.append(Step(name, points_in, len(scan), milliseconds))
         return scan, tuple(steps)
 
-
     def warm_up(self) -> None:
         """Compile the kernels of our filters, for all types that scans may have."""
         for dtype in (np.float32, np.float64):

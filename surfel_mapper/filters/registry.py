@@ -37,8 +37,12 @@ _FILTERS: dict[str, type[Filter]] = {}
 
 @overload
 def register(cls: F) -> F: ...
+
+
 @overload
 def register(*, name: str = '', theirs: str = '') -> Callable[[F], F]: ...
+
+
 def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | Callable[[F], F]:
     """
     Register a filter; a decorator, above ``@dataclass``, with or without arguments.

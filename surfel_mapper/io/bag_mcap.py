@@ -129,4 +129,3 @@ def text(content: bytes, at: int) -> tuple[str, int]:
     if end > len(content):
         raise ValueError('a string longer than its record')
     return content[at + 4 : end].decode(), end
-

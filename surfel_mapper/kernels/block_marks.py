@@ -36,6 +36,7 @@ ROW_BAND = 7
 COLUMN_BAND = 8
 NUM_REACH = 9
 
+
 @njit(cache=True, nogil=True)
 def lowest_bits(count):
     """Return the largest power of two that divides each number from 0 on; a large one for 0."""

@@ -45,5 +45,5 @@ def _prefetch(typingctx, array, index):
 
 @overload(prefetch, inline='always')
 def _compiled_prefetch(array, index):
-    """Compile to the instruction; the interpreter runs the empty function above."""
+    # the instruction where it is compiled; the interpreter runs the empty function above
     return lambda array, index: _prefetch(array, index)

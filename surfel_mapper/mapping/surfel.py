@@ -206,7 +206,7 @@ class Surfel:
         return self._sums.mean()
 
     def covariance(self) -> Array:
-        """Return the covariance (3, 3), m^2: scatter / (n - 1); 0 of fewer than two points."""
+        """Return the covariance, (3, 3) m^2: scatter / (n - 1); 0 of fewer than two points."""
         matrix = np.zeros((3, 3))
         if self.num_points > 1:
             matrix[ROWS, COLUMNS] = self._sums.scatter / (self.num_points - 1)

@@ -70,7 +70,7 @@ class Clusters:
         return counts
 
     def covariances(self) -> Array:
-        """Return the covariances (K, 3, 3), m^2."""
+        """Return the covariances, (K, 3, 3) m^2."""
         scaled = self.eigenvalues[:, ::-1, None] * self.frames
         result: Array = np.einsum('kij,kil->kjl', self.frames, scaled)
         return result

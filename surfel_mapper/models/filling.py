@@ -84,7 +84,7 @@ def trapezoids(
 
 
 def areas(triangles: Array) -> Array:
-    """Return the areas (T,) of triangles (T, 3, 2) or (T, 3, 3); in 2D against the clock."""
+    """Return the areas, (T,), of triangles (T, 3, 2) or (T, 3, 3); in 2D against the clock."""
     a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     if triangles.shape[2] == 2:
         across: Array = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]

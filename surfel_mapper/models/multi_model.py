@@ -63,7 +63,7 @@ class Plane:
 
     @property
     def normal(self) -> Array:
-        """Unit normal (3,), towards the viewpoint; the mean direction for a surface."""
+        """Unit normal, (3,), towards the viewpoint; the mean direction for a surface."""
         normal: Array = self.R_patch_map[2]
         return normal
 
@@ -108,7 +108,7 @@ class Surface(Plane):
         return self.spline.heights(xy)
 
     def normals(self, xy: Array) -> Array:
-        """Return the unit normals (M, 3) at (M, 2) places in the frame."""
+        """Return the unit normals, (M, 3), at (M, 2) places in the frame."""
         slopes = self.spline.slopes(xy)
         local = np.column_stack([-slopes, np.ones(len(xy))])
         normals: Array = local @ self.R_patch_map

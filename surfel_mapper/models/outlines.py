@@ -47,7 +47,7 @@ def local_outline(patch: Plane) -> list[Array]:
 
 
 def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Return vertices (V, 3) m and triangles (T, 3) of a patch, facing along its normal."""
+    """Return vertices, (V, 3) m, and triangles, (T, 3), of a patch, facing along its normal."""
     side_m = patch.grid.pitch_m / PARTS_OF_SURFACE
     squares = np.argwhere(patch.grid.mask(PARTS_OF_SURFACE))
     steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])

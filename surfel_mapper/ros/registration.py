@@ -135,5 +135,5 @@ class RegistrationOutputs:
 
 
 def covariance(information: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the covariance (6, 6) of position and turn; huge where nothing is known."""
+    """Return the covariance, (6, 6), of position and turn; huge where nothing is known."""
     return np.asarray(np.linalg.inv(information + UNKNOWN * np.eye(6)), np.float64)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 from types import SimpleNamespace
 from typing import Any
@@ -102,7 +103,7 @@ def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
         )
 
     kinds = ('planarity', 'normal', 'age')
-    return {f'markers by {kind}': lambda kind=kind: draw(kind) for kind in kinds}  # type: ignore[misc]
+    return {f'markers by {kind}': partial(draw, kind) for kind in kinds}
 
 
 def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:

@@ -79,8 +79,10 @@ def sweep(**columns):
         (np.array([0, 20, 50, 70], np.uint32) * 10**6, {}),  # ns since the first point
         (np.array([1.0, 1.02, 1.05, 1.07]), {}),  # s
         (NS + np.array([0, 20, 50, 70]) * 10**6, {}),  # ns since 1970, exact
-        (NS + np.array([-70, -50, -20, 0]) * 10**6, {'since': 'stamp', 'start_s': -0.055,
-                                                      'end_s': -0.01}),
+        (
+            NS + np.array([-70, -50, -20, 0]) * 10**6,
+            {'since': 'stamp', 'start_s': -0.055, 'end_s': -0.01},
+        ),
         (np.array([0, 20, 50, 70], np.uint16), {'unit_s': 1e-3}),
         (np.array([0.0, 20.0, 50.0, 70.0], np.float32), {'unit_s': 1e-3, 'since': 'zero'}),
     ],
