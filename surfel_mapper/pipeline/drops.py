@@ -28,7 +28,8 @@ REMEDIES = {
     'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',
     'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, '
-    'and its stamps with theirs; pose.max_wait_s waits longer',
+    'and its stamps with theirs; a sensor that no transform places needs frames.base_to_sensor; '
+    'pose.max_wait_s waits longer',
     'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',

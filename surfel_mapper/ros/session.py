@@ -120,6 +120,11 @@ class Session:
 
     def _on_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
+        if not self.latencies_s:
+            self._node.get_logger().info(
+                f'first scan mapped: {update.num_points} points of frame {update.scan.frame_id}, '
+                f'{len(update.changed)} surfels'
+            )
         self.outputs.publish_update(update)
         if self.registration is not None:
             self.registration.publish(update)
