@@ -3,9 +3,9 @@
 """
 The node: its life cycle and its parameters, around a session that does the work.
 
-Three threads. The main one makes the transitions and hears signals (running.py). The executor's
-takes messages and requests and passes them on. The mapping thread alone touches the map, and
-publishes what comes of it.
+Four threads. The main one makes the transitions and hears signals (running.py). That of the intake
+takes clouds and poses and passes them on, the executor's does so with requests and timers. The
+mapping thread alone touches the map, and publishes what comes of it.
 
     unconfigured  parameters and diagnostics
     inactive      kernels are compiled, topics and services are there, no scan is taken
