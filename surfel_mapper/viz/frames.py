@@ -82,28 +82,31 @@ class Frame:
         right, up, _ = self.view.seen(positions)
         return np.column_stack([right - self.left, self.top - up]) * self.px_per_m - 0.5
 
+    @property
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """Where the axes of the map end: at the left and the right, below and above."""
+        right = self.left + self.width / self.px_per_m
+        bottom = self.top - self.height / self.px_per_m
+        across, up, _ = self.view.signs
+        return (across * self.left, across * right), (up * bottom, up * self.top)
+
     def ticks(self) -> tuple[Array, Array]:
-        """Return round numbers of metres along either axis, as the axes of the map have them."""
+        """Return round numbers of metres along either axis of the map."""
         from matplotlib.ticker import MaxNLocator
 
-        found: list[Array] = []
-        signs = self.view.signs
-        for first, sign, length, room in (
-            (self.left, signs[0], self.width, TICK_COLUMNS),
-            (self.top - self.height / self.px_per_m, signs[1], self.height, TICK_ROWS),
-        ):
-            low, high = sorted([sign * first, sign * (first + length / self.px_per_m)])
-            values = np.asarray(MaxNLocator(max(length // room, 1)).tick_values(low, high))
-            found.append(values[(values >= low) & (values <= high)])
+        found = []
+        rooms = (self.width // TICK_COLUMNS, self.height // TICK_ROWS)
+        for ends, number in zip(self.bounds, rooms, strict=True):
+            values = np.asarray(MaxNLocator(max(number, 1)).tick_values(min(ends), max(ends)))
+            found.append(values[(values >= min(ends)) & (values <= max(ends))])
         return found[0], found[1]
 
     def gridded(self) -> npt.NDArray[np.float32]:
         """Return a white image with lines at the ticks, (H, W, 3)."""
         image = np.full((self.height, self.width, 3), 255.0, np.float32)
-        along, up = self.ticks()
-        signs = self.view.signs
-        columns = np.rint((signs[0] * along - self.left) * self.px_per_m - 0.5).astype(np.int64)
-        rows = np.rint((self.top - signs[1] * up) * self.px_per_m - 0.5).astype(np.int64)
+        (along, up), (across, upwards, _) = self.ticks(), self.view.signs
+        columns = np.rint((across * along - self.left) * self.px_per_m - 0.5).astype(np.int64)
+        rows = np.rint((self.top - upwards * up) * self.px_per_m - 0.5).astype(np.int64)
         image[:, columns.clip(0, self.width - 1)] = GRID
         image[rows.clip(0, self.height - 1)] = GRID
         return image

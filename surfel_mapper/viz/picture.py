@@ -172,15 +172,6 @@ def framed(
 
 def label(ax: Axes, frame: Frame) -> None:
     """Give axes the scales and labels of a frame."""
-    view = frame.view
-    for name, axis, sign, ticks, first, last in zip(
-        'xy',
-        (view.right, view.up),
-        view.signs,
-        frame.ticks(),
-        (frame.left, frame.top - frame.height / frame.px_per_m),
-        (frame.left + frame.width / frame.px_per_m, frame.top),
-        strict=False,
-    ):
-        ax.set(**{f'{name}lim': (sign * first, sign * last)})
-        ax.set(**{f'{name}ticks': ticks, f'{name}label': f'{"xyz"[axis]} (m)'})
+    (along, up), (xticks, yticks) = frame.bounds, frame.ticks()
+    names = [f'{"xyz"[axis]} (m)' for axis in (frame.view.right, frame.view.up)]
+    ax.set(xlim=along, ylim=up, xlabel=names[0], ylabel=names[1], xticks=xticks, yticks=yticks)

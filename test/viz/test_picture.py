@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.viz.frames import Frame
 from surfel_mapper.viz.picture import draw_map, limits, views, X, Y, Z
 
 YELLOW, PURPLE = (np.array(colormaps['viridis'](value)[:3]) for value in (1.0, 0.0))
@@ -91,6 +92,22 @@ def test_the_longer_way_lies_across_and_both_views_stand_the_right_way_round():
             ):
                 axes[row, axis] = sign
             assert np.linalg.det(axes) == 1.0  # no mirror image
+
+
+def test_pixels_lie_where_the_axes_say_whichever_way_they_run():
+    low, high = np.array([-3.0, 10.0, 0.0]), np.array([5.0, 50.0, 2.0])
+    above, side = (Frame.of(view, (low, high), 10.0) for view in views(high - low))
+
+    assert (above.width, above.height) == (400, 80)
+    assert above.bounds == ((10.0, 50.0), (5.0, -3.0))  # y to the right, x down
+    assert side.bounds == ((10.0, 50.0), (0.0, 2.0))
+    np.testing.assert_allclose(above.placed(low[None]), [[-0.5, -0.5]])
+    np.testing.assert_allclose(above.placed(high[None]), [[399.5, 79.5]])
+    np.testing.assert_allclose(side.placed(low[None]), [[-0.5, 19.5]])
+    image = above.gridded()
+    for value, column in ((20.0, 100), (40.0, 300)):
+        assert value in above.ticks()[0]
+        assert (image[:, column] < 255.0).all()
 
 
 def test_the_trajectory_is_drawn(tmp_path):
