@@ -75,9 +75,13 @@ class Grid:
 
     def mask(self, per_side: int) -> npt.NDArray[np.bool_]:
         """Return which parts of the cells are covered by their middle, so many a side."""
-        shape = np.array(self.filled.shape) * per_side
-        xy = self.origin + (np.argwhere(np.ones(shape)) + 0.5) * (self.pitch_m / per_side)
-        return self.contains(xy).reshape(tuple(shape))
+        covered = self.filled.repeat(per_side, axis=0).repeat(per_side, axis=1)
+        inner = np.argwhere(np.ones((per_side, per_side)))
+        # only cells at the rim are cut
+        parts = (per_side * np.argwhere(self.rim)[:, None] + inner).reshape(-1, 2)
+        xy = self.origin + (parts + 0.5) * (self.pitch_m / per_side)
+        covered[parts[:, 0], parts[:, 1]] = self.contains(xy)
+        return covered
 
     def area_m2(self, per_side: int = 16) -> float:
         """Return how much is covered, m^2, from so many samples along a cell."""

@@ -49,13 +49,16 @@ def local_outline(patch: Plane) -> list[Array]:
 def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
     """Return vertices, (V, 3) m, and triangles, (T, 3), of a patch, facing along its normal."""
     side_m = patch.grid.pitch_m / PARTS_OF_SURFACE
-    squares = np.argwhere(patch.grid.mask(PARTS_OF_SURFACE))
+    mask = patch.grid.mask(PARTS_OF_SURFACE)
+    squares = np.argwhere(mask)
     steps = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
-    corners = (squares[:, None] + steps).reshape(-1, 2)
-    places, number = np.unique(corners, axis=0, return_inverse=True)
-    quads = number.reshape(-1, 4)
+    x, y = np.moveaxis(squares[:, None] + steps, 2, 0)
+    lattice = np.zeros(np.array(mask.shape) + 1, np.bool_)
+    lattice[x, y] = True
+    number = np.cumsum(lattice).reshape(lattice.shape) - 1
+    quads = number[x, y]
     faces = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
-    return patch.lifted(patch.grid.origin + side_m * places), faces
+    return patch.lifted(patch.grid.origin + side_m * np.argwhere(lattice)), faces
 
 
 def rings(mask: npt.NDArray[np.bool_]) -> list[Array]:

@@ -60,6 +60,15 @@ def test_no_triangle_of_a_plane_is_in_its_hole_or_beyond_its_rim(frame):
     assert np.abs(corners[:, 2]).max() < 1e-3 + A / 10
 
 
+def test_the_mask_of_a_grid_says_of_the_middle_of_every_part_whether_it_is_covered(frame):
+    grid = frame[0].grid
+    mask = grid.mask(3)
+    assert mask.shape == (3 * grid.filled.shape[0], 3 * grid.filled.shape[1])
+    for (x, y), covered in np.ndenumerate(mask):
+        middle = grid.origin + (np.array([[x, y]]) + 0.5) * grid.pitch_m / 3
+        assert grid.contains(middle)[0] == covered
+
+
 def test_the_box_of_a_plane_lies_around_it(frame):
     shape = shape_of(frame[0])
     assert shape.middle == pytest.approx([5.0, 1.0, 2.0], abs=A)
