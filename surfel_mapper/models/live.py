@@ -18,7 +18,7 @@ Source: Gao and Dong 2025 for the tests and the models; that a voxel is a piece 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
 
@@ -175,13 +175,17 @@ class LiveModels:
 
     def warm_up(self) -> None:
         """Compile the kernels."""
-        surfel_map = SurfelMap(self.map.voxel_size_m)
-        models = LiveModels(self.config, surfel_map)
-        x, y = np.mgrid[0:60, 0:60] * (0.2 * self.map.voxel_size_m)
-        for bend in (0.0, 0.05 / self.map.voxel_size_m):
-            moments = surfel_map.add(np.stack([x, y, bend * x * x], -1).reshape(-1, 3))
+        size_m = self.map.voxel_size_m
+        surfel_map = SurfelMap(size_m)
+        models = LiveModels(replace(self.config, min_points=4, min_voxels=1), surfel_map)
+        x, y = np.mgrid[0:130, 0:130] * (0.2 * size_m)
+        for bend in (0.0, 0.012 / size_m):  # a plane, a surface that is a large field
+            points = np.stack([x, y, bend * x * x], -1).reshape(-1, 3)
+            moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m)]
             models.update()
-            surfel_map.remove(moments)
+            surfel_map.remove(moments[1])
+            models.update()
+            surfel_map.remove(moments[0])
         models.update()
 
     def summary(self) -> dict[str, Any]:

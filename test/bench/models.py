@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.models import evaluate, fit, MultiModel
+from test.bench import live_models
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import OPEN3D, PeerSpec
@@ -48,7 +49,7 @@ PEER_RUNS = 3
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for every cloud and voxel size, then those of Open3D."""
+    """Return a row for every cloud and voxel size, those of Open3D, and those of live models."""
     rows: list[Row] = []
     runs = max(min(options.scans, 40), 5)
     for name, noise in (('room', 0.0), ('room, Kinect noise', KINECT)):
@@ -57,7 +58,7 @@ def run(options: Options) -> list[Row]:
             rows += [case(name, points, size_m, noise, runs) for size_m in SIZES_M]
             if options.peers:
                 rows += [peer(name, points, size_m, options.cache) for size_m in (0.01, 0.0)]
-    return rows
+    return [*rows, *live_models.run()]
 
 
 def case(

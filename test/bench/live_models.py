@@ -1,0 +1,90 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Models that follow a map: an update where some 5,000 of its voxels have changed.
+
+A lidar drives through the simulated street; the voxels within a radius of it change with every
+scan. Times are of the processor (cpu_ms), as others may be using it, and by the clock (median_ms).
+``access`` is what handing out all surfels and models adds.
+"""
+
+from __future__ import annotations
+
+from time import perf_counter, process_time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.models.live import LiveModels
+from surfel_mapper.simulation import Lidar, Simulation, World
+from test.bench.machine import load, one_core
+from test.bench.report import Row, spread
+
+SCANS = 16
+WARM = 6
+
+CASES = ((0.5, 22.0), (0.3, 12.0), (0.2, 10.0))
+"""Voxel size and radius, m, by which about 5,000 voxels change a scan."""
+
+
+def run() -> list[Row]:
+    """Return a row for every voxel size."""
+    scans = street_scans()
+    with one_core():
+        return [case(scans, size_m, radius_m) for size_m, radius_m in CASES]
+
+
+def street_scans() -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
+    """Return points in the frame of the map and where the sensor was, for every scan."""
+    lidar = Lidar(beams=64, columns=1024, range_noise_m=0.01)
+    simulation = Simulation(World.street(seed=1, length_m=200.0), lidar)
+    found = []
+    for number in range(0, 3 * SCANS, 3):
+        scan = simulation.scan(number)
+        points = scan.points[np.isfinite(scan.points).all(axis=1)].astype(np.float64)
+        T_odom_sensor = simulation.drive.T_odom_sensor(scan.stamp_ns)
+        origin = T_odom_sensor[:3, 3]
+        found.append((points @ T_odom_sensor[:3, :3].T + origin, origin))
+    return found
+
+
+def case(
+    scans: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]],
+    voxel_size_m: float,
+    radius_m: float,
+) -> Row:
+    """Return one row."""
+    surfel_map = SurfelMap(voxel_size_m)
+    models = LiveModels(ModelsLayerConfig(noise_m=0.01), surfel_map)
+    models.warm_up()
+    times, processor, access, changed = [], [], [], []
+    for points, origin in scans:
+        near = np.linalg.norm(points - origin, axis=1) < radius_m
+        surfel_map.add(points[near], origin=origin)
+        start, busy = perf_counter(), process_time()
+        update = models.update()
+        processor.append((process_time() - busy) * 1e3)
+        times.append((perf_counter() - start) * 1e3)
+        busy = process_time()
+        found = models.model, models.surfels
+        access.append((process_time() - busy) * 1e3)
+        changed.append(update.num_changed)
+    row: dict[str, Any] = {
+        'cloud': 'street, live',
+        'who': 'surfel_mapper',
+        'voxel_m': voxel_size_m,
+        **spread(times[WARM:]),
+        'cpu_ms': float(np.median(processor[WARM:])),
+        'cpu_least_ms': min(processor[WARM:]),
+        'access_ms': float(np.median(access[WARM:])),
+        'changed': int(np.median(changed[WARM:])),
+        'surfels': len(found[1]),
+        'planes': len(found[0].planes),
+        'surfaces': len(found[0].surfaces),
+        'gaussians': len(found[0].gaussians),
+        'load': load(),
+    }
+    return row

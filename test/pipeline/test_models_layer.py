@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The models of a mapper: when they follow; windows, alignments, clearing and restoring."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.geometry import q_xyzw
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from test.alignment.street import drifted, street_scans
+from test.models.live_scenes import groups, ids, live
+from test.models.scenes import room, VIEW
+
+S = 10**9
+SETTINGS = {
+    'pose.source': 'odometry',
+    'frames.base': 'lidar',
+    'map.voxel_size_m': 0.5,
+    'layers.models.enabled': True,
+    'layers.models.noise_m': 0.02,
+}
+
+
+@pytest.fixture(scope='module')
+def street():
+    scans, poses = street_scans(8)
+    return scans, poses
+
+
+def mapper_with(**settings):
+    settings = {name.replace('__', '.'): value for name, value in settings.items()}
+    return Mapper(Config.from_mapping({**SETTINGS, **settings}))
+
+
+def feed(mapper, scans, poses):
+    updates = []
+    for scan, pose in zip(scans, poses, strict=True):
+        mapper.add_pose('odom', 'lidar', scan.stamp_ns, pose[:3, 3], q_xyzw(pose))
+        mapper.add_scan(scan)
+        updates += mapper.insert_ready()
+    return updates
+
+
+def assert_up_to_date(mapper):
+    """The models are those that a map read at once has."""
+    mapper.models.update()
+    assert groups(mapper.models) == groups(live(mapper.map.copy(), mapper.config.models))
+
+
+def test_a_street_has_its_ground_and_its_walls(street):
+    mapper = mapper_with(layers__models__extract_period_s=0.0)
+    updates = feed(mapper, *street)
+    assert all(update.models is not None for update in updates)
+    assert all('models' in update.milliseconds for update in updates)
+    model = mapper.models.model
+    largest = max(model.patches, key=lambda patch: patch.num_points)
+    assert abs(largest.normal[2]) > 0.98
+    upright = [plane for plane in model.planes if abs(plane.normal[2]) < 0.1]
+    assert sum(plane.grid.area_m2(2) > 5.0 for plane in upright) >= 2
+    assert mapper.summary()['models'] == {
+        'planes': len(model.planes),
+        'surfaces': len(model.surfaces),
+        'gaussians': len(model.gaussians),
+        'bytes': model.size_bytes,
+    }
+    assert mapper.counters.summary()['milliseconds']['models']['median'] > 0.0
+    assert_up_to_date(mapper)
+
+
+def test_a_room_has_floor_walls_and_the_faces_of_the_box():
+    points, _ = room(320, 240)
+    scan = Scan(points=(points - VIEW).astype(np.float32), stamp_ns=S, frame_id='lidar')
+    mapper = mapper_with(map__voxel_size_m=0.1, layers__models__noise_m=0.0)
+    pose = np.eye(4)
+    pose[:3, 3] = VIEW
+    (update,) = feed(mapper, [scan], [pose])
+    assert len(update.models.created) == len(mapper.models.versions)
+    normals = np.abs([plane.normal for plane in mapper.models.model.planes])
+    assert sorted(normals.argmax(axis=1).tolist()) == [0, 0, 1, 1, 2, 2]
+    assert normals.max(axis=1) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_they_follow_by_the_stamps_of_the_scans():
+    mapper = mapper_with(layers__models__extract_period_s=1.0)
+    points = np.random.default_rng(0).uniform(-5, 5, (500, 3)).astype(np.float32)
+    stamps = (10.0, 10.4, 10.99, 11.0, 11.5, 12.1)
+    scans = [Scan(points=points, stamp_ns=round(s * S), frame_id='lidar') for s in stamps]
+    updates = feed(mapper, scans, [np.eye(4)] * len(stamps))
+    due = [update.models is not None for update in updates]
+    assert due == [True, False, False, True, False, True]
+    assert ['models' in update.milliseconds for update in updates] == due
+
+
+def test_what_leaves_the_window_leaves_the_models(street):
+    mapper = mapper_with(layers__models__extract_period_s=0.0, window__max_scans=2)
+    scans, poses = street
+    far = [pose.copy() for pose in poses]
+    for number, pose in enumerate(far):
+        pose[0, 3] += 200.0 * (number // 4)  # the second half sees another street
+    updates = feed(mapper, scans, far)
+    gone = {number for update in updates for number in update.models.removed}
+    assert set(updates[0].models.created) & gone
+    assert ids(mapper.models) == set(mapper.models.versions)
+    assert mapper.models.surfels.position[:, 0].min() > 100.0
+    assert_up_to_date(mapper)
+
+
+def test_an_alignment_moves_the_models(street):
+    scans, poses = street
+    mapper = mapper_with(window__keep_points=True, align__key_distance_m=0.0)
+    feed(mapper, scans, drifted(poses, 0.02, 0.2))
+    before = mapper.map.digest()
+    mapper.models.update()
+    kept = ids(mapper.models)
+    mapper.align()
+    assert mapper.map.digest() != before
+    assert_up_to_date(mapper)
+    largest = max(mapper.models.model.patches, key=lambda patch: patch.num_points)
+    assert largest.id in kept
+
+
+def test_clearing_and_restoring(street):
+    scans, poses = street
+    mapper = mapper_with()
+    feed(mapper, scans[:3], poses[:3])
+    mapper.models.update()
+    before = ids(mapper.models)
+    saved = mapper.map.copy()
+    mapper.clear()
+    assert ids(mapper.models) == set()
+    update = feed(mapper, scans[3:4], poses[3:4])[0]  # due at once again
+    assert set(update.models.removed) == before
+    mapper.restore(saved, [])
+    assert_up_to_date(mapper)
+    assert len(mapper.models.surfels) == saved.num_voxels
+
+
+def test_without_the_setting_there_are_none(street):
+    mapper = mapper_with(layers__models__enabled=False)
+    scans, poses = street
+    (update,) = feed(mapper, scans[:1], poses[:1])
+    assert mapper.models is None
+    assert update.models is None
+    assert 'models' not in mapper.summary()
+    assert 'models' not in update.milliseconds
+
+
+def test_warming_up_changes_nothing():
+    mapper = mapper_with()
+    mapper.warm_up()
+    assert mapper.models.versions == {}
+    assert mapper.map == SurfelMap(0.5)
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'), [('min_points', 2), ('reach_voxels', 3), ('extract_period_s', -1.0)]
+)
+def test_values_out_of_bounds_are_refused_by_name(name, value):
+    with pytest.raises(ConfigError, match=f'layers.models.{name}'):
+        Config.from_mapping({f'layers.models.{name}': value})
