@@ -16,6 +16,7 @@ from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.kernels.marching_cubes import CASES, edge_between, FACES
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.mesh import Mesher
+from test.tsdf.scenes import fused, image_of, VGA
 
 VOXEL_M = 0.1
 SIDE = 4
@@ -205,6 +206,24 @@ def test_free_space_beside_a_shadow_has_no_surface_between_them():
     assert as_triangles(mesh_of(blocks_of(distance, mesh_max_step_voxels=5.6))) == as_triangles(
         torn
     )
+
+
+def test_a_board_before_a_wall_leaves_no_mesh_along_its_shadow():
+    u, v = np.arange(VGA.columns) - VGA.cx, np.arange(VGA.rows)[:, None] - VGA.cy
+    board = (abs(u) < 80) & (abs(v) < 80)  # 0.61 m
+    image = image_of(VGA, np.where(board, 2.0, 3.0) * VGA.ray_length)
+    sizes = dict(voxel_size_m=0.05, truncation_m=0.15, distance='to_plane')
+    meshes = [
+        mesh_of(fused(image, **sizes, mesh_max_step_voxels=most)).vertices for most in (0.0, 4.25)
+    ]
+    behind = [((z > 2.01) & (z < 2.99)).sum() for z in (mesh[:, 2] for mesh in meshes)]
+    deepest = [mesh[mesh[:, 2] < 2.5, 2].max() for mesh in meshes]
+    assert behind[0] > 100
+    assert behind[1] < behind[0] / 2
+    assert deepest[0] > 2.1
+    assert deepest[1] < 2.05  # half a voxel
+    on_board = [(abs(mesh[:, 2] - 2.0) < 0.001).sum() for mesh in meshes]
+    assert on_board[0] == on_board[1] > 100
 
 
 def test_without_blocks_there_is_no_mesh():
