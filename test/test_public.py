@@ -115,3 +115,16 @@ def test_without_numba_the_error_says_how_to_install_it():
     assert 'Ubuntu 24.04' in done.stdout
     assert '--break-system-packages' in done.stdout
     assert '--system-site-packages' in done.stdout
+
+
+def test_a_mapper_loads_neither_solvers_nor_models_nor_pictures():
+    script = (
+        'import sys\nfrom surfel_mapper.pipeline import Mapper\nMapper()\n'
+        "late = ('scipy.spatial', 'scipy.sparse', 'scipy.linalg', 'surfel_mapper.models', "
+        "'matplotlib', 'pyarrow', 'dask', 'rosbags')\n"
+        'print([name for name in late if name in sys.modules])'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', script], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == '[]\n'

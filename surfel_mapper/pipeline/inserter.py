@@ -10,6 +10,7 @@ away, the alignment of the window, the TSDF.
 from __future__ import annotations
 
 import logging
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +24,6 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction, SlidingWindow, WindowedScan
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.look_ahead import LookAhead
-from surfel_mapper.pipeline.models_layer import ModelsLayer
 from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
 from surfel_mapper.pipeline.reduction import moments_at
@@ -34,6 +34,9 @@ from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.pipeline.update import removed_voxels, Update
 from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
 from surfel_mapper.scan import Scan
+
+if TYPE_CHECKING:
+    from surfel_mapper.pipeline.models_layer import ModelsLayer
 
 _log = logging.getLogger(__name__)
 
@@ -86,7 +89,11 @@ class Inserter:
         self._ahead = LookAhead(self.map, config.map.threads)
         sensors = SensorModels(config.tsdf)
         self.tsdf = TsdfLayer(config.tsdf, sensors) if config.tsdf.enabled else None
-        self.models = ModelsLayer(config.models, self.map) if config.models.enabled else None
+        self.models: ModelsLayer | None = None
+        if config.models.enabled:
+            from surfel_mapper.pipeline.models_layer import ModelsLayer  # 0.1 s to load
+
+            self.models = ModelsLayer(config.models, self.map)
         self._moved: MovedAway | None = None
         if config.dynamic.clear:
             self._moved = MovedAway(config.dynamic, self.map.voxel_size_m, sensors)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +15,11 @@ from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
-from surfel_mapper.models.live import ModelUpdate
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
+
+if TYPE_CHECKING:  # the models take 0.1 s to load
+    from surfel_mapper.models.live import ModelUpdate
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
