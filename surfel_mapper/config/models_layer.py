@@ -60,6 +60,3 @@ class ModelsLayerConfig(Stage):
     absorb: bool = setting(
         True, 'Voxels of few points, and rough ones, join the flat neighbour that they lie on.'
     )
-    smoothing: float = setting(
-        1e-2, 'Weight of the second differences of the splines.', low=1e-9, high=1e6
-    )

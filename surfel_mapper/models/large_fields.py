@@ -24,6 +24,9 @@ Mask = npt.NDArray[np.bool_]
 MOST_AT_ONCE = 2e6
 """Multiplications of a banded solve, about 1 ms, beyond which a field counts as large."""
 
+SMOOTHING = 1e-2
+"""Weight of the second differences."""
+
 STILL_M = 2e-4
 TOLERANCE_M = 5e-5
 MARGIN = 5
@@ -50,13 +53,7 @@ class Fitted:
     heights: Array
 
 
-def fit_field(
-    pitch_m: float,
-    origin: Array,
-    sums: Array,
-    smoothing: float,
-    before: Fitted | None,
-) -> Fitted:
+def fit_field(pitch_m: float, origin: Array, sums: Array, before: Fitted | None) -> Fitted:
     """
     Return the field through cells.
 
@@ -68,8 +65,6 @@ def fit_field(
         Lowest corner of the grid.
     sums : (Nx, Ny, 4) float64
         Of x, y, z and number of the points in every cell.
-    smoothing : float
-        Weight of the second differences.
     before : Fitted, optional
         The field as it was, over cells of the same lattice.
 
@@ -84,13 +79,13 @@ def fit_field(
     start = initial_field(pitch_m, origin, means[..., 2], filled, DEGREE)
     if not is_large:
         xyz, number = means[filled], sums[..., 3][filled]
-        return Fitted(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, smoothing), heights)
+        return Fitted(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, SMOOTHING), heights)
     known = np.zeros(start.control.shape, np.bool_)
     known[1:-1, 1:-1] = touched = filled
     if before is not None:
         touched = taken_over(before, start, heights, known)
         means[..., 2] = np.where(filled, heights, 0.0)
-    return Fitted(relaxed(start, means, filled, touched, known, smoothing), heights)
+    return Fitted(relaxed(start, means, filled, touched, known), heights)
 
 
 def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]:
@@ -147,7 +142,7 @@ def overlap(
 
 
 def relaxed(
-    start: HeightField, means: Array, filled: Mask, touched: Mask, known: Mask, smoothing: float
+    start: HeightField, means: Array, filled: Mask, touched: Mask, known: Mask
 ) -> HeightField:
     """Return a large field, fitted near touched cells, from the one to start from."""
     control = start.control
@@ -167,7 +162,7 @@ def relaxed(
     flat = control.ravel()
     relax(
         first[:num], values[:num], xyz[first[:num, 1], 2], control.shape[1],
-        np.concatenate(ats), np.concatenate(seconds), (smoothing, RIDGE, TOLERANCE_M),
+        np.concatenate(ats), np.concatenate(seconds), (SMOOTHING, RIDGE, TOLERANCE_M),
         np.flatnonzero(free), flat,
     )  # fmt: skip
     field = flat.reshape(control.shape)

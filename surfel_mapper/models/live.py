@@ -100,7 +100,7 @@ class LiveModels:
         self.map = surfel_map
         self.versions: dict[int, int] = {}
         self._pieces = Pieces(config, surfel_map)
-        self._fitter = PatchFitter(config, self._pieces)
+        self._fitter = PatchFitter(self._pieces)
         self._next_id = 0
         self.clear()
 

@@ -17,7 +17,6 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.kernels.patches import describe
 from surfel_mapper.kernels.piece_groups import mean_normals
 from surfel_mapper.kernels.pieces import FLAT, merge_moments, spread
@@ -77,17 +76,14 @@ class PatchFitter:
 
     Parameters
     ----------
-    config : ModelsLayerConfig
-        Settings.
     pieces : Pieces
         The voxels.
 
     """
 
-    def __init__(self, config: ModelsLayerConfig, pieces: Pieces) -> None:
-        """Take over the settings."""
+    def __init__(self, pieces: Pieces) -> None:
+        """Take over how thick flat things are."""
         self._pieces = pieces
-        self._smoothing = config.smoothing
         self._size_m = pieces.map.voxel_size_m
         self._surface_pitch_m = max(self._size_m, 3.0 * pieces.thickness_m)
 
@@ -145,9 +141,7 @@ class PatchFitter:
             if curved[k]:
                 sums = cells.sums[cells.of(k)].reshape(*patch.grid.filled.shape, 4)
                 was = known.fitted if known is not None and stays[k] else None
-                field = fit_field(
-                    float(pitches[k]), patch.grid.origin, sums, self._smoothing, was
-                )
+                field = fit_field(float(pitches[k]), patch.grid.origin, sums, was)
                 patch = self._surface(patch, field.field, origins[k], rows[k])
             shift = frames[k] @ (means[k] - origins[k])
             found.append((moved(patch, shift), origins[k], field))

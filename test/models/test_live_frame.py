@@ -136,9 +136,10 @@ def test_large_planes_are_those_of_the_single_cloud_fit():
         twins = [
             other
             for other in models.model.planes
-            if other.normal @ plane.normal > 0.9999
-            and abs(other.offset_m - plane.offset_m) < 2e-3
+            if other.normal @ plane.normal > 0.999
+            and abs(other.to_local(plane.mean[None])[0, 2]) < 5e-3
+            and other.grid.contains(other.to_local(plane.mean[None])[:, :2]).all()
         ]
         assert len(twins) == 1
         if plane.grid.area_m2(2) > 1.0:
-            assert twins[0].grid.area_m2(4) == pytest.approx(plane.grid.area_m2(4), rel=0.1)
+            assert twins[0].grid.area_m2(4) == pytest.approx(plane.grid.area_m2(4), rel=0.15)
