@@ -22,6 +22,7 @@ settings.load_profile('repeatable')
 HERE = Path(__file__).parent
 
 
+@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the marks
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Keep together what shares a node, or hears the nodes of others: all of ROS; else a file."""
     for item in items:
