@@ -5,8 +5,8 @@ What goes out of the node beside the map, and what comes in beside clouds, on on
 
 Each is timed as the mapping thread does it, from the map to the bytes of the message: markers of
 20,000 discs (choosing them, their surfels, vertices, CDR), changes of one scan with and without
-exact moments, the scan with normals, the grid; and the other way deskewing of a sweep, a depth
-image of 640 x 480, and what a mirror takes to follow one change. Publishing is not in it.
+exact moments, the scan with normals, the grid, the models; and the other way deskewing of a sweep,
+a depth image of 640 x 480, and what a mirror takes to follow one change. Publishing is not in it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from surfel_mapper.config import Config, GridConfig
+from surfel_mapper.config import Config, GridConfig, ModelsLayerConfig
 from surfel_mapper.depth import depth_points, PinholeCamera
 from surfel_mapper.deskew import deskewed, point_times
 from surfel_mapper.io.cdr import marker_array
@@ -28,11 +28,15 @@ from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.io.map_cloud import moment_cloud
 from surfel_mapper.io.markers import disc_colors, surfel_markers
 from surfel_mapper.io.mirror import MapMirror
+from surfel_mapper.io.model_cloud import primitive_columns, surfel_primitive_columns
+from surfel_mapper.io.model_markers import model_markers
 from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.io.scan_normals import scan_with_normals
 from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.traversability import traversability
+from surfel_mapper.models.live import LiveModels
+from surfel_mapper.models.shapes import Shapes
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from test.bench.machine import one_core
@@ -54,6 +58,7 @@ def run(options: Options) -> list[Row]:
     with one_core():
         mapper, update = mapped(options)
         tasks = {**markers(mapper), **clouds(mapper, update), **inputs(mapper, update)}
+        tasks.update(models(mapper))
         return [row(name, task) for name, task in tasks.items()]
 
 
@@ -104,6 +109,27 @@ def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
 
     kinds = ('planarity', 'normal', 'age')
     return {f'markers by {kind}': partial(draw, kind) for kind in kinds}
+
+
+def models(mapper: Mapper) -> dict[str, Callable[[], Any]]:
+    """Return what says what the models are; their shapes anew, or as kept from the last time."""
+    live = LiveModels(ModelsLayerConfig(enabled=True), mapper.map)
+    live.update()
+    model, versions = live.model, live.versions
+    shapes = Shapes().of(model, versions)
+
+    def draw() -> bytes:
+        found = model_markers(shapes, model.gaussians, VOXEL_M, stamp_ns=0, frame_id='odom')
+        return marker_array(found)
+
+    return {
+        f'shapes of {len(shapes)} planes and surfaces': lambda: Shapes().of(model, versions),
+        f'their markers, and {len(model.gaussians)} Gaussians': draw,
+        'a row a primitive': lambda: from_columns(
+            primitive_columns(shapes, model.gaussians, versions)
+        ),
+        'a row a voxel': lambda: from_columns(surfel_primitive_columns(live.surfels, model)),
+    }
 
 
 def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
