@@ -28,7 +28,7 @@ SMOOTHING = 1e-2
 """Weight of the second differences."""
 
 STILL_M = 2e-4
-TOLERANCE_M = 5e-5
+TOLERANCE_M = 2e-4
 MARGIN = 5
 DEGREE = 3
 BLOCK = 16

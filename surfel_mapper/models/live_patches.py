@@ -11,7 +11,7 @@ nothing changed in stay what they were.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 import math
 
 import numpy as np
@@ -127,24 +127,23 @@ class PatchFitter:
             groups, (origins, frames, pitches, local), 0.5 * self._size_m, snapped=True
         )
         found = []
-        for k in range(number):
-            patch = Plane(
-                id=ids[k],
-                num_points=int(total[k]),
-                mean=means[k],
-                covariance=covariances[k],
-                R_patch_map=frames[k],
-                rms_m=rms_across(covariances[k], frames[k, 2], int(total[k])),
-                grid=cells.grid(k),
-            )
-            known, field = before[k], None
-            if curved[k]:
-                sums = cells.sums[cells.of(k)].reshape(*patch.grid.filled.shape, 4)
-                was = known.fitted if known is not None and stays[k] else None
-                field = fit_field(float(pitches[k]), patch.grid.origin, sums, was)
-                patch = self._surface(patch, field.field, origins[k], rows[k])
+        for k, known in enumerate(before):
+            field, spline, rms_m = None, None, 0.0
             shift = frames[k] @ (means[k] - origins[k])
-            found.append((moved(patch, shift), origins[k], field))
+            if curved[k]:
+                sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
+                was = known.fitted if known is not None and stays[k] else None
+                field = fit_field(float(pitches[k]), cells.origins[k].copy(), sums, was)
+                rms_m = self._rms_m(field.field, frames[k], origins[k], rows[k])
+                spline = moved(field.field, shift)
+            cells.origins[k] -= shift[:2]  # the grid is handed out about the mean
+            common = (ids[k], int(total[k]), means[k], covariances[k], frames[k])
+            if spline is None:
+                rms_m = rms_across(covariances[k], frames[k, 2], int(total[k]))
+                patch = Plane(*common, rms_m, cells.grid(k))
+            else:
+                patch = Surface(*common, rms_m, cells.grid(k), spline)
+            found.append((patch, origins[k], field))
         return found
 
     def _points(self, rows: Rows) -> Array:
@@ -201,22 +200,13 @@ class PatchFitter:
         origins[rows[turns]] = (anchors - height[:, None] * normals)[turns]
         return origins, stays
 
-    def _surface(self, plane: Plane, spline: HeightField, origin: Array, rows: Rows) -> Surface:
-        """Return the surface of a field about an origin."""
-        local = (self._pieces.position[rows] - origin) @ plane.R_patch_map.T
-        error = local[:, 2] - spline.heights(local[:, :2])
+    def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
+        """Return the root mean square distance of the points of voxels from a field, m."""
+        local = (self._pieces.position[rows] - origin) @ frame.T
+        error = local[:, 2] - field.heights(local[:, :2])
         count = self._pieces.count[rows]
         across = error**2 + self._pieces.eigenvalues[rows, 0]
-        return Surface(
-            id=plane.id,
-            num_points=plane.num_points,
-            mean=plane.mean,
-            covariance=plane.covariance,
-            R_patch_map=plane.R_patch_map,
-            rms_m=math.sqrt(float(count @ across) / float(count.sum())),
-            grid=plane.grid,
-            spline=spline,
-        )
+        return math.sqrt(float(count @ across) / float(count.sum()))
 
 
 def turned(x: Array, normals: Array) -> Array:
@@ -243,15 +233,7 @@ def plane_frames(covariances: Array, normals: Array) -> Array:
     return frames
 
 
-def moved(patch: Plane, shift: Array) -> Plane:
-    """Return a patch whose grid, which was about another place, is about its mean."""
-    grid = replace(patch.grid, origin=patch.grid.origin - shift[:2])
-    if not isinstance(patch, Surface):
-        return replace(patch, grid=grid)
-    spline = HeightField(
-        patch.spline.pitch_m,
-        patch.spline.origin - shift[:2],
-        patch.spline.degrees,
-        patch.spline.control - shift[2],
-    )
-    return replace(patch, grid=grid, spline=spline)
+def moved(field: HeightField, shift: Array) -> HeightField:
+    """Return a field about a place that is so far from the one it was about, (3,) m."""
+    origin, control = field.origin - shift[:2], field.control - shift[2]
+    return HeightField(field.pitch_m, origin, field.degrees, control)
