@@ -223,7 +223,7 @@ def inputs_of(config):
         resolve_topic_name=lambda name: f'/{name}',
         get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
     )
-    thread = SimpleNamespace(put_cloud=None, refuse_cloud=lambda *_: None)
+    thread = SimpleNamespace(put_cloud=lambda *_: None, refuse_cloud=lambda *_: None)
     return Inputs(node, config, thread, on_failure=None)
 
 
