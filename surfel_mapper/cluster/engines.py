@@ -179,7 +179,7 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
     except ImportError as error:
         raise DependencyError(
             f'dask cannot be loaded ({error}). It runs the workers; install it with '
-            '`pip install surfel_mapper[cluster]`'
+            "`pip install 'surfel_mapper[cluster]'`"
         ) from error
     logging.getLogger('distributed').setLevel(logging.WARNING)
     settings: dict[str, Any] = {

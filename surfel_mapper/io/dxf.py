@@ -65,6 +65,6 @@ def import_ezdxf() -> Any:
     except ImportError as error:
         raise DependencyError(
             f'ezdxf cannot be loaded ({error}). It writes DXF; install it with '
-            '`pip install surfel_mapper[formats]` or `pip install ezdxf`'
+            "`pip install 'surfel_mapper[formats]'` or `pip install ezdxf`"
         ) from error
     return ezdxf

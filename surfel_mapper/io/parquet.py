@@ -232,6 +232,6 @@ def import_pyarrow() -> tuple[Any, Any]:
     except ImportError as error:
         raise DependencyError(
             f'pyarrow cannot be loaded ({error}). It reads and writes Parquet; install it with '
-            '`pip install surfel_mapper[formats]` or `pip install pyarrow`'
+            "`pip install 'surfel_mapper[formats]'` or `pip install pyarrow`"
         ) from error
     return pyarrow, parquet

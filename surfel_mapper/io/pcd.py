@@ -191,7 +191,7 @@ def compressed_table(path: str | Path, header: Header, file: BinaryIO) -> npt.ND
     except ImportError as error:
         raise DependencyError(
             f'{path}: lzf cannot be loaded ({error}). It unpacks compressed PCD files; install it '
-            'with `pip install surfel_mapper[formats]` or `pip install python-neo-lzf`'
+            "with `pip install 'surfel_mapper[formats]'` or `pip install python-neo-lzf`"
         ) from error
     sizes = file.read(8)
     packed_size, size = struct.unpack('<II', sizes.ljust(8, b'\0'))

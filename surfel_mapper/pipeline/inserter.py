@@ -209,7 +209,7 @@ class Inserter:
         models = self.models.follow(scan.stamp_ns) if self.models else None
         if models is not None:
             laps.end('models')
-        self._count(windowed, evictions, laps.milliseconds)
+        self._count(windowed, evictions, laps)
         return Update(
             scan=scan,
             stamp_ns=scan.stamp_ns,
@@ -291,11 +291,9 @@ class Inserter:
             return self.map.surfels_changed(self.map.version)
         return self.map.surfels_changed(version, self._config.map.min_points)
 
-    def _count(
-        self, scan: WindowedScan, evictions: list[Eviction], times: dict[str, float]
-    ) -> None:
+    def _count(self, scan: WindowedScan, evictions: list[Eviction], laps: Laps) -> None:
         self._counters.mapped += 1
         self._counters.points += scan.moments.num_points
         self._counters.evicted.update(eviction.limit for eviction in evictions)
-        for stage, milliseconds in times.items():
+        for stage, milliseconds in laps.milliseconds.items():
             self._counters.add_time(stage, milliseconds)

@@ -196,6 +196,6 @@ def import_rerun() -> Any:
     except ImportError as error:
         raise DependencyError(
             f'rerun cannot be loaded ({error}). It shows replays; install it with '
-            '`pip install surfel_mapper[viewer]` or `pip install rerun-sdk`'
+            "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
         ) from error
     return rerun
