@@ -18,7 +18,7 @@ Source: Gao and Dong 2025 for the tests and the models; that a voxel is a piece 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -38,42 +38,15 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.charts import charts_of
 from surfel_mapper.models.identity import match, Matched
 from surfel_mapper.models.live_patches import PatchFitter, symmetric, Tracked
+from surfel_mapper.models.model_update import ModelUpdate
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
-from surfel_mapper.models.pieces import Change, Pieces
+from surfel_mapper.models.piece_changes import Change
+from surfel_mapper.models.pieces import Pieces
+
+__all__ = ['LiveModels', 'ModelUpdate']
 
 Rows = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True, slots=True)
-class ModelUpdate:
-    """
-    What became of the primitives since the update before.
-
-    Attributes
-    ----------
-    created, updated, removed : tuple of int
-        Ids that are new, that stand for something else than before, that are no more; each in
-        one of these at most, in ascending order. Those of splits are created, those that were
-        merged are removed.
-    merged : tuple of (int, int)
-        Planes and surfaces that are no more, and those that they went into.
-    split : tuple of (int, int)
-        Planes and surfaces, and the new ones that were part of them.
-    milliseconds : float
-        What it took.
-    num_changed : int
-        Voxels that had changed.
-
-    """
-
-    created: tuple[int, ...]
-    updated: tuple[int, ...]
-    removed: tuple[int, ...]
-    merged: tuple[tuple[int, int], ...]
-    split: tuple[tuple[int, int], ...]
-    milliseconds: float
-    num_changed: int
 
 
 class LiveModels:

@@ -11,7 +11,6 @@ Whether a change is worth telling anyone is another question: see ``is_material`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 import math
 from typing import Any
@@ -34,6 +33,7 @@ from surfel_mapper.kernels.pieces import (
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.piece_changes import Change, found, Gone
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int32]
@@ -42,36 +42,6 @@ LEAST_THICKNESS_M, THICKNESS_VOXELS = 0.02, 0.2
 MOVED, TURNED, GREW = 0.1, math.cos(math.radians(2.0)), 1.2
 """A change is material if the mean moves by so much of the thickness, the normal turns farther, or
 there are so many times the points."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Change:
-    """
-    What changed in the pieces.
-
-    Attributes
-    ----------
-    num_voxels : int
-        Voxels that came, changed or went.
-    rows : (N,) int32
-        Those whose label may be another now, apart from what hangs together anew.
-    loose : (C,) int32
-        Components that may hang together otherwise than before.
-    touched : (C,) int32
-        Components of which some voxel, or one that lies on it, changed at all.
-    hosts : (H,) int32
-        Rows on which other voxels lie now.
-    gone : (G,) int32
-        Labels of voxels that have gone; those that have come back elsewhere are not among them.
-
-    """
-
-    num_voxels: int
-    rows: Rows
-    loose: Rows
-    touched: Rows
-    hosts: Rows
-    gone: Rows
 
 
 class Pieces:
@@ -167,7 +137,7 @@ class Pieces:
         self._blank(left)
         came = here[self.key[here] < 0]
         self.key[here] = new[new >= 0]
-        gone.return_to(self, came)
+        gone.return_to(came, self.key, self.label, self.alone)
         keys = (self.key[came][:, None] + self._steps).ravel()
         enter(came, self.map.find(keys).reshape(len(came), len(self._steps)), self.around)
         was_flat = self.kind[here] == FLAT
@@ -278,46 +248,6 @@ class Pieces:
         self.host[flat] = -1
         self.host[rows] = hosts
         return rows[changed], once, hosts[changed]
-
-
-@dataclass(slots=True, eq=False)
-class Gone:
-    """Voxels that have left their rows: keys, labels, whether alone, components."""
-
-    key: npt.NDArray[np.int64]
-    label: Rows
-    alone: npt.NDArray[np.bool_]
-    component: Rows
-
-    def joined(self, other: Gone) -> Gone:
-        """Return these and others."""
-        names = ('key', 'label', 'alone', 'component')
-        return Gone(*(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names))
-
-    def return_to(self, pieces: Pieces, came: Rows) -> None:
-        """Give the labels of voxels that are in another row now to that row."""
-        if not len(self.key) or not len(came):
-            return
-        order = np.argsort(self.key)
-        place = np.minimum(np.searchsorted(self.key[order], pieces.key[came]), len(order) - 1)
-        back = order[place]
-        same = self.key[back] == pieces.key[came]
-        pieces.label[came[same]] = self.label[back[same]]
-        pieces.alone[came[same]] = self.alone[back[same]]
-        kept = np.ones(len(self.key), np.bool_)
-        kept[back[same]] = False
-        self.label, self.alone = self.label[kept], self.alone[kept]
-
-    @property
-    def remaining(self) -> Rows:
-        """Labels of Gaussians whose voxels are no more."""
-        return self.label[self.alone]
-
-
-def found(components: list[Rows]) -> Rows:
-    """Return the components among these, without -1, each once."""
-    every = np.unique(np.concatenate(components))
-    return every[every >= 0]
 
 
 def half_steps(reach: int) -> npt.NDArray[np.int64]:
