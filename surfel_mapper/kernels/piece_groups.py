@@ -12,6 +12,9 @@ import numpy as np
 
 from surfel_mapper.kernels.joining import find_root
 
+LEAST_SHARE = 0.4
+"""The mean of unit vectors within 60 deg of it is at least half as long, but for outliers."""
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def rows_of_groups(group, flags, loose, rows):
@@ -117,7 +120,10 @@ def sort_by_group(rows, group, places, ordered, starts):
 @njit(cache=True, nogil=True, error_model='numpy')
 def mean_normals(rows, starts, flat, normal, means):
     """
-    Find the mean unit normals of groups, from their flat voxels alone; 0 where they cancel.
+    Find the mean unit normals of groups, from their flat voxels alone.
+
+    Those of a chart are within a cone; where they cancel, nobody saw the voxels from one side, and
+    they are turned to the side of most.
 
     rows    (M,) int32; group k has those from starts[k] to starts[k + 1] - 1
     flat    (R,) bool
@@ -125,14 +131,26 @@ def mean_normals(rows, starts, flat, normal, means):
     means   (K, 3) float64, out
     """
     for k in range(len(starts) - 1):
-        x = y = z = 0.0
-        for i in range(starts[k], starts[k + 1]):
-            row = rows[i]
-            if flat[row]:
-                x, y, z = x + normal[row, 0], y + normal[row, 1], z + normal[row, 2]
-        length = np.sqrt(x * x + y * y + z * z)
-        scale = 1.0 / length if length > 0.0 else 0.0
-        means[k, 0], means[k, 1], means[k, 2] = scale * x, scale * y, scale * z
+        mean = means[k]
+        mean[:] = 0.0
+        for turn in range(3):
+            x = y = z = 0.0
+            num = 0
+            for i in range(starts[k], starts[k + 1]):
+                n = normal[rows[i]]
+                if not flat[rows[i]]:
+                    continue
+                if turn == 1 and num == 0:
+                    mean[0], mean[1], mean[2] = n[0], n[1], n[2]
+                cosine = n[0] * mean[0] + n[1] * mean[1] + n[2] * mean[2]
+                side = -1.0 if turn > 0 and cosine < 0.0 else 1.0
+                x, y, z = x + side * n[0], y + side * n[1], z + side * n[2]
+                num += 1
+            length = np.sqrt(x * x + y * y + z * z)
+            scale = 1.0 / length if length > 0.0 else 0.0
+            mean[0], mean[1], mean[2] = scale * x, scale * y, scale * z
+            if turn == 0 and length > LEAST_SHARE * num:
+                break
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -107,18 +107,12 @@ class PatchFitter:
             return []
         pieces, every = self._pieces, np.concatenate(rows)
         starts = np.concatenate([[0], np.cumsum([len(part) for part in rows])])
-        number, total = len(ids), np.empty(len(ids), np.int64)
-        means, normals = np.empty((2, number, 3))
-        merged = np.empty((number, 6))
-        merge_moments(
-            every, starts, pieces.count, pieces.position, pieces.covariance, total, means, merged
-        )
+        total, means, covariances = self._merged(every, starts)
+        normals = np.empty_like(means)
         mean_normals(every, starts, pieces.kind == FLAT, pieces.normal, normals)
-        groups = Groups(
-            self._points(every), POINTS * starts, normals, np.full(number, pieces.limit_m)
-        )
+        thickness = np.full(len(ids), pieces.limit_m)
+        groups = Groups(self._points(every), POINTS * starts, normals, thickness)
         frames, curved = self._described(groups)
-        covariances = symmetric(merged)
         frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
         origins, stays = self._steadied(before, frames, means, covariances, curved)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
@@ -145,6 +139,16 @@ class PatchFitter:
                 patch = Surface(*common, rms_m, cells.grid(k), spline)
             found.append((patch, origins[k], field))
         return found
+
+    def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
+        """Return number, mean and covariance of all points of groups of voxels."""
+        number, pieces = len(starts) - 1, self._pieces
+        total, merged = np.empty(number, np.int64), np.empty((number, 6))
+        means = np.empty((number, 3))
+        merge_moments(
+            rows, starts, pieces.count, pieces.position, pieces.covariance, total, means, merged
+        )
+        return total, means, symmetric(merged)
 
     def _points(self, rows: Rows) -> Array:
         """Return the points (9 n, 3) across voxels, m."""
