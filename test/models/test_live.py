@@ -316,6 +316,24 @@ def test_a_sheet_whose_normals_have_either_sign_is_one_plane():
     assert models.model.planes[0].grid.area_m2() == pytest.approx(9.0, rel=0.1)
 
 
+def test_a_bent_sheet_that_nobody_is_known_to_have_seen_is_one_surface():
+    x, y = np.meshgrid(np.arange(-1.5, 1.5, 0.02), np.arange(-1.5, 1.5, 0.02), indexing='ij')
+    z = 0.12 * x**2
+    along = (x + z) / np.sqrt(2.0)  # turned so that its normals change sign somewhere
+    points = np.stack([along, (z - x) / np.sqrt(2.0), y], -1).reshape(-1, 3)
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(points)
+    models = live(surfel_map)
+    (surface,) = models.model.surfaces
+    assert models.model.planes == []
+    local = surface.to_local(points)
+    inside = surface.grid.contains(local[:, :2])
+    error = local[inside, 2] - surface.heights(local[inside, :2])
+    assert inside.mean() > 0.99
+    assert np.sqrt(np.mean(error**2)) < 2e-3
+    assert surface.rms_m < 3e-3
+
+
 def test_a_ramp_over_itself_is_cut():
     turn, out = np.meshgrid(np.arange(0, 14, 0.004), np.arange(3.0, 5.0, 0.02), indexing='ij')
     ramp = np.stack([out * np.cos(turn), out * np.sin(turn), 0.25 * turn], -1).reshape(-1, 3)
