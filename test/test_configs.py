@@ -113,3 +113,9 @@ def test_the_page_about_the_node_names_settings_that_there_are():
     named = set(re.findall(rf'`((?:{stages})\.\w+)', page))
     assert len(named) > 15
     assert named - names == set()
+
+
+def test_every_setting_is_read_somewhere():
+    code = ''.join(path.read_text('utf-8') for path in (settings.ROOT / 'surfel_mapper').rglob('*.py'))
+    names = {name.rpartition('.')[2] for name in Config().to_mapping()}
+    assert [name for name in sorted(names) if not re.search(rf'\.{name}\b', code)] == []

@@ -9,7 +9,47 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.queries import in_voxels
+
 Float32 = npt.NDArray[np.float32]
+
+
+def labels_at(
+    blocks: BlockMap, points: npt.ArrayLike
+) -> tuple[npt.NDArray[np.int32], Float32]:
+    """
+    Return the labels of the voxels that points lie in, and their weights.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        A map that keeps labels (``semantics``).
+    points : (P, 3) float
+        In the map frame, m.
+
+    Returns
+    -------
+    (P,) int32 and (P,) float32
+        As ``labels_of`` has them; -1 and 0 where the map has no voxel.
+
+    Raises
+    ------
+    ValueError
+        If points are of another shape, or the map keeps no labels.
+
+    """
+    config = blocks.config
+    if config.semantics == 'none':
+        raise ValueError("semantics: 'none', expected a map that keeps labels")
+    places, bits = in_voxels(blocks, points)
+    near = np.abs(places).max(axis=1) < 1e12  # false for nan; farther there are no blocks
+    voxel = np.floor(np.where(near[:, None], places, 0.0)).astype(np.int64)
+    rows = np.where(near, blocks.find(voxel >> bits), -1)
+    x, y, z = (voxel & ((1 << bits) - 1)).T
+    votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]
+    votes[rows < 0] = 0.0  # as in a voxel that was never labelled
+    return labels_of(config.semantics, votes.T, min_weight=config.min_label_weight)
 
 
 def labels_of(

@@ -7,8 +7,10 @@ from collections import Counter
 import numpy as np
 import pytest
 
+from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.kernels.tsdf_labels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
-from surfel_mapper.tsdf.labels import labels_of, log_odds
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.labels import labels_at, labels_of, log_odds
 from test.tsdf.scenes import image_of, integrator, SMALL
 
 RNG = np.random.default_rng(2)
@@ -102,3 +104,36 @@ def test_labels_of_images_reach_the_voxels_of_the_surface(semantics):
     in_band = seen & (abs(blocks.distance[rows]) < 0.29)
     assert {*np.unique(labels[in_band])} == {2, 5}
     assert (labels[blocks.distance[rows] > 0.2999] == -1).all()
+
+
+@pytest.mark.parametrize('semantics', ['majority', 'first_k', 'single', 'binary'])
+def test_labels_at_points_are_those_of_the_wall_that_was_seen(semantics):
+    one = integrator(voxel_size_m=0.1, truncation_m=0.3, semantics=semantics, num_labels=6)
+    wall = image_of(SMALL, np.full((60, 80), 2.0))
+    left = np.arange(80) * np.ones((60, 1)) < 40
+    one.integrate(wall.with_images(label=np.where(left, 0, 3)), np.eye(4))
+    points = [[-0.25, 0.02, 1.97], [0.25, 0.02, 1.97], [0.25, 0.02, 1.0], [0, 0, 50.0]]
+    strange = [[np.nan, 0, 2], [0, np.inf, 2], [1e300, 0, 0], [2e5, 0, 0]]
+    label, weight = labels_at(one.blocks, points + strange)
+    other = 1 if semantics == 'binary' else 3
+    assert label.tolist() == [0, other, *[-1] * 6]
+    assert (weight[:2] > 0.0).all()
+    assert not weight[2:].any()
+
+
+def test_a_label_that_weighs_too_little_is_none():
+    settings = {'semantics': 'first_k', 'min_label_weight': 1e6}
+    one = integrator(voxel_size_m=0.1, truncation_m=0.3, **settings)
+    wall = image_of(SMALL, np.full((60, 80), 2.0))
+    one.integrate(wall.with_images(label=np.full((60, 80), 4)), np.eye(4))
+    assert labels_at(one.blocks, [[0.0, 0.02, 1.97]])[0].tolist() == [-1]
+
+
+def test_labels_at_no_point_are_none_and_bad_requests_are_refused():
+    blocks = BlockMap(TsdfConfig(semantics='single'))
+    assert [len(found) for found in labels_at(blocks, np.empty((0, 3)))] == [0, 0]
+    assert labels_at(blocks, [[1.0, 2.0, 3.0]])[0].tolist() == [-1]
+    with pytest.raises(ValueError, match=r'expected \(P, 3\)'):
+        labels_at(blocks, [1.0, 2.0, 3.0])
+    with pytest.raises(ValueError, match='keeps labels'):
+        labels_at(BlockMap(TsdfConfig()), [[1.0, 2.0, 3.0]])
