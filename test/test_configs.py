@@ -116,6 +116,7 @@ def test_the_page_about_the_node_names_settings_that_there_are():
 
 
 def test_every_setting_is_read_somewhere():
-    code = ''.join(path.read_text('utf-8') for path in (settings.ROOT / 'surfel_mapper').rglob('*.py'))
+    paths = (settings.ROOT / 'surfel_mapper').rglob('*.py')
+    code = ''.join(path.read_text('utf-8') for path in paths)
     names = {name.rpartition('.')[2] for name in Config().to_mapping()}
     assert [name for name in sorted(names) if not re.search(rf'\.{name}\b', code)] == []
