@@ -5,7 +5,7 @@ Two threads against one, the same scans through both: decode to normals.
 
 ``calls``: one thread decodes and reduces the next scan while the other inserts this one and
 derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
-a replay or a node with a backlog. The two take turns, ten scans at a time, and every other turn
+a replay or a node with a backlog. The two take turns, twenty scans at a time, and every other turn
 in the opposite order; ``ratio`` is the median of the ratios of the turns. Maps have to be equal
 in the end.
 """
@@ -30,7 +30,7 @@ from test.bench.ours import Ours
 from test.bench.report import Row
 from test.bench.street import Street
 
-TURN = 10
+TURN = 20
 
 Turn = Sequence[tuple[int, RawCloud]]
 
