@@ -139,5 +139,5 @@ def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
     arguments = ['--output', 'city', '--workers', 2, '--shard', 1]
     printed = run('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
-    assert printed.startswith('3 shards')
+    assert printed.startswith('2 shards')
     assert f'digest {digest_of(street / "mapped")}' in printed
