@@ -189,3 +189,16 @@ def test_every_folder_says_what_it_is():
         or ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) is None
     ]
     assert silent == []
+
+
+def test_a_long_file_says_at_its_top_why_it_is():
+    long = [
+        path
+        for folder in ('surfel_mapper', 'test', 'examples')
+        for path in (ROOT / folder).rglob('*.py')
+        if path.read_text(encoding='utf-8').count('\n') > 300
+    ]
+    for path in long:
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding='utf-8'))) or ''
+        assert '(Longer than other files: ' in docstring, path
+    assert long  # else nothing was looked at

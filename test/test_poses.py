@@ -5,6 +5,8 @@ The buffer of transforms: what it returns bit for bit, what it interpolates, wha
 
 The twin below knows nothing of edges in time or of common ancestors: it multiplies 4 by 4
 matrices from the root to each of two frames and solves for what lies between, with scipy's slerp.
+
+(Longer than other files: most tests need the twin.)
 """
 
 import math

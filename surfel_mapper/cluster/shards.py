@@ -135,7 +135,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
         The settings; all scans stay in the map, whatever they say of a window. Where they make
         a scan depend on all before it, the recording is one shard, and so is a folder of scans.
     shard_s : float
-        How long a shard should be at most.
+        How long a shard should be.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
     with open_recording(request, whole.config) as recording:
         if not isinstance(recording, BagRecording) or not may_be_cut(recording):
             return [whole]
-        start_ns, stop_ns = clipped(recording)
+        start_ns, stop_ns = recording.bounds_ns
     number = max(math.ceil((stop_ns - start_ns) / 1e9 / shard_s - SLACK), 1)
     bounds = [start_ns + (stop_ns - start_ns) * part // number for part in range(1, number)]
     lead_s = LEAD_S + config.input.reset_after_s + sweep_s(config)
@@ -175,11 +175,6 @@ def may_be_cut(recording: BagRecording) -> bool:
     path = recording.poses.path
     by_number = recording.span.every > 1 or (path is not None and not path.has_stamps)
     return is_divisible(recording.config) and not by_number
-
-
-def clipped(recording: BagRecording) -> tuple[int, int]:
-    """Return record time of the first and last message of what is mapped."""
-    return recording.span.clipped(recording.reader.start_ns, recording.reader.end_ns)
 
 
 def map_shard(shard: Shard, path: str) -> ShardResult:
@@ -204,7 +199,7 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
             places = [update.T_fixed_sensor[:3, 3] for update in recording.replay(mapper)]
         elif isinstance(recording, BagRecording):
             entry, places = map_middle(recording, mapper, shard)
-            first_ns, last_ns = clipped(recording)
+            first_ns, last_ns = recording.bounds_ns
             start_ns = first_ns if shard.start_ns is None else shard.start_ns
             recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
         else:

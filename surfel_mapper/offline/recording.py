@@ -201,8 +201,13 @@ class BagRecording:
     @property
     def recorded_s(self) -> float:
         """How long the part that is mapped took to record."""
-        start_ns, stop_ns = self.span.clipped(self.reader.start_ns, self.reader.end_ns)
+        start_ns, stop_ns = self.bounds_ns
         return (stop_ns - start_ns) / 1e9
+
+    @property
+    def bounds_ns(self) -> tuple[int, int]:
+        """Record time of the first and last message of what is mapped."""
+        return self.span.clipped(self.reader.start_ns, self.reader.end_ns)
 
     def describe(self) -> dict[str, Any]:
         """Return where scans and poses come from, for the summary."""

@@ -6,6 +6,9 @@ PointCloud2: any valid layout decodes, any invalid one is refused, columns encod
 The twin reads one number at a time with struct. Layouts, contents and damage come from
 hypothesis; the layouts of real sensors stand by name. Messages are stand-ins with the attributes
 that rclpy and rosbags share, and once each the real ones.
+
+(Longer than other files: the layouts stand here by name, and decoding and encoding check each
+other.)
 """
 
 import array

@@ -4,6 +4,8 @@
 Models that follow a map: the same as those of the map as it is, whatever happened before.
 
 Fixed seeds; the random sequences add and remove scans, clear the map, and ask in between.
+
+(Longer than other files: every test drives the same scenes.)
 """
 
 from __future__ import annotations

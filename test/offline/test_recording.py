@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of bags, several sensors, poses from files and folders of scans give the same maps."""
+"""
+Parts of bags, several sensors, poses from files and folders of scans give the same maps.
+
+(Longer than other files: every test replays the same recordings.)
+"""
 
 import math
 

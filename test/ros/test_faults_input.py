@@ -5,6 +5,8 @@ One node that is fed all that goes wrong with sensors, poses and clocks, fault a
 
 Whatever comes, the node goes on, every cloud is accounted for, and in the end its map is to the
 bit what a map made anew is.
+
+(Longer than other files: one node lives through all of them, in this order.)
 """
 
 from __future__ import annotations

@@ -4,6 +4,8 @@
 What a node publishes of the models of its map, seen over DDS.
 
 Expected values come from a mapper that is fed the same messages here, and from the scene.
+
+(Longer than other files: all topics show the models of one drive.)
 """
 
 from __future__ import annotations

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node as a process of its own, talked to over DDS."""
+"""
+The node as a process of its own, talked to over DDS.
+
+(Longer than other files: all tests share one way to start a node and to talk to it.)
+"""
 
 from __future__ import annotations
 
