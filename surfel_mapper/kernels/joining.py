@@ -45,6 +45,12 @@ def agree(normal_i, normal_j, delta, scale, rules):
         cosine += normal_i[j] * normal_j[j]
         n_i += normal_i[j] * delta[j]
         n_j += normal_j[j] * delta[j]
+    return go_on(cosine, n_i, n_j, scale, rules)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def go_on(cosine, n_i, n_j, scale, rules):
+    """Return what agree does, from the products of the normals and of each with the step."""
     if abs(cosine) > rules[0] and 0.5 * (abs(n_i) + abs(n_j)) < rules[1] * scale:
         return True
     return cosine > rules[2] and 0.5 * abs(n_i + n_j) < rules[3] * scale

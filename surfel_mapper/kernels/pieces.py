@@ -15,8 +15,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.eigen_frames import eigen_frame
-from surfel_mapper.kernels.joining import agree
+from surfel_mapper.kernels.joining import go_on
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
 """What a voxel is: no points, too few, a piece of a surface, none."""
@@ -26,35 +25,67 @@ LEAST_WIDTH = 0.04
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def classify(chosen, count, covariance, rules, kind, axes):
+def classify(chosen, count, normal, covariance, rules, kind, axes):
     """
     Say what voxels are, and how far their points reach across the normal.
 
     chosen      (K,) int32, rows; each holds points
     count       (R,) int64
+    normal      (R, 3) float64, nan where all points are equal
     covariance  (R, 6) float64, m^2
     rules       least points, most variance along the normal m^2, voxel size m
     kind        (R,) uint8, out
     axes        (R, 2, 3) float64, out: half edges of a square that has the same variance, m
+
+    With the normal known there are two axes left, across it: no iterations.
     """
-    matrix, vectors, values = np.empty((3, 3)), np.empty((3, 3)), np.empty(3)
     longest = rules[2] * math.sqrt(0.5)
     for row in chosen:
+        x, y, z = normal[row, 0], normal[row, 1], normal[row, 2]
+        if math.isnan(x):
+            x, y, z = 0.0, 0.0, 1.0
+        ux, uy, uz, vx, vy, vz = across(x, y, z)
         c = covariance[row]
-        matrix[0, 0], matrix[1, 1], matrix[2, 2] = c[0], c[3], c[5]
-        matrix[0, 1] = matrix[1, 0] = c[1]
-        matrix[0, 2] = matrix[2, 0] = c[2]
-        matrix[1, 2] = matrix[2, 1] = c[4]
-        eigen_frame(matrix, values, vectors)
-        wide = values[1] > LEAST_WIDTH * values[2]
+        uu, vv = variance(c, ux, uy, uz), variance(c, vx, vy, vz)
+        both = variance(c, ux + vx, uy + vy, uz + vz)
+        half, off = 0.5 * (uu - vv), 0.5 * (both - uu - vv)
+        radius = math.hypot(half, off)
+        most, least = 0.5 * (uu + vv) + radius, max(0.5 * (uu + vv) - radius, 0.0)
+        cosine, sine = 1.0, 0.0  # of the longer axis
+        if radius > 0.0:
+            larger = math.sqrt(0.5 + 0.5 * abs(half) / radius)
+            smaller = 0.5 * off / (radius * larger)
+            cosine, sine = (larger, smaller) if half >= 0.0 else (smaller, larger)
         if count[row] < rules[0]:
             kind[row] = YOUNG
+        elif least > LEAST_WIDTH * most and variance(c, x, y, z) < rules[1]:
+            kind[row] = FLAT
         else:
-            kind[row] = FLAT if wide and values[0] < rules[1] else ROUGH
-        for k in range(2):
-            half = min(math.sqrt(3.0 * values[2 - k]), longest)
-            for j in range(3):
-                axes[row, k, j] = half * vectors[2 - k, j]
+            kind[row] = ROUGH
+        most = min(math.sqrt(3.0 * most), longest)
+        least = min(math.sqrt(3.0 * least), longest)
+        axes[row, 0, 0] = most * (cosine * ux + sine * vx)
+        axes[row, 0, 1] = most * (cosine * uy + sine * vy)
+        axes[row, 0, 2] = most * (cosine * uz + sine * vz)
+        axes[row, 1, 0] = least * (cosine * vx - sine * ux)
+        axes[row, 1, 1] = least * (cosine * vy - sine * uy)
+        axes[row, 1, 2] = least * (cosine * vz - sine * uz)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def across(x, y, z):
+    """Return two unit vectors across a third and each other."""
+    sign = 1.0 if z >= 0.0 else -1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def variance(c, x, y, z):
+    """Return the variance along a direction; c: xx xy xz yy yz zz."""
+    along = x * x * c[0] + y * y * c[3] + z * z * c[5]
+    return along + 2.0 * (x * y * c[1] + x * z * c[2] + y * z * c[4])
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -96,10 +127,16 @@ def joins(i, j, kind, position, normal, rules):
     """Return whether two neighbours are pieces of one surface; see agree."""
     if kind[i] != FLAT or kind[j] != FLAT:
         return False
-    delta = position[i] - position[j]
-    if not delta[0] * delta[0] + delta[1] * delta[1] + delta[2] * delta[2] < rules[4]:
+    away = cosine = n_i = n_j = 0.0
+    for k in range(3):  # no views of rows: they take longer than the sums
+        delta = position[i, k] - position[j, k]
+        away += delta * delta
+        cosine += normal[i, k] * normal[j, k]
+        n_i += normal[i, k] * delta
+        n_j += normal[j, k] * delta
+    if not away < rules[4]:
         return False  # the index of a voxel at the end of the world has run over
-    return agree(normal[i], normal[j], delta, 1.0, rules)
+    return go_on(cosine, n_i, n_j, 1.0, rules)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -227,13 +264,13 @@ def lie_on(chosen, around, state, covariance, rules, host):
             if other < 0 or kind[other] != FLAT:
                 continue
             x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]
-            delta = position[row] - position[other]
-            if not delta[0] * delta[0] + delta[1] * delta[1] + delta[2] * delta[2] < rules[2]:
+            dx = position[row, 0] - position[other, 0]
+            dy = position[row, 1] - position[other, 1]
+            dz = position[row, 2] - position[other, 2]
+            if not dx * dx + dy * dy + dz * dz < rules[2]:
                 continue
-            away = abs(x * delta[0] + y * delta[1] + z * delta[2])
-            along = x * x * c[0] + y * y * c[3] + z * z * c[5]
-            along += 2.0 * (x * y * c[1] + x * z * c[2] + y * z * c[4])
-            if away < best and along < rules[1]:
+            away = abs(x * dx + y * dy + z * dz)
+            if away < best and variance(c, x, y, z) < rules[1]:
                 best = away
                 host[i] = other
 

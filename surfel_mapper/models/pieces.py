@@ -220,7 +220,10 @@ class Pieces:
         self.count[rows], self.position[rows] = surfels.num_points, surfels.position
         self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
         self.covariance[rows] = self.map.covariances_of(rows)
-        classify(rows, self.count, self.covariance, self._class_rules, self.kind, self.axes)
+        classify(
+            rows, self.count, self.normal, self.covariance, self._class_rules, self.kind,
+            self.axes,
+        )  # fmt: skip
         self.is_material[:] = False
         told = (self._told_count, self._told_position, self._told_normal)
         tell(
