@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Voxels as pieces of surfaces: which are flat, which of them belong together, which lie on them.
+Voxels as pieces of surfaces: which of them belong together, which lie on them.
 
 All arrays have a row for each row of the map's slab. A link of two flat neighbours is a bit of
 the one of lesser key: bit h of ``links`` says that the voxel in place h of ``around`` goes on
@@ -10,116 +10,11 @@ order they change in, they are those of the map as it is. Row r of ``around`` ha
 neighbours, so that only voxels that come need the hash table.
 """
 
-import math
-
 from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.joining import go_on
-
-NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
-"""What a voxel is: no points, too few, a piece of a surface, none."""
-
-LEAST_WIDTH = 0.04
-"""Of less variance across than along it is a line, whose normal says little."""
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def classify(chosen, count, normal, covariance, rules, kind, axes):
-    """
-    Say what voxels are, and how far their points reach across the normal.
-
-    chosen      (K,) int32, rows; each holds points
-    count       (R,) int64
-    normal      (R, 3) float64, nan where all points are equal
-    covariance  (R, 6) float64, m^2
-    rules       least points, most variance along the normal m^2, voxel size m
-    kind        (R,) uint8, out
-    axes        (R, 2, 3) float64, out: half edges of a square that has the same variance, m
-
-    With the normal known there are two axes left, across it: no iterations.
-    """
-    longest = rules[2] * math.sqrt(0.5)
-    for row in chosen:
-        x, y, z = normal[row, 0], normal[row, 1], normal[row, 2]
-        if math.isnan(x):
-            x, y, z = 0.0, 0.0, 1.0
-        ux, uy, uz, vx, vy, vz = across(x, y, z)
-        c = covariance[row]
-        uu, vv = variance(c, ux, uy, uz), variance(c, vx, vy, vz)
-        both = variance(c, ux + vx, uy + vy, uz + vz)
-        half, off = 0.5 * (uu - vv), 0.5 * (both - uu - vv)
-        radius = math.hypot(half, off)
-        most, least = 0.5 * (uu + vv) + radius, max(0.5 * (uu + vv) - radius, 0.0)
-        cosine, sine = 1.0, 0.0  # of the longer axis
-        if radius > 0.0:
-            larger = math.sqrt(0.5 + 0.5 * abs(half) / radius)
-            smaller = 0.5 * off / (radius * larger)
-            cosine, sine = (larger, smaller) if half >= 0.0 else (smaller, larger)
-        if count[row] < rules[0]:
-            kind[row] = YOUNG
-        elif least > LEAST_WIDTH * most and variance(c, x, y, z) < rules[1]:
-            kind[row] = FLAT
-        else:
-            kind[row] = ROUGH
-        most = min(math.sqrt(3.0 * most), longest)
-        least = min(math.sqrt(3.0 * least), longest)
-        axes[row, 0, 0] = most * (cosine * ux + sine * vx)
-        axes[row, 0, 1] = most * (cosine * uy + sine * vy)
-        axes[row, 0, 2] = most * (cosine * uz + sine * vz)
-        axes[row, 1, 0] = least * (cosine * vx - sine * ux)
-        axes[row, 1, 1] = least * (cosine * vy - sine * uy)
-        axes[row, 1, 2] = least * (cosine * vz - sine * uz)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def across(x, y, z):
-    """Return two unit vectors across a third and each other."""
-    sign = 1.0 if z >= 0.0 else -1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return 1.0 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def variance(c, x, y, z):
-    """Return the variance along a direction; c: xx xy xz yy yz zz."""
-    along = x * x * c[0] + y * y * c[3] + z * z * c[5]
-    return along + 2.0 * (x * y * c[1] + x * z * c[2] + y * z * c[4])
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def tell(rows, before, count, position, normal, kind, told, rules, material):
-    """
-    See which changes matter since they were told last, and take note of those.
-
-    rows      (K,) int32
-    before    (K,) uint8, the kinds that they were
-    told      count (R,), position (R, 3), normal (R, 3) as last told, in place
-    rules     square of the distance m^2, cosine, factor of the count
-    material  (R,) bool, all False; out
-    """
-    told_count, told_position, told_normal = told
-    for i in range(len(rows)):
-        row = rows[i]
-        away = cosine = 0.0
-        for j in range(3):
-            delta = position[row, j] - told_position[row, j]
-            away += delta * delta
-            cosine += normal[row, j] * told_normal[row, j]
-        more, less = count[row], told_count[row]
-        if more < less:
-            more, less = less, more
-        if (
-            before[i] != kind[row]
-            or away > rules[0]
-            or cosine < rules[1]
-            or more >= rules[2] * less
-        ):
-            material[row] = True
-            told_count[row] = count[row]
-            for j in range(3):
-                told_position[row, j], told_normal[row, j] = position[row, j], normal[row, j]
+from surfel_mapper.kernels.piece_classes import FLAT, variance
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

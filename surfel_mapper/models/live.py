@@ -26,13 +26,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.kernels.piece_classes import FLAT, NONE, YOUNG
 from surfel_mapper.kernels.piece_groups import (
     hang_together,
     name_components,
     rows_of_groups,
     sort_by_group,
 )
-from surfel_mapper.kernels.pieces import FLAT, NONE, YOUNG
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.charts import charts_of

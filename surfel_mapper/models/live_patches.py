@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.patches import describe
+from surfel_mapper.kernels.piece_classes import FLAT
 from surfel_mapper.kernels.piece_groups import mean_normals
-from surfel_mapper.kernels.pieces import FLAT, merge_moments, spread
+from surfel_mapper.kernels.pieces import merge_moments, spread
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.large_fields import fit_field, Fitted

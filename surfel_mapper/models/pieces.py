@@ -20,16 +20,8 @@ import numpy.typing as npt
 
 from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
-from surfel_mapper.kernels.pieces import (
-    classify,
-    enter,
-    FLAT,
-    leave,
-    lie_on,
-    link,
-    NONE,
-    tell,
-)
+from surfel_mapper.kernels.piece_classes import classify, FLAT, NONE, tell
+from surfel_mapper.kernels.pieces import enter, leave, lie_on, link
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
@@ -60,9 +52,9 @@ class Pieces:
     key : (R,) int64
         Of the voxel in each row, -1 for none.
     count, position, normal, eigenvalues, covariance, axes
-        What it holds; covariance xx xy xz yy yz zz; axes as in kernels/pieces.py.
+        What it holds; covariance xx xy xz yy yz zz; axes as in kernels/piece_classes.py.
     kind, links, around
-        See kernels/pieces.py.
+        See kernels/piece_classes.py and kernels/pieces.py.
     host : (R,) int32
         The flat neighbour that a voxel lies on which is not flat, -1 for none.
     component : (R,) int32
