@@ -5,7 +5,9 @@ What a scan costs in longer windows and larger maps, on one core.
 
 It should be the same. The maps that are compared take turns, scan by scan, so that whatever else
 the machine does hits all alike, and every other scan in the opposite order, so that none always
-finds the scan in the cache. ``ratio`` is between medians, the first being 1. The larger maps hold
+finds the scan in the cache. ``ratio`` is between medians, the first being 1. In a longer window the
+scan that leaves has seen other places than the one that comes, so more voxels change: ``changed``
+is how many in the median, ``ratio_changed`` the ratio of the times by voxel. The larger maps hold
 voxels far from the street that no scan touches.
 """
 
@@ -29,6 +31,9 @@ FAR_INDEX = 20_000
 BATCH = 10_000
 """So many are added at once: fewer than a scan has, for which the map keeps memory to reduce."""
 
+Figures = dict[int, list[float]]
+"""A figure a scan, by what is varied."""
+
 
 def run(options: Options) -> list[Row]:
     """Return a row for every length of window and every size of map, by voxel size."""
@@ -39,21 +44,24 @@ def run(options: Options) -> list[Row]:
     with one_core():
         for size_m in options.voxel_sizes_m:
             windows = {window: Ours(size_m, window) for window in options.windows}
-            times = in_turns(windows, street, longest, options.scans)
-            rows += compared(size_m, 'window', windows, times)
+            rows += compared(
+                size_m, 'window', windows, *in_turns(windows, street, longest, options.scans)
+            )
             maps = {voxels: Ours(size_m, options.window) for voxels in options.map_voxels}
             for voxels, ours in maps.items():
                 fill(ours.map, voxels)
-            times = in_turns(maps, street, options.untimed, options.scans)
-            rows += compared(size_m, 'map', maps, times)
+            rows += compared(
+                size_m, 'map', maps, *in_turns(maps, street, options.untimed, options.scans)
+            )
     return rows
 
 
 def in_turns(
     maps: Mapping[int, Ours], street: Street, untimed: int, timed: int
-) -> dict[int, list[float]]:
-    """Return the times of every map, each given every scan."""
-    times: dict[int, list[float]] = {name: [] for name in maps}
+) -> tuple[Figures, Figures]:
+    """Return times, and numbers of changed voxels, of every map, each given every scan."""
+    times: Figures = {name: [] for name in maps}
+    changed: Figures = {name: [] for name in maps}
     for number, message, counts in street.drive(untimed, timed):
         pose = street.pose(number)
         for name in sorted(maps, reverse=number % 2 == 1):
@@ -61,14 +69,17 @@ def in_turns(
             maps[name].step(message, pose)
             if counts:
                 times[name].append((perf_counter() - start) * 1e3)
-    return times
+                changed[name].append(maps[name].num_changed)
+    return times, changed
 
 
 def compared(
-    size_m: float, varied: str, maps: Mapping[int, Ours], times: Mapping[int, list[float]]
+    size_m: float, varied: str, maps: Mapping[int, Ours], times: Figures, changed: Figures
 ) -> list[Row]:
     """Return a row for each map, with the ratio to the first."""
-    first = float(np.median(next(iter(times.values()))))
+    medians = {name: float(np.median(values)) for name, values in times.items()}
+    numbers = {name: float(np.median(values)) for name, values in changed.items()}
+    first = next(iter(maps))
     return [
         {
             'voxel_m': size_m,
@@ -76,7 +87,9 @@ def compared(
             'window': len(ours.scans),
             'voxels': ours.map.num_voxels,
             **spread(times[name]),
-            'ratio': float(np.median(times[name])) / first,
+            'changed': int(numbers[name]),
+            'ratio': medians[name] / medians[first],
+            'ratio_changed': medians[name] / numbers[name] / (medians[first] / numbers[first]),
         }
         for name, ours in maps.items()
     ]
