@@ -16,10 +16,12 @@ solution nearest to the initial control points, which is where gradient descent 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.banded import solve_band
 from surfel_mapper.kernels.splines import (
     add_differences,
     add_equations,
@@ -34,10 +36,17 @@ RIDGE = 1e-6
 
 LSQR_STEPS = 2000
 
+SMALL = 1e6
+"""Multiplications of a banded solve up to which LAPACK is not worth its checks."""
 
+KEPT = 4096
+"""Axes of which knots and places are kept: most fields are as small as others before them."""
+
+
+@lru_cache(KEPT)
 def knots(num_cells: int, degree: int) -> Array:
     """
-    Return the clamped knots for num_cells + 2 control points, in [0, 1].
+    Return the clamped knots for num_cells + 2 control points, in [0, 1]; not to be changed.
 
     Parameters
     ----------
@@ -49,6 +58,15 @@ def knots(num_cells: int, degree: int) -> Array:
     """
     inner = np.arange(1, num_cells + 2 - degree) / (num_cells + 2 - degree)
     return np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
+
+
+@lru_cache(KEPT)
+def greville_cells(num_cells: int, degree: int) -> Array:
+    """Return where control points stand along an axis, in cells; not to be changed."""
+    knot = knots(num_cells, degree)
+    mean = sum(knot[k : k + num_cells + 2] for k in range(1, degree + 1)) / degree
+    found: Array = (num_cells + 1) * mean - 0.5
+    return found
 
 
 def axis_degree(num_cells: int, degree: int) -> int:
@@ -132,13 +150,12 @@ class HeightField:
 
     def greville(self) -> tuple[Array, Array]:
         """Return x (Nx + 2,) and y (Ny + 2,) of the control points of the same NURBS patch, m."""
-        found = []
-        for axis in range(2):
-            cells, degree = self.control.shape[axis] - 2, self.degrees[axis]
-            knot = knots(cells, degree)
-            mean = sum(knot[k : k + cells + 2] for k in range(1, degree + 1)) / degree
-            found.append(self.origin[axis] + self.pitch_m * ((cells + 1) * mean - 0.5))
-        return found[0], found[1]
+        x, y = (
+            self.origin[axis]
+            + self.pitch_m * greville_cells(self.control.shape[axis] - 2, self.degrees[axis])
+            for axis in range(2)
+        )
+        return x, y
 
 
 def design(
@@ -252,9 +269,12 @@ def fit_pspline(
     add_equations(np.column_stack([xy, z]), weight / weight.mean(), start.parts(), band, right)
     add_differences(*start.greville(), smoothing, band)
     band[:, 0] += RIDGE
-    control = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
+    if band.size * reach < SMALL:
+        solve_band(band, right)
+    else:
+        right = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
     return HeightField(
-        start.pitch_m, start.origin, start.degrees, control.reshape(start.control.shape)
+        start.pitch_m, start.origin, start.degrees, right.reshape(start.control.shape)
     )
 
 

@@ -17,6 +17,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.banded import rms_off_field
 from surfel_mapper.kernels.patches import describe
 from surfel_mapper.kernels.piece_classes import FLAT
 from surfel_mapper.kernels.piece_groups import mean_normals
@@ -207,11 +208,9 @@ class PatchFitter:
 
     def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
         """Return the root mean square distance of the points of voxels from a field, m."""
-        local = (self._pieces.position[rows] - origin) @ frame.T
-        error = local[:, 2] - field.heights(local[:, :2])
-        count = self._pieces.count[rows]
-        across = error**2 + self._pieces.eigenvalues[rows, 0]
-        return math.sqrt(float(count @ across) / float(count.sum()))
+        held = self._pieces.count, self._pieces.position, self._pieces.eigenvalues
+        found: float = rms_off_field(rows, held, frame, origin, field.parts())
+        return found
 
 
 def turned(x: Array, normals: Array) -> Array:

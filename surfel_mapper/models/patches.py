@@ -72,12 +72,12 @@ class Cells:
 
     def of(self, patch: int) -> slice:
         """Return the rows of a patch."""
-        begin = self.first[patch]
-        return slice(begin, begin + self.sizes[patch].prod())
+        begin, (x, y) = int(self.first[patch]), self.sizes[patch].tolist()
+        return slice(begin, begin + x * y)
 
     def grid(self, patch: int) -> Grid:
         """Return what a patch covers."""
-        rows, shape = self.of(patch), tuple(self.sizes[patch])
+        rows, shape = self.of(patch), tuple(self.sizes[patch].tolist())
         return Grid(
             pitch_m=float(self.pitches[patch]),
             origin=self.origins[patch],

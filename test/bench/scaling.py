@@ -5,10 +5,11 @@ What a scan costs in longer windows and larger maps, on one core.
 
 It should be the same. The maps that are compared take turns, scan by scan, so that whatever else
 the machine does hits all alike, and every other scan in the opposite order, so that none always
-finds the scan in the cache. ``ratio`` is between medians, the first being 1. In a longer window the
-scan that leaves has seen other places than the one that comes, so more voxels change: ``changed``
-is how many in the median, ``ratio_changed`` the ratio of the times by voxel. The larger maps hold
-voxels far from the street that no scan touches.
+finds the scan in the cache. ``ratio`` is between medians, the first being 1.
+
+In a longer window the scan that leaves has seen other places than the one that comes, so more
+voxels change: ``changed`` is how many in the median, ``ratio_changed`` the ratio of the times by
+changed voxel. The larger maps hold voxels far from the street that no scan touches.
 """
 
 from __future__ import annotations
