@@ -64,8 +64,8 @@ def knots(num_cells: int, degree: int) -> Array:
 def greville_cells(num_cells: int, degree: int) -> Array:
     """Return where control points stand along an axis, in cells; not to be changed."""
     knot = knots(num_cells, degree)
-    mean = sum(knot[k : k + num_cells + 2] for k in range(1, degree + 1)) / degree
-    found: Array = (num_cells + 1) * mean - 0.5
+    total = sum((knot[k : k + num_cells + 2] for k in range(1, degree + 1)), 0.0)
+    found: Array = np.asarray(total) * ((num_cells + 1) / degree) - 0.5
     return found
 
 
