@@ -167,29 +167,36 @@ def multiply(first, values, num_y, at, second, smoothing, ridge, x, result):
     """
     for i in range(len(x)):
         result[i] = ridge * x[i]
+    one, step = np.uint64(1), np.uint64(num_y)  # places without a sign: none is from the end
+    two, three = one + one, one + one + one
     for i in range(len(first)):
-        begin, height = first[i, 0], 0.0
+        row, height = np.uint64(first[i, 0]), 0.0
+        a, b, c, d = values[i, 1, 0], values[i, 1, 1], values[i, 1, 2], values[i, 1, 3]
         for j in range(4):
-            row = begin + j * num_y
-            along = 0.0
-            for k in range(4):
-                along += values[i, 1, k] * x[row + k]
+            along = a * x[row] + b * x[row + one] + c * x[row + two] + d * x[row + three]
             height += values[i, 0, j] * along
+            row += step
+        row = np.uint64(first[i, 0])
         for j in range(4):
-            row, share = begin + j * num_y, height * values[i, 0, j]
-            for k in range(4):
-                result[row + k] += share * values[i, 1, k]
+            share = height * values[i, 0, j]
+            result[row] += share * a
+            result[row + one] += share * b
+            result[row + two] += share * c
+            result[row + three] += share * d
+            row += step
     for i in range(len(at)):
-        a, step = at[i, 0], at[i, 1]
-        bend = second[i, 0] * x[a] + second[i, 1] * x[a + step] + second[i, 2] * x[a + 2 * step]
-        bend *= smoothing
-        for j in range(3):
-            result[a + j * step] += bend * second[i, j]
+        left, step = np.uint64(at[i, 0]), np.uint64(at[i, 1])
+        middle, right = left + step, left + step + step
+        a, b, c = second[i, 0], second[i, 1], second[i, 2]
+        bend = smoothing * (a * x[left] + b * x[middle] + c * x[right])
+        result[left] += bend * a
+        result[middle] += bend * b
+        result[right] += bend * c
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal):
-    """Write the diagonal (n,) of the matrix of multiply."""
+    """Write one over the diagonal (n,) of the matrix of multiply."""
     for i in range(len(diagonal)):
         diagonal[i] = ridge
     for i in range(len(first)):
@@ -200,6 +207,8 @@ def preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal)
     for i in range(len(at)):
         for j in range(3):
             diagonal[at[i, 0] + j * at[i, 1]] += smoothing * second[i, j] * second[i, j]
+    for i in range(len(diagonal)):
+        diagonal[i] = 1.0 / diagonal[i]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -216,10 +225,10 @@ def relax(first, values, z, num_y, at, second, rules, free, control):
     Returns how many steps that took.
     """
     smoothing, ridge, tolerance = rules
-    product, diagonal = np.empty(len(control)), np.empty(len(control))
+    product, inverse = np.empty(len(control)), np.empty(len(control))
     residual, direction = np.zeros(len(control)), np.zeros(len(control))
     multiply(first, values, num_y, at, second, smoothing, ridge, control, product)
-    preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal)
+    preconditioner(first, values, num_y, at, second, smoothing, ridge, inverse)
     for i in range(len(first)):
         for j in range(4):
             for k in range(4):
@@ -228,7 +237,7 @@ def relax(first, values, z, num_y, at, second, rules, free, control):
     energy = 0.0
     for f in free:
         residual[f] -= product[f]
-        direction[f] = residual[f] / diagonal[f]
+        direction[f] = residual[f] * inverse[f]
         energy += residual[f] * direction[f]
     for step in range(MOST_STEPS):
         multiply(first, values, num_y, at, second, smoothing, ridge, direction, product)
@@ -243,9 +252,9 @@ def relax(first, values, z, num_y, at, second, rules, free, control):
             control[f] += length * direction[f]
             longest = max(longest, abs(length * direction[f]))
             residual[f] -= length * product[f]
-            energy += residual[f] * residual[f] / diagonal[f]
+            energy += residual[f] * residual[f] * inverse[f]
         if longest < tolerance:
             return step + 1
         for f in free:
-            direction[f] = residual[f] / diagonal[f] + energy / before * direction[f]
+            direction[f] = residual[f] * inverse[f] + energy / before * direction[f]
     return MOST_STEPS

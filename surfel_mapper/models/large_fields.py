@@ -27,8 +27,8 @@ MOST_AT_ONCE = 2e6
 SMOOTHING = 1e-2
 """Weight of the second differences."""
 
-STILL_M = 1e-3
-TOLERANCE_M = 4e-4
+STILL_M = 2e-4
+TOLERANCE_M = 2e-4
 MARGIN = 5
 DEGREE = 3
 BLOCK = 16
