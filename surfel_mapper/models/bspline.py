@@ -258,8 +258,6 @@ def fit_pspline(
         Weight of the second differences, where the mean weight is 1.
 
     """
-    from scipy.linalg import solveh_banded
-
     if start.control.shape[1] > start.control.shape[0]:  # the band is as wide as the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
         return transposed(turned)
@@ -272,6 +270,8 @@ def fit_pspline(
     if band.size * reach < SMALL:
         solve_band(band, right)
     else:
+        from scipy.linalg import solveh_banded
+
         right = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
     return HeightField(
         start.pitch_m, start.origin, start.degrees, right.reshape(start.control.shape)

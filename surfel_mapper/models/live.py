@@ -151,8 +151,9 @@ class LiveModels:
         size_m = self.map.voxel_size_m
         surfel_map = SurfelMap(size_m)
         models = LiveModels(replace(self.config, min_points=4, min_voxels=1), surfel_map)
-        x, y = np.mgrid[0:130, 0:130] * (0.2 * size_m)
-        for bend in (0.0, 0.012 / size_m):  # a plane, a surface that is a large field
+        for side, bend in ((130, 0.0), (130, 0.012), (40, 0.04)):  # plane, large field, small one
+            x, y = np.mgrid[0:side, 0:side] * (0.2 * size_m)
+            bend /= size_m
             points = np.stack([x, y, bend * x * x], -1).reshape(-1, 3)
             moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m)]
             models.update()
