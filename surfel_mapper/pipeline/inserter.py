@@ -104,15 +104,7 @@ class Inserter:
         return self._config.align.map_frame or self._config.frames.fixed
 
     def reconfigure(self, config: Config) -> None:
-        """
-        Take new settings.
-
-        Raises
-        ------
-        ConfigError
-            If ``filters`` names a file that holds no chain; nothing has changed then.
-
-        """
+        """Take new settings; where preparation refuses them, nothing has changed."""
         self.preparation.reconfigure(config)
         self._config = config
         self.window.config = config.window
