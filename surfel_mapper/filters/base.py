@@ -62,6 +62,7 @@ class Filter:
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay, (N,) bool; nobody asks filters that implement ``apply``."""
+        # not abstract, because those have none; register refuses a filter that has neither
         raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
 
     def apply(self, scan: Scan) -> Scan:

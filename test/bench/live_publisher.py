@@ -91,6 +91,7 @@ def ros_cloud(raw):
         point_step=raw.point_step,
         row_step=raw.row_step,
         data=array('B', bytes(raw.data)),
+        is_dense=raw.is_dense,
     )
     message.header.frame_id = raw.header.frame_id
     return message

@@ -62,7 +62,8 @@ def test_a_signal_within_a_destructor_is_found_by_check():
         Freed()
         with pytest.raises(KeyboardInterrupt):
             signals.check()
-        time.sleep(5 * RETRY_S)  # nor does it interrupt a second time
+        # longer than an interrupt waits: one that was not taken back would come now
+        time.sleep(5 * RETRY_S)
 
 
 def test_a_signal_within_a_destructor_interrupts_what_comes_after():

@@ -10,7 +10,6 @@ its map, which is compared with one made anew from the clouds of its window.
 
 from __future__ import annotations
 
-from array import array
 from collections import deque
 from collections.abc import Iterable, Iterator
 import math
@@ -24,7 +23,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 from scipy.spatial.transform import Rotation
-from sensor_msgs.msg import PointCloud2, PointField
 
 from surfel_mapper.config import Config
 from surfel_mapper.io.map_state import load_map
@@ -32,6 +30,7 @@ from surfel_mapper.io.pointcloud2 import to_scan
 from surfel_mapper.io.raw_cloud import RawCloud
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.ros.shared_memory import enlarge_shared_memory
+from test.bench.live_publisher import ros_cloud
 from test.bench.options import Options
 from test.bench.report import Row
 from test.bench.street import Street
@@ -55,7 +54,7 @@ class Drive:
         street = Street(options)
         street.prepare(options.scans)
         self.raw = [street.message(number) for number in range(options.scans)]
-        self._messages = [ros_message(raw) for raw in self.raw]
+        self._messages = [ros_cloud(raw) for raw in self.raw]
         self._poses = [street.pose(number) for number in range(options.scans)]
         self.latest: deque[RawCloud] = deque(maxlen=CONFIG['window.max_scans'])
         settings = {**CONFIG, 'publish.diagnostics_rate_hz': 50.0, 'output.directory': MAPS}
@@ -106,24 +105,6 @@ class Drive:
         """Return how much memory the node has."""
         statm = Path(f'/proc/{self.node._process.pid}/statm').read_text(encoding='ascii')
         return int(statm.split()[1]) * os.sysconf('SC_PAGE_SIZE')
-
-
-def ros_message(raw: RawCloud) -> PointCloud2:
-    """Return the message that is published of a cloud."""
-    message = PointCloud2(
-        height=raw.height,
-        width=raw.width,
-        fields=[
-            PointField(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count)
-            for f in raw.fields
-        ],
-        point_step=raw.point_step,
-        row_step=raw.row_step,
-        data=array('B', raw.data.tobytes()),
-        is_dense=raw.is_dense,
-    )
-    message.header.frame_id = raw.header.frame_id
-    return message
 
 
 def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
