@@ -12,9 +12,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 import threading
 from typing import NamedTuple
+
+PATIENCE_S = 0.2
+"""A signal that comes just before a wait does not end it, so none lasts longer."""
 
 
 class Request(NamedTuple):
@@ -59,7 +62,10 @@ class Inbox:
         """
         while True:
             check()
-            item = self._items.get()
+            try:
+                item = self._items.get(timeout=PATIENCE_S)
+            except Empty:
+                continue
             if isinstance(item, BaseException):
                 raise item
             done = False

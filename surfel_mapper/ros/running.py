@@ -15,6 +15,7 @@ import threading
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.io.heap import keep_freed_memory
@@ -77,12 +78,11 @@ def executing(node: MapperNode) -> Iterator[None]:
     """Execute the callbacks of a node in a thread, in a with-block."""
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    stopping = threading.Event()
+    stopping: Future[None] = Future()
 
     def work() -> None:
         try:
-            while not stopping.is_set():
-                executor.spin_once()
+            executor.spin_until_future_complete(stopping)
         except BaseException as error:
             node.inbox.fail(error)
 
@@ -91,7 +91,6 @@ def executing(node: MapperNode) -> Iterator[None]:
     try:
         yield
     finally:
-        stopping.set()
-        executor.wake()
+        stopping.set_result(None)
         thread.join()
         executor.shutdown()

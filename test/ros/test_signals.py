@@ -126,6 +126,24 @@ def test_what_is_asked_for_at_the_end_or_after_it_is_answered_with_no():
     assert inbox.ask(lambda: True).result(TIMEOUT_S) is False
 
 
+def test_a_signal_that_does_not_wake_whoever_waits_ends_the_service():
+    asleep = threading.Thread(target=threading.Event().wait, daemon=True)
+    asleep.start()  # takes the signal, as the main thread just before it waits
+
+    def strike():
+        time.sleep(0.1)  # until the main thread waits
+        signal.pthread_kill(asleep.ident, signal.SIGTERM)
+
+    inbox = Inbox()
+    alarm = threading.Timer(TIMEOUT_S, inbox.ask, [nothing])
+    alarm.start()
+    threading.Thread(target=strike).start()
+    with Signals() as signals, pytest.raises(KeyboardInterrupt):
+        inbox.serve(signals.check)
+    assert alarm.is_alive(), 'heard only when something else woke it'
+    alarm.cancel()
+
+
 def test_an_interruption_is_noticed_before_the_next_wait():
     def check():
         raise KeyboardInterrupt
