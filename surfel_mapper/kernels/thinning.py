@@ -56,9 +56,9 @@ def rows_held(rows, used, min_points, chosen, mixed):
 
 
 @njit(cache=True, nogil=True)
-def mark_seen(seen, limit, keys, table, marks, mark):
+def mark_seen(seen, limit, keys, table, marks, mark, left):
     """
-    Mark the surfels whose voxels a scan saw, unless they are marked already; return how many.
+    Mark the surfels whose voxels a scan saw, unless they are marked already.
 
     seen    (S,) int64, voxel keys of the scan
     limit   uint64, no hash of a surfel's voxel is larger
@@ -66,16 +66,23 @@ def mark_seen(seen, limit, keys, table, marks, mark):
     table   (B,) int32, hash table of the keys, as build_table makes it
     marks   (K,) int64, in and out: -1 where there is no mark yet
     mark    int64
+    left    (S,) int64, out: the keys seen but for those of surfels that were marked already
+
+    Returns how many surfels were marked, and how many keys are left.
     """
     shift = hash_shift(len(table))
-    num = 0
+    num = num_left = 0
     for key in seen:
         if mix(key) <= limit:
             row = find_key(key, keys, table, shift)
-            if row >= 0 and marks[row] < 0:
+            if row >= 0:
+                if marks[row] >= 0:
+                    continue
                 marks[row] = mark
                 num += 1
-    return num
+        left[num_left] = key
+        num_left += 1
+    return num, num_left
 
 
 @njit(cache=True, nogil=True)

@@ -184,9 +184,10 @@ def test_the_kernel_attaches_and_leaves_out(call):
 
 
 @both
-def test_the_first_mark_stays(call):
-    keys = np.array([5, 9, 2])
-    marks = np.array([-1, 40, -1])
+def test_the_first_mark_stays_and_what_it_was_for_is_not_asked_again(call):
+    keys, seen = np.array([5, 9, 2]), np.array([9, 2, 77])
+    marks, left = np.array([-1, 40, -1]), np.empty(3, np.int64)
     limit = np.uint64(2**64 - 1)
-    assert call(mark_seen, np.array([9, 2, 77]), limit, keys, table_of(keys), marks, 30) == 1
+    assert call(mark_seen, seen, limit, keys, table_of(keys), marks, 30, left) == (1, 2)
     assert marks.tolist() == [-1, 40, 30]
+    assert left[:2].tolist() == [2, 77]

@@ -50,3 +50,12 @@ def test_a_scan_that_loses_voxels_has_not_seen_them():
     made[0] = WindowedScan(moments=half, stamp_ns=made[0].stamp_ns, T_map_sensor=np.eye(4))
 
     assert ages.last_seen_ns(drawn, made).tolist() == slow_last_seen_ns(drawn, made)
+
+
+def test_scans_may_come_and_leave_in_any_order():
+    made, surfel_map = scans(num=10, num_points=400, seed=3)
+    rng, ages = np.random.default_rng(4), Ages()
+    for _ in range(30):
+        held = [made[k] for k in np.flatnonzero(rng.uniform(size=len(made)) < 0.7)]
+        drawn = surfel_map.surfels(1, int(rng.integers(100, 400))).voxel_index
+        assert ages.last_seen_ns(drawn, held).tolist() == slow_last_seen_ns(drawn, held)
