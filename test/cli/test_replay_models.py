@@ -79,7 +79,7 @@ def test_report_picture_and_recording_show_them(output):
     assert 'Planes, surfaces, Gaussians' in [text for tag, _, text in parsed.text if tag == 'h2']
     assert (output / 'models.png').stat().st_size > 10_000
     command = [sys.executable, '-m', 'rerun', 'rrd', 'print', str(output.with_name('a.rrd'))]
-    printed = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    printed = subprocess.run(command, capture_output=True, text=True).stdout
     for entity in ('patches', 'outlines', 'gaussians'):
         assert f'/map/models/{entity}' in printed
 

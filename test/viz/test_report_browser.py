@@ -7,6 +7,7 @@ from __future__ import annotations
 import io
 import os
 import shutil
+import time
 
 from matplotlib.image import imread
 import numpy as np
@@ -27,29 +28,40 @@ pytestmark = pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH
 SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """WebGL without a graphics card."""
 
+WAIT_S = 180.0
+"""At most, for what takes a second on an idle machine."""
+
 
 @pytest.fixture(scope='module')
 def browser():
     # root, as in containers, cannot have the sandbox
     root = ('--no-sandbox',) if os.geteuid() == 0 else ()
     with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=BROWSER, args=[*SOFTWARE_GL, *root])
+        chromium = started.chromium.launch(
+            executable_path=BROWSER, args=[*SOFTWARE_GL, *root], timeout=1000 * WAIT_S
+        )
         yield chromium
         chromium.close()
+
+
+def new_page(browser):
+    page = browser.new_page(viewport={'width': 900, 'height': 800})
+    page.set_default_timeout(1000 * WAIT_S)
+    return page
 
 
 @pytest.fixture
 def opened(browser, tmp_path):
     """Return a page that shows a report, and what it complained about or asked for."""
     report(tmp_path, plane(30))
-    complaints, page = [], browser.new_page(viewport={'width': 900, 'height': 800})
+    complaints, page = [], new_page(browser)
     address = (tmp_path / 'report.html').as_uri()
     page.on('console', lambda message: complaints.append(message.text))
     page.on('pageerror', lambda error: complaints.append(str(error)))
     page.on('request', lambda asked: asked.url == address or complaints.append(asked.url))
     page.goto(address)
     page.locator('#surfels').wait_for()
-    settle(page)
+    picture_when(page, is_drawn)
     yield page, complaints
     page.close()
 
@@ -67,17 +79,29 @@ def pixels(page):
     return imread(io.BytesIO(page.locator('#surfels').screenshot()))[..., :3]
 
 
+def picture_when(page, is_so):
+    """Return the picture once it is as it should be; it comes some time after what is done."""
+    end = time.monotonic() + WAIT_S
+    while True:
+        settle(page)
+        image = pixels(page)
+        if is_so(image) or time.monotonic() > end:
+            return image
+
+
 def num_coloured(image):
     return int((np.ptp(image, axis=2) > 0.1).sum())
+
+
+def is_drawn(image):
+    return num_coloured(image) > 5000  # discs in the colours of planarity, on grey
 
 
 def test_the_map_is_drawn_without_an_error_and_without_a_request(opened):
     page, complaints = opened
 
-    image = pixels(page)
-
+    assert is_drawn(pixels(page))
     assert complaints == []
-    assert num_coloured(image) > 5000  # discs in the colours of planarity, on grey
 
 
 def test_dragging_turns_the_map_and_reset_turns_it_back(opened):
@@ -90,11 +114,9 @@ def test_dragging_turns_the_map_and_reset_turns_it_back(opened):
     page.mouse.down()
     page.mouse.move(middle[0] + 150, middle[1] + 40, steps=5)
     page.mouse.up()
-    settle(page)
-    turned = pixels(page)
+    turned = picture_when(page, lambda image: np.abs(image - before).mean() > 0.01)
     page.locator('#reset').dispatch_event('click')
-    settle(page)
-    again = pixels(page)
+    again = picture_when(page, lambda image: np.allclose(image, before, atol=0.02))
 
     assert np.abs(turned - before).mean() > 0.01
     np.testing.assert_allclose(again, before, atol=0.02)
@@ -107,33 +129,37 @@ def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
     box = page.locator('#surfels').bounding_box()
     page.mouse.move(box['x'] + 200, box['y'] + 200)
     page.mouse.wheel(0, -400)
-    settle(page)
-    near = pixels(page)
-    page.locator('#colouring').select_option('normal', force=True)
-    settle(page)
-    by_normal = pixels(page)
 
-    assert num_coloured(near) > 1.1 * num_coloured(far)
-    # up is (0.5, 0.5, 1) in the colours of normals: blue is the strongest
-    drawn = np.ptp(by_normal, axis=2) > 0.1
-    assert (by_normal[drawn].argmax(axis=1) == 2).mean() > 0.95
+    def is_nearer(image):
+        return num_coloured(image) > 1.1 * num_coloured(far)
+
+    assert is_nearer(picture_when(page, is_nearer))
+
+    def is_blue(image):  # up is (0.5, 0.5, 1) in the colours of normals
+        drawn = np.ptp(image, axis=2) > 0.1
+        return (image[drawn].argmax(axis=1) == 2).mean() > 0.95
+
+    page.locator('#colouring').select_option('normal', force=True)
+    assert is_blue(picture_when(page, is_blue))
     assert complaints == []
 
 
 def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):
     report(tmp_path, plane(30), layers={'mesh': sphere(40, 3.0, (7.5, 7.5, 5.0))})
-    complaints, page = [], browser.new_page(viewport={'width': 900, 'height': 800})
+    complaints, page = [], new_page(browser)
     page.on('console', lambda message: complaints.append(message.text))
     page.on('pageerror', lambda error: complaints.append(str(error)))
     page.goto((tmp_path / 'report.html').as_uri())
     page.locator('#shown').select_option('mesh')
-    settle(page)
-    image = pixels(page)
-    red = (image[..., 0] > 0.3) & (image[..., 1:].max(axis=2) < 0.05)
-    blue = (image[..., 2] > 0.3) & (image[..., :2].max(axis=2) < 0.05)
-    # seen from above, more of the upper half
-    assert red.sum() > blue.sum() > 500
-    assert np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean()
+
+    def is_red_above_blue(image):
+        red = (image[..., 0] > 0.3) & (image[..., 1:].max(axis=2) < 0.05)
+        blue = (image[..., 2] > 0.3) & (image[..., :2].max(axis=2) < 0.05)
+        # seen from above, more of the upper half
+        is_more = red.sum() > blue.sum() > 500
+        return is_more and np.nonzero(red)[0].mean() < np.nonzero(blue)[0].mean()
+
+    assert is_red_above_blue(picture_when(page, is_red_above_blue))
     assert not page.locator('#colouring').is_visible()
     assert complaints == []
     page.close()
@@ -141,7 +167,7 @@ def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):
 
 def test_without_webgl_the_page_says_so(browser, tmp_path):
     report(tmp_path, plane(3))
-    page = browser.new_page()
+    page = new_page(browser)
     page.add_init_script('HTMLCanvasElement.prototype.getContext = () => null')
     errors = []
     page.on('pageerror', lambda error: errors.append(str(error)))

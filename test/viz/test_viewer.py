@@ -22,7 +22,7 @@ ENTITIES = ('/map/surfels', '/map/changed', '/map/trajectory', '/map/window', '/
 
 def rerun(*arguments):
     command = [sys.executable, '-m', 'rerun', 'rrd', *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+    return subprocess.run(command, capture_output=True, text=True)
 
 
 def test_a_replay_is_recorded_with_scans_surfels_trajectory_and_window(tmp_path):
