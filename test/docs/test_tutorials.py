@@ -24,7 +24,7 @@ from surfel_mapper import Scan, SurfelMap
 
 ROOT = Path(__file__).parents[2]
 TUTORIALS = ROOT / 'docs' / 'tutorials'
-OPTIONS = doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL
+OPTIONS = doctest.ELLIPSIS
 
 
 def blocks(name, language):
