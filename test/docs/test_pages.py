@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 import re
 
 import pytest
@@ -15,11 +16,17 @@ from test.settings import README, ROOT
 
 DOCS = ROOT / 'docs'
 PAGES = sorted(DOCS.rglob('*.md'))
-TEXTS = [README, ROOT / 'CONTRIBUTING.md', *PAGES]
+TEXTS = [README, ROOT / 'CONTRIBUTING.md', ROOT / 'SECURITY.md', *PAGES]
 
 
 def without_code(text):
     return re.sub(r'```.*?```|`[^`\n]*`', '', text, flags=re.DOTALL)
+
+
+def everything(*patterns):
+    """Return the texts of files of the repository, one behind the other."""
+    paths = (path for pattern in patterns for path in sorted(ROOT.glob(pattern)))
+    return ''.join(path.read_text(encoding='utf-8') for path in paths)
 
 
 def anchors(path):
@@ -58,9 +65,23 @@ def test_every_link_leads_to_a_file_and_heading_that_are_there(path):
 
 
 def test_the_reference_has_every_public_name():
-    pages = ''.join(path.read_text(encoding='utf-8') for path in DOCS.glob('api/*.md'))
-    described = {line.rpartition('.')[2] for line in re.findall(r'^::: (\S+)', pages, re.M)}
+    pages = re.findall(r'^::: (\S+)', everything('docs/api/*.md'), re.MULTILINE)
+    described = {line.rpartition('.')[2] for line in pages}
     assert set(surfel_mapper.__all__) - {'__version__'} <= described
+
+
+def test_the_reference_has_every_name_that_pages_and_examples_import():
+    described = set(re.findall(r'^::: (\S+)', everything('docs/api/*.md'), re.MULTILINE))
+    described.add('surfel_mapper.config')  # by the page of settings
+    missing = set()
+    texts = everything('docs/*.md', 'docs/tutorials/*.md', 'examples/*.py', 'README.md')
+    for module, names in re.findall(r'from (surfel_mapper\.[\w.]+) import ([\w, ]+)', texts):
+        for name in names.split(','):
+            thing = getattr(import_module(module), name.strip())
+            home = getattr(thing, '__module__', module)  # constants do not know theirs
+            if not {module, home, f'{home}.{name.strip()}'} & described:
+                missing.add(f'{home}.{name.strip()}')
+    assert missing == set()
 
 
 def test_the_readme_names_every_verb():
