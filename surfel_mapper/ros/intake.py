@@ -16,7 +16,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import copy
+import math
 import threading
+import time
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -38,6 +40,9 @@ OVERRIDABLE = (
     QoSPolicyKind.DURABILITY,
 )
 """What a user may set of a subscription, in ``qos_overrides``."""
+
+LAST_S = 1.0
+"""What has arrived is taken before the end, but no longer than this where more keeps coming."""
 
 
 class KeptFromExecutor(ReentrantCallbackGroup):
@@ -68,7 +73,7 @@ class Intake:
         self._group = KeptFromExecutor()
         self._eager: list[Subscription] = []
         self._others: list[Subscription] = []
-        self._stopping = False
+        self._end_s = math.inf
         self._thread: threading.Thread | None = None
 
     def subscribe(
@@ -123,15 +128,15 @@ class Intake:
 
     def start(self) -> None:
         """Take messages from now on."""
-        self._stopping = False
+        self._end_s = math.inf
         self._stop = GuardCondition(None, None, context=self._node.context)
         self._thread = threading.Thread(target=self._run, name='intake', daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Take no more, and destroy the subscriptions."""
+        """Take what has arrived and no more, and destroy the subscriptions."""
         if self._thread is not None:
-            self._stopping = True
+            self._end_s = time.monotonic() + LAST_S
             self._stop.trigger()
             self._thread.join()
             self._stop.destroy()
@@ -143,7 +148,7 @@ class Intake:
 
     def _run(self) -> None:
         try:
-            while not self._stopping:
+            while self._end_s == math.inf:
                 self._wait()
                 while self._take_turn():
                     pass
@@ -180,7 +185,7 @@ class Intake:
 
     def _take(self, subscription: Subscription) -> bool:
         """Take a message and call the callback; return whether there was one."""
-        if self._stopping:
+        if time.monotonic() > self._end_s:
             return False
         taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
         if taken is None:

@@ -10,15 +10,14 @@ import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Int32, String
 
 from surfel_mapper.ros.intake import Intake
-from test.ros.live import cloud, odometry, RELIABLE, room, START_NS
-
-pytestmark = pytest.mark.timeout(120)
+from test.ros.live import cloud, odometry, RELIABLE, room, START_NS, TIMEOUT_S
 
 ARGUMENTS = (
     '--ros-args',
@@ -95,10 +94,9 @@ def published(peer, topic, kind, values, qos=ALL):
     """Publish messages to somebody who has subscribed."""
     publisher = peer.node.create_publisher(kind, topic, qos)
     peer.spin_until(publisher.get_subscription_count)
-    peer.spin_for(0.3)
     for value in values:
         publisher.publish(kind(data=value))
-    peer.spin_for(0.3)
+    assert publisher.wait_for_all_acked(Duration(seconds=TIMEOUT_S))
 
 
 def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
@@ -139,6 +137,44 @@ def test_an_error_of_a_callback_ends_the_thread_and_is_handed_on(peer, bench):
 
     peer.spin_until(lambda: bench.failures)
     assert bench.failures == [error]
+
+
+def test_what_has_arrived_is_taken_before_the_end(peer, bench):
+    busy, released = threading.Event(), threading.Event()
+
+    def take(message):
+        busy.set()
+        released.wait(TIMEOUT_S)
+        bench.take(message)
+
+    bench.intake.subscribe(String, 'others', take, ALL)
+    bench.intake.start()
+    published(peer, 'others', String, ['a', 'b', 'c'])
+    assert busy.wait(TIMEOUT_S)
+    stopping = threading.Thread(target=bench.intake.stop)
+    stopping.start()
+    stopping.join(0.2)  # it waits for the callback by now
+    released.set()
+    stopping.join(TIMEOUT_S)
+    assert bench.taken == ['a', 'b', 'c']
+
+
+def test_it_can_be_stopped_while_messages_keep_coming(peer, bench, monkeypatch):
+    monkeypatch.setattr('surfel_mapper.ros.intake.LAST_S', 0.1)
+    publisher = peer.node.create_publisher(String, 'others', ALL)
+
+    def answer_with_another(message):
+        bench.take(message)
+        publisher.publish(message)
+
+    bench.intake.subscribe(String, 'others', answer_with_another, ALL)
+    bench.intake.start()
+    published(peer, 'others', String, ['a'])
+    peer.spin_until(lambda: len(bench.taken) > 10)
+    stopping = threading.Thread(target=bench.intake.stop, daemon=True)
+    stopping.start()
+    stopping.join(TIMEOUT_S)
+    assert not stopping.is_alive()
 
 
 def test_it_can_be_stopped_at_any_time_and_started_again(peer, bench):
