@@ -216,7 +216,7 @@ class Mapper:
         if self._posed.first is not None:
             self._inserter.begin(*self._posed.first)
 
-    def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> None:
+    def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """
         Go on from a pose of the robot that somebody states, with registration; else warn.
 
@@ -228,6 +228,11 @@ class Mapper:
             Position of the base, or of the sensor where it is not known how it sits on a base.
         q_xyzw : (4,) float
             Its orientation.
+
+        Returns
+        -------
+        bool
+            Whether it goes on from there.
 
         """
         if self.registered is None:
@@ -241,8 +246,9 @@ class Mapper:
                 reason = str(error)
             else:
                 self.registered.restart(compose(inverse(self.T_map_fixed), T_map_body))
-                return
+                return True
         self._drops.message('initial_pose', f'initial pose ignored: {reason}')
+        return False
 
     def finish(self) -> None:
         """End the input: what still waits for a pose is dropped and counted."""

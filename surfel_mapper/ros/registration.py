@@ -70,6 +70,7 @@ class RegistrationOutputs:
         self._mapper = mapper
         self._registered = registered
         self._thread = thread
+        self._log = node.get_logger()
         self._odometry = node.create_publisher(Odometry, '~/odometry', 10)
         self._track = node.create_publisher(Path, '~/track', LATCHED)
         self._transforms: Any = None
@@ -83,7 +84,7 @@ class RegistrationOutputs:
         try:
             self._message = transform_message()
         except DependencyError as error:
-            node.get_logger().warning(
+            self._log.warning(
                 'registration.publish_tf: the transform from '
                 f'{mapper.config.frames.fixed} is not published, ~/odometry is: {error}'
             )
@@ -124,14 +125,14 @@ class RegistrationOutputs:
 
     def _on_initial_pose(self, msg: PoseWithCovarianceStamped) -> None:
         """Have the mapper go on from a pose that somebody states; called by the executor."""
+        self._thread.call(partial(self._start_from, msg))
+
+    def _start_from(self, msg: PoseWithCovarianceStamped) -> None:
+        """Go on from a pose, and say so; called in the mapping thread."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        start = partial(
-            self._mapper.start_from,
-            msg.header.frame_id,
-            (p.x, p.y, p.z),
-            (q.x, q.y, q.z, q.w),
-        )
-        self._thread.call(start)
+        xyz, xyzw = (p.x, p.y, p.z), (q.x, q.y, q.z, q.w)
+        if self._mapper.start_from(msg.header.frame_id, xyz, xyzw):
+            self._log.info(f'goes on from the initial pose at ({p.x:.2f}, {p.y:.2f}, {p.z:.2f})')
 
 
 def covariance(information: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
