@@ -212,7 +212,8 @@ class Player:
 
     def flush(self) -> None:
         """Wait until those who subscribe reliably have everything."""
-        for name, publisher in self._publishers.items():
+        clock = {'/clock': self._clock} if self._clock is not None else {}
+        for name, publisher in {**self._publishers, **clock}.items():
             if not publisher.wait_for_all_acked(Duration(seconds=5)):
                 log.warning('%s: a subscriber has not confirmed all messages after 5 s', name)
         time.sleep(SETTLE_S)
