@@ -87,7 +87,6 @@ def test_the_digest_is_that_of_python_integers():
     assert reference.digest(moments, 0.5) == DIGEST
 
 
-@pytest.mark.timeout(200)
 @pytest.mark.parametrize(
     'how',
     [

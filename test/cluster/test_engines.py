@@ -16,8 +16,6 @@ from test.cluster.bags import in_one_go, shards_of, written
 
 distributed = pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
 
-pytestmark = pytest.mark.timeout(180)
-
 
 def squared(number):
     return number * number

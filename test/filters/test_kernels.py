@@ -43,7 +43,6 @@ for chain in CHAINS:
 """
 
 
-@pytest.mark.timeout(200)
 def test_filters_give_the_same_to_the_bit_without_the_compiler():
     text = printed_alike(SHORT_CHAINS)
     assert len(text.splitlines()) == 20

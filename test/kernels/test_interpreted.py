@@ -39,7 +39,6 @@ except ValueError as error:
 """
 
 
-@pytest.mark.timeout(200)
 def test_a_map_is_the_same_to_the_bit_without_the_compiler():
     text = printed_alike(SHORT_MAPPING)
     assert 'does not hold' in text

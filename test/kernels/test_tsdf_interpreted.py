@@ -54,7 +54,6 @@ np.savez(sys.argv[1], *found)
 """
 
 
-@pytest.mark.timeout(200)
 def test_a_field_is_the_same_without_the_compiler(tmp_path):
     # The compiler may round once where numpy rounds twice.
     assert len(saved_alike(SHORT_FUSING, tmp_path, rtol=1e-5, atol=1e-5)) == 32

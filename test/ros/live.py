@@ -14,31 +14,37 @@ import sys
 import time
 
 from diagnostic_msgs.msg import DiagnosticArray
+from lifecycle_msgs.srv import GetState
 from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.parameter_client import AsyncParameterClient
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).parents[2]
-TIMEOUT_S = 60.0
-SETTLE_S = 0.3
-"""A server answers nobody whom it has not discovered yet, though he knows it."""
+TIMEOUT_S = 120.0
+"""Of what takes a second on an idle machine."""
 
+RETRY_S = 1.0
 START_NS = 1_700_000_000_000_000_000
 NODE = '/surfel_mapper'
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RVIZ = QoSProfile(depth=10)
-SENSOR = QoSProfile(depth=50, reliability=ReliabilityPolicy.BEST_EFFORT)
+ALL = QoSProfile(depth=1000)
+"""Reliable, with room for whatever a test is sent: nothing is lost."""
 
-RELIABLE = [
-    *('-p', 'qos_overrides./points.subscription.reliability:=reliable'),
-    *('-p', 'qos_overrides./odom.subscription.reliability:=reliable'),
-]
+
+def reliably(*topics):
+    """Return the arguments of a node that loses nothing of these topics."""
+    names = [f'qos_overrides.{topic}.subscription.reliability' for topic in topics]
+    return [item for name in names for item in ('-p', f'{name}:=reliable')]
+
+
+RELIABLE = reliably('/points', '/odom')
 
 
 class Process:
@@ -113,45 +119,75 @@ class Peer:
         end = time.monotonic() + seconds
         self.spin_until(lambda: time.monotonic() > end)
 
+    def meet(self, name=NODE):
+        """
+        Return when a node knows all publishers and subscribers that there are here by now.
+
+        A publisher or client that knows a node is not known to it yet: a server answers nobody
+        whom it has not discovered, a best-effort subscriber misses what comes before. What is
+        made here is announced in that order, the two ends of a client last; so a node that
+        answers a new client has heard of everything before it.
+        """
+        client = self.node.create_client(GetState, f'{name}/get_state')
+        answers, asked_s = [], [-RETRY_S]
+
+        def is_answered():
+            if client.service_is_ready() and time.monotonic() - asked_s[0] > RETRY_S:
+                answers.append(client.call_async(GetState.Request()))
+                asked_s[0] = time.monotonic()
+            return any(answer.done() for answer in answers)
+
+        self.spin_until(is_answered, what=lambda: f'{name} does not answer')
+        self.node.destroy_client(client)
+
     def advertise(self, *topics, depth=50, kinds=None):
         """Publish clouds on topics of points and odometry on others, once they are read."""
         for topic in topics:
             kind = Odometry if topic.endswith('odom') else PointCloud2
             kind = (kinds or {}).get(topic, kind)
             self._publishers[topic] = self.node.create_publisher(kind, topic, depth)
+        self.wait_until_read(*topics)
+
+    def wait_until_read(self, *topics):
+        """Return when the node reads what is published on topics that are advertised."""
         self.spin_until(
             lambda: all(self._publishers[t].get_subscription_count() for t in topics)
         )
-        self.spin_for(0.5)  # the other side needs to know of us too
+        self.meet()
 
     def publish(self, topic, message):
         self._publishers[topic].publish(message)
 
-    def subscribe(self, kind, topic, qos=SENSOR):
+    def subscribe(self, kind, topic, qos=ALL):
         """Return a list that fills with the messages of a topic."""
         messages = []
         self.node.create_subscription(kind, topic, messages.append, qos)
         return messages
 
-    def collect(self, kind, topic, qos=SENSOR):
-        """Return the same once somebody publishes them."""
+    def collect(self, kind, topic, qos=ALL):
+        """Return the same once the node publishes them, and to us too."""
         messages = self.subscribe(kind, topic, qos)
         self.spin_until(lambda: self.node.count_publishers(topic) > 0)
+        self.meet()
         return messages
 
     def call(self, service, kind=Trigger, request=None):
-        client = self.node.create_client(kind, f'{NODE}/{service}')
-        self.spin_until(client.service_is_ready)
-        self.spin_for(SETTLE_S)
-        future = client.call_async(request or kind.Request())
-        self.spin_until(future.done)
+        client = self.client(kind, service)
+        answer = self.result(client.call_async(request or kind.Request()))
         self.node.destroy_client(client)
-        return future.result()
+        return answer
+
+    def client(self, kind, service):
+        """Return a client of a service of the node, which answers it."""
+        client = self.node.create_client(kind, f'{NODE}/{service}')
+        self.meet()
+        self.spin_until(client.service_is_ready)
+        return client
 
     def parameters(self):
         client = AsyncParameterClient(self.node, NODE)
+        self.meet()
         self.spin_until(client.services_are_ready)
-        self.spin_for(SETTLE_S)
         return client
 
     def result(self, future):
@@ -160,8 +196,10 @@ class Peer:
 
     def diagnosis(self, expected=None):
         """Return the first report that holds some values, as (status, values)."""
-        reports = self.collect(DiagnosticArray, '/diagnostics')
-        values = {}
+        reports, values = [], {}
+        listening = self.node.create_subscription(
+            DiagnosticArray, '/diagnostics', reports.append, ALL
+        )
 
         def is_as_expected():
             if reports:
@@ -171,6 +209,7 @@ class Peer:
             )
 
         self.spin_until(is_as_expected, what=lambda: f'no {expected}, but {values}')
+        self.node.destroy_subscription(listening)
         return reports[-1].status[0], values
 
 

@@ -21,8 +21,6 @@ from surfel_mapper.pipeline import Mapper
 from test.alignment.street import drifted, relative_errors, street_scans
 from test.ros.live import cloud, LATCHED, odometry, RELIABLE
 
-pytestmark = pytest.mark.timeout(120)
-
 NUM_SCANS = 4
 SETTINGS = {
     'pose.source': 'odometry',

@@ -193,8 +193,7 @@ def test_a_map_that_cannot_be_loaded_is_answered_with_why_and_nothing_changes(
 
 def test_several_requests_at_a_time_are_answered_and_clouds_taken_meanwhile(peer, node):
     feed(peer, 1)
-    client = peer.node.create_client(Trigger, f'{NODE}/save_map')
-    peer.spin_until(client.service_is_ready)
+    client = peer.client(Trigger, 'save_map')
     answers = [client.call_async(Trigger.Request()) for _ in range(8)]
     for points, pose in drive(4)[1:]:
         send(peer, [(points, pose)])

@@ -31,7 +31,7 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.viz.history import History
 from test.ros.driving import ARGUMENTS, drive, send
 from test.ros.fault_table import fault
-from test.ros.live import NODE, node_and_peer, ROOT
+from test.ros.live import node_and_peer, ROOT
 
 
 def mapper_of(num_scans, folder):
@@ -246,8 +246,7 @@ def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
     node, peer, maps = running
     pointed(maps, tmp_path)
     pid = node._process.pid
-    client = peer.node.create_client(Trigger, f'{NODE}/save_map')
-    peer.spin_until(client.service_is_ready)
+    client = peer.client(Trigger, 'save_map')
     assert peer.result(client.call_async(Trigger.Request())).success
     reports = peer.collect(DiagnosticArray, '/diagnostics')
     peer.spin_until(lambda: reports)

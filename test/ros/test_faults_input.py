@@ -279,14 +279,15 @@ def test_a_burst_is_mapped_as_far_as_it_goes(stream):
     lost='nothing in the map; that subscriber misses messages',
 )
 def test_a_subscriber_that_is_slow_holds_nobody_up(stream):
-    asleep = Peer()  # nobody spins it
+    asleep = Peer()  # nobody spins it later
     try:
         for topic in ('normals', 'changed'):
             asleep.subscribe(PointCloud2, f'{NODE}/{topic}', QoSProfile(depth=1))
-        stream.peer.spin_for(0.5)
-        for _ in range(30):
-            stream.pair(num=4000)
-        stream.wait(scans__mapped=30)
+        asleep.meet()
+        for number in range(10, 40, 10):  # fewer than the node lets wait
+            for _ in range(10):
+                stream.pair(num=4000)
+            stream.wait(scans__mapped=number)
     finally:
         asleep.close()
 

@@ -27,9 +27,7 @@ from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.shared_memory import OWN_SETTINGS
 from surfel_mapper.simulation import Lidar, Simulation, World
-from test.ros.live import cloud, odometry, RELIABLE, room, stamp, START_NS
-
-pytestmark = pytest.mark.timeout(120)
+from test.ros.live import cloud, odometry, RELIABLE, reliably, room, stamp, START_NS
 
 PERIOD_NS = 100_000_000
 RELIABLE_QOS = QoSProfile(depth=50)
@@ -74,11 +72,7 @@ def test_several_lidars_are_mapped_each_where_it_is_mounted(start, peer):
         'frames.sensors': ['front', 'rear'],
         'frames.base_to_sensor': [*FRONT, *REAR],
     }
-    reliable = [
-        *('-p', 'qos_overrides./front/points.subscription.reliability:=reliable'),
-        *('-p', 'qos_overrides./rear/points.subscription.reliability:=reliable'),
-        *('-p', 'qos_overrides./odom.subscription.reliability:=reliable'),
-    ]
+    reliable = reliably('/front/points', '/rear/points', '/odom')
     node = start('node', *arguments(reliable, **settings))
     peer.advertise('/odom', '/front/points', '/rear/points')
     clouds, poses = [], []
@@ -98,13 +92,13 @@ def test_several_lidars_are_mapped_each_where_it_is_mounted(start, peer):
 
 
 def test_reliable_and_best_effort_publishers_are_heard_alike_and_after_a_restart(start, peer):
-    node = start('node', *arguments([]))
+    node = start('node', *arguments(reliably('/odom')))
     peer.advertise('/odom')
     number = 0
     for qos in (RELIABLE_QOS, BEST_EFFORT, RELIABLE_QOS):
         publisher = peer.node.create_publisher(PointCloud2, '/points', qos)
         peer.spin_until(publisher.get_subscription_count)
-        peer.spin_for(0.5)
+        peer.meet()
         for _ in range(2):
             stamp_ns = START_NS + number * PERIOD_NS
             peer.publish('/odom', odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
@@ -133,13 +127,12 @@ def camera_info(camera):
 @pytest.mark.parametrize('encoding', ['16UC1', '32FC1'])
 def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
     settings = {'input.kind': 'depth', 'frames.base_to_sensor': OPTICAL}
+    image, info = '/camera/depth/image_raw', '/camera/depth/camera_info'
     node = start(
         'node',
-        *arguments([], **settings),
-        *('-r', 'depth/image:=/camera/depth/image_raw'),
-        *('-p', 'qos_overrides./camera/depth/image_raw.subscription.reliability:=reliable'),
+        *arguments(reliably('/odom', image, info), **settings),
+        *('-r', f'depth/image:={image}'),
     )
-    image, info = '/camera/depth/image_raw', '/camera/depth/camera_info'
     peer.advertise('/odom', image, info, kinds={image: Image, info: CameraInfo})
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     dtype = np.uint16 if encoding == '16UC1' else np.float32
@@ -258,11 +251,13 @@ def test_large_clouds_that_get_lost_are_noticed_and_the_remedy_named(start, peer
         lambda report: warned.append('clouds lost on the way' in report.status[0].message),
         10,
     )
-    for number in range(100):
-        publisher.publish(cloud(START_NS + number * PERIOD_NS, points))
+    num_sent = 0
+    while num_sent < 100 and not any(warned):
+        publisher.publish(cloud(START_NS + num_sent * PERIOD_NS, points))
+        num_sent += 1
         peer.spin_for(0.05)
-        if any(warned):
-            break
+    if not any(warned) and int(peer.diagnosis()[1]['scans.received']) == num_sent:
+        pytest.skip('the middleware of this machine loses none')
     assert any(warned), node.output
     assert 'fastdds_shm.xml' in node.output
 

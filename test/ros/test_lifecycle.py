@@ -64,8 +64,7 @@ def test_a_node_is_configured_activated_and_back_as_it_is_told(start, peer):
     assert (values['scans.received'], values['window_scans']) == ('2', '2')
 
     assert transit(peer, 'activate')
-    peer.spin_until(lambda: peer.node.count_subscribers('/points') == 1)
-    peer.spin_for(0.5)
+    peer.wait_until_read('/odom', '/points')
     send(peer, messages[3:])
     _, values = peer.diagnosis({'state': 'active', 'scans.mapped': 3})
     assert values['window_scans'] == '3'

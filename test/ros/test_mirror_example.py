@@ -16,8 +16,6 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.io.map_state import load_map
 from test.ros.live import Peer, ROOT
 
-pytestmark = pytest.mark.timeout(180)
-
 EXAMPLES = ROOT / 'examples'
 
 

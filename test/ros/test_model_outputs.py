@@ -27,8 +27,6 @@ from surfel_mapper.io.pose_messages import poses_in
 from surfel_mapper.models.multi_model import Surface
 from test.ros.live import cloud, LATCHED, NODE, odometry, RELIABLE, RVIZ, START_NS
 
-pytestmark = pytest.mark.timeout(180)
-
 ALL_OUTLINES = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SETTINGS = {
     'pose.source': 'odometry',
@@ -149,7 +147,16 @@ def wait_for(peer, found, stamp_ns, names=TOPICS):
         lambda: len(stamps()) == len(names) and min(stamps().values()) >= stamp_ns,
         what=lambda: f'{stamps()}, expected {stamp_ns}',
     )
-    peer.spin_for(0.5)
+
+
+def wait_for_outlines(peer, found, ids):
+    """Spin until the outlines are those of some models: each comes as a message of its own."""
+    peer.spin_until(
+        lambda: sorted(outlines_in(found['outlines'])) == ids,
+        what=lambda: f'{sorted(outlines_in(found["outlines"]))}, expected {ids}',
+    )
+    peer.call('publish_normals')  # answered behind all that is published of the last scan
+    peer.spin_for(0.3)
 
 
 def outlines_in(messages):
@@ -166,7 +173,6 @@ def outlines_in(messages):
 def test_what_is_published_is_what_a_mapper_without_ros_finds(start, peer):
     start_node(start, peer)
     found = collect(peer)
-    peer.spin_for(0.5)
     messages = drive(True, True, True)
     send(peer, messages)
     wait_for(peer, found, START_NS + 2 * PERIOD_NS)
@@ -175,6 +181,7 @@ def test_what_is_published_is_what_a_mapper_without_ros_finds(start, peer):
     assert len(model.planes) >= 2
     assert model.surfaces
     assert len(model.gaussians)
+    wait_for_outlines(peer, found, sorted(patch.id for patch in model.patches))
 
     check_primitives(to_scan(found['primitives'][-1]), model, models.versions)
     check_picture(Picture(found['planes']), model)
@@ -257,13 +264,12 @@ def check_surfels(rows, models):
 def test_what_is_no_more_is_deleted(start, peer):
     start_node(start, peer)
     found = collect(peer)
-    peer.spin_for(0.5)
     messages = drive(True, True, False, False)
     send(peer, messages[:2])
     wait_for(peer, found, START_NS + PERIOD_NS)
     (wall,) = [p.id for p in models_of(messages[:2]).model.planes if abs(p.normal[1]) > 0.9]
     assert wall in Picture(found['planes']).ids('planes')
-    assert wall in outlines_in(found['outlines'])
+    peer.spin_until(lambda: wall in outlines_in(found['outlines']))
     send(peer, messages[2:])  # and the two with the wall leave the window
     wait_for(peer, found, START_NS + 3 * PERIOD_NS, ('planes', 'primitives'))
     left = sorted(patch.id for patch in models_of(messages).model.patches)
@@ -271,7 +277,7 @@ def test_what_is_no_more_is_deleted(start, peer):
     picture = Picture(found['planes'])
     assert sorted(picture.ids('planes') + picture.ids('surfaces')) == left
     assert picture.ids('outlines') == picture.ids('ids') == left
-    assert sorted(outlines_in(found['outlines'])) == left
+    wait_for_outlines(peer, found, left)
     assert wall not in to_scan(found['primitives'][-1]).columns['id']
     peer.call('clear')
     peer.spin_until(lambda: not Picture(found['planes']).shown)
@@ -291,21 +297,19 @@ def test_who_comes_late_gets_everything_without_another_scan(start, peer, qos):
         wait_for(peer, found, START_NS + PERIOD_NS)
         picture = Picture(found['planes'])
         assert sorted(picture.ids('planes') + picture.ids('surfaces')) == expected
-        assert sorted(outlines_in(found['outlines'])) == expected
+        wait_for_outlines(peer, found, expected)
         assert expected == to_scan(found['primitives'][-1]).columns['id'][: len(expected)].tolist()
 
 
 def test_a_late_reader_does_not_learn_of_outlines_that_went_while_nobody_read(start, peer):
     start_node(start, peer)
     first = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
-    peer.spin_for(0.5)
     messages = drive(True, True, False, False)
     send(peer, messages[:2])
     peer.spin_until(lambda: first and stamp_of(first[-1]) == START_NS + PERIOD_NS)
-    peer.spin_for(0.3)
     (subscription,) = [s for s in peer.node.subscriptions if s.topic_name.endswith('outlines')]
     peer.node.destroy_subscription(subscription)
-    peer.spin_for(0.5)
+    peer.meet()
     send(peer, messages[2:])
     peer.diagnosis({'scans.mapped': 4})
     late = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)

@@ -19,12 +19,10 @@ from visualization_msgs.msg import Marker
 from surfel_mapper.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import Lidar
 from test.io.test_compressed_image import packed, packed_depth
-from test.ros.live import cloud, LATCHED, odometry, stamp, START_NS
+from test.ros.live import cloud, LATCHED, odometry, reliably, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
 from test.ros.test_node import PERIOD_NS
 from test.ros.test_outputs import BASE, start_node
-
-pytestmark = pytest.mark.timeout(120)
 
 RADIUS_M = 5.0
 SETTINGS = {
@@ -79,8 +77,8 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
         'layers.tsdf.color': 'true',
         'layers.tsdf.color_topic': '/rgb/image',
     }
-    start('node', *arguments([], **settings))
     kinds = {'/depth/image': Image, '/depth/camera_info': CameraInfo, '/rgb/image': Image}
+    start('node', *arguments(reliably('/odom', *kinds), **settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
     meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
@@ -107,8 +105,8 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
         'layers.tsdf.color': 'true',
         'layers.tsdf.color_topic': color_topic,
     }
-    start('node', *arguments([], **settings))
     kinds = {depth_topic: CompressedImage, info: CameraInfo, color_topic: CompressedImage}
+    start('node', *arguments(reliably('/odom', *kinds), **settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
     meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
