@@ -138,16 +138,25 @@ class Tracker:
         if not (is_steady and self._registration.fits(found)):
             self._forget()
             self.twist = 0.5 * self.twist  # it is not what it was; in the end, at rest
-            config = self._registration.config
-            raise AlignmentError(
-                f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
-                f'{found.fit:.0%} of these fit it, expected {config.min_overlap_ratio:.0%} and '
-                f'{config.min_fit_ratio:.0%} (registration.min_overlap_ratio, min_fit_ratio)'
-            )
+            raise AlignmentError(self._refusal(found))
         self._supports.append(found.support)
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
         return found
+
+    def _refusal(self, found: Alignment) -> str:
+        """Return why a scan was not followed."""
+        config = self._registration.config
+        said = (
+            f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
+            f'{found.fit:.0%} of these fit it'
+        )
+        if self._registration.fits(found):
+            return f'{said}, but its pose has not settled (registration.max_iterations)'
+        return (
+            f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%} '
+            '(registration.min_overlap_ratio, min_fit_ratio)'
+        )
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """

@@ -71,6 +71,13 @@ def test_however_good_predictions_are_noise_is_expected():
     assert tracker.deviation_m == pytest.approx(3.0 * NOISE_M)
 
 
+def test_a_scan_that_fits_and_has_not_settled_is_refused_for_that():
+    tracker = tracker_at(pose_at(0.2), max_iterations=1, coarse_levels=0)
+
+    with pytest.raises(AlignmentError, match=r'fit it, but its pose has not settled'):
+        tracker.track(cells_at(tracker, pose_at(0.3)), SECOND, map_of(ROOM), np.eye(4))
+
+
 def test_a_sensor_is_followed_through_a_room():
     tracker = tracker_at(TRUE)
     for k in range(1, 8):
