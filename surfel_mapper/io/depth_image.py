@@ -21,7 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.depth import depth_points, free_rays, PinholeCamera
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.io.compressed_image import base_topic, unpacked
-from surfel_mapper.io.pointcloud2 import checked_stamp_ns
+from surfel_mapper.io.pointcloud2 import bytes_of, checked_stamp_ns
 from surfel_mapper.scan import Scan
 
 ENCODINGS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
@@ -187,12 +187,7 @@ def pixels_in(msg: Any, topic: str, type_: str, channels: int = 1) -> npt.NDArra
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     dtype = np.dtype(('>' if msg.is_bigendian else '<') + type_)
     pixel_bytes = channels * dtype.itemsize
-    try:
-        data = np.frombuffer(msg.data, np.uint8)
-    except (TypeError, ValueError, BufferError) as error:
-        raise CloudFormatError(
-            f'{topic}: data is a {type(msg.data).__name__}, expected a buffer of bytes: {error}'
-        ) from error
+    data = bytes_of(msg, topic)
     if step < width * pixel_bytes or len(data) != step * height:
         raise CloudFormatError(
             f'{topic}: {len(data)} bytes in rows of {step}, expected height {height} rows of '

@@ -117,14 +117,19 @@ def checked_stamp_ns(stamp: Any, topic: str) -> int:
     return sec * 10**9 + nanosec
 
 
-def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
-    """Return the bytes of a message, or refuse sizes that do not agree."""
+def bytes_of(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
+    """Return what a message holds as data, or refuse what is no buffer of bytes."""
     try:
-        data = np.frombuffer(msg.data, np.uint8)
+        return np.frombuffer(msg.data, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
         raise CloudFormatError(
             f'{topic}: data is a {type(msg.data).__name__}, expected a buffer of bytes: {error}'
         ) from error
+
+
+def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
+    """Return the bytes of a message, or refuse sizes that do not agree."""
+    data = bytes_of(msg, topic)
     height, width, point_step = int(msg.height), int(msg.width), int(msg.point_step)
     row_step = int(msg.row_step)
     if len(data) != row_step * height:

@@ -19,7 +19,6 @@ from collections.abc import Iterator
 import json
 import os
 from pathlib import Path
-import shutil
 import subprocess
 import tempfile
 from time import perf_counter
@@ -33,6 +32,7 @@ from surfel_mapper.scan import Scan
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import OPEN3D, PeerSpec
+from test.bench.peers.pcl import compiled
 from test.bench.peers.run import environment, output, PeerError
 from test.bench.report import Row
 from test.bench.street import Street
@@ -67,9 +67,7 @@ CHAINS: dict[str, tuple[Any, float | None]] = {
 STATED = {'libpointmatcher': 13.6, 'PCL VoxelGrid': 30.8, 'PCL ApproximateVoxelGrid': 58.0}
 """Mpt/s of others as stated for one real scan, 0.5 m voxels, one core."""
 
-SOURCE = Path(__file__).with_name('peers') / 'pcl_voxel_grid.cpp'
-INCLUDE = ('/usr/include/pcl-1.13', '/usr/include/eigen3')
-LIBRARIES = ('filters', 'common')
+PCL_LIBRARIES = ('filters', 'common')
 
 REPEATS = 40
 
@@ -78,7 +76,7 @@ Points = npt.NDArray[np.float32]
 
 def run(options: Options) -> list[Row]:
     """Return a row for every filter and scan, and for the voxel grids of others."""
-    program = compiled(options)
+    program = compiled('pcl_voxel_grid', PCL_LIBRARIES, options)
     rows: list[Row] = []
     with one_core():
         for name, points in scans(options):
@@ -142,20 +140,6 @@ def row(name: str, who: str, num_points: int, figures: tuple[float, int]) -> Row
         'least_ms': milliseconds,
         'Mpt_s': num_points / milliseconds * 1e-3,
     }
-
-
-def compiled(options: Options) -> Path | None:
-    """Return the program that times PCL, None where it cannot be compiled."""
-    compiler = shutil.which('g++')
-    if compiler is None:
-        return None
-    target = options.cache / 'pcl_voxel_grid'
-    target.parent.mkdir(parents=True, exist_ok=True)
-    command = [compiler, '-std=c++14', '-O2', '-w', str(SOURCE), '-o', str(target)]
-    command += [f'-I{path}' for path in INCLUDE]
-    command += [f'-lpcl_{name}' for name in LIBRARIES] + ['-Wl,--allow-shlib-undefined']
-    done = subprocess.run(command, capture_output=True, check=False)
-    return target if done.returncode == 0 else None
 
 
 def others(points: Points, program: Path | None) -> Iterator[tuple[str, tuple[float, int]]]:

@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 import os
 from pathlib import Path
-import shutil
 import subprocess
 from time import perf_counter
 
@@ -24,12 +23,10 @@ import numpy as np
 from surfel_mapper.alignment import LUM
 from test.bench.machine import one_core
 from test.bench.options import Options
+from test.bench.peers.pcl import compiled
 from test.bench.report import Row
 
-SOURCE = Path(__file__).with_name('peers') / 'pcl_lum.cpp'
-
-INCLUDE = ('/usr/include/pcl-1.13', '/usr/include/eigen3')
-LIBRARIES = ('registration', 'search', 'kdtree', 'octree', 'common')
+PCL_LIBRARIES = ('registration', 'search', 'kdtree', 'octree', 'common')
 
 REPEATS = 5
 
@@ -72,8 +69,7 @@ CASES = (
 
 def run(options: Options) -> list[Row]:
     """Return a row for every graph."""
-    del options  # nothing here is a scan of the street
-    program = compiled()
+    program = compiled('pcl_lum', PCL_LIBRARIES, options)
     rows: list[Row] = []
     with one_core():
         for case in CASES:
@@ -125,20 +121,6 @@ def ours(case: Case, clouds: np.ndarray) -> tuple[float, float]:
             times.append((perf_counter() - start) * 1e3)
         more.append((times[1] - times[0]) / 2.0)
     return min(compute), min(more)
-
-
-def compiled() -> Path | None:
-    """Return the program that times PCL, None where it cannot be compiled."""
-    compiler = shutil.which('g++')
-    if compiler is None:
-        return None
-    target = Options().cache / 'pcl_lum'
-    target.parent.mkdir(parents=True, exist_ok=True)
-    command = [compiler, '-std=c++14', '-O2', '-w', str(SOURCE), '-o', str(target)]
-    command += [f'-I{path}' for path in INCLUDE]
-    command += [f'-lpcl_{name}' for name in LIBRARIES] + ['-Wl,--allow-shlib-undefined']
-    done = subprocess.run(command, capture_output=True, check=False)
-    return target if done.returncode == 0 else None
 
 
 def pcl(case: Case, clouds: np.ndarray, program: Path | None) -> Row:

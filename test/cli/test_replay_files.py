@@ -4,8 +4,6 @@
 
 import json
 import shutil
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -15,6 +13,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.io.map_state import load_map
 from surfel_mapper.io.parquet import read_map
 from surfel_mapper.io.trajectory import read_trajectory
+from test.cli.small_disk import run_on_small_disk
 from test.io.recorded import (
     cut,
     drive,
@@ -219,36 +218,22 @@ ON_A_SMALL_DISK = """
 import json, sys
 from pathlib import Path
 from surfel_mapper.cli.main import main
+from test.cli.small_disk import filled
 from test.cli.test_replay_files import contents
 
-bag, disk = sys.argv[1], Path(sys.argv[2])
+disk, bag = Path(sys.argv[1]), sys.argv[2]
 for name in sys.argv[3].split(','):
     arguments = ['replay', bag, '--formats', name, '--output', str(disk / name), '--json']
     assert main([*arguments, '--duration', '0.3']) == 0
     before = contents(disk)
-    with open(disk / 'filler', 'wb', buffering=0) as filler:
-        try:
-            while filler.write(bytes(4096)):
-                pass
-        except OSError:
-            pass
-    code = main(arguments)
-    (disk / 'filler').unlink()
+    with filled(disk):
+        code = main(arguments)
     print(json.dumps([name, code, contents(disk) == before]))
 """
 
 
-@pytest.mark.skipif(shutil.which('unshare') is None, reason='no unshare to mount a small disk')
 def test_a_full_disk_leaves_the_earlier_result_whole(bag, tmp_path):
-    (tmp_path / 'disk').mkdir()
-    mounted = 'mount -t tmpfs -o size=8m none "$4" && "$1" -c "$2" "$3" "$4" "$5" || exit 77'
-    arguments = [sys.executable, ON_A_SMALL_DISK, str(bag), str(tmp_path / 'disk'), ALL]
-    command = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c', mounted, 'sh']
-
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
-
-    if 'mount' in done.stderr or 'unshare' in done.stderr:
-        pytest.skip(f'no small disk can be mounted here: {done.stderr.strip()}')
+    done = run_on_small_disk(ON_A_SMALL_DISK, tmp_path, bag, ALL, size='8m')
     found = [json.loads(line) for line in done.stdout.splitlines() if line.startswith('[')]
     assert found == [[name, 1, True] for name in ALL.split(',')], done.stderr
     assert done.stderr.count('cannot be written: No space left on device') == len(found)

@@ -3,9 +3,6 @@
 """``replay`` of several bags or with workers, and ``merge``, make the map of one process."""
 
 import json
-import shutil
-import subprocess
-import sys
 
 import pytest
 
@@ -13,6 +10,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.io.parquet import read_map
 from surfel_mapper.io.parquet_tiles import dataset_digest
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
 from test.io.recorded import cut
 
@@ -172,34 +170,21 @@ import sys
 from pathlib import Path
 from surfel_mapper.cli.main import main
 from surfel_mapper.io.parquet_tiles import dataset_digest
+from test.cli.small_disk import filled
 
-bag, disk = sys.argv[1], Path(sys.argv[2])
+disk, bag = Path(sys.argv[1]), sys.argv[2]
 arguments = ['replay', bag, bag, '--pose-topic', '/tf', '--output', str(disk / 'out'), '--json']
 assert main([*arguments, '--duration', '0.5']) == 0
 before = dataset_digest(disk / 'out' / 'map')
 free = len(list((disk / 'out').iterdir()))
-with open(disk / 'filler', 'wb', buffering=0) as filler:
-    try:
-        while filler.write(bytes(4096)):
-            pass
-    except OSError:
-        pass
-code = main(arguments)
-(disk / 'filler').unlink()
+with filled(disk):
+    code = main(arguments)
 same = dataset_digest(disk / 'out' / 'map') == before
 print('found', code, same, len(list((disk / 'out').iterdir())) == free)
 """
 
 
-@pytest.mark.skipif(shutil.which('unshare') is None, reason='no unshare to mount a small disk')
 def test_a_full_disk_leaves_the_earlier_tiles_whole(bags, tmp_path):
-    mounted = 'mount -t tmpfs -o size=16m none "$4" && "$1" -c "$2" "$3" "$4" || exit 77'
-    arguments = [sys.executable, ON_A_SMALL_DISK, bags[0], str(tmp_path)]
-    command = ['unshare', '--user', '--map-root-user', '--mount', 'sh', '-c', mounted, 'sh']
-
-    done = subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
-
-    if 'mount' in done.stderr or 'unshare' in done.stderr:
-        pytest.skip(f'no small disk can be mounted here: {done.stderr.strip()}')
+    done = run_on_small_disk(ON_A_SMALL_DISK, tmp_path, bags[0], size='16m')
     assert done.stdout.splitlines()[-1] == 'found 1 True True', done.stderr
     assert 'No space left on device' in done.stderr

@@ -17,6 +17,8 @@ VIEW = np.array([0.0, -0.2, 1.5])
 FLOOR, LEFT, BACK, TOP, FRONT, SIDE, CYLINDER, BALL = range(8)
 """What a point of the room lies on: floor, two walls, three faces of the box, and the rest."""
 
+FLAT = (FLOOR, LEFT, BACK, TOP, FRONT, SIDE)
+
 FOCAL_PX = 525.0
 BOX = np.array([[0.5, 1.8, 0.0], [1.1, 2.4, 0.7]])
 AXIS, CYLINDER_RADIUS = np.array([-0.6, 2.3]), 0.35

@@ -17,22 +17,15 @@ from surfel_mapper.models.clusters import clusters_of, folded, surfaces_of
 from surfel_mapper.models.fitting import thin
 from test.models.scenes import (
     A,
-    BACK,
     BALL,
     BALL_RADIUS,
     CENTRE,
     CYLINDER,
-    FLOOR,
-    FRONT,
-    LEFT,
+    FLAT,
     room,
     sheet,
-    SIDE,
-    TOP,
     VIEW,
 )
-
-FLAT = (FLOOR, LEFT, BACK, TOP, FRONT, SIDE)
 
 
 @pytest.fixture(scope='module')

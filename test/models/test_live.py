@@ -26,22 +26,15 @@ from test.models.live_scenes import (
     VOXEL_M,
 )
 from test.models.scenes import (
-    BACK,
     BALL,
     BALL_RADIUS,
     CENTRE,
     CYLINDER,
-    FLOOR,
-    FRONT,
-    LEFT,
+    FLAT,
     room,
     sheet,
-    SIDE,
-    TOP,
     VIEW,
 )
-
-FLAT = (FLOOR, LEFT, BACK, TOP, FRONT, SIDE)
 
 
 @pytest.fixture(scope='module')
