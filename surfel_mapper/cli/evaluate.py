@@ -177,9 +177,15 @@ def true_poses(
 
     from surfel_mapper.io.trajectory import read_trajectory
     from surfel_mapper.simulation import load_simulation
+    from surfel_mapper.simulation.recording import SIMULATION_FILE
 
     if not path.is_dir():
         return poses_of(path, read_trajectory(path))
+    if not (path / SIMULATION_FILE).exists():
+        raise FileFormatError(
+            f'{path}: not a simulated bag, which has a {SIMULATION_FILE}; '
+            'expected one, or a trajectory (TUM, KITTI or CSV)'
+        )
     drive = load_simulation(path).drive
     poses = [drive.T_odom_sensor(int(stamp_ns)) for stamp_ns in stamps_ns]
     return stamps_ns, np.array(poses).reshape(-1, 4, 4)

@@ -31,15 +31,30 @@ def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         for name, done in summary['filters'].items()
     )
     aligned = f'{summary["alignment"]["text"]}\n' if 'alignment' in summary else ''
+    errors = f'{in_a_line(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     speed = summary['recorded_s'] / summary['replay_s']
     return (
         f'scans {scans["received"]}{out if scans["dropped"] else ""}'
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
-        f'{filters}{aligned}'
+        f'{filters}{aligned}{errors}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(str(path) for path in written)}'
+    )
+
+
+def in_a_line(errors: Mapping[str, Any]) -> str:
+    """Return how far poses are from the true ones for people."""
+    absolute, relative = (
+        f'{errors[kind]["translation_m"]["rmse"]:.3f} m, '
+        f'{errors[kind]["rotation_deg"]["rmse"]:.3f} deg'
+        for kind in ('absolute', 'relative')
+    )
+    drift = f'{errors["drift_m_per_100m"]:.3f} m, {errors["drift_deg_per_100m"]:.3f} deg'
+    return (
+        f'errors of {errors["num_poses"]} poses   absolute {absolute} (rmse)   '
+        f'from scan to scan {relative}   drift {drift} in 100 m'
     )
 
 

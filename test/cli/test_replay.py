@@ -155,7 +155,7 @@ def test_an_output_without_permission_is_refused_before_the_work(tmp_path, capsy
     assert 'no permission to write in' in capsys.readouterr().err
 
 
-def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path):
+def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path, capsys):
     first, second = tmp_path / 'first', tmp_path / 'second'
     track = tmp_path / 'track.tum'
     assert main(['replay', str(bag), '--output', str(first), '--poses-out', str(track)]) == 0
@@ -165,8 +165,10 @@ def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path):
         values[1] = repr(float(values[1]) + 0.1 * (row % 2))  # every other pose is off by 10 cm
     track.write_text('\n'.join(' '.join(values) for values in shifted))
 
+    assert 'errors of' not in capsys.readouterr().out
     assert main(['replay', str(bag), '--output', str(second), '--truth', str(track)]) == 0
 
+    assert f'errors of {len(shifted)} poses   absolute 0.05' in capsys.readouterr().out
     assert 'pose_errors' not in summary_of(first)
     errors = summary_of(second)['pose_errors']
     assert errors['num_poses'] == len(shifted)
@@ -180,6 +182,8 @@ def test_a_truth_that_is_none_is_refused_before_the_work(bag, tmp_path, capsys):
     output = tmp_path / 'out'
     assert main(['replay', str(bag), '--output', str(output), '--truth', '/nowhere']) == 1
     assert '/nowhere' in capsys.readouterr().err
+    assert main(['replay', str(bag), '--output', str(output), '--truth', str(bag)]) == 1
+    assert 'not a simulated bag' in capsys.readouterr().err
     assert not output.exists()
 
 
