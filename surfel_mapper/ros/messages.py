@@ -17,17 +17,10 @@ from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from surfel_mapper.io.pointcloud2 import CloudBytes, from_columns
-from surfel_mapper.io.surfel_columns import surfel_columns
+from surfel_mapper.io.pointcloud2 import CloudBytes
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.cost_grid import CostGrid
-    from surfel_mapper.mapping.surfels import Surfels
-
-
-def surfel_cloud(surfels: Surfels, stamp_ns: int, frame_id: str) -> PointCloud2:
-    """Return surfels as a cloud, one point each; the columns are those of surfel_columns."""
-    return cloud_message(from_columns(surfel_columns(surfels)), stamp_ns, frame_id)
 
 
 def cloud_message(content: CloudBytes, stamp_ns: int, frame_id: str) -> PointCloud2:

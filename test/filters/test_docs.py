@@ -20,11 +20,7 @@ from surfel_mapper.filters.registry import all_filters
 PAGE = (Path(__file__).parents[2] / 'docs/filters.md').read_text(encoding='utf-8')
 
 
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch):
-    """Leave the registry as it was, whatever the example registers."""
-    registry.load_built_in()
-    monkeypatch.setattr(registry, '_FILTERS', dict(registry._FILTERS))
+pytestmark = pytest.mark.usefixtures('own_registry')
 
 
 def blocks(language):

@@ -192,7 +192,7 @@ def run(tmp_path, text, *keys):
     return scan
 
 
-def test_the_chain_of_the_conversion_tutorial(tmp_path):
+def test_the_chain_of_the_conversion_tutorial_cuts_the_box_and_turns_normals(tmp_path):
     found = run(tmp_path, CONVERT)
     assert (np.abs(found.points) >= 4.0).any(axis=1).all()
     assert 0.35 < len(found) / len(room()) < 0.55
@@ -200,7 +200,7 @@ def test_the_chain_of_the_conversion_tutorial(tmp_path):
     assert (towards >= 0.0).all()
 
 
-def test_the_filters_of_the_registration_tutorial(tmp_path):
+def test_the_filters_of_the_registration_tutorial_thin_and_add_normals(tmp_path):
     assert abs(len(run(tmp_path, ICP, 'readingDataPointsFilters')) - 1500) < 150
     assert 'normals' in run(tmp_path, ICP, 'referenceDataPointsFilters').columns
     found = run(tmp_path, EMPTY_ICP, 'readingDataPointsFilters', 'referenceDataPointsFilters')
@@ -214,7 +214,7 @@ def test_what_is_no_filter_of_points_is_refused_by_name(tmp_path):
         run(tmp_path, ICP)
 
 
-def test_the_deviation_of_points(tmp_path):
+def test_the_deviation_of_points_is_added(tmp_path):
     found = run(tmp_path, DEVIATION)
     np.testing.assert_allclose(
         found.columns['deviation'].reshape(-1, 3, 3), np.tile(0.0009 * np.eye(3), (3000, 1, 1)),
@@ -222,7 +222,7 @@ def test_the_deviation_of_points(tmp_path):
     )
 
 
-def test_the_filters_of_the_mappers_examples(tmp_path):
+def test_the_filters_of_the_mappers_examples_drop_the_robot_and_thin(tmp_path):
     found = run(tmp_path, MAPPER, 'input', 'post')
     x, y, z = found.points.T
     assert not ((np.abs(y) < 1.0) & (x > -1.5) & (x < 0.5) & (z > -1.0) & (z < 0.5)).any()
@@ -230,14 +230,14 @@ def test_the_filters_of_the_mappers_examples(tmp_path):
     assert len(run(tmp_path, INPUT, 'input')) == pytest.approx(900, abs=130)
 
 
-def test_the_filters_of_the_mapper_for_ros(tmp_path):
+def test_the_filters_of_the_mapper_for_ros_run_one_after_another(tmp_path):
     keys = ('icp.readingDataPointsFilters', 'icp.referenceDataPointsFilters', 'post')
     found = run(tmp_path, MAPPER_ROS, 'input', *keys)
     assert 2 < len(found) < 60
     assert {'normals', 'observationDirections', 'probabilityDynamic'} <= set(found.columns)
 
 
-def test_the_examples_of_every_filter_one_after_another(tmp_path):
+def test_the_examples_of_every_filter_run_one_after_another(tmp_path):
     path = tmp_path / 'chain.yaml'
     path.write_text(EXAMPLES, encoding='utf-8')
     found, steps = Chain.load(path).run(room(20_000))

@@ -48,7 +48,7 @@ def test_a_point_that_float32_puts_on_a_bound_is_on_it(dtype):
     assert kept('bounding_box', points, x_max_m=0.1, remove_inside=False) == [1]
 
 
-def test_bounding_box_of_half_a_space():
+def test_a_bounding_box_may_be_half_a_space():
     points = [[-5.0, 9.0, 9.0], [5.0, -9.0, 9.0], [1e30, 0.0, 0.0], [INF, 0.0, 0.0]]
     box = {'xMin': 0, 'xMax': 'inf', 'yMin': '-inf', 'yMax': 'inf', 'zMin': '-inf', 'zMax': 'inf'}
     assert kept('BoundingBoxDataPointsFilter', points, **box) == [0, 3]

@@ -19,12 +19,7 @@ from surfel_mapper.filters.registry import all_filters, find, register
 from surfel_mapper.filters.voxel_grid import VoxelGrid
 from test.filters.examples import scan_of
 
-
-@pytest.fixture(autouse=True)
-def own_registry(monkeypatch):
-    """Leave the registry as it was, whatever a test registers."""
-    registry.load_built_in()
-    monkeypatch.setattr(registry, '_FILTERS', dict(registry._FILTERS))
+pytestmark = pytest.mark.usefixtures('own_registry')
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -69,7 +69,7 @@ def test_what_is_no_scan_is_refused(tmp_path, name, write, says):
         read_scan(tmp_path / name)
 
 
-def test_real_scans_of_fourteen_sensors_read(data_folder):
+def test_real_scans_of_fourteen_sensors_are_read(data_folder):
     files = scan_files(Path(data_folder, 'data', 'scans'))
 
     sizes = {}

@@ -125,7 +125,7 @@ def test_an_alignment_moves_the_models(street):
     assert largest.id in kept
 
 
-def test_clearing_and_restoring(street):
+def test_models_follow_a_map_that_is_cleared_or_restored(street):
     scans, poses = street
     mapper = mapper_with()
     feed(mapper, scans[:3], poses[:3])

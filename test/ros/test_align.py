@@ -50,6 +50,17 @@ def messages():
     return found
 
 
+def driven(peer):
+    """Publish what ``messages`` gives, and return it."""
+    peer.advertise('/odom', '/points')
+    sent = messages()
+    for points, pose in sent:
+        time.sleep(0.05)
+        peer.publish('/odom', pose)
+        peer.publish('/points', points)
+    return sent
+
+
 def aligned_twin(sent):
     mapper = Mapper(Config.from_mapping(SETTINGS))
     for points, pose in sent:
@@ -66,12 +77,7 @@ def test_the_window_is_aligned_and_the_path_published(start, peer, tmp_path):
     node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
     refused = peer.call('align')
     paths = peer.collect(Path, '/surfel_mapper/path', LATCHED)
-    peer.advertise('/odom', '/points')
-    sent = messages()
-    for points, pose in sent:
-        time.sleep(0.05)
-        peer.publish('/odom', pose)
-        peer.publish('/points', points)
+    sent = driven(peer)
     peer.diagnosis({'scans.mapped': NUM_SCANS})
 
     answer = peer.call('align')
@@ -106,12 +112,7 @@ def test_the_transform_from_map_to_odom_goes_out_with_every_scan(start, peer):
 
     start('node', *ARGUMENTS)
     transforms = peer.collect(TFMessage, '/tf')
-    peer.advertise('/odom', '/points')
-    sent = messages()
-    for points, pose in sent:
-        time.sleep(0.05)
-        peer.publish('/odom', pose)
-        peer.publish('/points', points)
+    sent = driven(peer)
 
     peer.spin_until(lambda: len(transforms) == NUM_SCANS)
 

@@ -58,7 +58,7 @@ def compare(start, bag, tmp_path, capsys, num_scans, rate, **settings):
     assert sum(summary['scans']['evicted'].values()) > 5
 
 
-def test_on_a_simulated_street(start, tmp_path, capsys):
+def test_live_equals_offline_on_a_simulated_street(start, tmp_path, capsys):
     bag = tmp_path / 'street'
     lidar = ['--beams', '16', '--columns', '512', '--noise', '0.02']
     assert main(['simulate', 'street', '--output', str(bag), '--scans', '30', *lidar]) == 0
@@ -67,13 +67,13 @@ def test_on_a_simulated_street(start, tmp_path, capsys):
     compare(start, bag, tmp_path, capsys, 30, 2, **{'window.max_distance_m': 8.0})
 
 
-def test_on_a_real_bag(start, tmp_path, capsys, data_folder):
+def test_live_equals_offline_on_a_real_bag(start, tmp_path, capsys, data_folder):
     bag = data_folder / 'data' / 'bags' / 'hall_os0_full'
 
     compare(start, bag, tmp_path, capsys, 22, 5, **{'window.max_scans': 9})
 
 
-def test_in_the_demo(domain, tmp_path):
+def test_the_demo_finds_live_equal_to_offline(domain, tmp_path):
     lidar = ['--scans', '8', '--beams', '16', '--columns', '256']
     done = subprocess.run(
         [sys.executable, str(ROOT / 'examples' / 'demo.py'), '--output', 'out', *lidar],

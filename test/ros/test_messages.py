@@ -12,9 +12,10 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.io.pointcloud2 import from_columns, to_scan
+from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.ros.messages import surfel_cloud, time_message
+from surfel_mapper.ros.messages import cloud_message, time_message
 from test.ros.live import room
 
 
@@ -22,7 +23,7 @@ def test_surfels_arrive_as_they_were_sent():
     surfel_map = SurfelMap(voxel_size_m=0.5)
     surfel_map.add(room(seed=1))
     surfels = surfel_map.surfels(min_points=3)
-    sent = surfel_cloud(surfels, 12_000_000_034, 'odom')
+    sent = cloud_message(from_columns(surfel_columns(surfels)), 12_000_000_034, 'odom')
 
     scan = to_scan(deserialize_message(serialize_message(sent), PointCloud2))
 
@@ -43,7 +44,8 @@ def test_surfels_arrive_as_they_were_sent():
 
 
 def test_an_empty_map_is_a_cloud_without_points():
-    scan = to_scan(surfel_cloud(SurfelMap(0.5).surfels(), 0, 'odom'))
+    empty = surfel_columns(SurfelMap(0.5).surfels())
+    scan = to_scan(cloud_message(from_columns(empty), 0, 'odom'))
     assert len(scan) == 0
 
 

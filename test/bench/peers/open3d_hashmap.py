@@ -9,39 +9,26 @@ hash map, so that eviction looks nothing up; the hash map is made large enough n
 
 from __future__ import annotations
 
-from collections import deque
-
 import numpy as np
 from open3d import core
 
-from test.bench.numpy_map import derive, reduce_points, unpack
+from test.bench.numpy_map import NumpyMap, unpack
 
 CAPACITY = 1 << 20
 
 
-class Peer:
+class Peer(NumpyMap):
     """A map out of core.HashMap, and its window of scans."""
 
     def __init__(self, voxel_size_m, window):
-        self._size_m, self._window = voxel_size_m, window
+        super().__init__(voxel_size_m, window)
         self._map = core.HashMap(CAPACITY, core.int64, (3,), core.int64, (13,))
         self._moments = self._map.value_tensor().numpy()
-        self._key = np.zeros(CAPACITY, np.int64)
-        self._scans = deque()
+        self._row_key = np.zeros(CAPACITY, np.int64)
 
     def step(self, points, T_map_sensor):
         """Map a scan, evict the oldest, return the surfels of all voxels that changed."""
-        key, moments = reduce_points(list(points.T), T_map_sensor, self._size_m)
-        rows = self._insert(key, moments)
-        self._scans.append((rows, moments))
-        changed = np.zeros(CAPACITY, bool)
-        changed[rows] = True
-        if len(self._scans) > self._window:
-            rows, moments = self._scans.popleft()
-            changed[rows] = True
-            changed[self._remove(rows, moments)] = False
-        rows = np.flatnonzero(changed)
-        return derive(self._key[rows], self._moments[rows], self._size_m)
+        return super().step(list(points.T), T_map_sensor)
 
     @property
     def num_voxels(self):
@@ -54,7 +41,7 @@ class Peer:
         rows = place.astype(np.int64)  # of those known, nothing yet
         if known.any():  # the hash map refuses to look up nothing
             rows[known] = self._map.find(tensor(key[known]))[0].numpy()
-        self._moments[rows[is_new]], self._key[rows[is_new]] = moments[is_new], key[is_new]
+        self._moments[rows[is_new]], self._row_key[rows[is_new]] = moments[is_new], key[is_new]
         self._moments[rows[known]] += moments[known]
         return rows
 
@@ -63,7 +50,7 @@ class Peer:
         self._moments[rows] = left
         empty = rows[left[:, 0] == 0]
         if len(empty):
-            self._map.erase(tensor(self._key[empty]))
+            self._map.erase(tensor(self._row_key[empty]))
         return empty
 
 
