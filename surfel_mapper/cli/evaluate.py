@@ -162,7 +162,7 @@ def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     lines = [f'poses {result["num_poses"]}']
     for kind in ('absolute', 'relative'):
         moved, turned = result[kind]['translation_m'], result[kind]['rotation_deg']
-        lines.append(f'{kind} {in_words(moved, "m")}')
+        lines.append(f'{kind} {in_words(moved, "mm", 1e3)}')
         lines.append(f'{" " * len(kind)} {in_words(turned, "deg")}')
     drift_m, drift_deg = result['drift_m_per_100m'], result['drift_deg_per_100m']
     lines.append(f'drift {drift_m:.3f} m, {drift_deg:.3f} deg in 100 m')
