@@ -14,9 +14,9 @@ from surfel_mapper.kernels.hashing import (
     DEPTH,
     find_row,
     FREE_ROW,
-    FULL,
     hash_key,
     insert_row,
+    is_full,
     remove_row,
     ROWS_USED,
     split_segment,
@@ -63,14 +63,13 @@ def place_blocks(keys, head, table, state, limit, start, rows):
     Returns how many are done; fewer than K where rows, segments or the directory are too small:
     make room and go on from there.
     """
-    directory, _, held, _ = table
     depth = state[DEPTH]
     for place in range(start, len(keys)):
         key = keys[place]
         row = find_row(key, head, table, depth)
         if row < 0 and state[VOXELS] < limit:
             hashed = hash_key(key)
-            while held[directory[hashed >> (32 - depth)]] >= FULL:
+            while is_full(hashed, table, depth):
                 if not split_segment(hashed, table, state):
                     return place
             row = state[FREE_ROW]

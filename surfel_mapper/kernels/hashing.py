@@ -27,8 +27,8 @@ from surfel_mapper.kernels.layout import KEY
 SEGMENT = 512
 """Buckets of a segment: 4 KiB."""
 
-FULL = SEGMENT * 3 // 4
-"""A segment that holds so many splits before the next insertion."""
+FULLEST = SEGMENT * 3 // 4
+"""No segment holds more; see is_full."""
 
 # Scalars of a map that kernels write: an int64 array of these.
 FREE_ROW = 0
@@ -82,6 +82,20 @@ def likely_row(hashed, directory, buckets, depth):
         bucket = next_bucket(bucket)
         entry = buckets[bucket]
     return (entry & _LOW) - 1
+
+
+@njit(cache=True, nogil=True, inline='always')
+def is_full(hashed, table, depth):
+    """
+    Return whether the segment of a hash has to split before the next insertion.
+
+    Segments are full at 1/2 to 3/4 of their buckets, each at another share (by multiples of the
+    golden ratio). If all had the same they would split at the same time, since hashes are
+    uniform, and a look-up take twice as long before that as after it.
+    """
+    directory, _, held, _ = table
+    segment = np.int64(directory[hashed >> (32 - depth)])
+    return held[segment] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
 @njit(cache=True, nogil=True)

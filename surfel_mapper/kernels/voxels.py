@@ -17,9 +17,9 @@ from surfel_mapper.kernels.hashing import (
     find_row,
     first_bucket,
     FREE_ROW,
-    FULL,
     hash_key,
     insert_row,
+    is_full,
     likely_row,
     POINTS,
     remove_row,
@@ -136,9 +136,8 @@ def add_moments(moments, view_weight, rows, table, state, version, start, change
 @njit(cache=True, nogil=True)
 def new_row(key, hashed, rows, table, state):
     """Return a row of zeros for a voxel that the map has not, or -1 where there is no room."""
-    directory, _, held, _ = table
     depth = state[DEPTH]
-    while held[directory[hashed >> (32 - depth)]] >= FULL:
+    while is_full(hashed, table, depth):
         if not split_segment(hashed, table, state):
             return np.int64(-1)
     row = state[FREE_ROW]

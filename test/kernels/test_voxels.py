@@ -165,8 +165,8 @@ def test_adding_stops_where_a_segment_cannot_split(call):
     twin = {(i, j, k): [1] * 13 for i in side for j in side for k in side}
     memory = Memory(call, 1000)
     done, _ = memory.add(arrays_of(twin), 1)
-    assert done == hashing.FULL
-    assert memory.state[hashing.ROWS_USED] == hashing.FULL
+    assert done == hashing.FULLEST
+    assert memory.state[hashing.ROWS_USED] == hashing.FULLEST
     directory, *rest = memory.table
     memory.table = (np.repeat(directory, 2), *rest)
     memory.state[hashing.DEPTH] += 1
