@@ -80,6 +80,7 @@ def start(compiled, tmp_path):
     yield run
     for process in processes:
         process.kill()
+        print(process.output)  # shown where a test failed
 
 
 @pytest.fixture

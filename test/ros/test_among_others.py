@@ -114,6 +114,23 @@ def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
     assert (values['resets'], values['window_scans']) == ('1', '1')
 
 
+def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
+    node = start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
+    peer.advertise('/clock', kinds={'/clock': Clock})
+    peer.advertise('/odom', '/points')
+    wrong = Clock()
+    wrong.clock.sec = -1
+
+    def is_noticed():
+        peer.publish('/clock', wrong)
+        return 'message on /clock ignored: -1 s' in node.output
+
+    peer.spin_until(is_noticed, what=lambda: node.output)
+    send(peer, drive(1))
+    peer.diagnosis({'scans.mapped': 1})
+    assert node.stop() == 0
+
+
 def test_filters_change_while_scans_come_and_bad_files_are_refused(start, peer, tmp_path):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
