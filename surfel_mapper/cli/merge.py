@@ -41,7 +41,7 @@ def run(args: argparse.Namespace) -> int:
     """Merge and report."""
     from surfel_mapper.cluster.engines import engine
     from surfel_mapper.cluster.running import merge_maps
-    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.io.files import write_json
 
     began = time.perf_counter()
     with engine(args.workers, args.scheduler) as running:
@@ -53,8 +53,7 @@ def run(args: argparse.Namespace) -> int:
         'seconds': time.perf_counter() - began,
         'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
     }
-    with replace_file(args.output / 'summary.json') as file:
-        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    write_json(args.output / 'summary.json', summary)
     if args.json:
         print(json.dumps(summary))
         return 0

@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-import json
 import logging
 import os
 from pathlib import Path
@@ -98,7 +97,7 @@ def write_files(
     history: History,
 ) -> list[Path]:
     """Write the map in some formats, picture, report and summary; return what is there."""
-    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.io.files import write_json
     from surfel_mapper.io.ply import write_mesh
     from surfel_mapper.models.shapes import Shapes
     from surfel_mapper.viz.models import page_mesh
@@ -129,8 +128,7 @@ def write_files(
     )
     draw_map(surfels, picture, title, trajectory=mapped.positions)
     write_report(page, title, summary, surfels, history, picture, layers, sections)
-    with replace_file(figures) as file:
-        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    write_json(figures, summary)
     return [*(output / FORMATS[name] for name in formats), picture, page, figures]
 
 

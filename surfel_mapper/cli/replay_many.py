@@ -167,7 +167,7 @@ def write_overview(
     places: npt.NDArray[np.float64] | None,
 ) -> list[Path]:
     """Write picture, report and summary of a map in tiles; return what is there."""
-    from surfel_mapper.io.files import replace_file
+    from surfel_mapper.io.files import write_json
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
@@ -178,6 +178,5 @@ def write_overview(
     )
     draw_map(tiled.sample, picture, title)
     write_report(page, title, summary, tiled.sample, picture=picture)
-    with replace_file(figures) as file:
-        file.write((json.dumps(summary, indent=2) + '\n').encode())
+    write_json(figures, summary)
     return [tiled.directory, picture, page, figures]

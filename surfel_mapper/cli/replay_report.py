@@ -47,7 +47,7 @@ def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
 def in_a_line(errors: Mapping[str, Any]) -> str:
     """Return how far poses are from the true ones for people."""
     absolute, relative = (
-        f'{errors[kind]["translation_m"]["rmse"]:.3f} m, '
+        f'{1e3 * errors[kind]["translation_m"]["rmse"]:.3f} mm, '
         f'{errors[kind]["rotation_deg"]["rmse"]:.3f} deg'
         for kind in ('absolute', 'relative')
     )

@@ -10,12 +10,13 @@ name, also after a crash or with the disk full, sees the old file or the new one
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+import json
 import os
 from pathlib import Path
 import secrets
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 from surfel_mapper.errors import FileFormatError
 
@@ -60,6 +61,12 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             raise cannot_write(path, error) from error
         raise
+
+
+def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
+    """Write values as JSON, for people too, whole or not at all; see replace_file."""
+    with replace_file(path) as file:
+        file.write((json.dumps(content, indent=2) + '\n').encode())
 
 
 def cannot_write(path: str | Path, error: OSError) -> FileFormatError:

@@ -19,13 +19,13 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.io.bag import BagMessage, BagReader
-from surfel_mapper.io.bag_topics import CLOUD, ODOMETRY, POSE, TF, Topic
+from surfel_mapper.io.bag_topics import CLOUD, Topic
 from surfel_mapper.io.pose_messages import frame_name, stamp_ns, StampedPose
 from surfel_mapper.io.raw_pose import raw_poses
-from surfel_mapper.offline.pose_topics import static_topics
+from surfel_mapper.offline.pose_topics import static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 
-SOURCES = {TF: 'tf', ODOMETRY: 'odometry', POSE: 'pose'}
+SOURCES = {type_: source for source, type_ in TYPES.items()}
 """The pose.source that reads each type."""
 
 ALL_TIME_S = 1e9
