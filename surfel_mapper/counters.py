@@ -18,6 +18,12 @@ from typing import Any
 
 import numpy as np
 
+STAGES = (
+    'decode', 'deskew', 'images', 'filter', 'register', 'reduce', 'insert', 'clear', 'align',
+    'normals', 'tsdf', 'models', 'total',
+)  # fmt: skip
+"""What is timed, in the order in which a scan goes through it; ``total``: all but decoding."""
+
 LATEST = 1000
 """Times of so many scans are kept for the percentiles."""
 

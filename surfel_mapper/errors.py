@@ -16,6 +16,7 @@ Every exception that this package raises on purpose.
       ModelError           points that no models can be fitted to                     (ValueError)
       BagError             a bag that cannot be read, or lacks what is asked of it
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
+      SubscriberError      nobody subscribes to what is to be published
       ClusterError         workers or a scheduler that cannot be reached, or die again and again
       DependencyError      an optional package is missing; says how to install it     (ImportError)
 

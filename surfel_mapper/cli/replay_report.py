@@ -8,14 +8,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-STAGES = (
-    'decode', 'deskew', 'filter', 'register', 'reduce', 'insert', 'align', 'normals', 'total'
-)  # fmt: skip
-"""Of which the report states the times."""
-
 
 def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     """Return the summary in a few lines for people."""
+    from surfel_mapper.counters import STAGES  # brings numpy, which --help does without
+
     scans, times = summary['scans'], summary['milliseconds']
     out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
     gated = f' ({scans["gated"]} left out by the motion gate)'

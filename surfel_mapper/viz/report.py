@@ -19,15 +19,13 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.config import Config
+from surfel_mapper.counters import STAGES
 from surfel_mapper.io.files import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, named_bars, short
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.turning_view import turning_view
-
-STAGES = ('decode', 'filter', 'reduce', 'insert', 'normals', 'total')
-"""Stages in the order in which a scan goes through them."""
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
 
