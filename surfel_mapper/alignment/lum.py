@@ -103,8 +103,6 @@ class LUM:
         jacobian: str = 'exact',
     ) -> None:
         """Make an empty graph."""
-        if jacobian not in JACOBIANS:
-            raise AlignmentError(f'jacobian {jacobian!r}, expected one of {", ".join(JACOBIANS)}')
         self.graph = Graph()
         self.jacobian = jacobian
         self.max_iterations = max_iterations
@@ -114,6 +112,17 @@ class LUM:
     def num_vertices(self) -> int:
         """Number of clouds in the graph."""
         return self.graph.num_vertices
+
+    @property
+    def jacobian(self) -> str:
+        """``exact``, or ``pcl`` for the steps that PCL takes."""
+        return self._jacobian
+
+    @jacobian.setter
+    def jacobian(self, value: str) -> None:
+        if value not in JACOBIANS:
+            raise AlignmentError(f'jacobian {value!r}, expected one of {", ".join(JACOBIANS)}')
+        self._jacobian = value
 
     @property
     def max_iterations(self) -> int:

@@ -46,6 +46,7 @@ def pair():
         (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
         (lambda lum: setattr(lum, 'convergence_threshold', np.nan), 'convergence_threshold nan'),
         (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
+        (lambda lum: setattr(lum, 'jacobian', 'PCL'), "jacobian 'PCL', expected one of"),
         (lambda _: LUM().compute(), '0 vertices'),
     ],
 )  # fmt: skip
