@@ -286,8 +286,8 @@ def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> Non
         raise KeyboardInterrupt
     found = recording.describe()
     of = f' of {", ".join(found["topics"])}' if 'topics' in found else ''
+    look = f'; `surfel-mapper info {found["bag"]}` shows what poses it has'
     raise BagError(
         f'{found["bag"]}: none of {counters.received} clouds{of} was mapped '
-        f'({causes(counters.dropped)}); '
-        f'`surfel-mapper info {found["bag"]}` shows what poses it has'
+        f'({causes(counters.dropped)}){look if "no_pose" in counters.dropped else ""}'
     )

@@ -102,7 +102,7 @@ def test_a_replay_that_maps_nothing_is_refused_with_the_causes(bag, tmp_path, ca
     said = capsys.readouterr().err
     assert 'none of 6 clouds of /points was mapped (no pose 6); `surfel-mapper info' in said
     assert not (tmp_path / 'out').exists()
-    chain = settings_file(tmp_path, '- range_limit: {max_m: 0.1}')
+    chain = settings_file(tmp_path, '- MaxDistDataPointsFilter: {maxDist: 0.01}')
     assert main(['replay', str(bag), '--filters', chain, '--output', str(tmp_path / 'out')]) == 1
     assert capsys.readouterr().err.endswith('was mapped (filtered out 6)\n')
 
