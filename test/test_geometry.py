@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from surfel_mapper.geometry import (
     compose,
+    face_normals,
     interpolate,
     inverse,
     pose_matrix,
@@ -274,3 +275,10 @@ def test_the_logarithm_keeps_all_digits_of_a_tiny_turn(axis, angle):
 def test_a_twist_that_is_none_is_refused(xi):
     with pytest.raises(ValueError, match='expected 6 finite numbers'):
         se3_exp(xi)
+
+
+@pytest.mark.parametrize('number', [0, 1, 50])
+def test_normals_of_triangles_are_cross_products_of_their_sides(number):
+    corners = np.random.default_rng(number).normal(size=(number, 3, 3))
+    sides = corners[:, 1:] - corners[:, :1]
+    assert np.array_equal(face_normals(corners), np.cross(sides[:, 0], sides[:, 1]))

@@ -105,25 +105,30 @@ class Writer:
 
     def numbers(self, code: str, *values: float) -> None:
         """Write numbers of one type, a format character of struct, each aligned to its size."""
-        self._append(struct.pack(f'<{len(values)}{code}', *values), struct.calcsize(code))
+        self.append(struct.pack(f'<{len(values)}{code}', *values), struct.calcsize(code))
 
     def string(self, text: str) -> None:
         """Write a string: its length with the closing zero, its UTF-8, the zero."""
         content = text.encode() + b'\0'
         self.numbers('I', len(content))
-        self._append(content, 1)
+        self.append(content, 1)
 
     def sequence(self, values: npt.NDArray[Any], dtype: str) -> None:
         """Write a sequence of structures, one a row, whose members are all of one type."""
         self.numbers('I', len(values))
         if values.size:
             content = np.ascontiguousarray(values, dtype)
-            self._append(content.reshape(-1).view(np.uint8).data, content.itemsize)
+            self.append(content.reshape(-1).view(np.uint8).data, content.itemsize)
 
-    def _append(self, content: bytes | memoryview, alignment: int) -> None:
+    def append(self, content: bytes | memoryview, alignment: int) -> None:
+        """Write what is serialised, at a multiple of so many bytes."""
         padding = bytes(-self._size % alignment)
         self._parts += [padding, content]
         self._size += len(padding) + len(content)
+
+    def content(self) -> bytes:
+        """Return what is written."""
+        return b''.join(self._parts)
 
     def join(self) -> bytes:
         """Return the message with the header that says how it is written."""
@@ -184,14 +189,32 @@ def write_marker(writer: Writer, marker: Marker) -> None:
     writer.numbers('B', 0)  # frame_locked
     writer.sequence(marker.points, '<f8')
     writer.sequence(marker.colors, '<f4')
+    writer.append(NO_TEXTURE, 4)
+    writer.string(marker.text)
+    writer.append(NO_MESH, 4)
+
+
+def no_texture() -> bytes:
+    """Return the members of a marker from texture_resource to uv_coordinates, all empty."""
+    writer = Writer()
     writer.string('')  # texture_resource
     writer.numbers('I', 0, 0)  # texture.header.stamp
     writer.string('')  # texture.header.frame_id
     writer.string('')  # texture.format
     writer.numbers('I', 0)  # texture.data
     writer.numbers('I', 0)  # uv_coordinates
-    writer.string(marker.text)
+    return writer.content()
+
+
+def no_mesh() -> bytes:
+    """Return the members of a marker from mesh_resource on, all empty."""
+    writer = Writer()
     writer.string('')  # mesh_resource
     writer.string('')  # mesh_file.filename
     writer.numbers('I', 0)  # mesh_file.data
     writer.numbers('B', 0)  # mesh_use_embedded_materials
+    return writer.content()
+
+
+NO_TEXTURE, NO_MESH = no_texture(), no_mesh()
+"""What is the same in every marker; numbers in it are at multiples of 4."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.geometry import face_normals
 from surfel_mapper.io.cdr import ADD, DELETE, Marker, TRIANGLE_LIST
 
 if TYPE_CHECKING:
@@ -50,7 +51,7 @@ def mesh_marker(mesh: Mesh, *, stamp_ns: int, frame_id: str) -> Marker:
 
 def shade(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
     """Return how bright triangles (F, 3, 3) are, (F,) from 0.3 to 1."""
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = face_normals(corners)
     lengths = np.linalg.norm(normals, axis=1)
     towards = normals @ LIGHT / np.where(lengths > 0.0, lengths, 1.0)
     return np.asarray(0.65 + 0.35 * towards / np.linalg.norm(LIGHT), np.float32)

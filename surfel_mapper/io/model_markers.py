@@ -30,6 +30,7 @@ from surfel_mapper.io.cdr import (
     TRIANGLE_LIST,
 )
 from surfel_mapper.io.mesh_marker import shade
+from surfel_mapper.models.outlines import next_corners
 from surfel_mapper.models.shapes import ellipsoid_corners, FACES
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ def patch_markers(
     filled: dict[str, Any] = {'color': (*color, OPACITY)}
     if shape.is_curved:  # viewers light no markers, and without shades it would look flat
         filled = {'colors': shaded(shape.corners, color, OPACITY)}
-    ends = [np.stack([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in shape.rings]
+    ends = [np.stack([ring, next_corners(ring)], axis=1) for ring in shape.rings]
     return [
         make(
             ns='surfaces' if shape.is_curved else 'planes', id=number, type=TRIANGLE_LIST,

@@ -10,9 +10,12 @@ that no point that the patch was made of lies outside.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+
+from surfel_mapper.kernels.coverage import cover_parts, cover_places
 
 Array = npt.NDArray[np.float64]
 
@@ -46,21 +49,15 @@ class Grid:
     corner: npt.NDArray[np.uint8]
     cuts: npt.NDArray[np.uint8]
 
+    @property
+    def _cells(self) -> tuple[npt.NDArray[Any], ...]:
+        """What kernels take."""
+        return self.filled, self.rim, self.corner, self.cuts
+
     def contains(self, xy: Array) -> npt.NDArray[np.bool_]:
         """Return which of (M, 2) places in the frame of the patch are covered, (M,) bool."""
-        cell = np.floor((xy - self.origin) / self.pitch_m).astype(np.int64)
-        # the last point of a grid may stand on its end
-        on_end = (xy - self.origin) <= np.array(self.filled.shape) * self.pitch_m
-        last = np.array(self.filled.shape) - 1
-        cell = np.where(on_end, np.minimum(cell, last), cell)
-        inside: npt.NDArray[np.bool_] = np.all((cell >= 0) & (cell <= last), axis=1)
-        x, y = np.clip(cell, 0, last).T
-        inside &= self.filled[x, y]
-        corner = self.corner[x, y]
-        from_x = np.abs(xy[:, 0] - self.origin[0] - (x + (corner & 1)) * self.pitch_m)
-        from_y = np.abs(xy[:, 1] - self.origin[1] - (y + (corner >> 1)) * self.pitch_m)
-        cut = self.cuts[x, y] * (np.array([1.0, 1.0, 2.0]) * self.pitch_m / 255.0)
-        inside &= ~((from_x < cut[:, 0]) | (from_y < cut[:, 1]) | (from_x + from_y < cut[:, 2]))
+        inside = np.empty(len(xy), np.bool_)
+        cover_places(xy, self._cells, self.pitch_m, self.origin, inside)
         return inside
 
     def samples(self, step_m: float) -> Array:
@@ -75,12 +72,8 @@ class Grid:
 
     def mask(self, per_side: int) -> npt.NDArray[np.bool_]:
         """Return which parts of the cells are covered by their middle, so many a side."""
-        covered = self.filled.repeat(per_side, axis=0).repeat(per_side, axis=1)
-        inner = np.argwhere(np.ones((per_side, per_side)))
-        # only cells at the rim are cut
-        parts = (per_side * np.argwhere(self.rim)[:, None] + inner).reshape(-1, 2)
-        xy = self.origin + (parts + 0.5) * (self.pitch_m / per_side)
-        covered[parts[:, 0], parts[:, 1]] = self.contains(xy)
+        covered = np.empty(per_side * np.array(self.filled.shape), np.bool_)
+        cover_parts(per_side, self._cells, self.pitch_m, self.origin, covered)
         return covered
 
     def area_m2(self, per_side: int = 16) -> float:

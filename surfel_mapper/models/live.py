@@ -42,6 +42,7 @@ from surfel_mapper.models.model_update import ModelUpdate
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.piece_changes import Change
 from surfel_mapper.models.pieces import Pieces
+from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 
 __all__ = ['LiveModels', 'ModelUpdate']
 
@@ -147,7 +148,7 @@ class LiveModels:
         return self._model
 
     def warm_up(self) -> None:
-        """Compile the kernels."""
+        """Compile the kernels, those that draw the models too."""
         size_m = self.map.voxel_size_m
         surfel_map = SurfelMap(size_m)
         models = LiveModels(replace(self.config, min_points=4, min_voxels=1), surfel_map)
@@ -157,6 +158,8 @@ class LiveModels:
             points = np.stack([x, y, bend * x * x], -1).reshape(-1, 3)
             moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m)]
             models.update()
+            Shapes().of(models.model, models.versions)
+            ellipsoid_corners(models.model.gaussians)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])

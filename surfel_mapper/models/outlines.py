@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.rims import follow_sides, lay_sides, mark_corners
 from surfel_mapper.models.multi_model import Plane
 
 Array = npt.NDArray[np.float64]
@@ -24,8 +25,6 @@ PARTS_OF_SURFACE = 2
 
 TOLERANCE = 0.75
 """An outline is this near to the rim of the mask, in squares."""
-
-Corner = tuple[int, int]
 
 
 def outline(patch: Plane) -> list[Array]:
@@ -67,67 +66,26 @@ def rings(mask: npt.NDArray[np.bool_]) -> list[Array]:
 
     Squares that touch at a corner only do not hang together there.
     """
-    padded = np.pad(mask, 1)
-    inner = padded[1:-1, 1:-1]
-    after: dict[Corner, list[Corner]] = {}
-    # a square's side towards an empty neighbour, from its first corner to its last
-    for empty, first, last in (
-        (~padded[1:-1, :-2], (0, 0), (1, 0)),
-        (~padded[2:, 1:-1], (1, 0), (1, 1)),
-        (~padded[1:-1, 2:], (1, 1), (0, 1)),
-        (~padded[:-2, 1:-1], (0, 1), (0, 0)),
-    ):
-        for x, y in np.argwhere(inner & empty).tolist():
-            start = (x + first[0], y + first[1])
-            after.setdefault(start, []).append((x + last[0], y + last[1]))
-    found = []
-    while after:
-        found.append(np.array(followed(after, next(iter(after))), np.float64))
-    return found
-
-
-def followed(after: dict[Corner, list[Corner]], start: Corner) -> list[Corner]:
-    """Return one ring from a corner on, taking its sides out of what is left."""
-    ring, at, before = [start], start, start
-    while True:
-        ways = after[at]
-        ahead = (at[0] - before[0], at[1] - before[1])
-        left = (at[0] - ahead[1], at[1] + ahead[0])
-        step = left if len(ways) > 1 and left in ways else ways[0]
-        ways.remove(step)
-        if not ways:
-            del after[at]
-        if step == start:
-            return ring
-        ring.append(step)
-        at, before = step, at
+    ways = np.zeros(np.array(mask.shape) + 1, np.uint8)
+    num = lay_sides(mask, ways)
+    corners, ends = np.empty((num, 2)), np.empty(num, np.int64)
+    num_rings = follow_sides(mask, ways, corners, ends)
+    return np.split(corners, ends[: num_rings - 1]) if num else []
 
 
 def middles(ring: Array) -> Array:
     """Return the middles of the sides of a ring: steps become slopes."""
-    return 0.5 * (ring + np.roll(ring, -1, axis=0))
+    return 0.5 * (ring + next_corners(ring))
+
+
+def next_corners(ring: Array) -> Array:
+    """Return for each corner of a ring (M, D) the one after it; np.roll takes longer."""
+    return np.concatenate([ring[1:], ring[:1]])
 
 
 def simplified(ring: Array) -> Array:
     """Return the corners of a ring (M, 2) that matter, by Douglas and Peucker; at least three."""
-    far = int(np.argmax(((ring - ring[0]) ** 2).sum(axis=1)))
-    closed = np.concatenate([ring, ring[:1]])
-    kept = np.zeros(len(closed), bool)
-    kept[[0, far]] = True
-    waiting = [(0, far), (far, len(ring))]
-    while waiting:
-        first, last = waiting.pop()
-        if last - first < 2:
-            continue
-        a, b = closed[first], closed[last]
-        along, inner = b - a, closed[first + 1 : last] - a
-        length = float(np.hypot(*along))
-        across = np.abs(along[0] * inner[:, 1] - along[1] * inner[:, 0])
-        away = across / length if length > 0.0 else np.hypot(*inner.T)
-        worst = int(np.argmax(away))
-        if away[worst] > TOLERANCE:
-            middle = first + 1 + worst
-            kept[middle] = True
-            waiting += [(first, middle), (middle, last)]
-    chosen = ring[kept[:-1]]
+    kept = np.zeros(len(ring), np.bool_)
+    mark_corners(ring, TOLERANCE, kept)
+    chosen = ring[kept]
     return chosen if len(chosen) >= 3 else ring

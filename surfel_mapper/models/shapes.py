@@ -3,7 +3,8 @@
 """
 What primitives look like: outlines, triangles and boxes of patches, ellipsoids of Gaussians.
 
-To find the outline of a floor takes tens of milliseconds, so Shapes keeps what has not changed.
+An outline takes a quarter of a millisecond, that of a large floor several, and there are hundreds:
+Shapes keeps what has not changed.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.filters.shapes import eigen
 from surfel_mapper.models.filling import areas, filled
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import local_outline, triangles
@@ -105,9 +107,8 @@ def shape_of(patch: Plane) -> PatchShape:
     if isinstance(patch, Surface):
         vertices, faces = triangles(patch)
     else:
-        corners = filled(rims).reshape(-1, 2)
-        places, number = np.unique(corners, axis=0, return_inverse=True)
-        vertices, faces = patch.lifted(places), number.reshape(-1, 3)
+        places, faces = indexed(filled(rims))
+        vertices = patch.lifted(places)
     rings = [patch.lifted(rim) for rim in rims]
     local = np.concatenate([patch.to_local(vertices), *map(patch.to_local, rings)])
     low, high = local.min(axis=0), local.max(axis=0)
@@ -124,6 +125,18 @@ def shape_of(patch: Plane) -> PatchShape:
     )
 
 
+def indexed(triangles: Array) -> tuple[Array, npt.NDArray[np.int64]]:
+    """Return the different corners of triangles (T, 3, 2), (V, 2) by x and y, and faces (T, 3)."""
+    corners = triangles.reshape(-1, 2)
+    order = np.lexsort(corners.T[::-1])
+    ordered = corners[order]
+    is_new = np.ones(len(ordered), np.bool_)
+    is_new[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
+    number = np.empty(len(ordered), np.int64)
+    number[order] = np.cumsum(is_new) - 1
+    return ordered[is_new], number.reshape(-1, 3)
+
+
 class Shapes:
     """Shapes of patches, each made once and kept while its version stays."""
 
@@ -131,22 +144,40 @@ class Shapes:
         """Begin with none."""
         self._kept: dict[int, tuple[int, PatchShape]] = {}
 
+    def make(
+        self, model: MultiModel, versions: Mapping[int, int], at_most: int | None = None
+    ) -> bool:
+        """Make shapes that are missing, so many now; return whether all are there."""
+        missing = [
+            patch
+            for patch in model.patches
+            if self._kept.get(patch.id, (0,))[0] != versions[patch.id]
+        ]
+        made = missing[:at_most]
+        for patch in made:
+            self._kept[patch.id] = versions[patch.id], shape_of(patch)
+        return len(made) == len(missing)
+
     def of(self, model: MultiModel, versions: Mapping[int, int]) -> list[PatchShape]:
         """Return the shapes of planes, then surfaces, whose versions are given by id."""
-        before, self._kept = self._kept, {}
-        for patch in model.patches:
-            version, kept = versions[patch.id], before.get(patch.id)
-            if kept is None or kept[0] != version:
-                kept = (version, shape_of(patch))
-            self._kept[patch.id] = kept
+        self.make(model, versions)
+        self._kept = {patch.id: self._kept[patch.id] for patch in model.patches}
         return [shape for _, shape in self._kept.values()]
 
 
 def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
     """Return axes (G, 3, 3) as columns, right-handed, and half axes (G, 3), m, ascending."""
-    values, R_map_axes = np.linalg.eigh(gaussians.covariance)
-    R_map_axes[..., 2] *= np.sign(np.linalg.det(R_map_axes))[:, None]
-    return R_map_axes, SIGMAS * np.sqrt(np.maximum(values, 0.0))
+    rows, columns = np.triu_indices(3)
+    values, axes = eigen(gaussians.covariance[:, rows, columns].T)
+    axes[values[:, 2] == 0.0] = np.eye(3)  # without extent any axes will do
+    x, y, z = axes.transpose(1, 2, 0)
+    is_left = (
+        (x[1] * y[2] - x[2] * y[1]) * z[0]
+        + (x[2] * y[0] - x[0] * y[2]) * z[1]
+        + (x[0] * y[1] - x[1] * y[0]) * z[2]
+    ) < 0.0
+    axes[is_left, 2] *= -1.0
+    return np.swapaxes(axes, 1, 2), SIGMAS * np.sqrt(values)
 
 
 def ellipsoid_corners(gaussians: Gaussians) -> Array:

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.geometry import face_normals
 from surfel_mapper.tsdf.mesh import Mesh
 
 MAX_TRIANGLES = 150_000
@@ -31,7 +32,7 @@ GREY = np.array([200, 200, 205], np.uint8)
 def vertex_normals(mesh: Mesh) -> npt.NDArray[np.float32]:
     """Return unit normals, (V, 3), towards free space; those of no triangle are 0."""
     corners = mesh.vertices[mesh.triangles]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    across = face_normals(corners)
     normals = np.zeros_like(mesh.vertices)
     for corner, axis in np.ndindex(3, 3):
         place = mesh.triangles[:, corner]

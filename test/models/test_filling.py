@@ -9,8 +9,10 @@ import math
 import numpy as np
 import pytest
 
+from surfel_mapper.kernels.filling import fill_rings
 from surfel_mapper.models.filling import areas, filled, joined
 from surfel_mapper.models.outlines import rings
+from test.kernels.modes import both
 from test.models.test_outlines import area
 
 SQUARE = np.array([[0.0, 0], [4, 0], [4, 4], [0, 4]])
@@ -86,6 +88,15 @@ def test_rings_of_any_mask_are_filled_with_what_it_covers():
     for _ in range(30):
         mask = rng.random((8, 6)) < 0.6
         assert areas(filled(rings(mask))).sum() == pytest.approx(mask.sum(), rel=1e-12)
+
+
+@both
+def test_the_kernel_cuts_off_no_corner_and_begins_anew_where_sides_begin(call):
+    arrow = np.array([[0.0, 0], [4, 0], [4, 4], [2, 1], [0, 3]])
+    corners, ends = np.concatenate([arrow, HOLE[::-1] + 9.0]), np.array([5, 9])
+    found = call(fill_rings, corners, ends)
+    assert np.array_equal(found, filled([arrow, HOLE[::-1] + 9.0]))
+    assert sorted(areas(found)) == [2.0, 2.0, 2.0, 2.0, 2.0, 3.0]
 
 
 def test_a_rectangle_is_two_triangles_whatever_corners_lie_on_its_sides_elsewhere():

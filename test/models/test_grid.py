@@ -9,7 +9,9 @@ import pytest
 
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.kernels.cells import fill_cells
+from surfel_mapper.kernels.coverage import cover_parts, cover_places
 from surfel_mapper.models import fit
+from test.kernels.modes import compiled, interpreted
 from test.models.scenes import A, room, sheet, VIEW
 
 PITCH = 4 * A
@@ -70,6 +72,40 @@ def test_cells_and_rims_are_those_of_a_slow_loop():
             for x, y in around
         )
         assert is_rim == (filled[i, j] and alone)
+
+
+def slow_contains(grid, xy):
+    """Return the same a step of all places at a time."""
+    cell = np.floor((xy - grid.origin) / grid.pitch_m).astype(np.int64)
+    # the last point of a grid may stand on its end
+    on_end = (xy - grid.origin) <= np.array(grid.filled.shape) * grid.pitch_m
+    last = np.array(grid.filled.shape) - 1
+    cell = np.where(on_end, np.minimum(cell, last), cell)
+    inside = np.all((cell >= 0) & (cell <= last), axis=1)
+    x, y = np.clip(cell, 0, last).T
+    inside &= grid.filled[x, y]
+    corner = grid.corner[x, y]
+    from_x = np.abs(xy[:, 0] - grid.origin[0] - (x + (corner & 1)) * grid.pitch_m)
+    from_y = np.abs(xy[:, 1] - grid.origin[1] - (y + (corner >> 1)) * grid.pitch_m)
+    cut = grid.cuts[x, y] * (np.array([1.0, 1.0, 2.0]) * grid.pitch_m / 255.0)
+    inside &= ~((from_x < cut[:, 0]) | (from_y < cut[:, 1]) | (from_x + from_y < cut[:, 2]))
+    return inside
+
+
+@pytest.mark.parametrize('call', [compiled, interpreted])
+def test_places_and_parts_are_covered_as_a_slow_twin_says(call):
+    (plane,) = fit(shape(SHAPES['triangle'][0]), ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
+    grid, end = plane.grid, np.array(plane.grid.filled.shape) * plane.grid.pitch_m
+    places = np.random.default_rng(2).uniform(-0.1, 1.1, (3000, 2)) * end
+    places = grid.origin + np.concatenate([places, end * [[1, 1], [1, 0.5], [0, 0]]])
+    cells = grid.filled, grid.rim, grid.corner, grid.cuts
+    inside = np.empty(len(places), bool)
+    call(cover_places, places, cells, grid.pitch_m, grid.origin, inside)
+    assert np.array_equal(inside, slow_contains(grid, places))
+    parts = np.empty((3 * grid.filled.shape[0], 3 * grid.filled.shape[1]), bool)
+    call(cover_parts, 3, cells, grid.pitch_m, grid.origin, parts)
+    middles = grid.origin + (np.argwhere(np.ones_like(parts)) + 0.5) * (grid.pitch_m / 3)
+    assert np.array_equal(parts.reshape(-1), slow_contains(grid, middles))
 
 
 def test_a_corner_that_cells_surround_is_not_cut():

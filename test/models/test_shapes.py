@@ -101,6 +101,16 @@ def test_shapes_are_made_anew_for_another_version_only():
     ]
 
 
+def test_shapes_may_be_made_a_few_at_a_time():
+    model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
+    shapes, versions = Shapes(), {patch.id: 1 for patch in model.patches}
+    steps = [shapes.make(model, versions, 2) for _ in range(-(-len(model.patches) // 2))]
+    assert steps == [False] * (len(steps) - 1) + [True]
+    found = shapes.of(model, versions)
+    assert [shape.patch.id for shape in found] == [patch.id for patch in model.patches]
+    assert all(a is b for a, b in zip(found, shapes.of(model, versions), strict=True))
+
+
 def test_the_icosahedron_has_twenty_equal_faces_that_face_out():
     corners = CORNERS[FACES]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

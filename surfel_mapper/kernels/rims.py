@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Rims of masks as rings of corners, and which corners of a ring matter.
+
+Corner (x, y) is the lowest of square (x, y). The sides of squares towards nothing run with what
+is covered on the left; at most two leave a corner, each in a direction of its own, so a byte a
+corner says which: bit 0 for x, 1 for y, 2 for -x, 3 for -y.
+
+Source: Douglas and Peucker 1973 for what matters.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+
+@njit(cache=True, nogil=True)
+def lay_sides(mask, ways):
+    """
+    Lay the sides of what a mask covers; return how many.
+
+    mask  (X, Y) bool
+    ways  (X + 1, Y + 1) uint8, zeros; out: directions in which sides leave each corner
+    """
+    end_x, end_y = mask.shape
+    num = 0
+    for x in range(end_x):
+        for y in range(end_y):
+            if not mask[x, y]:
+                continue
+            if y == 0 or not mask[x, y - 1]:
+                ways[x, y] |= 1
+                num += 1
+            if x + 1 == end_x or not mask[x + 1, y]:
+                ways[x + 1, y] |= 2
+                num += 1
+            if y + 1 == end_y or not mask[x, y + 1]:
+                ways[x + 1, y + 1] |= 4
+                num += 1
+            if x == 0 or not mask[x - 1, y]:
+                ways[x, y + 1] |= 8
+                num += 1
+    return num
+
+
+@njit(cache=True, nogil=True)
+def follow_sides(mask, ways, corners, ends):
+    """
+    Follow the sides until all are used; return how many rings they are.
+
+    mask     (X, Y) bool
+    ways     (X + 1, Y + 1) uint8, of lay_sides; is used up
+    corners  (S, 2) float64, out: ring after ring
+    ends     (S,) int64, out: behind the last corner of each
+
+    Every ring has a side along x, so those are where rings are looked for.
+    """
+    end_x, end_y = mask.shape
+    num = num_rings = 0
+    for x in range(end_x):
+        for y in range(end_y):
+            if not mask[x, y] or (y > 0 and mask[x, y - 1]):
+                continue
+            while ways[x, y] != 0:
+                num = follow(ways, x, y, corners, num)
+                ends[num_rings] = num
+                num_rings += 1
+    return num_rings
+
+
+@njit(cache=True, nogil=True)
+def follow(ways, start_x, start_y, corners, num):
+    """
+    Write one ring behind the first num corners; return how many there are then.
+
+    Where two sides leave, the one to the left is taken: squares that touch at a corner only do
+    not hang together.
+    """
+    x, y = start_x, start_y
+    left = 4  # there is none at the start
+    while True:
+        corners[num, 0], corners[num, 1] = x, y
+        num += 1
+        direction = 0
+        while not ways[x, y] >> direction & 1:
+            direction += 1
+        if left < 4 and ways[x, y] >> left & 1:
+            direction = left
+        ways[x, y] ^= 1 << direction
+        x += (1, 0, -1, 0)[direction]
+        y += (0, 1, 0, -1)[direction]
+        left = (direction + 1) % 4
+        if x == start_x and y == start_y:
+            return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def mark_corners(ring, tolerance, kept):
+    """
+    Mark the corners that matter: what is left out is nearer than a tolerance to the rest.
+
+    ring  (M, 2) float64, its corners, not closed; at least one
+    kept  (M,) bool, zeros; out
+
+    The first corner and the one farthest from it are kept; then, again and again, the farthest
+    from the line between two that are.
+    """
+    size = len(ring)
+    kept[0] = True
+    waiting = np.empty((size + 2, 2), np.int64)
+    far = farthest_from(ring)
+    kept[far] = True
+    waiting[0, 0], waiting[0, 1] = 0, far
+    waiting[1, 0], waiting[1, 1] = far, size
+    num = 2
+    while num > 0:
+        num -= 1
+        first, last = waiting[num, 0], waiting[num, 1]
+        ax, ay = ring[first, 0], ring[first, 1]
+        along_x, along_y = ring[last % size, 0] - ax, ring[last % size, 1] - ay
+        length = math.hypot(along_x, along_y)
+        worst, most = 0, -1.0
+        for k in range(first + 1, last):
+            x, y = ring[k, 0] - ax, ring[k, 1] - ay
+            away = math.hypot(x, y)
+            if length > 0.0:
+                away = abs(along_x * y - along_y * x) / length
+            if away > most:
+                worst, most = k, away
+        if most > tolerance:
+            kept[worst] = True
+            waiting[num, 0], waiting[num, 1] = first, worst
+            waiting[num + 1, 0], waiting[num + 1, 1] = worst, last
+            num += 2
+
+
+@njit(cache=True, nogil=True)
+def farthest_from(ring):
+    """Return which corner is the farthest from the first."""
+    far, most = 0, -1.0
+    for k in range(len(ring)):
+        x, y = ring[k, 0] - ring[0, 0], ring[k, 1] - ring[0, 1]
+        if x * x + y * y > most:
+            far, most = k, x * x + y * y
+    return far
