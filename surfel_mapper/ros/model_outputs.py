@@ -5,7 +5,8 @@ What the node publishes of the models: pictures, tables, outlines, and whose eac
 
 They are published when they have followed the map, which they do at a period of their own, and
 once more to whoever subscribes later; nothing is made while nobody does. Messages are made in the
-mapping thread, between two scans, and shapes only of what has changed.
+mapping thread, between two scans, and shapes only of what has changed; for somebody who comes late
+to a large map, a few between each two scans.
 """
 
 from __future__ import annotations
@@ -47,6 +48,10 @@ OUTLINES = QoSProfile(
 """A message a polygon: there may be hundreds at once."""
 
 
+STEP = 50
+"""So many shapes are made at a time for a new subscriber: some 15 ms."""
+
+
 class ModelOutputs:
     """
     The publishers of live models.
@@ -76,15 +81,18 @@ class ModelOutputs:
         self._stamp_ns = 0
         self._told: dict[int, int] = {}
         """Versions of the outlines that subscribers know, by id."""
-        self._planes = self._advertise(MarkerArray, '~/planes', LATCHED, self._publish_planes)
+        self._planes = self._advertise(
+            MarkerArray, '~/planes', LATCHED, self._in_steps(self._publish_planes)
+        )
         self._primitives = self._advertise(
-            PointCloud2, '~/primitives', LATCHED, self._publish_primitives
+            PointCloud2, '~/primitives', LATCHED, self._in_steps(self._publish_primitives)
         )
         self._surfels = self._advertise(
             PointCloud2, '~/surfel_primitives', LATCHED, self._publish_surfels
         )
+        outlines = self._in_steps(self._publish_all_outlines)
         self._outlines = self._advertise(
-            PolygonInstanceStamped, '~/outlines', OUTLINES, self._publish_all_outlines
+            PolygonInstanceStamped, '~/outlines', OUTLINES, outlines
         )
 
     def note(self, update: Update) -> None:
@@ -115,6 +123,17 @@ class ModelOutputs:
 
         events = PublisherEventCallbacks(matched=on_matched)
         return self._node.create_publisher(kind, topic, qos, event_callbacks=events)
+
+    def _in_steps(self, publish: Callable[[], None]) -> Callable[[], None]:
+        """Return what makes missing shapes, a few at a time, and then publishes."""
+
+        def step() -> None:
+            if self._shapes.make(self._models.model, self._models.versions, STEP):
+                publish()
+            else:
+                self._thread.post(step)  # after the scans that wait
+
+        return step
 
     # What follows is called in the mapping thread.
 
