@@ -22,8 +22,9 @@ from surfel_mapper.kernels.channels import sum_channels
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.kernels.moments import (
     BEYOND,
+    look_back,
     NOT_FINITE,
-    pack_moments,
+    pack_sums,
     reduce_points,
     TOO_FAR,
     TOO_NEAR,
@@ -171,16 +172,8 @@ class Reducer:
             view=np.empty((num, 3), np.int16),
             left_out=scratch.causes(),
         )
-        pack_moments(
-            key,
-            sums,
-            origin,
-            self.voxel_size_m,
-            moments.count,
-            moments.total,
-            moments.product,
-            moments.view,
-        )
+        pack_sums(sums, moments.count, moments.total, moments.product)
+        look_back(key, origin, self.voxel_size_m, moments.view)
         return moments
 
 

@@ -19,8 +19,9 @@ from surfel_mapper.kernels.moments import (
     find_runs,
     hash_shift,
     home,
+    look_back,
     NOT_FINITE,
-    pack_moments,
+    pack_sums,
     quantise,
     reason,
     reduce_points,
@@ -173,20 +174,27 @@ def test_every_point_left_out_has_one_cause(call, point, cause):
 
 @both
 @pytest.mark.parametrize('wide', [np.int32, np.int64])
-@pytest.mark.parametrize('origin', [[3.0, -40.0, 2.0], [0.25, 0.25, 0.25], None])
-def test_sums_become_the_integers_they_are(call, wide, origin):
-    twin = reference.scan_moments(some_points(200), 0.5, origin)
-    rows = np.array(list(twin.values()))
+def test_sums_become_the_integers_they_are(call, wide):
+    rows = np.array(list(reference.scan_moments(some_points(200), 0.5, None).values()))
     num = len(rows)
     count, total = np.empty(num, np.int32), np.empty((num, 3), wide)
-    product, view = np.empty((num, 6), np.int64), np.empty((num, 3), np.int16)
-    seen_from = np.full(3, np.nan) if origin is None else np.array(origin)
-
-    keys = pack_keys(np.array(list(twin)))
-    sums = rows[:, :10].astype(np.float64)
-    call(pack_moments, keys, sums, seen_from, 0.5, count, total, product, view)
+    product = np.empty((num, 6), np.int64)
+    call(pack_sums, rows[:, :10].astype(np.float64), count, total, product)
 
     assert (count == rows[:, 0]).all()
     assert (total == rows[:, 1:4]).all()
     assert (product == rows[:, 4:10]).all()
-    assert (view * count[:, None].astype(np.int64) == rows[:, 10:]).all()
+
+
+@both
+@pytest.mark.parametrize('origin', [[3.0, -40.0, 2.0], [0.25, 0.25, 0.25], None])
+def test_a_voxel_is_seen_from_the_sensor(call, origin):
+    points = np.random.default_rng(4).uniform(-20.0, 20.0, (CHUNK + 100, 3))
+    twin = reference.scan_moments(points, 0.5, origin)
+    rows, keys = np.array(list(twin.values())), pack_keys(np.array(list(twin)))
+    assert len(keys) > CHUNK
+    view = np.empty((len(keys), 3), np.int16)
+    seen_from = np.full(3, np.nan) if origin is None else np.array(origin)
+    call(look_back, keys, seen_from, 0.5, view)
+
+    assert (view * rows[:, :1] == rows[:, 10:]).all()
