@@ -68,7 +68,7 @@ class Scan:
     Raises
     ------
     ValueError
-        If the points are not (N, 3) floating point or a column is not of length N.
+        If the points are no array (N, 3) of floating point or a column is not of length N.
 
     """
 
@@ -86,6 +86,8 @@ class Scan:
     def __post_init__(self) -> None:
         """Check the shapes."""
         points = self.points
+        if not isinstance(points, np.ndarray):
+            raise ValueError(f'points: {type(points).__name__}, expected an array (N, 3)')
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
         if points.dtype not in (np.float32, np.float64):
