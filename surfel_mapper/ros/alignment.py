@@ -18,7 +18,6 @@ from nav_msgs.msg import Path
 import numpy as np
 import numpy.typing as npt
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
 from surfel_mapper.errors import DependencyError
@@ -26,11 +25,7 @@ from surfel_mapper.geometry import q_xyzw, Transform
 from surfel_mapper.pipeline import Aligned, Mapper, Update
 from surfel_mapper.ros.inputs import transform_message
 from surfel_mapper.ros.messages import time_message
-
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-"""The last path is kept for those who subscribe later."""
+from surfel_mapper.ros.publishing import LATCHED
 
 
 class AlignmentOutputs:

@@ -19,13 +19,13 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
+from surfel_mapper.ros.publishing import steady_timer
 from surfel_mapper.ros.session import Session
 
 LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
@@ -66,7 +66,7 @@ class Diagnostics:
         self._asked_s: float | None = None
         self._last = Totals()
         if rate_hz:
-            node.create_timer(1.0 / rate_hz, self._on_timer, clock=_steady())
+            steady_timer(node, rate_hz, self._on_timer)
 
     def watch(self, session: Session | None) -> None:
         """Report about a session from now on, or about none."""
@@ -241,7 +241,3 @@ def leaves(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, A
             yield from leaves(value, f'{prefix}{key}.')
         else:
             yield f'{prefix}{key}', value
-
-
-def _steady() -> Clock:
-    return Clock(clock_type=ClockType.STEADY_TIME)

@@ -19,9 +19,8 @@ from nav_msgs.msg import OccupancyGrid
 import numpy as np
 import numpy.typing as npt
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
@@ -45,14 +44,10 @@ from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message, grid_message
 from surfel_mapper.ros.model_outputs import ModelOutputs
+from surfel_mapper.ros.publishing import LATCHED, steady_timer
 from surfel_mapper.ros.tsdf_outputs import TsdfOutputs
 from surfel_mapper.ros.waiting import result_of
 from surfel_mapper.scan import Scan
-
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-"""The last message is kept for those who subscribe later."""
 
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 """Holds 5 s at 20 Hz, so that a client that mirrors the map may be slow for a while."""
@@ -156,11 +151,8 @@ class Outputs:
         ]
         for rate_hz, publisher, publish in published:
             if rate_hz:
-                steady = Clock(clock_type=ClockType.STEADY_TIME)
                 callback = self._poster(publisher, publish)
-                self._timers.append(
-                    self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
-                )
+                self._timers.append(steady_timer(self._node, rate_hz, callback))
         if self._tsdf is not None:
             self._tsdf.start_timers(config.tsdf)
 

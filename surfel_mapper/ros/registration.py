@@ -24,10 +24,11 @@ from surfel_mapper.errors import DependencyError
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
-from surfel_mapper.ros.alignment import fill, LATCHED, pose_message
+from surfel_mapper.ros.alignment import fill, pose_message
 from surfel_mapper.ros.inputs import transform_message
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import time_message
+from surfel_mapper.ros.publishing import LATCHED
 
 MAX_TRACK = 1000
 """The track holds the poses of so many scans, the newest."""

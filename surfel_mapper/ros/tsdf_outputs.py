@@ -5,9 +5,7 @@
 from __future__ import annotations
 
 from nav_msgs.msg import OccupancyGrid
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.timer import Timer
 from visualization_msgs.msg import Marker
 
@@ -18,12 +16,8 @@ from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import grid_message
+from surfel_mapper.ros.publishing import LATCHED, steady_timer
 from surfel_mapper.tsdf.obstacles import slice_at
-
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-"""The last message is kept for those who subscribe later."""
 
 
 class TsdfOutputs:
@@ -67,9 +61,7 @@ class TsdfOutputs:
             (config.slice_rate_hz, self._on_slice_timer),
         ):
             if rate_hz:
-                steady = Clock(clock_type=ClockType.STEADY_TIME)
-                timer = self._node.create_timer(1.0 / rate_hz, callback, clock=steady)
-                self._timers.append(timer)
+                self._timers.append(steady_timer(self._node, rate_hz, callback))
 
     def stop_timers(self) -> None:
         """Publish nothing any more."""
