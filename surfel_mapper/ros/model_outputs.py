@@ -34,11 +34,7 @@ from surfel_mapper.models.shapes import PatchShape, Shapes
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message
-
-LATCHED = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
-)
-"""The last message is kept for those who subscribe later."""
+from surfel_mapper.ros.publishing import LATCHED
 
 OUTLINES = QoSProfile(
     depth=1000,
