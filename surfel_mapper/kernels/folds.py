@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Halve a surface by the normals of its pieces: 2-means that begin across their longest axis.
+Halve a surface that is no graph over one plane, by the normals of its pieces or by their heights.
 
 A surface has some dozen pieces, for which the calls of numpy take ten times as long.
 """
+
+import math
 
 from numba import njit
 import numpy as np
@@ -12,6 +14,12 @@ import numpy as np
 from surfel_mapper.kernels.eigen_frames import eigen_frame
 
 MEANS_ITERATIONS = 20
+
+FOLD_PERCENTILE = 98.0
+"""So many pieces have normals near the mean, else a surface is folded."""
+
+STACKED_SHARE = 0.05
+"""A part lies over itself where it is high in more than this share of its columns."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -62,3 +70,119 @@ def halve_normals(normals, side):
             plane[j] = first - second
             plane[3] += 0.5 * (first * first - second * second)
     return True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def halve_part(normals, points, limit, height, size, side):
+    """
+    Halve a chart that has several heights over one plane; return whether it has.
+
+    normals  (n, 3) float64, unit
+    points   (n, 3) float64, m, of the pieces
+    limit    least cosine to their mean that nearly all normals have
+    height   m, of a column in which pieces lie over one another
+    size     m, width of a column
+    side     (n,) bool, out: one half
+    """
+    mean = np.zeros(3)
+    for i in range(len(normals)):
+        for j in range(3):
+            mean[j] += normals[i, j]
+    length = math.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2])
+    if length > 0.0:
+        mean /= length
+    if fold(normals, mean, limit, side):
+        axis = longest_axis(normals)
+        cosines = along(normals, axis)
+        if percentile(np.abs(cosines), 100.0 - FOLD_PERCENTILE) < limit:
+            return True
+        mean = axis  # they are alike but for their signs: nobody saw these voxels from one side
+    return stack(points, mean, height, size, side)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fold(normals, mean, limit, side):
+    """
+    Halve a surface that turns too far from its mean normal; return whether it does.
+
+    normals  (n, 3) float64, unit
+    mean     (3,) float64
+    limit    least cosine between these that nearly all have
+    side     (n,) bool, out: one half
+    """
+    cosines = along(normals, mean)
+    if len(normals) < 2 or cosines.min() >= limit:
+        return False
+    if percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
+        return False
+    return halve_normals(normals, side)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def stack(points, normal, height, size, side):
+    """
+    Find the upper half of what lies over itself; return whether it does.
+
+    points, height, size, side  of halve_part
+    normal                      (3,) float64, unit or 0
+    """
+    heights = along(points, normal)
+    low, high = heights.min(), heights.max()
+    if high - low <= height:
+        return False
+    least = np.abs(normal).argmin()
+    x, y = np.zeros(3), np.empty(3)
+    j, k = (least + 1) % 3, (least + 2) % 3
+    length = math.hypot(normal[j], normal[k])
+    x[j], x[k] = -normal[k] / length, normal[j] / length
+    for axis in range(3):
+        j, k = (axis + 1) % 3, (axis + 2) % 3
+        y[axis] = normal[j] * x[k] - normal[k] * x[j]
+    # voxel indices have 21 bits, so no two columns have one number
+    column = np.floor(along(points, x) / size) * 2.0**26 + np.floor(along(points, y) / size)
+    order = np.argsort(column, kind='mergesort')
+    columns = stacked = begin = 0
+    for end in range(1, len(order) + 1):
+        if end < len(order) and column[order[end]] == column[order[begin]]:
+            continue
+        inside = heights[order[begin:end]]
+        columns += 1
+        stacked += inside.max() - inside.min() > height
+        begin = end
+    for i in range(len(heights)):
+        side[i] = heights[i] > 0.5 * (low + high)
+    return stacked > STACKED_SHARE * columns
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def along(vectors, direction):
+    """Return how far vectors (n, 3) go along a direction (3,)."""
+    found = np.empty(len(vectors))
+    for i in range(len(vectors)):
+        found[i] = (
+            vectors[i, 0] * direction[0]
+            + vectors[i, 1] * direction[1]
+            + vectors[i, 2] * direction[2]
+        )
+    return found
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def longest_axis(normals):
+    """Return the direction (3,) that normals (n, 3), whatever their signs, are nearest to."""
+    products, values, axes = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
+    for i in range(len(normals)):
+        for j in range(3):
+            for k in range(3):
+                products[j, k] += normals[i, j] * normals[i, k]
+    eigen_frame(products, values, axes)
+    return axes[2].copy()
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def percentile(values, share):
+    """Return a percentile as numpy does."""
+    ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
+    low = int(place)
+    high = min(low + 1, len(values) - 1)
+    return ordered[low] + (place - low) * (ordered[high] - ordered[low])

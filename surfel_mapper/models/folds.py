@@ -7,11 +7,9 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.folds import halve_normals
+from surfel_mapper.kernels.folds import fold
 
 Array = npt.NDArray[np.float64]
-
-FOLD_PERCENTILE = 98.0
 
 
 def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
@@ -28,18 +26,5 @@ def folded(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] |
         Least cosine between these that nearly all pieces have.
 
     """
-    cosines = normals @ mean
-    if len(normals) < 2 or cosines.min() >= limit:
-        return None
-    if percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
-        return None
     side = np.empty(len(normals), np.bool_)
-    return side if halve_normals(normals, side) else None
-
-
-def percentile(values: Array, share: float) -> float:
-    """Return a percentile as numpy does, whose checks take longer than a few values."""
-    ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
-    low = int(place)
-    high = min(low + 1, len(values) - 1)
-    return float(ordered[low] + (place - low) * (ordered[high] - ordered[low]))
+    return side if fold(normals, mean, limit, side) else None

@@ -35,7 +35,7 @@ from surfel_mapper.kernels.piece_groups import (
 )
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.charts import charts_of
+from surfel_mapper.models.charts import charts_of, cut
 from surfel_mapper.models.identity import match, Matched
 from surfel_mapper.models.live_patches import PatchFitter, symmetric, Tracked
 from surfel_mapper.models.model_update import ModelUpdate
@@ -160,6 +160,7 @@ class LiveModels:
             models.update()
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
+            cut(models._pieces, np.arange(2, dtype=np.int32), 0.5, 1)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])

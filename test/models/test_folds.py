@@ -9,7 +9,9 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.folds import folded, percentile
+from surfel_mapper.kernels.folds import halve_part, percentile
+from surfel_mapper.models.folds import folded
+from test.kernels.modes import both
 
 LIMIT = math.cos(math.radians(60.0))
 
@@ -46,6 +48,39 @@ def test_two_unequal_bundles_are_parted_where_the_gap_is():
 )
 def test_what_turns_less_or_cannot_be_halved_stays_whole(normals):
     assert folded(normals, np.array([0.0, 0.0, 1.0]), LIMIT) is None
+
+
+def halved(call, normals, points):
+    """Return one half of a part, of columns of 1 m in which 4 m are high; None for a whole one."""
+    side = np.empty(len(normals), bool)
+    return side if call(halve_part, normals, points, LIMIT, 4.0, 1.0, side) else None
+
+
+@both
+def test_a_part_is_halved_where_its_normals_turn_or_it_lies_over_itself(call):
+    level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
+    up = np.tile([0.0, 0.0, 1.0], (48, 1))
+    ramps = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
+    assert halved(call, up, np.concatenate([level, np.add(level, [0.0, 0.0, 3.9])])) is None
+    assert halved(call, up, np.concatenate([level, np.add(level, [6.0, 0.0, 5.0])])) is None
+    assert halved(call, up, ramps).tolist() == [False] * 24 + [True] * 24
+
+    bent = fan(-85.0, 85.0, 48)
+    side = halved(call, bent, np.concatenate([level, np.add(level, [6.0, 0.0, 0.0])]))
+    assert len(set(side[:24])) == len(set(side[24:])) == 1
+    assert side[0] != side[-1]
+
+
+@both
+def test_normals_that_differ_in_their_signs_alone_are_no_fold(call):
+    normals = np.tile([0.0, 0.0, 1.0], (24, 1))
+    normals[::3] *= -1.0
+    level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
+    assert halved(call, normals, level) is None
+    assert halved(call, normals, level + np.arange(24.0)[:, None] * [0.0, 0.0, 1.0]) is None
+    stacked = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
+    side = halved(call, np.tile(normals, (2, 1)), stacked)
+    assert set(np.flatnonzero(side)) in ({*range(24)}, {*range(24, 48)})
 
 
 @pytest.mark.parametrize('number', [1, 2, 3, 50, 51, 52, 200])
