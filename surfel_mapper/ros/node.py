@@ -31,12 +31,11 @@ from rclpy.lifecycle import (
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
-from rosgraph_msgs.msg import Clock
 
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.ros.diagnostics import CountedPublisher, Diagnostics
+from surfel_mapper.ros.guarded import GuardedNode
 from surfel_mapper.ros.inbox import Inbox
 from surfel_mapper.ros.parameters import as_declared, changed_config, declare_settings, refusal
 from surfel_mapper.ros.session import Session
@@ -45,7 +44,7 @@ from surfel_mapper.ros.waiting import result_of
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
-class MapperNode(LifecycleNodeMixin, Node):
+class MapperNode(LifecycleNodeMixin, GuardedNode):
     """
     A managed node that maps clouds.
 
@@ -107,14 +106,6 @@ class MapperNode(LifecycleNodeMixin, Node):
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """Create a publisher whose messages are counted for the diagnostics."""
         return super().create_publisher(*args, publisher_class=CountedPublisher, **kwargs)
-
-    def create_subscription(
-        self, msg_type: Any, topic: str, callback: Callable[[Any], None], *args: Any, **kwargs: Any
-    ) -> Subscription:
-        """Create a subscription; that of simulated time passes over what is no time."""
-        if msg_type is Clock:
-            callback = partial(self._on_clock, callback)
-        return super().create_subscription(msg_type, topic, callback, *args, **kwargs)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters that someone sends; the reason of a refusal names what is wrong."""
@@ -231,16 +222,6 @@ class MapperNode(LifecycleNodeMixin, Node):
             reason = self.refusal or f'not possible while {before}'
             self.get_logger().error(f'transition {name} refused: {reason}')
         return done
-
-    def _on_clock(self, set_time: Callable[[Clock], None], msg: Clock) -> None:
-        """Take the time of a message; rclpy raises where it is negative, which ends a node."""
-        if msg.clock.sec >= 0:
-            set_time(msg)
-            return
-        self.get_logger().warning(
-            f'message on /clock ignored: {msg.clock.sec} s, expected a time that is not negative',
-            throttle_duration_sec=10.0,
-        )
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse values that the configuration refuses, and files that hold no filters."""

@@ -9,6 +9,9 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -129,6 +132,21 @@ def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
     send(peer, drive(1))
     peer.diagnosis({'scans.mapped': 1})
     assert node.stop() == 0
+
+
+@pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
+def test_a_parameter_of_no_known_type_is_refused(start, peer, kind):
+    node = start('node', *ARGUMENTS)
+    name = 'set_parameters' if kind is SetParameters else 'set_parameters_atomically'
+    fine = Parameter('window.max_scans', value=2).to_parameter_msg()
+    wrong = ParameterMessage(name='map.min_points', value=ParameterValue(type=10))
+    answer = peer.call(name, kind, kind.Request(parameters=[fine, wrong]))
+    results = answer.results if kind is SetParameters else [answer.result] * 2
+    reason = 'map.min_points: a value of type 10, expected 1 to 9'
+    assert [(found.successful, found.reason) for found in results] == [(False, reason)] * 2
+    answer = peer.call(name, kind, kind.Request(parameters=[fine]))
+    assert all(r.successful for r in getattr(answer, 'results', None) or [answer.result])
+    node.check()
 
 
 def test_filters_change_while_scans_come_and_bad_files_are_refused(start, peer, tmp_path):
