@@ -11,11 +11,13 @@ itself, and several attempts leave the same files.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, ExitStack
 import logging
 import multiprocessing
 from multiprocessing import forkserver
 import os
+import signal
+import threading
 from typing import Any, Protocol, TypeVar
 
 from surfel_mapper.errors import ClusterError, DependencyError
@@ -128,7 +130,8 @@ def begin_workers() -> str:
     if 'forkserver' not in multiprocessing.get_all_start_methods():
         return 'spawn'
     forkserver.set_forkserver_preload(PRELOADED)
-    with environment(WORKER_ENVIRONMENT):  # libraries read it when they are loaded
+    # libraries read it when they are loaded; a terminal sends Ctrl-C to that process too
+    with environment(WORKER_ENVIRONMENT), on_interrupt(signal.SIG_IGN):
         forkserver.ensure_running()
     return 'forkserver'
 
@@ -146,6 +149,29 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
                 del os.environ[name]
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def on_interrupt(handler: Callable[[int, Any], object] | signal.Handlers) -> Iterator[None]:
+    """Have Ctrl-C do something else in a block, and in what is started there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield  # others are not interrupted
+        return
+    before = signal.signal(signal.SIGINT, handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def interrupt_held() -> Iterator[None]:
+    """Hold Ctrl-C back until the end of a block: Dask cannot end a cluster that half began."""
+    pressed: list[int] = []
+    with on_interrupt(lambda number, _: pressed.append(number)):
+        yield
+    if pressed:
+        raise KeyboardInterrupt
 
 
 @contextmanager
@@ -191,12 +217,16 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
     }
     with dask.config.set(settings):
         if scheduler is None:
-            with (
-                LocalCluster(
-                    n_workers=workers, threads_per_worker=1, dashboard_address='127.0.0.1:0'
-                ) as cluster,
-                Client(cluster) as client,
-            ):
+            with ExitStack() as begun:
+                with interrupt_held():
+                    cluster = begun.enter_context(
+                        LocalCluster(
+                            n_workers=workers,
+                            threads_per_worker=1,
+                            dashboard_address='127.0.0.1:0',
+                        )
+                    )
+                    client = begun.enter_context(Client(cluster))
                 yield OnDask(client)
             return
         try:

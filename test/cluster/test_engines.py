@@ -4,6 +4,7 @@
 
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -70,6 +71,42 @@ def test_every_task_is_answered_under_its_number(two_workers):
 
 def test_workers_are_born_with_all_that_tasks_need(two_workers):
     assert set(two_workers._client.run(what_is_there).values()) == {(True, True, '1')}
+
+
+def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
+    made = []
+
+    class Interrupted(distributed.LocalCluster):
+
+        def __init__(self, *args, **kwargs):
+            made.append(self)
+            signal.raise_signal(signal.SIGINT)
+            super().__init__(*args, **kwargs)
+
+    monkeypatch.setattr(distributed, 'LocalCluster', Interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt), engine(workers=1):
+        pytest.fail('it has begun')
+    assert made[0].status is distributed.Status.closed
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+FORKSERVER = """
+from multiprocessing import forkserver
+from pathlib import Path
+from surfel_mapper.cluster.engines import begin_workers
+assert begin_workers() == 'forkserver'
+words = Path(f'/proc/{forkserver._forkserver._forkserver_pid}/status').read_text().split()
+print(words[words.index('SigIgn:') + 1])
+"""
+
+
+@pytest.mark.skipif(not os.path.exists('/proc/self/status'), reason='signals are not shown')
+def test_what_workers_are_forked_from_ignores_ctrl_c_from_its_first_moment():
+    done = subprocess.run(
+        [sys.executable, '-c', FORKSERVER], capture_output=True, text=True, check=True
+    )
+    assert int(done.stdout, 16) >> (signal.SIGINT - 1) & 1
 
 
 def test_the_environment_is_left_as_it_was(monkeypatch):
