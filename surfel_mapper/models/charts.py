@@ -80,5 +80,7 @@ def connected(pieces: Pieces, rows: Rows) -> list[Rows]:
     """Return which of some rows hang together, each part in their order."""
     parent = np.empty(len(rows), np.int64)
     hang_together(rows, pieces.links, pieces.around, pieces.places, parent)
+    if not parent.any():  # as mostly: all with the first
+        return [rows]
     order = np.argsort(parent, kind='stable')
     return np.split(rows[order], np.flatnonzero(np.diff(parent[order])) + 1)
