@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from surfel_mapper.errors import PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Prism
 
@@ -26,11 +27,13 @@ def prism(msg: Any, mapper: Mapper) -> Prism:
     Raises
     ------
     PoseError
-        If there is no transform to the fixed frame at the stamp.
+        If it names no frame, or there is no transform to the fixed one at the stamp.
     ValueError
         If it has fewer than three corners, or one is not finite.
 
     """
+    if not msg.header.frame_id:
+        raise PoseError('its frame_id is empty')
     stamp_ns = msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec
     T_map_frame = mapper.T_map_of(msg.header.frame_id, stamp_ns)
     corners = np.array([(p.x, p.y, p.z) for p in msg.polygon.points]).reshape(-1, 3)

@@ -17,10 +17,12 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import SetBool, Trigger
 
 from surfel_mapper.config import Config
+from surfel_mapper.errors import PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
 from surfel_mapper.ros.control import Control, MAX_WAITING
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.polygons import prism
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import NODE, odometry, stamp, START_NS
 
@@ -139,6 +141,19 @@ def test_a_polygon_is_cleared_in_whatever_frame_it_comes(peer, node):
     assert digest(peer) == twin.map.digest()
     assert "in frame 'odom' ignored: polygon of 2 corners, expected 3 or more" in node.output
     assert f'voxels in the polygon on {NODE}/clear_polygon in frame base_link' in node.output
+
+
+@pytest.mark.parametrize(
+    ('corner', 'frame_id', 'error', 'reason'),
+    [
+        ((0.0, 0.0), '', PoseError, 'frame_id is empty'),
+        ((0.0, 0.0), 'elsewhere', PoseError, 'elsewhere'),
+        ((float('nan'), 0.0), 'odom', ValueError, 'finite corners'),
+    ],
+)
+def test_a_polygon_of_nowhere_is_refused(corner, frame_id, error, reason):
+    with pytest.raises(error, match=reason):
+        prism(polygon([corner, (1.0, 0.0), (1.0, 1.0)], frame_id), Mapper(Config()))
 
 
 def test_a_map_that_was_saved_is_loaded_and_goes_on_as_if_it_had_never_stopped(
