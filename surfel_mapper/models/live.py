@@ -268,15 +268,16 @@ class LiveModels:
 
     def _refit(self, members: Rows, ends: Indices, matched: Matched) -> list[int]:
         """Fit the patches of which something has changed that matters; return those known."""
-        pieces = self._pieces
-        chosen, parts = [], []
-        for k, number in enumerate(matched.ids):
+        pieces, chosen, parts = self._pieces, [], []
+        flat = np.flatnonzero(pieces.component[members] >= 0)
+        first = members[flat[np.searchsorted(flat, ends[:-1])]]
+        is_material = np.logical_or.reduceat(pieces.is_material[members], ends[:-1])
+        found = zip(matched.ids, pieces.component[first].tolist(), is_material, strict=True)
+        for k, (number, component, matters) in enumerate(found):
             rows, known = members[ends[k] : ends[k + 1]], self._patches.get(number)
-            flat = rows[pieces.component[rows] >= 0]
-            component = int(pieces.component[flat[0]])
             if known is not None:
                 known.component = component
-                if np.array_equal(known.rows, rows) and not pieces.is_material[rows].any():
+                if not matters and np.array_equal(known.rows, rows):
                     continue
             chosen.append(number)
             parts.append((rows, component))
