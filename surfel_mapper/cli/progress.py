@@ -97,3 +97,12 @@ def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@contextmanager
+def finished_first() -> Iterator[None]:
+    """Finish what takes a second before Ctrl-C interrupts; pressed again, it does at once."""
+    with stopped_by_interrupt() as stopped:
+        yield
+    if stopped():
+        raise KeyboardInterrupt

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from functools import partial
 import json
 import math
@@ -23,7 +23,7 @@ import time
 from typing import TYPE_CHECKING
 
 from surfel_mapper.cli import replay_many
-from surfel_mapper.cli.progress import progress, stopped_by_interrupt
+from surfel_mapper.cli.progress import finished_first, progress, stopped_by_interrupt
 from surfel_mapper.cli.replay_files import (
     BAG,
     check_truth,
@@ -195,8 +195,9 @@ def map_one(args: argparse.Namespace, config: Config, request: Request, output: 
         }
     if args.poses_out is not None:
         mapped.write(args.poses_out)
-    written = write_files(output, formats_wanted, mapper, mapped, summary, history)
-    print(json.dumps(summary) if args.json else report(summary, written))
+    with nullcontext() if was_stopped else finished_first():
+        written = write_files(output, formats_wanted, mapper, mapped, summary, history)
+        print(json.dumps(summary) if args.json else report(summary, written))
     if was_stopped:
         return INTERRUPTED
     return CUT if args.strict and summary['cut'] else 0

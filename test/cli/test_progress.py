@@ -19,9 +19,11 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli import progress as progress_module
-from surfel_mapper.cli.progress import progress, stopped_by_interrupt
+from surfel_mapper.cli.main import main
+from surfel_mapper.cli.progress import finished_first, progress, stopped_by_interrupt
 from surfel_mapper.io.parquet import read_map
-from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from surfel_mapper.viz import picture
+from test.io.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
 
 MANY = 5000
 WAIT_S = 300.0
@@ -63,6 +65,41 @@ def test_the_first_interrupt_is_told_and_the_second_interrupts():
             signal.raise_signal(signal.SIGINT)
 
     assert signal.getsignal(signal.SIGINT) is before
+
+
+def test_an_interrupt_in_what_is_finished_first_comes_after_it_and_a_second_one_at_once():
+    done = []
+
+    def press(times):
+        with finished_first():
+            for _ in range(times):
+                signal.raise_signal(signal.SIGINT)
+            done.append(times)
+
+    for times in (1, 2):
+        with pytest.raises(KeyboardInterrupt):
+            press(times)
+    assert done == [1]
+
+
+def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch, capsys):
+    draw, pressed = picture.draw_map, []
+
+    def pressing(*args, **options):
+        pressed.append(signal.raise_signal(signal.SIGINT))
+        draw(*args, **options)
+
+    monkeypatch.setattr(picture, 'draw_map', pressing)
+    bag = write_rosbag2(tmp_path / 'bag', drive())
+
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'out'), '--json']) == 130
+
+    assert len(pressed) == 1
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
+    assert summary == json.loads(capsys.readouterr().out)
+    assert {path.name for path in (tmp_path / 'out').iterdir()} == {
+        'map.ply', 'map.png', 'report.html', 'summary.json',
+    }  # fmt: skip
 
 
 def test_in_another_thread_nothing_is_caught():
