@@ -23,7 +23,7 @@ CONFIG = Config.from_mapping(
     {'pose.source': 'odometry', 'frames.base_to_sensor': [0.0, 0.0, 0.5, *UNTURNED]}
 )
 MAX_CLOUDS = CONFIG.input.max_waiting_clouds
-TIMEOUT_S = 20
+TIMEOUT_S = 120
 
 
 class Bench:

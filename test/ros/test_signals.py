@@ -15,7 +15,7 @@ import pytest
 from surfel_mapper.ros.inbox import Inbox
 from surfel_mapper.ros.signals import NUMBERS, RETRY_S, Signals
 
-TIMEOUT_S = 20
+TIMEOUT_S = 120
 HANDLED = (*NUMBERS, signal.SIGALRM)
 
 
