@@ -83,10 +83,11 @@ def test_a_signal_while_llvm_calls_back_interrupts_what_comes_after(capfd):
     assert 'KeyboardInterrupt' not in capfd.readouterr().err
 
 
-def test_without_a_signal_all_is_as_before(handlers):
+def test_without_a_signal_all_is_as_before():
+    before = {number: signal.getsignal(number) for number in HANDLED}
     with Signals() as signals:
         signals.check()
-    assert {number: signal.getsignal(number) for number in HANDLED} == handlers
+    assert {number: signal.getsignal(number) for number in HANDLED} == before
 
 
 def nothing():
