@@ -11,6 +11,7 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
+from surfel_mapper.cli.replay_report import rounded
 from surfel_mapper.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -79,8 +80,8 @@ def run(args: argparse.Namespace) -> int:
         print(json.dumps(report))
     else:
         print(
-            f'{args.output}: scans {report["scans"]}   points {report["points"] / 1e6:.1f} M '
-            f'({returns / 1e6:.1f} M returns)   {report["distance_m"]:g} m   '
+            f'{args.output}: scans {report["scans"]}   points {rounded(report["points"])} '
+            f'({rounded(returns)} returns)   {report["distance_m"]:g} m   '
             f'{report["seconds"]} s'
         )
     return 0

@@ -65,14 +65,15 @@ class Lidar:
     def __post_init__(self) -> None:
         """Check every value."""
         low, high = self.elevation_deg
+        nearest = self.min_range_m
         checks = (
             ('beams', 1 <= self.beams <= 1024, 'from 1 to 1024'),
             ('columns', 1 <= self.columns <= 65536, 'from 1 to 65536'),
             ('elevation_deg', -90.0 < low <= high < 90.0, 'ascending, between -90 and 90'),
             ('rate_hz', 0.0 < self.rate_hz <= 1000.0, 'positive, at most 1000'),
             ('range_noise_m', 0.0 <= self.range_noise_m < math.inf, 'zero or positive, finite'),
-            ('min_range_m', 0.0 <= self.min_range_m < self.max_range_m, 'in [0, max_range_m)'),
-            ('max_range_m', self.max_range_m < math.inf, 'finite'),
+            ('min_range_m', 0.0 <= nearest < math.inf, 'zero or positive, finite'),
+            ('max_range_m', nearest < self.max_range_m < math.inf, f'over {nearest}, finite'),
             ('seed', self.seed >= 0, 'zero or positive'),
         )
         for name, holds, expected in checks:

@@ -27,7 +27,7 @@ def counts(path):
 def test_it_writes_a_bag_and_says_what_is_in_it(tmp_path, capsys):
     assert run(tmp_path / 'street', '--scans', '3') == 0
     out, err = capsys.readouterr()
-    assert out.startswith(f'{tmp_path}/street: scans 3   points 0.0 M')
+    assert out.startswith(f'{tmp_path}/street: scans 3   points 1.54 k (')
     assert err == ''
     assert counts(tmp_path / 'street') == {'/odom': 31, '/points': 3, '/tf': 31, '/tf_static': 1}
 

@@ -133,6 +133,11 @@ def test_a_lidar_that_cannot_be_is_refused_by_its_setting(setting):
     assert 'expected' in text
 
 
+def test_a_range_that_ends_before_it_begins_is_refused_by_its_end():
+    with pytest.raises(ConfigError, match=r'max_range_m: 0\.1, expected over 0\.3, finite'):
+        Lidar(max_range_m=0.1)
+
+
 def test_poses_of_another_shape_are_refused():
     with pytest.raises(ValueError, match='T_world_sensor'):
         SMALL.scan(FLOOR, np.tile(HERE, (31, 1, 1)))
