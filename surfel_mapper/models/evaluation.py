@@ -5,12 +5,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.multi_model import MultiModel
+if TYPE_CHECKING:
+    from surfel_mapper.models.multi_model import MultiModel
 
 POINT_BYTES = 12
 """A point as three float32."""
@@ -62,7 +63,7 @@ def evaluate(model: MultiModel, reference: npt.NDArray[Any], seed: int = 0) -> E
         Of what is drawn from the Gaussians.
 
     """
-    cloud = reference.reshape(-1, 3).astype(np.float64)
+    cloud = np.asarray(reference, np.float64).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     made = model.resample(seed=seed)
     precise = nearest(made, cloud)

@@ -79,7 +79,7 @@ def fit(
 
     """
     config = config or ModelsConfig()
-    view = np.asarray(viewpoint, np.float64)
+    points, view = np.asarray(points), np.asarray(viewpoint, np.float64)
     if points.ndim < 2 or points.shape[-1] != 3 or points.dtype not in (np.float32, np.float64):
         raise ModelError(
             f'points: {points.dtype} {points.shape}, expected (..., 3) float32 or float64'

@@ -10,11 +10,13 @@ the viewpoint.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.bspline import HeightField
+from surfel_mapper.models.evaluation import evaluate, Evaluation
 from surfel_mapper.models.grid import Grid
 
 Array = npt.NDArray[np.float64]
@@ -225,3 +227,7 @@ class MultiModel:
         step_m = self.voxel_size_m if step_m is None else step_m
         parts = [patch.samples(step_m) for patch in self.patches]
         return np.concatenate([*parts, self.gaussians.samples(seed)])
+
+    def evaluate(self, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
+        """Compare what the models generate with a cloud; see models.evaluate."""
+        return evaluate(self, reference, seed)

@@ -92,7 +92,8 @@ def test_an_exact_plane_comes_back_to_half_a_voxel():
     (plane,) = model.planes
     assert plane.normal == pytest.approx(np.array([1, 2, 3]) / math.sqrt(14), abs=1e-9)
     assert plane.normal @ cloud.T + plane.offset_m == pytest.approx(0.0, abs=1e-9)
-    found = evaluate(model, cloud)
+    found = model.evaluate(cloud)
+    assert found == evaluate(model, cloud)
     assert found.precision_rms_m < A / 2
     assert found.completeness_rms_m < A
     assert found.coverage == 1.0
