@@ -104,7 +104,7 @@ def node(*ros_args: object) -> Iterator[subprocess.Popen[bytes]]:
     finally:
         process.terminate()  # it logs what it mapped, and ends
         try:
-            process.wait(30)
+            process.wait(60)
         except subprocess.TimeoutExpired:
             process.kill()
 
@@ -132,10 +132,13 @@ def save_map() -> dict[str, str]:
     rclpy.init()
     asking = rclpy.create_node('demo')
     client = asking.create_client(Trigger, '/surfel_mapper/save_map')
-    if not client.wait_for_service(20.0):
+    if not client.wait_for_service(60.0):
         sys.exit('The node does not answer.')
-    future = client.call_async(Trigger.Request())
-    rclpy.spin_until_future_complete(asking, future, timeout_sec=60.0)
+    for _ in range(6):  # it answers nobody whom it has not discovered yet, though he knows it
+        future = client.call_async(Trigger.Request())
+        rclpy.spin_until_future_complete(asking, future, timeout_sec=10.0)
+        if future.done():
+            break
     answer = future.result()
     asking.destroy_node()
     rclpy.shutdown()

@@ -29,8 +29,9 @@ def offered_settings(bag, capsys):
 def live_digest(start, bag, config, num_scans, rate):
     """Return what the node says at its end, having mapped the bag."""
     node = start('node', '--ros-args', '--params-file', config, *RELIABLE)
-    playing = start('play', bag, '--rate', rate, '--wait-for', '/points', '/odom', '--json')
-    assert playing.wait() == 0, playing.output
+    waiting = ['--wait-for', '/points', '/odom', '--timeout', TIMEOUT_S]
+    playing = start('play', bag, '--rate', rate, *waiting, '--json')
+    assert playing.wait(2 * TIMEOUT_S) == 0, playing.output
     assert json.loads(playing.output.splitlines()[-1])['published']['/points'] == num_scans
     assert node.stop() == 0, node.output
     assert f'scans received {num_scans}, mapped {num_scans},' in node.output
