@@ -94,7 +94,7 @@ def surfel_markers(
         they delete them.
 
     """
-    rows = np.flatnonzero(np.isfinite(surfels.normal).all(axis=1))
+    rows = np.flatnonzero(np.isfinite(surfels.normal[:, 0]))  # nan in all of it, or in none
     drawn = (surfels.position, surfels.normal)
     discs = np.empty((len(rows) * 3 * (SEGMENTS - 2), 3))
     disc_colors = np.empty((len(discs), 4), np.float32)
