@@ -12,11 +12,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-import re
 from typing import Any
 
 from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import BagError
+from surfel_mapper.io.files import by_number
 
 STORAGE_SUFFIXES = ('.mcap', '.db3')
 PACKED_SUFFIX = '.zstd'
@@ -135,10 +135,6 @@ def loose_files(directory: Path) -> list[Path]:
         raise BagError(
             f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'
         )
-
-    def by_number(file: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)]
-
     return sorted(files, key=by_number)
 
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Files that are written whole or not at all.
+Files that are written whole or not at all, and the order of those that are numbered.
 
 The bytes go to a temporary file in the directory of the file wanted (a rename works within one
 file system only) and to the disk, before the name moves to them in one step. Whoever reads the
@@ -15,6 +15,7 @@ from contextlib import contextmanager
 import json
 import os
 from pathlib import Path
+import re
 import secrets
 from typing import Any, BinaryIO
 
@@ -67,6 +68,11 @@ def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
     """Write values as JSON, for people too, whole or not at all; see replace_file."""
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=2) + '\n').encode())
+
+
+def by_number(file: Path) -> list[Any]:
+    """Return what files are sorted by so that scan2 comes before scan10."""
+    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)]
 
 
 def cannot_write(path: str | Path, error: OSError) -> FileFormatError:

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-import re
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.io import pcd, ply
+from surfel_mapper.io.files import by_number
 
 SUFFIXES = ('.ply', '.pcd', '.bin')
 
@@ -34,10 +34,6 @@ Columns = dict[str, npt.NDArray[Any]]
 
 def scan_files(directory: Path) -> list[Path]:
     """Return the files of scans in a directory, scan2 before scan10."""
-
-    def by_number(file: Path) -> list[Any]:
-        return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)]
-
     files = [file for file in directory.iterdir() if file.suffix in SUFFIXES and file.is_file()]
     return sorted(files, key=by_number)
 
