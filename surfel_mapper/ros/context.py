@@ -46,8 +46,10 @@ def context(ros_args: Sequence[str]) -> Iterator[None]:
 
 
 def reason(error: RuntimeError) -> str:
-    """Return why ROS refuses to start; what it says of security is not enough to go by."""
+    """Return why ROS refuses to start; what it says of two things is not enough to go by."""
     said = str(error).partition(', at /')[0]
+    if 'before ros__parameters' in said:  # such a file is one for --config of replay
+        return f'{said}; put the settings below /**: and ros__parameters:, each indented deeper'
     if os.environ.get('ROS_SECURITY_ENABLE') != 'true':
         return said
     keystore = os.environ.get('ROS_SECURITY_KEYSTORE')

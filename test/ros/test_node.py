@@ -279,6 +279,16 @@ def test_what_cannot_work_ends_the_node_with_a_message(domain, capfd, arguments,
     assert 'surfel-mapper node: ' in said
 
 
+def test_a_file_of_settings_alone_is_refused_with_what_to_put_around_them(
+    domain, capfd, tmp_path
+):
+    (tmp_path / 'my.yaml').write_text('map: {voxel_size_m: 1.0}\n', encoding='utf-8')
+    assert main(['node', '--ros-args', '--params-file', str(tmp_path / 'my.yaml')]) == 1
+    said = capfd.readouterr().err
+    assert 'my.yaml' in said
+    assert 'put the settings below /**: and ros__parameters:' in said
+
+
 def test_an_unknown_parameter_gives_no_traceback(start):
     node = start('node', '--ros-args', '-p', 'map.voxelsize:=1.0')
     assert node.wait() == 1
