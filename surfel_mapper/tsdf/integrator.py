@@ -81,6 +81,7 @@ class Integrator:
     """
 
     def __init__(self, blocks: BlockMap) -> None:
+        """Prepare for the settings of a map; warn of those that leave holes."""
         self.blocks = blocks
         config = blocks.config
         if config.truncation_m < 2.0 * config.voxel_size_m:

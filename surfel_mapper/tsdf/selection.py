@@ -42,6 +42,7 @@ class BlockSelection:
     """
 
     def __init__(self, config: TsdfConfig) -> None:
+        """Begin without memory."""
         self._config = config
         self._marks = np.zeros(0, np.int64)
 
