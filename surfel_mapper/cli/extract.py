@@ -97,10 +97,16 @@ def read(
 ) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64]]:
     """Return points (N, 3), the size of voxels and the viewpoint (3,), m."""
     from surfel_mapper.config.models import ModelsConfig
+    from surfel_mapper.errors import FileFormatError
     from surfel_mapper.io import map_state, parquet
-    from surfel_mapper.io.scan_files import read_scan
+    from surfel_mapper.io.scan_files import read_scan, SUFFIXES
     from surfel_mapper.models.surfel_points import above, surfel_points
 
+    if args.cloud.suffix not in (*MAPS, *SUFFIXES):
+        raise FileFormatError(
+            f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
+            f'{", ".join(MAPS)}'
+        )
     if args.cloud.suffix in MAPS:
         if args.cloud.suffix == '.npz':
             surfel_map, _ = map_state.load_map(args.cloud)

@@ -70,6 +70,12 @@ def test_what_is_no_cloud_is_refused_with_its_name(tmp_path, capsys, name):
     assert name in capsys.readouterr().err
 
 
+def test_what_can_be_read_is_told_where_the_ending_says_something_else(tmp_path, capsys):
+    assert main(['extract', 'notes.md', '--output', str(tmp_path)]) == 1
+    said = capsys.readouterr().err
+    assert 'a cloud ending in .ply, .pcd, .bin, or a map ending in .npz, .parquet' in said
+
+
 def test_a_voxel_size_of_nothing_is_refused(tmp_path, capsys):
     write_cloud(tmp_path / 'a.ply', sheet(1.0, 1.0, 0.1).astype(np.float32))
     arguments = [str(tmp_path / 'a.ply'), '--output', str(tmp_path / 'out')]
