@@ -9,9 +9,10 @@ done, so that an earlier map is there, whole, until then.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
+from itertools import islice
 from pathlib import Path
 import secrets
 import shutil
@@ -32,7 +33,7 @@ from surfel_mapper.cluster.merging import (
 from surfel_mapper.cluster.shard_run import OnDone, ShardRun
 from surfel_mapper.cluster.shards import Shard, ShardResult
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.io.parquet_tiles import dataset_digest, Part, Tile, tiles_in
+from surfel_mapper.io.parquet_tiles import dataset_digest, kind_of, Part, Tile, tiles_in
 from surfel_mapper.mapping.surfels import Surfels
 
 SAMPLE = 100_000
@@ -154,11 +155,27 @@ def merge_maps(
     """Merge finished maps into a dataset of tiles in ``map`` inside a directory; see map_bags."""
     with work_directory(directory) as work:
         found: list[dict[Tile, Part]] = []
+        kinds: dict[str | Path, dict[str, Any]] = {}
         for number, source in enumerate(sources):
             place = work / str(number)
             place.mkdir()
-            found += parts_of_map(source, place)
+            parts = parts_of_map(source, place)
+            for part in islice((part for tiles in parts for part in tiles.values()), 1):
+                kinds[source] = kind_of(part.path)
+            found += parts
+        check_alike(kinds)
         return merge(gathered(found), engine, directory, min_points, on_done)
+
+
+def check_alike(kinds: Mapping[str | Path, Mapping[str, Any]]) -> None:
+    """Refuse maps that do not add up, before the work."""
+    (first, expected), *others = kinds.items() or [(None, {})]
+    for source, kind in others:
+        for name, value in kind.items():
+            if value != expected[name]:
+                raise MapError(
+                    f'{source}: {name} {value}, expected {expected[name]} as in {first}'
+                )
 
 
 def merge(

@@ -62,6 +62,10 @@ ROWS_READ = 1 << 18
 """So many rows are read at a time where a file is cut into tiles, or a digest taken."""
 
 
+KIND = ('voxel_size_m', 'level', 'columns')
+"""What maps that add up have in common."""
+
+
 class Tile(NamedTuple):
     """A square of voxels: their indices shifted right by TILE_BITS."""
 
@@ -154,6 +158,12 @@ def split_map(path: str | Path) -> Iterator[SurfelMap]:
             yield surfel_map
 
 
+def kind_of(path: str | Path) -> dict[str, Any]:
+    """Return what maps that add up have in common; see KIND."""
+    with _opened(path) as (_, attributes):
+        return {name: attributes[name] for name in KIND}
+
+
 def dataset_digest(directory: str | Path) -> str:
     """
     Return the digest of the map in a dataset; the map is never in memory as a whole.
@@ -172,8 +182,7 @@ def dataset_digest(directory: str | Path) -> str:
     for path in tiles.values():
         with _opened(path) as (content, attributes):
             num_voxels += content.metadata.num_rows
-            kept = {k: attributes[k] for k in ('voxel_size_m', 'level', 'columns')}
-            kinds.setdefault(json.dumps(kept), path)
+            kinds.setdefault(json.dumps({name: attributes[name] for name in KIND}), path)
     if len(kinds) > 1:
         raise FileFormatError(f'{directory}: tiles of different maps: {kinds}')
     kind = json.loads(next(iter(kinds)))

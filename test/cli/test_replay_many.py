@@ -96,7 +96,9 @@ def test_maps_that_do_not_fit_are_refused(alone, bags, tmp_path, capsys):
     maps = [str(alone[0]), str(tmp_path / 'small')]
     assert main(['merge', *maps, '--output', str(tmp_path / 'sum')]) == 1
 
-    assert '0.2 m' in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f'small: voxel_size_m 0.2, expected 0.5 as in {alone[0]}' in said
+    assert '.part' not in said
     assert not (tmp_path / 'sum' / 'map').exists()
 
 
