@@ -182,7 +182,8 @@
   const half = data.size.map((side) => side / 2);
   const radius = Math.max(Math.hypot(...half), 1);
   const across = data.size[0] >= data.size[1];
-  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, distance: 1.4 * radius };
+  const narrow = Math.max(canvas.clientHeight / (canvas.clientWidth || 1e9), 1); // telephones
+  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, distance: 1.4 * radius * narrow };
   let view, running = false, moved = false, share = 1, last = 0, rest = 0;
 
   function reset() {
