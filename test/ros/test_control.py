@@ -24,7 +24,7 @@ from surfel_mapper.ros.control import Control, MAX_WAITING
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.polygons import prism
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
-from test.ros.live import NODE, odometry, stamp, START_NS
+from test.ros.live import NODE, odometry, stamp, START_NS, TIMEOUT_S
 
 ANSWERS = LoadMap.Response
 SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))
@@ -237,8 +237,8 @@ def test_of_too_many_requests_that_wait_the_last_are_refused_at_once(peer):
     mapper = Mapper(Config())
     thread, busy, released = MappingThread(mapper, pytest.fail), Event(), Event()
     thread.start(lambda update: None)
-    thread.call(lambda: (busy.set(), released.wait(60)))
-    assert busy.wait(60)
+    thread.call(lambda: (busy.set(), released.wait(TIMEOUT_S)))
+    assert busy.wait(TIMEOUT_S)
     Control(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
     client = peer.node.create_client(Trigger, '/peer/clear')
     peer.spin_until(client.service_is_ready)

@@ -14,7 +14,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.io.map_state import load_map
-from test.ros.live import Peer, ROOT
+from test.ros.live import Peer, ROOT, TIMEOUT_S
 
 EXAMPLES = ROOT / 'examples'
 
@@ -46,6 +46,6 @@ def test_the_mirror_of_a_node_has_the_digest_of_the_map_that_the_node_saves(star
     finally:
         peer.close()
         mirror.terminate()
-        mirror.wait(30)
+        mirror.wait(TIMEOUT_S)
     assert saved.num_points > 0
     assert 'flat and level' in said
