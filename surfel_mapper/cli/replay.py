@@ -46,7 +46,7 @@ SUMMARY = 'Map a bag, or a folder of scans, and write the map, a picture and fig
 
 EXAMPLE = 'surfel-mapper replay street.mcap --topic /points --config vehicle.yaml --output street/'
 
-CUT, INTERRUPTED = replay_many.CUT, 130
+CUT, INTERRUPTED = replay_many.CUT, replay_many.INTERRUPTED
 """Exit codes: the recording ends too early and --strict was given; Ctrl-C was pressed."""
 
 

@@ -11,15 +11,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 import json
 from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli.progress import progress
+from surfel_mapper.cli.progress import finished_first, progress, stopped_by_interrupt
 from surfel_mapper.cli.replay_report import report, rounded
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import ConfigError, MapError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from surfel_mapper.config import Config
     from surfel_mapper.offline.recording import Request
 
-CUT = 3
-"""Exit code: a recording ends too early and --strict was given."""
+CUT, INTERRUPTED = 3, 130
+"""Exit codes: a recording ends too early and --strict was given; Ctrl-C ended it."""
 
 ONE_PROCESS = ('window', 'align', 'poses_out', 'truth', 'view', 'rrd', 'formats')
 """Options that ask for the whole map, or all scans in order, in one process."""
@@ -70,17 +70,23 @@ def run(
 
     lengths_s, cuts = surveyed(requests, config)
     recorded_s = sum(lengths_s)
-    with engine(args.workers, args.scheduler) as running:
+    with engine(args.workers, args.scheduler) as running, stopped_by_interrupt() as stopped:
         shard_s = shard_length_s(recorded_s, running.num_workers)
         shards = [shard for request in requests for shard in cut(request, config, shard_s)]
-        with two_stages('replay', recorded_s, 'recorded second') as on_done:
-            mapped = map_bags(shards, running, output, on_done)
+        try:
+            with two_stages('replay', recorded_s, 'recorded second') as on_done:
+                mapped = map_bags(shards, running, output, on_done, stopped)
+        except MapError:
+            if stopped():  # before anything was mapped
+                raise KeyboardInterrupt from None
+            raise
         workers = running.num_workers
     summary = {
         'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
         'bags': [str(request.path) for request in requests],
         'recorded_s': recorded_s,
         'replay_s': time.perf_counter() - began,
+        'interrupted': mapped.interrupted,
         'cut': cuts,
         **mapped.counts(),
         **described(mapped.map),
@@ -91,8 +97,11 @@ def run(
         'core_s': core_s(mapped),
         'settings': config.to_mapping(),
     }
-    written = write_overview(output, summary, mapped.map, mapped.places)
-    print(json.dumps(summary) if args.json else report(summary, written))
+    with nullcontext() if mapped.interrupted else finished_first():
+        written = write_overview(output, summary, mapped.map, mapped.places)
+        print(json.dumps(summary) if args.json else report(summary, written))
+    if mapped.interrupted:
+        return INTERRUPTED
     return CUT if args.strict and cuts else 0
 
 

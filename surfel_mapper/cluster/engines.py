@@ -18,6 +18,7 @@ from multiprocessing import forkserver
 import os
 import signal
 import threading
+import time
 from typing import Any, Protocol, TypeVar
 
 from surfel_mapper.errors import ClusterError, DependencyError
@@ -31,6 +32,8 @@ CONNECT_S = 20
 LOSSES = 5
 """A task at which so many workers died is given up."""
 
+POLL_S = 0.02
+"""So often it is looked whether a task is done, or no more is wanted."""
 
 PRELOADED = ['surfel_mapper.cluster.preload', 'distributed']
 """What local workers are forked with; each of them would load it for 2 s otherwise."""
@@ -42,6 +45,11 @@ unless there is a single arena: every cloud would be paged in anew, which double
 """
 
 
+def never() -> bool:
+    """Return that all is wanted."""
+    return False
+
+
 class Engine(Protocol):
     """Runs tasks."""
 
@@ -50,9 +58,16 @@ class Engine(Protocol):
         """How many tasks run at a time."""
 
     def run(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
-        """Yield the number of each item and what the function returns, as they get done."""
+        """
+        Yield the number of each item and what the function returns, as they get done.
+
+        Once it is stopped, only what is under way gets done.
+        """
 
 
 class InProcess:
@@ -61,10 +76,15 @@ class InProcess:
     num_workers = 1
 
     def run(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
-        """Yield the number of each item and what the function returns."""
+        """Yield the number of each item and what the function returns, until it is stopped."""
         for number, item in enumerate(items):
+            if stopped():
+                return
             yield number, function(item)
 
 
@@ -89,10 +109,16 @@ class OnDask:
         return max(len(self._client.scheduler_info(n_workers=-1)['workers']), 1)
 
     def run(
-        self, function: Callable[[Item], Result], items: Sequence[Item]
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
         """
         Yield the number of each item and what the function returns, as they get done.
+
+        Once it is stopped, only what is under way gets done: of what is not done yet, as many as
+        there are workers, since tasks are begun in their order.
 
         Raises
         ------
@@ -102,14 +128,23 @@ class OnDask:
         """
         from distributed import as_completed, CancelledError, KilledWorker
 
-        futures = {
-            self._client.submit(function, item, pure=False): number
-            for number, item in enumerate(items)
-        }
+        futures = [self._client.submit(function, item, pure=False) for item in items]
+        numbers = {future: number for number, future in enumerate(futures)}
+        completed = as_completed(futures)
+        dropped: set[Any] = set()
         try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-                future.release()
+            while not completed.is_empty():
+                if stopped() and not dropped:
+                    left = [future for future in futures if future in numbers]
+                    dropped = set(left[self.num_workers :])
+                    self._client.cancel(list(dropped))
+                if not completed.has_ready():
+                    time.sleep(POLL_S)
+                    continue
+                for future in completed.next_batch(block=False):
+                    if future not in dropped:
+                        yield numbers.pop(future), future.result()
+                        future.release()
         except KilledWorker as error:
             raise ClusterError(
                 f'{LOSSES} workers died at the same task; is their memory large enough? {error}'
@@ -117,7 +152,7 @@ class OnDask:
         except (CancelledError, OSError) as error:
             raise ClusterError(f'the scheduler is gone: {error}') from error
         finally:
-            self._client.cancel(list(futures))
+            self._client.cancel(list(numbers))
 
 
 def begin_workers() -> str:

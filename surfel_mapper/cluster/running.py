@@ -9,7 +9,7 @@ done, so that an earlier map is there, whole, until then.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from itertools import islice
@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.cluster.engines import Engine
+from surfel_mapper.cluster.engines import Engine, never
 from surfel_mapper.cluster.merging import (
     DATASET,
     gathered,
@@ -88,12 +88,15 @@ class Mapped:
         In the order of the shards.
     repeated : int
         Shards that were mapped again because they had begun too late.
+    interrupted : bool
+        Whether shards are missing because it was stopped.
 
     """
 
     map: TiledMap
     results: list[ShardResult]
     repeated: int
+    interrupted: bool
 
     @property
     def places(self) -> npt.NDArray[np.float64]:
@@ -113,6 +116,7 @@ def map_bags(
     engine: Engine,
     directory: Path,
     on_done: OnDone = lambda kind, amount: None,
+    stopped: Callable[[], bool] = never,
 ) -> Mapped:
     """
     Map shards into a dataset of tiles.
@@ -127,6 +131,8 @@ def map_bags(
         The output directory; the tiles are in ``map`` inside it.
     on_done : callable
         For progress.
+    stopped : callable
+        Asked again and again whether to map no more shards than those under way.
 
     Raises
     ------
@@ -138,11 +144,11 @@ def map_bags(
     """
     with work_directory(directory) as work:
         run = ShardRun(list(shards), engine, work, on_done)
-        run.all()
+        is_whole = run.all(stopped)
         results = run.ordered()
         parts = gathered(result.parts for result in results)
         tiled = merge(parts, engine, directory, shards[0].config.map.min_points, on_done)
-    return Mapped(map=tiled, results=results, repeated=run.repeated)
+    return Mapped(map=tiled, results=results, repeated=run.repeated, interrupted=not is_whole)
 
 
 def merge_maps(

@@ -34,18 +34,30 @@ class ShardRun:
     repeated: int = 0
     results: dict[int, ShardResult] = field(default_factory=dict)
 
-    def all(self) -> None:
-        """Map all shards."""
+    def all(self, stopped: Callable[[], bool]) -> bool:
+        """Map all shards, or keep of those done when it is stopped what fits; return if all."""
         wanted = list(range(len(self.shards)))
         while wanted:
             paths = [str(self.work / f'shard-{number}.parquet') for number in wanted]
             tasks = [(self.shards[n], path) for n, path in zip(wanted, paths, strict=True)]
-            for done, result in self.engine.run(map_task, tasks):
+            for done, result in self.engine.run(map_task, tasks, stopped):
                 if wanted[done] not in self.results:
                     self.on_done('map', result.recorded_s)
                 self.results[wanted[done]] = result
+            if stopped():
+                self.keep_what_fits()
+                return len(self.results) == len(self.shards)
             wanted = self.torn() or self.begun_too_late()
             self.repeated += len(wanted)
+        return True
+
+    def keep_what_fits(self) -> None:
+        """Of every recording keep the shards from its first one on that fit, without a gap."""
+        for number in self.torn():
+            self.results.pop(number, None)
+        for number, shard in enumerate(self.shards):
+            if shard.start_ns is not None and not self.fits(number):
+                self.results.pop(number, None)
 
     def ordered(self) -> list[ShardResult]:
         """Return the results in the order of the shards."""
@@ -57,10 +69,15 @@ class ShardRun:
         for number, shard in enumerate(self.shards):
             if shard.start_ns is None or number not in self.results:
                 continue
-            if self.results[number].before != self.results[number - 1].after:
+            if not self.fits(number):
                 late.append(number)
                 self.shards[number] = replace(shard, lead_s=shard.lead_s * LONGER)
         return late
+
+    def fits(self, number: int) -> bool:
+        """Return whether a shard begins with what the one before it ends with, both being done."""
+        before, after = self.results.get(number - 1), self.results.get(number)
+        return before is not None and after is not None and after.before == before.after
 
     def torn(self) -> list[int]:
         """Return the first shards of bags in which time was set back: each is all of its bag."""

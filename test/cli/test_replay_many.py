@@ -3,10 +3,14 @@
 """``replay`` of several bags or with workers, and ``merge``, make the map of one process."""
 
 import json
+import signal
 
 import pytest
 
 from surfel_mapper.cli.main import main
+from surfel_mapper.cluster import shard_run, shards
+from surfel_mapper.cluster.engines import InProcess
+from surfel_mapper.cluster.shards import map_shard
 from surfel_mapper.io.parquet import read_map
 from surfel_mapper.io.parquet_tiles import dataset_digest
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -59,6 +63,40 @@ def test_several_bags_become_one_map_in_tiles(bags, both, alone, tmp_path, capsy
     printed = capsys.readouterr().out
     assert f'digest {both}' in printed
     assert str(tmp_path / 'report.html') in printed
+
+
+def test_ctrl_c_leaves_the_map_of_the_shards_that_are_done(
+    bags, alone, tmp_path, monkeypatch, capsys
+):
+    def pressing(*args):
+        signal.raise_signal(signal.SIGINT)
+        return map_shard(*args)
+
+    monkeypatch.setattr(shard_run, 'map_shard', pressing)
+    assert main(['replay', *bags, '--output', str(tmp_path), '--json', *TF]) == 130
+
+    assert {path.name for path in tmp_path.iterdir()} == FILES
+    summary = json.loads(capsys.readouterr().out)
+    assert summary['interrupted']
+    assert summary['digest'] == summary_of(alone[0])['digest'] == dataset_digest(tmp_path / 'map')
+
+
+def test_ctrl_c_before_a_shard_is_done_that_counts_leaves_the_earlier_map(
+    bags, tmp_path, monkeypatch, capsys
+):
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
+
+    def pressing(engine, function, items, stopped):
+        signal.raise_signal(signal.SIGINT)
+        yield len(items) - 1, function(items[-1])
+
+    monkeypatch.setattr(InProcess, 'run', pressing)
+    monkeypatch.setattr(shards, 'LONGEST_S', 3.0)
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 130
+
+    assert 'interrupted' in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
 
 
 def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys):

@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.cluster.engines import InProcess
+from surfel_mapper.cluster.engines import InProcess, never
 from surfel_mapper.cluster.running import map_bags
 from surfel_mapper.cluster.shards import (
     difference,
@@ -131,6 +131,74 @@ def test_poses_of_a_file_are_known_in_the_middle_too(tmp_path, has_stamps):
     assert len(shards) == (6 if has_stamps else 1)
     assert mapped.map.digest == expected.map.digest()
     assert mapped.counts()['scans']['mapped'] == 60
+
+
+class LastFirst(InProcess):
+    """Runs the tasks in the opposite order, as may happen among several workers."""
+
+    def run(self, function, items, stopped=never):
+        for done, result in super().run(function, items[::-1], stopped):
+            yield len(items) - 1 - done, result
+
+
+def after(number):
+    """Return what says after so many shards that it is enough."""
+    asked = iter(range(number))
+    return lambda: next(asked, None) is None
+
+
+def test_what_is_mapped_when_it_is_stopped_is_the_map(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    expected = in_one_go(bag, config, duration_s=RECORDED_S / 6 * 2 - 1e-6)
+
+    shards = shards_of(bag, config, 1.0)
+    mapped = map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(2))
+
+    assert mapped.interrupted
+    assert len(mapped.results) == 2
+    assert mapped.map.digest == expected.map.digest()
+    assert counted(mapped.counts()) == counted(expected.summary())
+
+
+def test_shards_that_nothing_leads_to_are_left_out_when_it_is_stopped(tmp_path):
+    first, config = written(tmp_path, 'plain')
+    second, _ = written(tmp_path, 'faults')
+    shards = shards_of(first, config, 3.0) + shards_of(second, config, 3.0)
+    expected = in_one_go(second, config)
+
+    mapped = map_bags(shards, LastFirst(), tmp_path / 'out', stopped=after(3))
+
+    assert mapped.interrupted
+    assert len(mapped.results) == 2
+    assert mapped.map.digest == expected.map.digest()
+    with pytest.raises(MapError, match='no scan was mapped'):
+        map_bags(shards, LastFirst(), tmp_path / 'out', stopped=after(1))
+    assert dataset_digest(tmp_path / 'out' / 'map') == mapped.map.digest
+
+
+def test_shards_that_do_not_fit_are_left_out_when_it_is_stopped(tmp_path):
+    bag, config = written(tmp_path, 'late poses')
+    short = [replace(shard, lead_s=0.01) for shard in shards_of(bag, config, 1.0)]
+    expected = map_bags(short[:1], InProcess(), tmp_path / 'first')
+
+    mapped = map_bags(short, InProcess(), tmp_path / 'out', stopped=after(3))
+
+    assert mapped.interrupted
+    assert len(mapped.results) == 1
+    assert mapped.map.digest == expected.map.digest
+
+
+def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path):
+    bag, config = written(tmp_path, 'time set back')
+    shards = shards_of(bag, config, 1.0)
+    with pytest.raises(MapError, match='no scan was mapped'):
+        map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(6))
+
+
+def test_when_it_is_stopped_at_the_end_nothing_is_missing(tmp_path):
+    bag, config = written(tmp_path, 'plain')
+    shards = shards_of(bag, config, 3.0)
+    assert not map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(2)).interrupted
 
 
 def test_several_bags_make_the_sum_of_their_maps(tmp_path):
