@@ -20,7 +20,11 @@ from typing import NamedTuple
 from test.fuzz.harnesses import HARNESSES
 
 PAGE = Path(__file__).parents[2] / 'docs' / 'faults.md'
-MODULES = ('test.ros.test_faults_input', 'test.ros.test_faults_files')
+MODULES = (
+    'test.ros.test_among_others',
+    'test.ros.test_faults_files',
+    'test.ros.test_faults_input',
+)
 BEGIN, END = '<!-- from here on made from test/ros -->', '<!-- to here -->'
 
 

@@ -18,6 +18,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
+from test.ros.fault_table import fault
 from test.ros.live import cloud, NODE, odometry, room, stamp, START_NS
 
 TOPICS = {
@@ -117,6 +118,12 @@ def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
     assert (values['resets'], values['window_scans']) == ('1', '1')
 
 
+@fault(
+    'a negative time on `/clock`',
+    happens='it is passed over, with a warning; time stays as it was',
+    counted='the log',
+    lost='nothing',
+)
 def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
     node = start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
     peer.advertise('/clock', kinds={'/clock': Clock})
@@ -134,6 +141,12 @@ def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
     assert node.stop() == 0
 
 
+@fault(
+    'a parameter set to a value of a type that there is not',
+    happens='refused with the reason, and all others of the request',
+    counted='the answer of the service',
+    lost='nothing',
+)
 @pytest.mark.parametrize('kind', [SetParameters, SetParametersAtomically])
 def test_a_parameter_of_no_known_type_is_refused(start, peer, kind):
     node = start('node', *ARGUMENTS)

@@ -191,6 +191,8 @@ def test_clouds_out_of_order_are_dropped(stream):
     lost='the map before it, on purpose: it is of another time',
 )
 def test_a_clock_set_back_and_forth_is_followed(stream):
+    stream.pair()
+    stream.wait(scans__mapped=1)
     for hours, resets in ((-1, 1), (1, 1), (-1, 2)):
         mapped_before = stream.grown()['scans.mapped']
         stream.now_ns += hours * 3600 * SECOND_NS
