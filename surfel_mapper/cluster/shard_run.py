@@ -88,7 +88,7 @@ class ShardRun:
                 continue
             if any(self.results[n].resets for n in parts if n in self.results):
                 path = shard.request.path
-                log.warning('%s: time is set back in it; it is mapped in one go', path)
+                log.warning('%s: time is set back in it; it cannot be mapped in parts', path)
                 self.shards[number] = replace(shard, stop_ns=None)
                 again.append(number)
                 for other in parts:
