@@ -41,7 +41,7 @@ test: $(STAMP)  ## all tests
 boundscheck: $(STAMP)  ## the tests of the kernels, with every index checked
 	cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" \
-	$(BIN)/python -m pytest -q $(wildcard test/kernels test/mapping) $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q $(shell find test -path '*kernels*' -name 'test_*.py') $(PYTEST_ARGS)
 
 versions:  ## one bag, one digest, on every Python of PYTHONS that is there
 	@for python in $(PYTHONS); do \
@@ -62,8 +62,9 @@ fuzz: $(STAMP)  ## search for inputs that break readers, a minute of each; FUZZ_
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
-lint: $(STAMP)  ## style, types, layers
+lint: $(STAMP)  ## style, format, types, layers
 	$(BIN)/ruff check
+	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -q test/test_layering.py
 

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from surfel_mapper import Surfels
-from surfel_mapper.io.map_state import load_map
-from surfel_mapper.io.ply import write_surfels
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.mapping.moments import pack_keys
 
 

@@ -36,9 +36,7 @@ def main() -> None:
     args = parser.parse_args()
 
     config = load_config(args.config)
-    shards = [
-        shard for bag in args.bags for shard in cut(Request(path=bag), config, args.shard)
-    ]
+    shards = [shard for bag in args.bags for shard in cut(Request(path=bag), config, args.shard)]
     with engine(args.workers, args.scheduler) as running:
         mapped = map_bags(shards, running, args.output)
     tiled = mapped.map

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from surfel_mapper.config import GridConfig
-from surfel_mapper.io.map_state import load_map
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.mapping.cost_grid import CostGrid
 from surfel_mapper.mapping.traversability import traversability
 

@@ -16,12 +16,12 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config, load_config
-    from surfel_mapper.io.mirror import MapMirror
     from surfel_mapper.mapping.moments import ScanMoments
     from surfel_mapper.mapping.surfel import Surfel
     from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.mapping.surfels import Surfels
     from surfel_mapper.mapping.window import SlidingWindow
+    from surfel_mapper.messages.mirror import MapMirror
     from surfel_mapper.pipeline import Mapper
     from surfel_mapper.scan import Scan
 
@@ -43,7 +43,7 @@ __all__ = [
 
 _HOMES = {
     'Config': 'config',
-    'MapMirror': 'io.mirror',
+    'MapMirror': 'messages.mirror',
     'Mapper': 'pipeline',
     'Scan': 'scan',
     'ScanMoments': 'mapping.moments',

@@ -19,9 +19,20 @@ from typing import Any
 import numpy as np
 
 STAGES = (
-    'decode', 'deskew', 'images', 'filter', 'register', 'reduce', 'insert', 'clear', 'align',
-    'normals', 'tsdf', 'models', 'total',
-)  # fmt: skip
+    'decode',
+    'deskew',
+    'images',
+    'filter',
+    'register',
+    'reduce',
+    'insert',
+    'clear',
+    'align',
+    'normals',
+    'tsdf',
+    'models',
+    'total',
+)
 """What is timed, in the order in which a scan goes through it; ``total``: all but decoding."""
 
 LATEST = 1000
@@ -111,9 +122,7 @@ class Counters:
         """Add the time that one scan spent in a stage."""
         self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(milliseconds)
 
-    def add_filter(
-        self, name: str, points_in: int, points_out: int, milliseconds: float
-    ) -> None:
+    def add_filter(self, name: str, points_in: int, points_out: int, milliseconds: float) -> None:
         """Add what one filter did to one scan."""
         counts = self.filters.setdefault(name, FilterCounts())
         counts.points_in += points_in

@@ -35,8 +35,8 @@ ANGLES = st.one_of(
     st.sampled_from([0.0, 1e-300, 1e-12, 1e-9, 0.99e-4, 1.01e-4, 1e-3]),
     st.sampled_from([1e-300, 1e-12, 1e-8, 1e-4]).map(lambda short: math.pi - short),
 )
-AXES = st.tuples(*[st.integers(-5, 5)] * 3).filter(any).map(
-    lambda a: np.array(a) / np.linalg.norm(a)
+AXES = (
+    st.tuples(*[st.integers(-5, 5)] * 3).filter(any).map(lambda a: np.array(a) / np.linalg.norm(a))
 )
 ROTATION_VECTORS = st.builds(lambda axis, angle: axis * angle, AXES, ANGLES)
 METRES = st.floats(-1e4, 1e4)
@@ -120,9 +120,7 @@ def test_the_quaternion_of_a_transform_is_that_of_scipy_at_every_angle(rotvec):
 def test_a_pose_gives_back_its_quaternion(rotvec):
     T_a_b = pose_matrix([0, 0, 0], Rotation.from_rotvec(rotvec).as_quat())
 
-    np.testing.assert_allclose(
-        pose_matrix([0, 0, 0], q_xyzw(T_a_b)), T_a_b, rtol=0, atol=8 * EPS
-    )
+    np.testing.assert_allclose(pose_matrix([0, 0, 0], q_xyzw(T_a_b)), T_a_b, rtol=0, atol=8 * EPS)
 
 
 @given(TRANSFORMS, TRANSFORMS)
@@ -130,9 +128,7 @@ def test_composing_multiplies_the_matrices(T_a_b, T_b_c):
     T_a_c = compose(T_a_b, T_b_c)
 
     np.testing.assert_allclose(T_a_c, T_a_b @ T_b_c, rtol=0, atol=2e4 * 8 * EPS)
-    np.testing.assert_allclose(
-        T_a_c[:3, :3], T_a_b[:3, :3] @ T_b_c[:3, :3], rtol=0, atol=4 * EPS
-    )
+    np.testing.assert_allclose(T_a_c[:3, :3], T_a_b[:3, :3] @ T_b_c[:3, :3], rtol=0, atol=4 * EPS)
 
 
 def test_composing_sums_from_left_to_right_without_fusing():

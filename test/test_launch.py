@@ -34,14 +34,12 @@ INPUT_TOPICS = {'/points'}
 
 
 class Argument:
-
     def __init__(self, name, *, default_value, description, choices=None):
         self.name, self.default, self.choices = name, default_value, choices
         self.description = description
 
 
 class Configuration:
-
     def __init__(self, name):
         self._name = name
 
@@ -50,13 +48,11 @@ class Configuration:
 
 
 class Function:
-
     def __init__(self, *, function):
         self.function = function
 
 
 class Started:
-
     def __init__(self, **given):
         self.__dict__.update(given)
 

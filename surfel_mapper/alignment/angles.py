@@ -24,11 +24,15 @@ def transforms(poses: Floats) -> Floats:
     (sr, sp, sy), (cr, cp, cy) = sines.T, cosines.T
     result = np.zeros((len(poses), 4, 4))
     result[:, 0, 0], result[:, 0, 1], result[:, 0, 2] = (
-        cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr,
-    )  # fmt: skip
+        cy * cp,
+        cy * sp * sr - sy * cr,
+        cy * sp * cr + sy * sr,
+    )
     result[:, 1, 0], result[:, 1, 1], result[:, 1, 2] = (
-        sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr,
-    )  # fmt: skip
+        sy * cp,
+        sy * sp * sr + cy * cr,
+        sy * sp * cr - cy * sr,
+    )
     result[:, 2, 0], result[:, 2, 1], result[:, 2, 2] = -sp, cp * sr, cp * cr
     result[:, :3, 3] = poses[:, :3]
     result[:, 3, 3] = 1.0

@@ -10,7 +10,7 @@ left, ss, gives its weight: information = sum M^T M / ss. Taken about the mean o
 into num times I for t and the matrix of inertia of c for w. About the origin, as PCL does, the
 two are mixed, and at 1 km nothing is left of either in float32.
 
-All sums follow from the moments of the pairs (kernels/edges.py) and the two poses.
+All sums follow from the moments of the pairs (alignment/kernels/edges.py) and the two poses.
 
 Source: Lu and Milios 1997; the weight is that of pcl::registration::LUM.
 """
@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.edges import (
+from surfel_mapper.alignment.kernels.edges import (
     COUNT,
     CROSS_SCATTER,
     NUM_MOMENTS,

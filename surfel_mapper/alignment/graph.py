@@ -15,14 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import AlignmentError
-from surfel_mapper.kernels.edges import (
+from surfel_mapper.alignment.kernels.edges import (
     fit_residual,
     NUM_MOMENTS,
     NUM_WEIGHTED,
     pair_moments,
     weighted_moments,
 )
+from surfel_mapper.errors import AlignmentError
 
 Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.int32]

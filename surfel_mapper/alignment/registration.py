@@ -164,8 +164,7 @@ class Registration:
         """Return whether an alignment may be right, by what it says itself."""
         config = self.config
         return (
-            alignment.fit >= config.min_fit_ratio
-            and alignment.overlap >= config.min_overlap_ratio
+            alignment.fit >= config.min_fit_ratio and alignment.overlap >= config.min_overlap_ratio
         )
 
     def _descend(

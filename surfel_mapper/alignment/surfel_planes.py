@@ -23,9 +23,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.geometry import Transform
-from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.kernels.registration import (
+from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
     MEAN,
     NORMAL,
@@ -35,6 +33,8 @@ from surfel_mapper.kernels.registration import (
     sum_equations,
     VARIANCE,
 )
+from surfel_mapper.geometry import Transform
+from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels

@@ -158,9 +158,7 @@ def relative_errors(
     return _motion_errors(estimated, true, rows, rows + step)
 
 
-def drift(
-    T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike
-) -> tuple[float, float]:
+def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[float, float]:
     """
     Return by how much the estimate goes astray, over stretches from an eighth to half of the way.
 

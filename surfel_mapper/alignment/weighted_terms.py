@@ -6,7 +6,8 @@ What pairs with weights say about the motions of the two scans of an edge, at gi
 A weight is a matrix W (3, 3) by which the gap z of a pair counts, z^T W z: the inverse of the
 covariance of the gap, so that two surfels of one wall hold each other across the wall and not
 along it. The square of all gaps is a quadratic form in the entries of the pose of the source in
-the target, whose coefficients (kernels/edges.py) are summed up once for any number of iterations.
+the target, whose coefficients (alignment/kernels/edges.py) are summed up once for any number of
+iterations.
 
 Information is sum M^T W M, and less where the gaps are larger than the weights would have them:
 over the variance of a weighted gap, where that is more than 1. So an edge of many pairs weighs
@@ -28,7 +29,7 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.angles import skew
 from surfel_mapper.alignment.edge_terms import EdgeTerms, FEW_PAIRS, MIN_PAIRS, WEAK
-from surfel_mapper.kernels.edges import COUNT, GAP_SQ, LINEAR, NUM_WEIGHTED, QUADRATIC
+from surfel_mapper.alignment.kernels.edges import COUNT, GAP_SQ, LINEAR, NUM_WEIGHTED, QUADRATIC
 
 Floats = npt.NDArray[np.float64]
 

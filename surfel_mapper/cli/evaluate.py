@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from surfel_mapper.evaluation.map_files import Discs
-    from surfel_mapper.io.trajectory import Trajectory
+    from surfel_mapper.files.trajectory import Trajectory
 
 SUMMARY = 'Compare a map with the truth or another map, or a trajectory with another.'
 
@@ -38,30 +38,45 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add(
-        'map', type=Path, metavar='MAP',
+        'map',
+        type=Path,
+        metavar='MAP',
         help='output of a replay or merge, or a file of it; .tum, .txt, .csv: a trajectory',
-    )  # fmt: skip
+    )
     add(
-        '--truth', type=Path, required=True, metavar='TRUTH',
+        '--truth',
+        type=Path,
+        required=True,
+        metavar='TRUTH',
         help='a simulated bag, its world.json, a .ply or .pcd of points, or another map; '
         'for a trajectory another one, or a simulated bag',
-    )  # fmt: skip
+    )
     add(
-        '--max-distance', type=positive, metavar='M',
+        '--max-distance',
+        type=positive,
+        metavar='M',
         help='surfels farther from the truth are not compared (the voxel size)',
-    )  # fmt: skip
+    )
     add(
-        '--radius', type=positive, metavar='M',
+        '--radius',
+        type=positive,
+        metavar='M',
         help='a place of the truth is found by a surfel this near (the voxel size)',
-    )  # fmt: skip
+    )
     add(
-        '--max-difference', type=positive, default=0.01, metavar='S',
+        '--max-difference',
+        type=positive,
+        default=0.01,
+        metavar='S',
         help='poses at most so far apart in time are compared (%(default)s)',
-    )  # fmt: skip
+    )
     add(
-        '--min-points', type=int, default=5, metavar='N',
+        '--min-points',
+        type=int,
+        default=5,
+        metavar='N',
         help='from how many points on a voxel counts as a surfel (%(default)s)',
-    )  # fmt: skip
+    )
     add('--json', action='store_true', help='print as JSON')
 
 
@@ -148,15 +163,18 @@ def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) ->
 def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of a trajectory, and lines that state them."""
     from surfel_mapper.alignment.trajectory_errors import compare
-    from surfel_mapper.io.trajectory import read_trajectory
+    from surfel_mapper.files.trajectory import read_trajectory
 
     estimated_ns, estimated = poses_of(args.map, read_trajectory(args.map))
     true_ns, true = true_poses(args.truth, estimated_ns)
     try:
         result = compare(
-            estimated_ns, estimated, true_ns, true,
+            estimated_ns,
+            estimated,
+            true_ns,
+            true,
             max_difference_ns=round(args.max_difference * 1e9),
-        )  # fmt: skip
+        )
     except ValueError as error:
         raise FileFormatError(f'{args.map}, {args.truth}: {error}') from error
     lines = [f'poses {result["num_poses"]}']
@@ -175,7 +193,7 @@ def true_poses(
     """Return the true poses: of a file, or of the lidar of a simulated bag at given stamps."""
     import numpy as np
 
-    from surfel_mapper.io.trajectory import read_trajectory
+    from surfel_mapper.files.trajectory import read_trajectory
     from surfel_mapper.simulation import load_simulation
     from surfel_mapper.simulation.recording import SIMULATION_FILE
 

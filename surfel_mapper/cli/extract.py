@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit, write the files, report."""
     from surfel_mapper.config.models import ModelsConfig
-    from surfel_mapper.io.model_files import write_models
+    from surfel_mapper.files.model_files import write_models
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.models import draw_models
 
@@ -98,8 +98,8 @@ def read(
     """Return points (N, 3), the size of voxels and the viewpoint (3,), m."""
     from surfel_mapper.config.models import ModelsConfig
     from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.io import map_state, parquet
-    from surfel_mapper.io.scan_files import read_scan, SUFFIXES
+    from surfel_mapper.files import map_state, parquet
+    from surfel_mapper.files.scan_files import read_scan, SUFFIXES
     from surfel_mapper.models.surfel_points import above, surfel_points
 
     if args.cloud.suffix not in (*MAPS, *SUFFIXES):

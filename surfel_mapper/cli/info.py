@@ -15,7 +15,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.cli.progress import progress
 
 if TYPE_CHECKING:
-    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.offline.survey import Offer, Survey
 
 SUMMARY = 'Show the topics, rates and poses of a bag, or the settings of node and replay.'
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
         print(settings_table(), end='')
         return 0
-    from surfel_mapper.io.bag import BagReader
+    from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.offline.survey import offers, survey, surveyed_topics
 
     with BagReader(args.bag) as reader:

@@ -26,8 +26,16 @@ import surfel_mapper
 from surfel_mapper.errors import SurfelMapperError
 
 VERBS = (
-    'node', 'replay', 'play', 'info', 'filters', 'extract', 'simulate', 'merge', 'evaluate',
-)  # fmt: skip
+    'node',
+    'replay',
+    'play',
+    'info',
+    'filters',
+    'extract',
+    'simulate',
+    'merge',
+    'evaluate',
+)
 
 EPILOG = 'surfel-mapper VERB --help shows the options of a verb and an example.'
 

@@ -25,14 +25,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add(
-        'maps', nargs='+', type=Path, metavar='DIR',
+        'maps',
+        nargs='+',
+        type=Path,
+        metavar='DIR',
         help='output of a replay with --formats parquet or --workers, of a merge, or map.parquet',
-    )  # fmt: skip
+    )
     add('--output', type=Path, required=True, metavar='DIR', help='directory to write to')
     add(
-        '--min-points', type=replay_many.positive, default=5, metavar='N',
+        '--min-points',
+        type=replay_many.positive,
+        default=5,
+        metavar='N',
         help='from how many points on a voxel counts as a surfel, for the figures (%(default)s)',
-    )  # fmt: skip
+    )
     add('--json', action='store_true', help='print the summary as JSON')
     replay_many.add_arguments(parser)
 
@@ -41,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
     """Merge and report."""
     from surfel_mapper.cluster.engines import engine
     from surfel_mapper.cluster.running import merge_maps
-    from surfel_mapper.io.files import write_json
+    from surfel_mapper.files.atomic import write_json
 
     began = time.perf_counter()
     with engine(args.workers, args.scheduler) as running:

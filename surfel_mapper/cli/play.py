@@ -30,20 +30,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--loop', action='store_true', help='begin anew at the end')
     add('--clock', action='store_true', help='publish the record time on /clock')
     add(
-        '--wait-for', nargs='+', default=[], metavar='T',
+        '--wait-for',
+        nargs='+',
+        default=[],
+        metavar='T',
         help='begin when somebody subscribes to each of these',
-    )  # fmt: skip
+    )
     add(
-        '--timeout', type=float, default=60.0, metavar='S',
+        '--timeout',
+        type=float,
+        default=60.0,
+        metavar='S',
         help='s to wait for subscribers at most (%(default)s)',
-    )  # fmt: skip
+    )
     add('--json', action='store_true', help='report as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
     """Play a bag and report what was published."""
+    from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.cli.ros import loading_ros
-    from surfel_mapper.io.bag import BagReader
 
     if not args.rate > 0.0:
         raise ConfigError(f'rate: {args.rate}, expected more than 0')

@@ -54,15 +54,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add(
-        'bags', nargs='+', type=Path, metavar='BAG',
+        'bags',
+        nargs='+',
+        type=Path,
+        metavar='BAG',
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory of .ply, .pcd, .bin scans',
-    )  # fmt: skip
+    )
     add('--config', type=Path, metavar='FILE', help='YAML file of settings')
     add(
-        '--filters', metavar='FILE',
+        '--filters',
+        metavar='FILE',
         help='YAML file of a filter chain, as libpointmatcher has them (see `surfel-mapper '
         'filters`); FILE#key: the list under a key of it',
-    )  # fmt: skip
+    )
     add_input_arguments(parser)
     add_output_arguments(parser)
     replay_many.add_arguments(parser)
@@ -72,31 +76,40 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what is mapped."""
     add = parser.add_argument_group('what is mapped').add_argument
     add(
-        '--topic', action='append', default=[],
+        '--topic',
+        action='append',
+        default=[],
         help='PointCloud2 topic (the only one, if there is one); repeatable',
-    )  # fmt: skip
+    )
     add(
-        '--mount', action='append', default=[], type=mount, metavar='TOPIC=X,Y,Z,QX,QY,QZ,QW',
+        '--mount',
+        action='append',
+        default=[],
+        type=mount,
+        metavar='TOPIC=X,Y,Z,QX,QY,QZ,QW',
         help='where the sensor of a topic sits on frames.base, m; repeatable',
-    )  # fmt: skip
+    )
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
     add('--poses', type=Path, metavar='FILE', help='file of poses of frames.base instead')
     add(
-        '--poses-format', choices=('tum', 'kitti', 'csv'),
+        '--poses-format',
+        choices=('tum', 'kitti', 'csv'),
         help='its format (told by its first line)',
-    )  # fmt: skip
+    )
     add('--start', type=float, default=0.0, metavar='S', help='leave out the first seconds')
     add('--duration', type=float, default=math.inf, metavar='S', help='map so many seconds')
     add('--every', type=int, default=1, metavar='N', help='map one cloud of every N')
     add(
-        '--window', action='store_true',
+        '--window',
+        action='store_true',
         help="let scans leave the map by the configuration's window, as the node does",
-    )  # fmt: skip
+    )
     add(
-        '--align', action='store_true',
+        '--align',
+        action='store_true',
         help='move the scans in the end to where they agree with each other; keeps all points '
         'in memory until then',
-    )  # fmt: skip
+    )
 
 
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
@@ -104,14 +117,18 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group('what is written').add_argument
     add('--output', type=Path, metavar='DIR', help='directory to write to (BAG_surfels)')
     add(
-        '--formats', type=formats, metavar='LIST',
+        '--formats',
+        type=formats,
+        metavar='LIST',
         help=f'of the map (dxf: of its models), with a comma between: {", ".join(FORMATS)} (ply)',
-    )  # fmt: skip
+    )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
-        '--truth', type=Path, metavar='FILE',
+        '--truth',
+        type=Path,
+        metavar='FILE',
         help='state how far the poses are from those of this file or simulated bag, of the sensor',
-    )  # fmt: skip
+    )
     add('--view', action='store_true', help='show it in rerun while it happens')
     add('--rrd', type=Path, metavar='FILE', help='write that to a file, for rerun to open')
     add('--json', action='store_true', help='print the summary as JSON')
@@ -153,7 +170,7 @@ def run(args: argparse.Namespace) -> int:
 
 def map_one(args: argparse.Namespace, config: Config, request: Request, output: Path) -> int:
     """Map a recording in this process and report."""
-    from surfel_mapper.io.heap import keep_freed_memory
+    from surfel_mapper.memory import keep_freed_memory
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.replay import load_start, poses_now
     from surfel_mapper.pipeline import Mapper
@@ -252,7 +269,7 @@ def viewers(
 
 def normals_bag(output: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:
     """Begin the bag of normals; it is whole when the files are closed, or not there."""
-    from surfel_mapper.io.bag_writer import BagWriter
+    from surfel_mapper.bags.writer import BagWriter
     from surfel_mapper.offline.normals_bag import NormalsBag
 
     writer = BagWriter(output / FORMATS[BAG], overwrite=True)

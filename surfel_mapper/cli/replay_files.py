@@ -76,7 +76,7 @@ class Mapped:
         """Write the poses as TUM text."""
         import numpy as np
 
-        from surfel_mapper.io.trajectory import write_tum
+        from surfel_mapper.files.trajectory import write_tum
 
         write_tum(path, self.stamps_ns, np.array(self.poses).reshape(-1, 4, 4))
 
@@ -97,8 +97,8 @@ def write_files(
     history: History,
 ) -> list[Path]:
     """Write the map in some formats, picture, report and summary; return what is there."""
-    from surfel_mapper.io.files import write_json
-    from surfel_mapper.io.ply import write_mesh
+    from surfel_mapper.files.atomic import write_json
+    from surfel_mapper.files.ply import write_mesh
     from surfel_mapper.models.shapes import Shapes
     from surfel_mapper.viz.models import page_mesh
     from surfel_mapper.viz.models_section import models_section
@@ -134,7 +134,7 @@ def write_files(
 
 def write_map(path: Path, name: str, mapper: Mapper) -> None:
     """Write the map in one format."""
-    from surfel_mapper.io import map_state, parquet, pcd, ply
+    from surfel_mapper.files import map_state, parquet, pcd, ply
 
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     if name == 'ply':
@@ -149,7 +149,7 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
 
 def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) -> None:
     """Write models as JSON and OBJ, in what other formats are asked for, and their picture."""
-    from surfel_mapper.io.model_files import write_models
+    from surfel_mapper.files.model_files import write_models
     from surfel_mapper.models.surfel_points import above, surfel_points
     from surfel_mapper.viz.models import draw_models
 

@@ -176,7 +176,7 @@ def write_overview(
     places: npt.NDArray[np.float64] | None,
 ) -> list[Path]:
     """Write picture, report and summary of a map in tiles; return what is there."""
-    from surfel_mapper.io.files import write_json
+    from surfel_mapper.files.atomic import write_json
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 

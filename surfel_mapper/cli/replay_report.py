@@ -18,9 +18,7 @@ def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     gated = f' ({scans["gated"]} left out by the motion gate)'
     localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
     stages = '   '.join(
-        f'{stage} {times[stage]["median"]:.1f} ms'
-        for stage in STAGES
-        if stage in times
+        f'{stage} {times[stage]["median"]:.1f} ms' for stage in STAGES if stage in times
     )
     filters = ''.join(
         f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '

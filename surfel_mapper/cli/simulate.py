@@ -65,9 +65,12 @@ def run(args: argparse.Namespace) -> int:
 
     with bar:
         record(
-            simulation, args.output,
-            storage=args.storage, overwrite=args.overwrite, on_scan=count,
-        )  # fmt: skip
+            simulation,
+            args.output,
+            storage=args.storage,
+            overwrite=args.overwrite,
+            on_scan=count,
+        )
     report = {
         'output': args.output,
         'scans': simulation.num_scans,

@@ -18,7 +18,7 @@ import numpy as np
 
 from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.io.parquet_tiles import (
+from surfel_mapper.files.parquet_tiles import (
     Part,
     read_part,
     split_map,

@@ -33,7 +33,7 @@ from surfel_mapper.cluster.merging import (
 from surfel_mapper.cluster.shard_run import OnDone, ShardRun
 from surfel_mapper.cluster.shards import Shard, ShardResult
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.io.parquet_tiles import dataset_digest, kind_of, Part, Tile, tiles_in
+from surfel_mapper.files.parquet_tiles import dataset_digest, kind_of, Part, Tile, tiles_in
 from surfel_mapper.mapping.surfels import Surfels
 
 SAMPLE = 100_000
@@ -259,8 +259,7 @@ def joined(parts: Sequence[Surfels]) -> Surfels:
     names = [each.name for each in fields(Surfels) if each.name != 'channels']
     columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
     channels = {
-        name: np.concatenate([part.channels[name] for part in parts])
-        for name in parts[0].channels
+        name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels
     }
     return Surfels(**columns, channels=channels)
 

@@ -21,11 +21,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.bags.reader import BagMessage
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
-from surfel_mapper.io.bag import BagMessage
-from surfel_mapper.io.heap import keep_freed_memory
-from surfel_mapper.io.parquet_tiles import Part, Tile, write_shard
+from surfel_mapper.files.parquet_tiles import Part, Tile, write_shard
+from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.offline.recording import BagRecording, open_recording, Request
 from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s

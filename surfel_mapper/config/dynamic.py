@@ -13,9 +13,7 @@ from surfel_mapper.config.settings import setting, Stage
 class DynamicConfig(Stage):
     """Clearing of surfels that later rays go through."""
 
-    clear: bool = setting(
-        False, 'Remove voxels of the surfel map that later scans see through.'
-    )
+    clear: bool = setting(False, 'Remove voxels of the surfel map that later scans see through.')
     min_scans: int = setting(
         5,
         'Remove a voxel that so many scans saw through, none of them hitting it in between.',

@@ -13,9 +13,7 @@ from surfel_mapper.config.settings import setting, Stage
 class GridConfig(Stage):
     """The nav_msgs/OccupancyGrid on ~/grid."""
 
-    rate_hz: float = setting(
-        0.0, 'Rate of ~/grid, Hz; 0: never.', low=0.0, high=100.0, live=True
-    )
+    rate_hz: float = setting(0.0, 'Rate of ~/grid, Hz; 0: never.', low=0.0, high=100.0, live=True)
     size_m: float = setting(
         100.0,
         'Edge of the grid, with the sensor in its middle, m.',

@@ -42,9 +42,7 @@ class ModelsConfig(Stage):
         low=4,
         high=100_000,
     )
-    min_points: int = setting(
-        40, 'Clusters of fewer points are not split.', low=4, high=100_000
-    )
+    min_points: int = setting(40, 'Clusters of fewer points are not split.', low=4, high=100_000)
     min_surface_points: int = setting(
         20, 'Planes and surfaces of fewer points become Gaussians.', low=1, high=100_000
     )

@@ -55,8 +55,7 @@ class RegistrationConfig(Stage):
     )
     coarse_levels: int = setting(
         2,
-        'Where deviations exceed a voxel, alignment begins with voxels up to 2^this times '
-        'larger.',
+        'Where deviations exceed a voxel, alignment begins with voxels up to 2^this times larger.',
         low=0,
         high=3,
         live=True,

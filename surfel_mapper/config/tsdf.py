@@ -117,9 +117,7 @@ class TsdfConfig(Stage):
         low=0.0,
         high=1e3,
     )
-    min_measurement_weight: float = setting(
-        1e-4, 'No measurement weighs less.', low=0.0, high=1e6
-    )
+    min_measurement_weight: float = setting(1e-4, 'No measurement weighs less.', low=0.0, high=1e6)
     max_weight: float = setting(
         1e5,
         'Weights of a voxel end here; the smaller, the faster it forgets: a measurement of weight '

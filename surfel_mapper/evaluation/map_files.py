@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.io import map_state, parquet, pcd, ply
-from surfel_mapper.io.parquet_tiles import dataset_digest, tiles_in
+from surfel_mapper.files import map_state, parquet, pcd, ply
+from surfel_mapper.files.parquet_tiles import dataset_digest, tiles_in
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 

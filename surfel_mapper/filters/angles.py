@@ -16,9 +16,7 @@ import numpy as np
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters.base import Filter, Mask
-from surfel_mapper.filters.parameters import parameter
-from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.directions import (
+from surfel_mapper.filters.kernels.directions import (
     ALWAYS,
     BOTH,
     EITHER,
@@ -26,6 +24,8 @@ from surfel_mapper.kernels.directions import (
     in_wedge,
     NEVER,
 )
+from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
 
@@ -122,14 +122,17 @@ class FieldOfView(Filter):
         elevation = (self.elevation_min_deg, self.elevation_max_deg)
         has_low, has_high = (abs(limit) < 90.0 for limit in elevation)
         edges = [f(limit) for limit in azimuth for f in (cosine, sine)]
-        edges += [
-            sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation
-        ]
+        edges += [sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation]
         extent = azimuth[1] - azimuth[0]
         seen = np.empty(len(scan), np.bool_)
         in_field_of_view(
-            scan.points.T, np.array(edges, scan.points.dtype), extent < 360.0, extent > 180.0,
-            has_low, has_high, seen,
+            scan.points.T,
+            np.array(edges, scan.points.dtype),
+            extent < 360.0,
+            extent > 180.0,
+            has_low,
+            has_high,
+            seen,
         )
         return seen
 

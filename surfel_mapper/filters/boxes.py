@@ -22,12 +22,12 @@ import numpy.typing as npt
 
 from surfel_mapper.filters.base import generator, Mask, select, with_columns, with_points
 from surfel_mapper.filters.columns import DENSITIES
+from surfel_mapper.filters.kernels.cutting import cut
 from surfel_mapper.filters.merging import Groups, MergedColumns
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, Moments, ShapeFilter
-from surfel_mapper.kernels.cutting import cut
 from surfel_mapper.scan import Scan
 
 INT32_MAX = 2**31 - 1
@@ -111,11 +111,15 @@ class BoxFilter(ShapeFilter):
         7, 'A box with more points is cut in two.', low=3, high=INT32_MAX, theirs='knn'
     )
     sampling_method: int = parameter(
-        0, '0: draw points by chance; 1: one point for a box, the mean.', low=0, high=1,
+        0,
+        '0: draw points by chance; 1: one point for a box, the mean.',
+        low=0,
+        high=1,
         theirs='samplingMethod',
     )
     max_box_m: float = parameter(
-        math.inf, 'Boxes whose points extend farther along an axis are dropped, m.',
+        math.inf,
+        'Boxes whose points extend farther along an axis are dropped, m.',
         theirs='maxBoxDim',
     )
     average_columns: bool = parameter(

@@ -33,9 +33,7 @@ MAX_COMPONENTS = 2**32 - 1
 class AddDescriptor(Filter):
     """Give every point the same value, in a new column or in place of one of the same name."""
 
-    column_name: str = parameter(
-        'testDescriptor', 'Name of the column.', theirs='descriptorName'
-    )
+    column_name: str = parameter('testDescriptor', 'Name of the column.', theirs='descriptorName')
     num_components: int = parameter(
         1, 'Numbers a point.', low=1, high=MAX_COMPONENTS, theirs='descriptorDimension'
     )

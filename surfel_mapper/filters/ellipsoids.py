@@ -33,7 +33,10 @@ class Ellipsoids(BoxFilter):
     """Cut the space into boxes of few points, sample from each, add the ellipsoid of the box."""
 
     ratio: float = parameter(
-        0.5, 'Share of the points that stay, drawn by chance.', low=1e-7, high=0.9999999,
+        0.5,
+        'Share of the points that stay, drawn by chance.',
+        low=1e-7,
+        high=0.9999999,
         theirs='ratio',
     )
     max_time_window: float = parameter(
@@ -43,7 +46,8 @@ class Ellipsoids(BoxFilter):
         theirs='maxTimeWindow',
     )
     min_planarity: float = parameter(
-        0.0, 'Boxes less planar are dropped; 1 is a plane, 0 a line or a ball.',
+        0.0,
+        'Boxes less planar are dropped; 1 is a plane, 0 a line or a ball.',
         theirs='minPlanarity',
     )
     keep_means: bool = parameter(False, 'Add means, of the box, m.', theirs='keepMeans')

@@ -43,8 +43,12 @@ MIN_TILT = math.sin(math.radians(10.0))
 """The normal has to lean from the vertical by this angle."""
 
 SIZES = {
-    'means': 3, 'covariance': 9, 'gestaltMeans': BINS, 'gestaltVariances': BINS,
-    'warpedXYZ': 3, 'gestaltShapes': 2,
+    'means': 3,
+    'covariance': 9,
+    'gestaltMeans': BINS,
+    'gestaltVariances': BINS,
+    'warpedXYZ': 3,
+    'gestaltShapes': 2,
 }
 """Numbers in the columns that are only found here, a row."""
 
@@ -55,7 +59,10 @@ class Gestalt(ShapeFilter):
     """Keep some keypoints, add gestaltMeans and gestaltVariances of the relief about them."""
 
     ratio: float = parameter(
-        0.1, 'Share of the occupied voxels that get a keypoint.', low=1e-7, high=0.9999999,
+        0.1,
+        'Share of the occupied voxels that get a keypoint.',
+        low=1e-7,
+        high=0.9999999,
         theirs='ratio',
     )
     radius_m: float = parameter(
@@ -69,15 +76,15 @@ class Gestalt(ShapeFilter):
     )
     size_y_m: float = parameter(1.0, 'Edge along y, m.', low=0.001, theirs='vSizeY')
     size_z_m: float = parameter(1.0, 'Edge along z, m.', low=0.001, theirs='vSizeZ')
-    keep_means: bool = parameter(
-        False, 'Add means, of the neighbours, m.', theirs='keepMeans'
-    )
+    keep_means: bool = parameter(False, 'Add means, of the neighbours, m.', theirs='keepMeans')
     max_box_m: float = parameter(
-        math.inf, 'Keypoints whose neighbours extend farther along an axis are dropped, m.',
+        math.inf,
+        'Keypoints whose neighbours extend farther along an axis are dropped, m.',
         theirs='maxBoxDim',
     )
     average_columns: bool = parameter(
-        True, 'Makes no difference here: keypoints keep their columns.',
+        True,
+        'Makes no difference here: keypoints keep their columns.',
         theirs='averageExistingDescriptors',
     )
     max_time_window: float = parameter(

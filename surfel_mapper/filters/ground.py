@@ -45,12 +45,14 @@ class Ground(Filter):
         5, 'With fewer points a voxel has no slope and is not ground.', low=3, high=2**31 - 1
     )
     min_planarity: float = parameter(
-        0.05, 'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
-        low=0.0, high=1.0,
+        0.05,
+        'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
+        low=0.0,
+        high=1.0,
     )
     max_height_m: float = parameter(
-        math.inf, 'Surfels higher than this above the origin of the robot (frames.base) are not '
-        'ground, m.',
+        math.inf,
+        'Surfels higher than this above the origin of the robot (frames.base) are not ground, m.',
     )
     up: str = parameter(
         'fixed',

@@ -108,7 +108,8 @@ class DistanceLimit(AxisFilter):
     """Keep the points beyond, or before, a distance from the origin or along one axis."""
 
     distance_m: float = parameter(
-        1.0, 'The limit, m; points at it do not stay; of a distance its size counts.',
+        1.0,
+        'The limit, m; points at it do not stay; of a distance its size counts.',
         theirs='dist',
     )
     remove_inside: bool = parameter(

@@ -20,10 +20,10 @@ import numpy as np
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import Filter, generator, select
 from surfel_mapper.filters.columns import NORMALS, with_normals
+from surfel_mapper.filters.kernels.stable_sampling import choose
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.stable_sampling import choose
 from surfel_mapper.scan import Scan
 
 UINT32_MAX = 2**32 - 1

@@ -42,19 +42,24 @@ class OctreeGrid(Filter):
     centroid columns are averaged.
     """
 
-    build_parallel: bool = parameter(
-        True, 'Makes no difference here.', theirs='buildParallel'
-    )
+    build_parallel: bool = parameter(True, 'Makes no difference here.', theirs='buildParallel')
     max_points: int = parameter(
-        1, 'A cube with more points is cut into eight.', low=1, high=2**32 - 1,
+        1,
+        'A cube with more points is cut into eight.',
+        low=1,
+        high=2**32 - 1,
         theirs='maxPointByNode',
     )
     max_size_m: float = parameter(
         0.0, 'A cube with an edge up to this long is not cut, m.', low=0.0, theirs='maxSizeByNode'
     )
     sampling_method: int = parameter(
-        0, 'What stands for a leaf, 0: its first point; 1: a random one; 2: the mean; 3: the one '
-        'nearest the mean.', low=0, high=3, theirs='samplingMethod',
+        0,
+        'What stands for a leaf, 0: its first point; 1: a random one; 2: the mean; 3: the one '
+        'nearest the mean.',
+        low=0,
+        high=3,
+        theirs='samplingMethod',
     )
     seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
 

@@ -56,9 +56,7 @@ class RadiusOutliers(Filter):
     """Drop the points that have too few others around them."""
 
     radius_m: float = parameter(0.5, 'How far around a point, m; the limit is in.', low=0.0)
-    min_neighbours: int = parameter(
-        2, 'Others that have to be there.', low=0, high=INT32_MAX
-    )
+    min_neighbours: int = parameter(2, 'Others that have to be there.', low=0, high=INT32_MAX)
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay; nan and infinite ones are refused."""

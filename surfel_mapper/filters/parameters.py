@@ -113,9 +113,7 @@ def parameters_of(cls: type) -> list[Parameter]:
     ]
 
 
-def values_of(
-    cls: type, given: Mapping[str, Any], where: str, *, theirs: bool
-) -> dict[str, Any]:
+def values_of(cls: type, given: Mapping[str, Any], where: str, *, theirs: bool) -> dict[str, Any]:
     """
     Return the values of a filter's parameters from what a chain says.
 

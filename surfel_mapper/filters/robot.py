@@ -16,10 +16,10 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import Filter, Mask
+from surfel_mapper.filters.kernels.boxes import outside_box
 from surfel_mapper.filters.limits import range_sq, rounded
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.boxes import outside_box
 from surfel_mapper.scan import Scan
 
 TIME_COLUMNS = ('t', 'time', 'times', 'timestamp', 'time_stamp', 'timeStamp', 'offset_time')

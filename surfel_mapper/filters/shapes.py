@@ -19,10 +19,10 @@ import numpy.typing as npt
 
 from surfel_mapper.filters.base import Filter
 from surfel_mapper.filters.columns import EIGEN_VALUES, EIGEN_VECTORS, NORMALS
+from surfel_mapper.filters.kernels.shapes import eigenvectors, group_moments, neighbour_moments
 from surfel_mapper.filters.neighbours import Ids, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.kernels.eigen3 import decompose
-from surfel_mapper.kernels.shapes import eigenvectors, group_moments, neighbour_moments
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Rows of a symmetric matrix as it is stored: xx xy xz yy yz zz."""

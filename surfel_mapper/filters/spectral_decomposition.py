@@ -89,11 +89,13 @@ class SpectralDecomposition(VotingFilter):
         with np.errstate(invalid='ignore'):  # nan where there are no votes: then not dense either
             ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
         nearest = ((ratios[:, None] - RATIOS) ** 2).sum(axis=2).argmin(axis=1)
-        expected = np.array([
-            mean_decay(1, self.sigma, 0.5 * self.radius_m),
-            mean_decay(2, self.sigma, self.radius_m),
-            mean_decay(3, self.sigma, self.radius_m) * 5.0 / 6.0,
-        ])
+        expected = np.array(
+            [
+                mean_decay(1, self.sigma, 0.5 * self.radius_m),
+                mean_decay(2, self.sigma, self.radius_m),
+                mean_decay(3, self.sigma, self.radius_m) * 5.0 / 6.0,
+            ]
+        )
         is_dense = highest > expected[nearest]
         return np.asarray(~is_dense | (random.random(len(is_dense)) < 0.5))
 

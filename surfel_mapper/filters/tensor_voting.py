@@ -21,11 +21,11 @@ import numpy.typing as npt
 
 from surfel_mapper.filters.base import Filter, with_columns
 from surfel_mapper.filters.columns import NORMALS
+from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, Points
 from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, PAIRS
-from surfel_mapper.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.scan import Scan
 
 Columns = dict[str, npt.NDArray[Any]]

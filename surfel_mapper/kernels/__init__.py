@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Compiled loops over arrays; the only place that imports numba.
+Compiled loops that two or more parts share; those of one part are in ``<part>/kernels/``.
 
-Ubuntu 24.04, the system of ROS 2 Jazzy, has no package of numba, so rosdep cannot install it there
-and it is missing on many a robot at first. Whoever imports a kernel then learns here what to do.
+Only folders of this name import numba. Ubuntu 24.04, the system of ROS 2 Jazzy, has no package of
+numba, so rosdep cannot install it there and it is missing on many robots at first. Importing a
+kernel then raises an error that says how to install it.
 
-Where numba can write no directory to keep compiled kernels in, it refuses to load any; then they
-are kept in a temporary one and compiled at every start.
+If numba finds no writable directory for its cache, it refuses to load any kernel; the kernels are
+then cached in a temporary directory and compiled at every start.
 
-numba compiles a kernel anew when its own file has changed, not when one has that it calls, whose
-old code it may hold: after an update kernels would disagree on how a table is laid out. So all
-that is kept goes with any change in this folder.
+numba compiles a kernel anew if its own file changed, but not if a kernel that it calls did: after
+an update, cached kernels would disagree on the layout of a table. So any change in any folder of
+kernels discards the whole cache.
 """
 
 import atexit
@@ -20,6 +21,7 @@ import logging
 from pathlib import Path
 import shutil
 import tempfile
+from types import FunctionType
 
 from surfel_mapper.errors import DependencyError
 
@@ -42,29 +44,38 @@ except ImportError as error:
 _log = logging.getLogger(__name__)
 
 STAMP = 'kernels.sha256'
-"""Beside the compiled kernels, the hash of all sources that they were compiled from."""
+"""File beside the cached kernels: the hash of all sources that they were compiled from."""
+
+_PACKAGE = Path(__file__).parents[1]
 
 
 def _probe() -> None:
-    """Stand for a kernel of this folder; it is never compiled."""
+    """Take the place of a kernel, to find the cache of its folder; never compiled."""
 
 
-def _forget_unless_of(sources: list[Path], directory: Path) -> None:
-    """Remove the compiled kernels of a directory that are not of these sources."""
-    found = hashlib.sha256(b''.join(source.read_bytes() for source in sources)).digest()
+def _cache_of(folder: Path) -> Path:
+    """Return numba's cache directory of a folder; RuntimeError if it can write none."""
+    code = _probe.__code__.replace(co_filename=str(folder / '__init__.py'))
+    path = _numba.njit(cache=True)(FunctionType(code, {})).stats.cache_path
+    assert path is not None, 'cache=True was given'
+    return Path(path)
+
+
+def _discard_stale(directory: Path, digest: bytes) -> None:
+    """Remove the cached kernels of a directory unless they were compiled from these sources."""
     stamp = directory / STAMP
     try:
-        if stamp.exists() and stamp.read_bytes() == found:
+        if stamp.exists() and stamp.read_bytes() == digest:
             return
         for kept in directory.glob('*.nb[ci]'):
             kept.unlink(missing_ok=True)  # another process may do the same
-        stamp.write_bytes(found)
+        stamp.write_bytes(digest)
     except OSError as error:
         _log.warning('%s: kernels may be compiled at every start: %s', stamp, error)
 
 
 try:
-    _compiled = _numba.njit(cache=True)(_probe)
+    _caches = [_cache_of(each.parent) for each in _PACKAGE.glob('**/kernels/__init__.py')]
 except RuntimeError:
     _directory = tempfile.mkdtemp(prefix='surfel_mapper-kernels-')
     atexit.register(shutil.rmtree, _directory, ignore_errors=True)
@@ -75,6 +86,7 @@ except RuntimeError:
     )
 else:
     if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        _kept_in = _compiled.stats.cache_path
-        assert _kept_in is not None, 'it was told to keep it'
-        _forget_unless_of(sorted(Path(__file__).parent.glob('*.py')), Path(_kept_in))
+        _sources = sorted(_PACKAGE.glob('**/kernels/*.py'))
+        _digest = hashlib.sha256(b''.join(each.read_bytes() for each in _sources)).digest()
+        for _cache in _caches:
+            _discard_stale(_cache, _digest)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.queries import build_table
-from surfel_mapper.kernels.thinning import keys_within, mark_seen, mix_keys
+from surfel_mapper.mapping.kernels.thinning import keys_within, mark_seen, mix_keys
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.windowed_scan import WindowedScan
 

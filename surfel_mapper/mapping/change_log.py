@@ -15,7 +15,7 @@ from itertools import takewhile
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.surfels import rows_changed_at
+from surfel_mapper.mapping.kernels.surfels import rows_changed_at
 
 Rows = npt.NDArray[np.int32]
 

@@ -41,9 +41,7 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(channel for name in columns for channel in CHANNELS[name])
 
 
-def missing_columns(
-    columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]
-) -> list[str]:
+def missing_columns(columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]) -> list[str]:
     """Return which of the named columns are not there; ``rgba`` will do for ``rgb``."""
     return [n for n in names if n not in columns and not (n == 'rgb' and 'rgba' in columns)]
 
@@ -77,8 +75,7 @@ def quantised(
         column = columns['rgba' if name not in columns else name]
         if len(column) != num_points:
             raise ValueError(
-                f'column {name}: of length {len(column)}, expected one row for '
-                f'{num_points} points'
+                f'column {name}: of length {len(column)}, expected one row for {num_points} points'
             )
         parts.append(_unpacked(column) if name == 'rgb' else _fixed(column))
     return np.ascontiguousarray(np.concatenate(parts, axis=1))
@@ -88,9 +85,7 @@ def means(
     sums: npt.NDArray[np.int64], count: npt.NDArray[np.int64], names: tuple[str, ...]
 ) -> dict[str, npt.NDArray[np.float64]]:
     """Return the mean of every channel, (K,) float64 each, from sums (K, C) and counts (K,)."""
-    return {
-        name: sums[:, channel] / (count * UNITS[name]) for channel, name in enumerate(names)
-    }
+    return {name: sums[:, channel] / (count * UNITS[name]) for channel, name in enumerate(names)}
 
 
 def _fixed(column: npt.NDArray[Any]) -> npt.NDArray[np.int32]:

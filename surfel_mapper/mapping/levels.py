@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from surfel_mapper.kernels.levels import coarsen
+from surfel_mapper.mapping.kernels.levels import coarsen
 from surfel_mapper.mapping.moments import ScanMoments
 
 

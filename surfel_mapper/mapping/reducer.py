@@ -18,7 +18,6 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.channels import sum_channels
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.kernels.moments import (
     BEYOND,
@@ -31,6 +30,7 @@ from surfel_mapper.kernels.moments import (
 )
 from surfel_mapper.kernels.queries import build_table
 from surfel_mapper.mapping.channels import channel_names, quantised
+from surfel_mapper.mapping.kernels.channels import sum_channels
 from surfel_mapper.mapping.moments import ScanMoments
 
 NARROW_COUNT = 1 << 16
@@ -152,9 +152,7 @@ class Reducer:
         self._idle.append(scratch)
         return moments
 
-    def _pack(
-        self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]
-    ) -> ScanMoments:
+    def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
         """Turn the sums into integers."""
         key, sums = scratch.keys[:num].copy(), scratch.sums[:num]
         largest = sums[:, 0].max(initial=0.0)
@@ -184,9 +182,7 @@ def within(
     x, y, z = points.astype(np.float64).T
     range_sq = (x * x + y * y) + z * z
     far_sq = max_range_m**2 if max_range_m else np.inf
-    return np.asarray(
-        np.isfinite(range_sq) & (range_sq >= min_range_m**2) & (range_sq <= far_sq)
-    )
+    return np.asarray(np.isfinite(range_sq) & (range_sq >= min_range_m**2) & (range_sq <= far_sq))
 
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:

@@ -28,10 +28,10 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
-from surfel_mapper.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.change_log import ChangeLog
 from surfel_mapper.mapping.channels import channel_names, means
 from surfel_mapper.mapping.digest import digest_of
+from surfel_mapper.mapping.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.levels import coarse_moments
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.reducer import Reducer

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.surfels import derive_surfels
-from surfel_mapper.mapping.threads import share
+from surfel_mapper.mapping.kernels.surfels import derive_surfels
+from surfel_mapper.threads import share
 
 
 @dataclass(frozen=True, slots=True, eq=False)

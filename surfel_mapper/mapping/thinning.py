@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.thinning import mix_keys
+from surfel_mapper.mapping.kernels.thinning import mix_keys
 
 
 def thinned(key: npt.NDArray[np.int64], number: int) -> npt.NDArray[np.int64]:

@@ -19,15 +19,15 @@ import numpy.typing as npt
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.kernels.queries import keys_in_box
-from surfel_mapper.kernels.surfels import rows_changed_after
-from surfel_mapper.kernels.thinning import rows_held
-from surfel_mapper.kernels.voxels import (
+from surfel_mapper.mapping.hash_table import HashTable
+from surfel_mapper.mapping.kernels.surfels import rows_changed_after
+from surfel_mapper.mapping.kernels.thinning import rows_held
+from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
     first_missing,
     subtract_moments,
 )
-from surfel_mapper.mapping.hash_table import HashTable
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.mapping.thinning import smallest

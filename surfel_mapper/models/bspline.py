@@ -21,8 +21,8 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.banded import solve_band
-from surfel_mapper.kernels.splines import (
+from surfel_mapper.models.kernels.banded import solve_band
+from surfel_mapper.models.kernels.splines import (
     add_differences,
     add_equations,
     basis_at,

@@ -14,8 +14,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.folds import halve_part
-from surfel_mapper.kernels.piece_groups import hang_together, mean_normals, suspects
+from surfel_mapper.models.kernels.folds import halve_part
+from surfel_mapper.models.kernels.piece_groups import hang_together, mean_normals, suspects
 from surfel_mapper.models.pieces import Pieces
 
 Array = npt.NDArray[np.float64]

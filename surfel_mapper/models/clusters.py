@@ -16,9 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.clustering import bisect, NOISE_SPREAD
-from surfel_mapper.kernels.joining import components
 from surfel_mapper.models import folds
+from surfel_mapper.models.kernels.clustering import bisect, NOISE_SPREAD
+from surfel_mapper.models.kernels.joining import components
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]

@@ -4,14 +4,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sized
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from surfel_mapper.models.multi_model import MultiModel
 
 POINT_BYTES = 12
 """A point as three float32."""
@@ -49,7 +47,34 @@ class Evaluation:
     compression: float
 
 
-def evaluate(model: MultiModel, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
+class Model(Protocol):
+    """The parts of a MultiModel that are compared with a cloud."""
+
+    @property
+    def voxel_size_m(self) -> float:
+        """Edge of the voxels that the cloud was thinned by, m."""
+
+    @property
+    def planes(self) -> Sized:
+        """Bounded planes."""
+
+    @property
+    def surfaces(self) -> Sized:
+        """B-spline surfaces."""
+
+    @property
+    def gaussians(self) -> Sized:
+        """Gaussians."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of all parameters."""
+
+    def resample(self, *, seed: int) -> npt.NDArray[np.float64]:
+        """Return points (K, 3) on the models, m."""
+
+
+def evaluate(model: Model, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
     """
     Compare what models generate with a cloud.
 

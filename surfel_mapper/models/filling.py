@@ -3,8 +3,8 @@
 """
 What rings enclose, as triangles for those who draw it, and as one ring for those who want one.
 
-Triangles are found by a line that sweeps over the sides (kernels/filling.py), so holes, pieces
-that do not hang together, and rings that touch need no care.
+Triangles are found by a line that sweeps over the sides (models/kernels/filling.py), so holes,
+pieces that do not hang together, and rings that touch need no care.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import face_normals
-from surfel_mapper.kernels.filling import fill_rings
+from surfel_mapper.models.kernels.filling import fill_rings
 
 Array = npt.NDArray[np.float64]
 

@@ -24,15 +24,6 @@ from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
-from surfel_mapper.kernels.voxel_means import (
-    finite_ends,
-    give_labels,
-    mean_runs,
-    row_bits,
-    sorted_runs,
-    voxel_keys,
-    voxel_runs,
-)
 from surfel_mapper.models.clusters import (
     Clusters,
     clusters_of,
@@ -40,6 +31,15 @@ from surfel_mapper.models.clusters import (
     mean_normal,
     surfaces_of,
     thickness,
+)
+from surfel_mapper.models.kernels.voxel_means import (
+    finite_ends,
+    give_labels,
+    mean_runs,
+    row_bits,
+    sorted_runs,
+    voxel_keys,
+    voxel_runs,
 )
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.patches import Groups, patches_of
@@ -113,7 +113,7 @@ class Thinned:
     means : (M, 3) float64, m
         Means of the points, in the order of the voxels.
     runs : (R,) int64
-        Which rows of the cloud are in which voxel; see kernels/voxel_means.py.
+        Which rows of the cloud are in which voxel; see models/kernels/voxel_means.py.
     num_points : int
         All points, finite or not.
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.folds import fold
+from surfel_mapper.models.kernels.folds import fold
 
 Array = npt.NDArray[np.float64]
 

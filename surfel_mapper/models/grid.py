@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.coverage import cover_parts, cover_places
+from surfel_mapper.models.kernels.coverage import cover_parts, cover_places
 
 Array = npt.NDArray[np.float64]
 

@@ -15,8 +15,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.relaxing import bends, equations, guess, mark_active, mark_near, relax
 from surfel_mapper.models.bspline import fit_pspline, HeightField, initial_field, RIDGE
+from surfel_mapper.models.kernels.relaxing import (
+    bends,
+    equations,
+    guess,
+    mark_active,
+    mark_near,
+    relax,
+)
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -135,9 +142,7 @@ def overlap(
     low = [max(int(s), 0) for s in step]
     high = [max(min(int(s) + o, n), a) for s, o, n, a in zip(step, old, new, low, strict=True)]
     here = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
-    there = tuple(
-        slice(a - int(s), b - int(s)) for a, b, s in zip(low, high, step, strict=True)
-    )
+    there = tuple(slice(a - int(s), b - int(s)) for a, b, s in zip(low, high, step, strict=True))
     return here, there
 
 
@@ -161,9 +166,15 @@ def relaxed(
         seconds.append(second[:bent])
     flat = control.ravel()
     relax(
-        first[:num], values[:num], xyz[first[:num, 1], 2], control.shape[1],
-        np.concatenate(ats), np.concatenate(seconds), (SMOOTHING, RIDGE, TOLERANCE_M),
-        np.flatnonzero(free), flat,
-    )  # fmt: skip
+        first[:num],
+        values[:num],
+        xyz[first[:num, 1], 2],
+        control.shape[1],
+        np.concatenate(ats),
+        np.concatenate(seconds),
+        (SMOOTHING, RIDGE, TOLERANCE_M),
+        np.flatnonzero(free),
+        flat,
+    )
     field = flat.reshape(control.shape)
     return HeightField(start.pitch_m, start.origin, start.degrees, field)

@@ -26,17 +26,17 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.models_layer import ModelsLayerConfig
-from surfel_mapper.kernels.piece_classes import FLAT, NONE, YOUNG
-from surfel_mapper.kernels.piece_groups import (
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.charts import charts_of, cut
+from surfel_mapper.models.identity import match, Matched
+from surfel_mapper.models.kernels.piece_classes import FLAT, NONE, YOUNG
+from surfel_mapper.models.kernels.piece_groups import (
     hang_together,
     name_components,
     rows_of_groups,
     sort_by_group,
 )
-from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.charts import charts_of, cut
-from surfel_mapper.models.identity import match, Matched
 from surfel_mapper.models.live_patches import PatchFitter, symmetric, Tracked
 from surfel_mapper.models.model_update import ModelUpdate
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface

@@ -17,13 +17,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.banded import rms_off_field
-from surfel_mapper.kernels.patches import describe
-from surfel_mapper.kernels.piece_classes import FLAT
-from surfel_mapper.kernels.piece_groups import mean_normals
-from surfel_mapper.kernels.pieces import merge_moments, spread
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import HeightField
+from surfel_mapper.models.kernels.banded import rms_off_field
+from surfel_mapper.models.kernels.patches import describe
+from surfel_mapper.models.kernels.piece_classes import FLAT
+from surfel_mapper.models.kernels.piece_groups import mean_normals
+from surfel_mapper.models.kernels.pieces import merge_moments, spread
 from surfel_mapper.models.large_fields import fit_field, Fitted
 from surfel_mapper.models.multi_model import Plane, Surface
 from surfel_mapper.models.patches import cells_of, Groups, rms_across
@@ -166,10 +166,16 @@ class PatchFitter:
         means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
         covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
         describe(
-            groups.points, groups.starts, groups.normals, np.zeros(3),
+            groups.points,
+            groups.starts,
+            groups.normals,
+            np.zeros(3),
             (groups.thickness, self._surface_pitch_m, True, True),
-            means, covariances, frames, curved,
-        )  # fmt: skip
+            means,
+            covariances,
+            frames,
+            curved,
+        )
         return frames, curved
 
     def _steadied(

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.rims import follow_sides, lay_sides, mark_corners
+from surfel_mapper.models.kernels.rims import follow_sides, lay_sides, mark_corners
 from surfel_mapper.models.multi_model import Plane
 
 Array = npt.NDArray[np.float64]

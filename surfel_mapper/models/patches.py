@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.cells import fill_cells, lay_grids
-from surfel_mapper.kernels.patches import describe
 from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
 from surfel_mapper.models.clusters import is_paper
 from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.kernels.cells import fill_cells, lay_grids
+from surfel_mapper.models.kernels.patches import describe
 from surfel_mapper.models.multi_model import Plane, Surface
 
 Array = npt.NDArray[np.float64]
@@ -59,7 +59,7 @@ class Groups:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """The cells of all patches, one row each; see kernels/cells.py."""
+    """The cells of all patches, one row each; see models/kernels/cells.py."""
 
     pitches: Array
     origins: Array
@@ -96,9 +96,16 @@ def patches_of(groups: Groups, config: ModelsConfig, viewpoint: Array) -> list[P
     covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
     rules = (groups.thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
     describe(
-        groups.points, groups.starts, groups.normals, viewpoint, rules,
-        means, covariances, frames, curved,
-    )  # fmt: skip
+        groups.points,
+        groups.starts,
+        groups.normals,
+        viewpoint,
+        rules,
+        means,
+        covariances,
+        frames,
+        curved,
+    )
     local = np.empty_like(groups.points)
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
@@ -141,9 +148,18 @@ def cells_of(
         cuts=np.zeros((total, 3), np.uint8),
     )
     fill_cells(
-        local, groups.starts, pitches, origins, sizes, cells.first,
-        cells.sums, cells.rim, cells.corner, cells.cuts, MARGIN_VOXELS * a,
-    )  # fmt: skip
+        local,
+        groups.starts,
+        pitches,
+        origins,
+        sizes,
+        cells.first,
+        cells.sums,
+        cells.rim,
+        cells.corner,
+        cells.cuts,
+        MARGIN_VOXELS * a,
+    )
     return cells
 
 

@@ -20,11 +20,11 @@ import numpy.typing as npt
 
 from surfel_mapper.config.models_layer import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
-from surfel_mapper.kernels.piece_classes import classify, FLAT, NONE, tell
-from surfel_mapper.kernels.pieces import enter, leave, lie_on, link
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.kernels.piece_classes import classify, FLAT, NONE, tell
+from surfel_mapper.models.kernels.pieces import enter, leave, lie_on, link
 from surfel_mapper.models.piece_changes import Change, found, Gone
 
 Array = npt.NDArray[np.float64]
@@ -52,9 +52,9 @@ class Pieces:
     key : (R,) int64
         Of the voxel in each row, -1 for none.
     count, position, normal, eigenvalues, covariance, axes
-        What it holds; covariance xx xy xz yy yz zz; axes as in kernels/piece_classes.py.
+        What it holds; covariance xx xy xz yy yz zz; axes as in models/kernels/piece_classes.py.
     kind, links, around
-        See kernels/piece_classes.py and kernels/pieces.py.
+        See models/kernels/piece_classes.py and models/kernels/pieces.py.
     host : (R,) int32
         The flat neighbour that a voxel lies on which is not flat, -1 for none.
     component : (R,) int32
@@ -141,9 +141,16 @@ class Pieces:
         self._is_here[here] = True
         state = (self.kind, self.position, self.normal)
         num = link(
-            here, self._is_here, self.around, state, self._link_rules, self.links, self._marks,
-            marked, num,
-        )  # fmt: skip
+            here,
+            self._is_here,
+            self.around,
+            state,
+            self._link_rules,
+            self.links,
+            self._marks,
+            marked,
+            num,
+        )
         self._is_here[here] = self._marks[marked[:num]] = False
         loose.append(self.component[marked[:num]])
         rehosted, old_hosts, new_hosts = self._rehosted(here, near)
@@ -213,15 +220,27 @@ class Pieces:
         self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
         self.covariance[rows] = self.map.covariances_of(rows)
         classify(
-            rows, self.count, self.normal, self.covariance, self._class_rules, self.kind,
+            rows,
+            self.count,
+            self.normal,
+            self.covariance,
+            self._class_rules,
+            self.kind,
             self.axes,
-        )  # fmt: skip
+        )
         self.is_material[:] = False
         told = (self._told_count, self._told_position, self._told_normal)
         tell(
-            rows, before, self.count, self.position, self.normal, self.kind, told,
-            self._tell_rules, self.is_material,
-        )  # fmt: skip
+            rows,
+            before,
+            self.count,
+            self.position,
+            self.normal,
+            self.kind,
+            told,
+            self._tell_rules,
+            self.is_material,
+        )
 
     def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows]:
         """Find on which flat neighbours voxels lie: rows, hosts before and now."""

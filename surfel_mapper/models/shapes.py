@@ -45,10 +45,15 @@ def faces_of_icosahedron() -> npt.NDArray[np.int64]:
         [
             (a, b, c)
             for a, b, c in np.ndindex(12, 12, 12)
-            if a < b and a < c and near[a, b] and near[b, c] and near[a, c] and b != c
+            if a < b
+            and a < c
+            and near[a, b]
+            and near[b, c]
+            and near[a, c]
+            and b != c
             and np.linalg.det(CORNERS[[a, b, c]]) > 0.0
         ]
-    )  # fmt: skip
+    )
 
 
 FACES = faces_of_icosahedron()

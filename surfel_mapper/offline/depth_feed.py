@@ -7,8 +7,13 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
-from surfel_mapper.io.bag import BagMessage
-from surfel_mapper.io.depth_image import camera_info_topic, CameraImage, depth_scan, DepthImages
+from surfel_mapper.bags.reader import BagMessage
+from surfel_mapper.messages.depth_image import (
+    camera_info_topic,
+    CameraImage,
+    depth_scan,
+    DepthImages,
+)
 from surfel_mapper.scan import Scan
 
 Decode = Callable[[Any, str], Scan]

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from surfel_mapper.errors import BagError
-from surfel_mapper.io.trajectory import read_trajectory, Trajectory
+from surfel_mapper.files.trajectory import read_trajectory, Trajectory
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper

@@ -7,9 +7,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from surfel_mapper.bags.topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError
-from surfel_mapper.io.bag_topics import ODOMETRY, POSE, TF, Topics
 from surfel_mapper.offline.pose_path import PosePath
 
 TYPES = {'tf': TF, 'odometry': ODOMETRY, 'pose': POSE}

@@ -17,10 +17,10 @@ import math
 from pathlib import Path
 from typing import Any, Protocol, TYPE_CHECKING
 
+from surfel_mapper.bags.reader import BagReader
+from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_topics import CLOUD
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.pose_topics import pose_topics, PoseTopics, static_topics
 from surfel_mapper.offline.replay import replay
@@ -114,9 +114,7 @@ def open_recording(request: Request, config: Config) -> Iterator[Recording]:
 
     """
     poses = None if request.poses is None else PosePath(request.poses, request.poses_format)
-    span = {
-        'start_s': request.start_s, 'duration_s': request.duration_s, 'every': request.every
-    }  # fmt: skip
+    span = {'start_s': request.start_s, 'duration_s': request.duration_s, 'every': request.every}
     if is_scan_folder(request.path):
         named = [*request.topics, *request.mounts, *filter(None, [request.pose_topic])]
         if named:
@@ -170,9 +168,13 @@ class BagRecording:
         self.poses = self._poses(request, config, path)
         self.config = config if path is None else config.replace({'pose.source': 'pose'})
         self.span = part(
-            str(request.path), reader.start_ns, reader.end_ns,
-            start_s=request.start_s, duration_s=request.duration_s, every=request.every,
-        )  # fmt: skip
+            str(request.path),
+            reader.start_ns,
+            reader.end_ns,
+            start_s=request.start_s,
+            duration_s=request.duration_s,
+            every=request.every,
+        )
 
     def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:
         """Return where the poses come from."""

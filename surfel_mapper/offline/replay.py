@@ -14,10 +14,10 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from surfel_mapper.bags.reader import BagMessage, BagReader
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
-from surfel_mapper.io.bag import BagMessage, BagReader
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.raw_pose import raw_poses
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import PoseTopics
 from surfel_mapper.offline.span import Span, WHOLE
 
@@ -51,7 +51,7 @@ def load_start(mapper: Mapper) -> None:
         If it has other columns than are configured.
 
     """
-    from surfel_mapper.io.map_state import load_map  # it brings the compiler
+    from surfel_mapper.files.map_state import load_map  # it brings the compiler
 
     path = mapper.config.map.load
     if path:

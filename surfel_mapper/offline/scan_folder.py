@@ -14,11 +14,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
-from surfel_mapper.io.bag_files import is_storage, METADATA
-from surfel_mapper.io.scan_files import read_scan, scan_files
-from surfel_mapper.io.trajectory import nanoseconds
+from surfel_mapper.files.scan_files import read_scan, scan_files
+from surfel_mapper.files.trajectory import nanoseconds
 from surfel_mapper.offline.pose_path import PosePath
 from surfel_mapper.offline.span import part, Span
 from surfel_mapper.scan import Scan
@@ -60,9 +60,7 @@ class ScanFolder:
 
     cuts: tuple[str, ...] = ()
 
-    def __init__(
-        self, path: Path, config: Config, poses: PosePath | None, **part_of: Any
-    ) -> None:
+    def __init__(self, path: Path, config: Config, poses: PosePath | None, **part_of: Any) -> None:
         """List the files and find the time of each."""
         self.path = path
         self.files = scan_files(path)

@@ -4,10 +4,10 @@
 
 from __future__ import annotations
 
+from surfel_mapper.bags.reader import BagMessage, BagReader
 from surfel_mapper.errors import BagError, CloudFormatError
-from surfel_mapper.io.bag import BagMessage, BagReader
-from surfel_mapper.io.depth_image import camera_info_topic
-from surfel_mapper.io.scene_image import SceneImages
+from surfel_mapper.messages.depth_image import camera_info_topic
+from surfel_mapper.messages.scene_image import SceneImages
 from surfel_mapper.pipeline import Mapper
 
 

@@ -15,13 +15,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
+from surfel_mapper.bags.reader import BagMessage, BagReader
+from surfel_mapper.bags.topics import CLOUD, Topic
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
-from surfel_mapper.io.bag import BagMessage, BagReader
-from surfel_mapper.io.bag_topics import CLOUD, Topic
-from surfel_mapper.io.pose_messages import frame_name, stamp_ns, StampedPose
-from surfel_mapper.io.raw_pose import raw_poses
+from surfel_mapper.messages.pose_messages import frame_name, stamp_ns, StampedPose
+from surfel_mapper.messages.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 

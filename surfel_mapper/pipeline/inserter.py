@@ -67,9 +67,7 @@ class Inserter:
 
     """
 
-    def __init__(
-        self, config: Config, poses: ScanPoses, counters: Counters, drops: Drops
-    ) -> None:
+    def __init__(self, config: Config, poses: ScanPoses, counters: Counters, drops: Drops) -> None:
         """Make an empty map with the settings of a configuration."""
         self._config = config
         self._poses = poses

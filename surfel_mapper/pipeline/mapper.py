@@ -24,8 +24,6 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
-from surfel_mapper.depth import SceneImage
-from surfel_mapper.deskew import point_times
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
@@ -42,6 +40,8 @@ from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Aligned
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import SceneImage
+from surfel_mapper.sensors.deskew import point_times
 
 _log = logging.getLogger(__name__)
 

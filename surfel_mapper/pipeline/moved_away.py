@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import DynamicConfig, TsdfConfig
 from surfel_mapper.geometry import inverse
-from surfel_mapper.kernels.free_space import look_through, SEEN, THROUGH
+from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.pipeline.sensor_models import measured, SensorModels
 from surfel_mapper.scan import Scan
@@ -41,9 +41,7 @@ class MovedAway:
 
     """
 
-    def __init__(
-        self, config: DynamicConfig, voxel_size_m: float, sensors: SensorModels
-    ) -> None:
+    def __init__(self, config: DynamicConfig, voxel_size_m: float, sensors: SensorModels) -> None:
         """Begin with no counts."""
         self._config = config
         self._voxel_size_m = voxel_size_m

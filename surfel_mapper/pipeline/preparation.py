@@ -14,7 +14,6 @@ from dataclasses import astuple, dataclass, replace
 from surfel_mapper.alignment.registration import Alignment
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Counters, Laps
-from surfel_mapper.deskew import warm_up as warm_up_deskewing
 from surfel_mapper.errors import (
     AlignmentError,
     CloudFormatError,
@@ -27,13 +26,14 @@ from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.free_rays import free_directions
 from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.window_aligner import WindowAligner
 from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.sensors.deskew import warm_up as warm_up_deskewing
+from surfel_mapper.sensors.free_rays import free_directions
 
 
 @dataclass(frozen=True)

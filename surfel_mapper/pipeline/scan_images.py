@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.depth import LABEL, PinholeCamera, SceneImage
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import LABEL, PinholeCamera, SceneImage
 
 MAX_IMAGES = 60
 """Images kept of each kind, 2 s at 30 Hz."""

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.config import Config
-from surfel_mapper.deskew import deskewed
 from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
+from surfel_mapper.sensors.deskew import deskewed
 
 
 class ScanPoses:

@@ -103,9 +103,7 @@ def is_rotation(a: list[float], b: list[float], c: list[float]) -> bool:
         abs(a0 * c0 + a1 * c1 + a2 * c2),
         abs(b0 * c0 + b1 * c1 + b2 * c2),
     )
-    volume = (
-        a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
-    )
+    volume = a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
     return skew <= MAX_SKEW and volume > 0.0
 
 

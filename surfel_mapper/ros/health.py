@@ -97,8 +97,9 @@ def _drops(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
     level = ERROR if share > limits.error_dropped_ratio else WARN
     causes = ', '.join(f'{cause} {number}' for cause, number in dropped.most_common())
     remedy = REMEDIES.get(dropped.most_common(1)[0][0], '')
-    yield level, f'{dropped.total()} scans dropped just now ({causes})' + (
-        f': {remedy}' if remedy else ''
+    yield (
+        level,
+        f'{dropped.total()} scans dropped just now ({causes})' + (f': {remedy}' if remedy else ''),
     )
 
 

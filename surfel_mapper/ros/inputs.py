@@ -25,23 +25,23 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from surfel_mapper.config import Config
-from surfel_mapper.depth import SceneImage
 from surfel_mapper.errors import CloudFormatError, DependencyError, PoseError
-from surfel_mapper.io.compressed_image import is_packed
-from surfel_mapper.io.depth_image import (
+from surfel_mapper.messages.compressed_image import is_packed
+from surfel_mapper.messages.depth_image import (
     camera_info_topic,
     CameraImage,
     depth_scan,
     DepthImages,
     warm_up,
 )
-from surfel_mapper.io.pose_messages import ODOMETRY, POSE, TF
-from surfel_mapper.io.raw_cloud import parse_cloud
-from surfel_mapper.io.raw_pose import raw_poses
-from surfel_mapper.io.scene_image import SceneImages
+from surfel_mapper.messages.pose_messages import ODOMETRY, POSE, TF
+from surfel_mapper.messages.raw_cloud import parse_cloud
+from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.messages.scene_image import SceneImages
 from surfel_mapper.ros.intake import Intake
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import SceneImage
 
 DEFAULT_TOPICS = {'cloud': 'points', 'depth': 'depth/image'}
 """Where clouds or images come in unless ``input.topics`` says so."""

@@ -17,14 +17,14 @@ from concurrent.futures import Future
 import threading
 from typing import Any, NamedTuple, TypeVar
 
-from surfel_mapper.depth import SceneImage
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import StampedPose
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.pose_messages import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.drops import REMEDIES
 from surfel_mapper.pipeline.scan_images import MAX_IMAGES
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import SceneImage
 
 MAX_POSES = 10_000
 """Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""

@@ -17,7 +17,7 @@ from nav_msgs.msg import OccupancyGrid
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import Header
 
-from surfel_mapper.io.pointcloud2 import CloudBytes
+from surfel_mapper.messages.pointcloud2 import CloudBytes
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.cost_grid import CostGrid

@@ -24,10 +24,10 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.io.cdr import marker_array, polygon_instance
-from surfel_mapper.io.model_cloud import primitive_columns, surfel_primitive_columns
-from surfel_mapper.io.model_markers import model_markers
-from surfel_mapper.io.pointcloud2 import from_columns
+from surfel_mapper.messages.cdr import marker_array, polygon_instance
+from surfel_mapper.messages.model_cloud import primitive_columns, surfel_primitive_columns
+from surfel_mapper.messages.model_markers import model_markers
+from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.models.filling import joined
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.models.shapes import PatchShape, Shapes
@@ -87,9 +87,7 @@ class ModelOutputs:
             PointCloud2, '~/surfel_primitives', LATCHED, self._publish_surfels
         )
         outlines = self._in_steps(self._publish_all_outlines)
-        self._outlines = self._advertise(
-            PolygonInstanceStamped, '~/outlines', OUTLINES, outlines
-        )
+        self._outlines = self._advertise(PolygonInstanceStamped, '~/outlines', OUTLINES, outlines)
 
     def note(self, update: Update) -> None:
         """Take note of a scan, and publish where the models have followed it."""

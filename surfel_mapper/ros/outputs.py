@@ -27,17 +27,17 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import Config
-from surfel_mapper.io.cdr import marker_array
-from surfel_mapper.io.map_cloud import moment_cloud, voxel_columns
-from surfel_mapper.io.markers import disc_colors, surfel_markers
-from surfel_mapper.io.pointcloud2 import from_columns
-from surfel_mapper.io.scan_normals import scan_with_normals
-from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.messages.cdr import marker_array
+from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
+from surfel_mapper.messages.markers import disc_colors, surfel_markers
+from surfel_mapper.messages.pointcloud2 import from_columns
+from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.pipeline import Aligned, Mapper, Update
 from surfel_mapper.ros.alignment import AlignmentOutputs
 from surfel_mapper.ros.changes import Change, Changes

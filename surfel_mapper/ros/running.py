@@ -18,7 +18,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.task import Future
 
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.ros.context import context, reason
 from surfel_mapper.ros.logs import logging_to
 from surfel_mapper.ros.node import MapperNode

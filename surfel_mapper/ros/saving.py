@@ -13,9 +13,9 @@ from urllib.parse import unquote, urlsplit
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.io.map_state import load_map as load_state
-from surfel_mapper.io.map_state import save_map as save_state
-from surfel_mapper.io.ply import write_surfels
+from surfel_mapper.files.map_state import load_map as load_state
+from surfel_mapper.files.map_state import save_map as save_state
+from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
 
 

@@ -14,7 +14,7 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
-from surfel_mapper.io.map_state import load_map
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.control import Control
 from surfel_mapper.ros.inbox import Inbox

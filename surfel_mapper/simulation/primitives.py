@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels.surfaces import BOX, CYLINDER, RECTANGLE, SPHERE, TUBE
+from surfel_mapper.simulation.kernels.surfaces import BOX, CYLINDER, RECTANGLE, SPHERE, TUBE
 
 KINDS = {
     'rectangle': (RECTANGLE, ('x', 'y')),

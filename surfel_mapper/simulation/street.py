@@ -148,9 +148,7 @@ class Street:
     def _tree(self, x: float, y: float) -> Iterator[Primitive]:
         size = (self._rng.uniform(0.15, 0.35), 5.0)
         turn = (self._about(0.0, 5.0), self._about(0.0, 5.0), 0.0)
-        yield self._place(
-            'cylinder', size, (x, y, 2.2), turn, label='trunk', reflectivity=0.3
-        )
+        yield self._place('cylinder', size, (x, y, 2.2), turn, label='trunk', reflectivity=0.3)
         for _ in range(2):
             centre = (self._about(x, 0.6), self._about(y, 0.6), self._about(5.0, 0.5))
             radius = self._rng.uniform(0.9, 1.4)

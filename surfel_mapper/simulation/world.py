@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels import raycast, surfaces
+from surfel_mapper.simulation.kernels import raycast, surfaces
 from surfel_mapper.simulation.primitives import KINDS, Primitive
 from surfel_mapper.simulation.street import street_pose, street_primitives
 from surfel_mapper.simulation.tree import bounding_boxes, build_tree

@@ -7,11 +7,11 @@ Block (a, b, c) spans from (a, b, c) * M * voxel_size_m to the next. Voxel (i, j
 number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
 ((a, b, c) * M + (i, j, k) + 0.5) * voxel_size_m. Row r of every array belongs to one block:
 
-    head    (R, 4) int64       key, version, stamp of the last change; see kernels/blocks.py
+    head    (R, 4) int64       key, version, stamp of the last change; see tsdf/kernels/blocks.py
     field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
                                it; weight, 0 where a voxel was never observed
     color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
-    votes   (R, V, N) float32  for labels, see kernels/tsdf_labels.py; V depends on the semantics
+    votes   (R, V, N) float32  for labels, see tsdf/kernels/labels.py; V depends on the semantics
     stamps  (R, 2, N) int64    first and last stamp, ns; 0 where a voxel was never observed
 
 color, votes and stamps have no rows where the configuration does not ask for them. All are slabs
@@ -26,9 +26,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import TsdfConfig
-from surfel_mapper.kernels.blocks import HEAD
 from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.tsdf.block_content import Blocks, some
+from surfel_mapper.tsdf.kernels.blocks import HEAD
 
 Int64 = npt.NDArray[np.int64]
 Float32 = npt.NDArray[np.float32]

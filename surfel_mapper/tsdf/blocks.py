@@ -20,7 +20,11 @@ import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.blocks import (
+from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
+from surfel_mapper.mapping.hash_table import HashTable
+from surfel_mapper.tsdf.block_arrays import BlockArrays
+from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks
+from surfel_mapper.tsdf.kernels.blocks import (
     find_blocks,
     FREE,
     NEW,
@@ -29,10 +33,6 @@ from surfel_mapper.kernels.blocks import (
     STAMP,
     VERSION,
 )
-from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
-from surfel_mapper.mapping.hash_table import HashTable
-from surfel_mapper.tsdf.block_arrays import BlockArrays
-from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks
 
 Int64 = npt.NDArray[np.int64]
 

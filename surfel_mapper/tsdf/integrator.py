@@ -5,7 +5,7 @@ Integrator: fuses range images into a block map.
 
 One step is: choose the blocks, place those that are missing, fuse each by itself, and take away
 those placed in vain. Threads share the blocks; what they write does not depend on how many there
-are. See kernels/tsdf.py for what happens in a block.
+are. See tsdf/kernels/integration.py for what happens in a block.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import INTERPOLATIONS, SEMANTICS, TsdfConfig
 from surfel_mapper.errors import PoseError
-from surfel_mapper.kernels import tsdf_lookup as kernels
-from surfel_mapper.kernels.tsdf import integrate_blocks
-from surfel_mapper.mapping.threads import pool, split
+from surfel_mapper.threads import pool, split
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
+from surfel_mapper.tsdf.kernels import lookup as kernels
+from surfel_mapper.tsdf.kernels.integration import integrate_blocks
 from surfel_mapper.tsdf.range_image import RangeImage
 from surfel_mapper.tsdf.selection import BlockSelection, NO_COSINE, reach_behind_m
 from surfel_mapper.tsdf.sensors import Lidar, Sensor

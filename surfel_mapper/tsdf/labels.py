@@ -15,9 +15,7 @@ from surfel_mapper.tsdf.queries import in_voxels
 Float32 = npt.NDArray[np.float32]
 
 
-def labels_at(
-    blocks: BlockMap, points: npt.ArrayLike
-) -> tuple[npt.NDArray[np.int32], Float32]:
+def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:
     """
     Return the labels of the voxels that points lie in, and their weights.
 
@@ -63,7 +61,7 @@ def labels_of(
     semantics : str
         As in the configuration.
     votes : (V, ...) float32
-        Of voxels, see kernels/tsdf_labels.py.
+        Of voxels, see tsdf/kernels/labels.py.
     min_weight : float
         first_k: a label counts if it weighs more.
 

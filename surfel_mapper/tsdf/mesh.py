@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.layout import KEY
-from surfel_mapper.kernels.marching_cubes import count_triangles, march
 from surfel_mapper.tsdf.blocks import BlockMap, UPPER
+from surfel_mapper.tsdf.kernels.marching_cubes import count_triangles, march
 
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]

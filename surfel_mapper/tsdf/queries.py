@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels import tsdf_queries as kernels
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.kernels import queries as kernels
 
 UNKNOWN = kernels.UNKNOWN
 FREE = kernels.FREE
@@ -126,9 +126,7 @@ def states(
     return found
 
 
-def in_voxels(
-    blocks: BlockMap, points: npt.ArrayLike
-) -> tuple[npt.NDArray[np.float64], int]:
+def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], int]:
     """Return points in voxels, and how many bits number the voxels along a block's edge."""
     places = np.asarray(points, np.float64)
     if places.ndim != 2 or places.shape[1] != 3:

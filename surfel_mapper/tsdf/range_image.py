@@ -4,7 +4,8 @@
 RangeImage: what one scan or depth image measured, pixel by pixel of its sensor.
 
 The images of a lidar that looks all around repeat the first column after the last, so that
-nothing that reads them has to know of the seam. See kernels/range_image.py for what a pixel holds.
+nothing that reads them has to know of the seam. See tsdf/kernels/range_image.py for
+what a pixel holds.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.kernels import range_image as kernels
+from surfel_mapper.tsdf.kernels import range_image as kernels
 from surfel_mapper.tsdf.sensors import Camera, Sensor
 
 Float32 = npt.NDArray[np.float32]
@@ -184,7 +185,10 @@ def from_depth(
 
 
 def from_points(
-    sensor: Sensor, points: npt.NDArray[Any], *, colors: npt.NDArray[np.uint8] | None = None,
+    sensor: Sensor,
+    points: npt.NDArray[Any],
+    *,
+    colors: npt.NDArray[np.uint8] | None = None,
     labels: npt.NDArray[Any] | None = None,
 ) -> RangeImage:
     """

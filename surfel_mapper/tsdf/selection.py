@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.block_marks import count_marks, list_marks, mark_rays
+from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
 
 Int64 = npt.NDArray[np.int64]
@@ -100,7 +100,7 @@ def half_side(config: TsdfConfig, image: RangeImage) -> int:
 
 
 def reach(config: TsdfConfig, image: RangeImage) -> Float64:
-    """Return what rays reach, as kernels/block_marks.py has it."""
+    """Return what rays reach, as tsdf/kernels/block_marks.py has it."""
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
@@ -108,9 +108,7 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
     return np.array([*ends, float(config.carve), *free, *band])
 
 
-def in_view(
-    config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: int
-) -> Int64:
+def in_view(config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: int) -> Int64:
     """Return the blocks that may lie in the view of the sensor, up to its largest range."""
     size_m, sensor = config.block_size_m, image.sensor
     radius_m = np.sqrt(0.75) * size_m

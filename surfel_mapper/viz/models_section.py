@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from surfel_mapper.io.model_markers import primitive_colors
+from surfel_mapper.messages.model_markers import primitive_colors
 from surfel_mapper.models.multi_model import MultiModel
 from surfel_mapper.models.shapes import PatchShape
 

@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.io.files import replace_file
-from surfel_mapper.kernels.painting import paint_discs
+from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.frames import Frame, View
+from surfel_mapper.viz.kernels.painting import paint_discs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -20,7 +20,7 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import STAGES
-from surfel_mapper.io.files import replace_file
+from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.charts import histogram, lines, named_bars, short

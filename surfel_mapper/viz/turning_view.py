@@ -83,9 +83,7 @@ def within_sight(surfels: Surfels) -> Surfels:
     return surfels.select(np.asarray(inside.all(axis=1)))
 
 
-def view_data(
-    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]
-) -> dict[str, Any]:
+def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -> dict[str, Any]:
     """Return what page/view.js needs: everything about the middle of the map, in metres."""
     from matplotlib import colormaps
 

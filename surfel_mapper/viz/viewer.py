@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
-from surfel_mapper.io.model_cloud import quaternions
-from surfel_mapper.io.model_markers import GREY, primitive_colors
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.messages.model_cloud import quaternions
+from surfel_mapper.messages.model_markers import GREY, primitive_colors
 from surfel_mapper.models.shapes import ellipsoid_frames, Shapes
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.mesh import vertex_normals

@@ -20,9 +20,11 @@ def unit(rng, num):
 
 def surfels(rng, num=200):
     return Samples(
-        rng.uniform(-3.0, 3.0, (num, 3)), unit(rng, num),
-        rng.uniform(1e-6, 1e-4, num), rng.uniform(1e-5, 1e-3, num),
-    )  # fmt: skip
+        rng.uniform(-3.0, 3.0, (num, 3)),
+        unit(rng, num),
+        rng.uniform(1e-6, 1e-4, num),
+        rng.uniform(1e-5, 1e-3, num),
+    )
 
 
 def brute_force(source, target, T, limits):
@@ -88,8 +90,12 @@ def test_weights_are_one_over_the_variance_along_the_normal():
 
 
 def test_a_gap_of_the_scale_counts_a_quarter():
-    source = Samples([[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]], np.tile([0.0, 0.0, 1.0], (2, 1)),
-                     [1e-3, 1e-3], [0.0, 0.0])  # fmt: skip
+    source = Samples(
+        [[0.0, 0.0, 0.0], [0.0, 0.0, 0.1]],
+        np.tile([0.0, 0.0, 1.0], (2, 1)),
+        [1e-3, 1e-3],
+        [0.0, 0.0],
+    )
     target = Samples([[0.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]], [1e-3], [0.0])
     pairs = np.array([[0, 0], [1, 0]], np.int32)
 
@@ -141,12 +147,23 @@ def test_loops_are_near_in_space_and_far_on_the_way():
         (lambda: Limits(max_distance_m=0.0), 'max_distance_m'),
         (lambda: Limits(max_distance_m=np.nan), 'max_distance_m'),
         (lambda: Limits(max_distance_m=1.0, max_angle_deg=0.0), 'max_angle_deg'),
-        (lambda: match(Samples(np.eye(3)), Samples(np.eye(3)), np.eye(4),
-                       Limits(max_distance_m=1.0, max_angle_deg=30.0)), 'no normals'),
-        (lambda: surface_weights(Samples(np.eye(3)), Samples(np.eye(3)), np.array([[0, 0]]),
-                                 np.eye(4), 0.1), 'not surfels'),
+        (
+            lambda: match(
+                Samples(np.eye(3)),
+                Samples(np.eye(3)),
+                np.eye(4),
+                Limits(max_distance_m=1.0, max_angle_deg=30.0),
+            ),
+            'no normals',
+        ),
+        (
+            lambda: surface_weights(
+                Samples(np.eye(3)), Samples(np.eye(3)), np.array([[0, 0]]), np.eye(4), 0.1
+            ),
+            'not surfels',
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_refused(refused, message):
     with pytest.raises(AlignmentError, match=message):
         refused()

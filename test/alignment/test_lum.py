@@ -21,8 +21,9 @@ from test.alignment.scan_graphs import chain, make, random_transforms
 def test_it_converges_from_no_pose_at_all_whatever_the_rotations(angle_rad, seed):
     rng = np.random.default_rng(seed)
     T = random_transforms(rng, 12, angle_rad)
-    lum = make(rng, T, chain(12, [(11, 0), (7, 2), (3, 9)]), max_iterations=60,
-               convergence_threshold=1e-7)  # fmt: skip
+    lum = make(
+        rng, T, chain(12, [(11, 0), (7, 2), (3, 9)]), max_iterations=60, convergence_threshold=1e-7
+    )
 
     result = lum.compute()
 
@@ -176,10 +177,15 @@ def test_steps_end_at_the_threshold():
     rng = np.random.default_rng(13)
     T = random_transforms(rng, 6, 0.4)
     few, many = (
-        make(np.random.default_rng(1), T, chain(6), max_iterations=50,
-             convergence_threshold=threshold)
+        make(
+            np.random.default_rng(1),
+            T,
+            chain(6),
+            max_iterations=50,
+            convergence_threshold=threshold,
+        )
         for threshold in (1e-2, 1e-9)
-    )  # fmt: skip
+    )
 
     assert few.compute().iterations < many.compute().iterations < 50
 

@@ -39,8 +39,10 @@ def pair():
         (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'whole numbers'),
         (lambda lum: lum.set_correspondences(0, 1, [0, 1, 2]), r'pairs of shape \(3,\)'),
         (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], np.eye(3)), 'weights of shape'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.full((3, 3), np.nan)]),
-         'all finite'),
+        (
+            lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.full((3, 3), np.nan)]),
+            'all finite',
+        ),
         (lambda lum: lum.correspondences(1, 0), 'no edge 1 -> 0'),
         (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
         (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
@@ -49,7 +51,7 @@ def pair():
         (lambda lum: setattr(lum, 'jacobian', 'PCL'), "jacobian 'PCL', expected one of"),
         (lambda _: LUM().compute(), '0 vertices'),
     ],
-)  # fmt: skip
+)
 def test_bad_input_is_refused_and_changes_nothing(pair, refused, message):
     with pytest.raises(AlignmentError, match=message):
         refused(pair)

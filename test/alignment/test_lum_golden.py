@@ -16,10 +16,25 @@ from surfel_mapper.alignment.edge_terms import edge_sums, exact_terms, pcl_terms
 from surfel_mapper.errors import AlignmentError
 
 TIGHT = (
-    'two_exact', 'loop3_noisy', 'loop10_drift', 'few_corrs', 'three_corrs', 'iters_1', 'iters_5',
-    'thr_1e-4', 'yaw170', 'both_directions', 'collinear_axis', 'first_pose_given', 'one_vertex',
-    'real_pair_outer0', 'real_pair_outer1', 'real_pair_outer2', 'real_pair_outer3', 'real_loop4',
-)  # fmt: skip
+    'two_exact',
+    'loop3_noisy',
+    'loop10_drift',
+    'few_corrs',
+    'three_corrs',
+    'iters_1',
+    'iters_5',
+    'thr_1e-4',
+    'yaw170',
+    'both_directions',
+    'collinear_axis',
+    'first_pose_given',
+    'one_vertex',
+    'real_pair_outer0',
+    'real_pair_outer1',
+    'real_pair_outer2',
+    'real_pair_outer3',
+    'real_loop4',
+)
 
 CHAOTIC = ('loop10_drift_fullturn', 'big_rotation')
 
@@ -105,8 +120,18 @@ def test_poses_after_every_step_are_those_of_pcl(golden, cases, name):
         np.testing.assert_allclose(poses(lum), expected, rtol=0, atol=compare['atol'])
 
 
-@pytest.mark.parametrize('name', ['loop3_noisy', 'loop10_drift', 'three_corrs', 'iters_1',
-                                  'both_directions', 'yaw170', 'real_loop4'])  # fmt: skip
+@pytest.mark.parametrize(
+    'name',
+    [
+        'loop3_noisy',
+        'loop10_drift',
+        'three_corrs',
+        'iters_1',
+        'both_directions',
+        'yaw170',
+        'real_loop4',
+    ],
+)
 def test_information_of_edges_is_that_of_pcl(golden, cases, name):
     lum = lum_of(golden, cases, name, 'pcl')
     T, ends = transforms(lum.graph.poses), lum.graph.ends
@@ -148,8 +173,9 @@ def test_disconnected_parts_move_as_in_pcl(golden, cases):
     np.testing.assert_allclose(
         np.linalg.inv(lum.transformation(3)) @ lum.transformation(4),
         np.linalg.inv(T[3]) @ T[4],
-        rtol=0, atol=compare['atol'],
-    )  # fmt: skip
+        rtol=0,
+        atol=compare['atol'],
+    )
 
 
 def test_pcl_drops_an_exact_edge(golden, cases):
@@ -185,11 +211,19 @@ def test_transforms_are_those_of_pcl(golden):
 
 # Errors against the truth that sigma and number of pairs allow, m and entries of R.
 WELL_POSED = {
-    'two_exact': 1e-6, 'loop3_noisy': 2e-3, 'loop10_drift': 1.5e-2,
-    'loop10_drift_fullturn': 1.5e-2, 'three_corrs': 2e-2, 'iters_5': 5e-3, 'thr_1e-4': 5e-3,
-    'big_rotation': 5e-3, 'yaw170': 2e-3, 'both_directions': 2e-2, 'first_pose_given': 5e-3,
+    'two_exact': 1e-6,
+    'loop3_noisy': 2e-3,
+    'loop10_drift': 1.5e-2,
+    'loop10_drift_fullturn': 1.5e-2,
+    'three_corrs': 2e-2,
+    'iters_5': 5e-3,
+    'thr_1e-4': 5e-3,
+    'big_rotation': 5e-3,
+    'yaw170': 2e-3,
+    'both_directions': 2e-2,
+    'first_pose_given': 5e-3,
     'exact_translation': 1e-9,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize('name', WELL_POSED)
@@ -207,9 +241,18 @@ def test_exact_steps_reach_the_truth(golden, cases, name):
 
 
 @pytest.mark.parametrize(
-    'name', [*WELL_POSED, 'disconnected', 'few_corrs', 'collinear_axis', 'near_collinear',
-             'real_pair_outer0', 'real_pair_outer3', 'real_loop4']
-)  # fmt: skip
+    'name',
+    [
+        *WELL_POSED,
+        'disconnected',
+        'few_corrs',
+        'collinear_axis',
+        'near_collinear',
+        'real_pair_outer0',
+        'real_pair_outer3',
+        'real_loop4',
+    ],
+)
 def test_exact_steps_end_where_all_information_is_in_balance(golden, cases, name):
     lum = lum_of(golden, cases, name, 'exact')
     lum.max_iterations, lum.convergence_threshold = 20, 1e-9

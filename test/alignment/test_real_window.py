@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import q_xyzw
-from surfel_mapper.io.bag import BagReader
 from surfel_mapper.offline.pose_topics import pose_topics
 from surfel_mapper.offline.replay import replay
 from surfel_mapper.pipeline import Mapper

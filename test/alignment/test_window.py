@@ -148,8 +148,9 @@ def test_scans_without_surfels_go_with_their_neighbours():
     np.testing.assert_allclose(
         np.linalg.inv(alignment.T_map_sensor[4]) @ alignment.T_map_sensor[5],
         np.linalg.inv(before[4]) @ before[5],
-        rtol=0, atol=1e-12,
-    )  # fmt: skip
+        rtol=0,
+        atol=1e-12,
+    )
 
 
 def test_scans_that_share_nothing_go_by_odometry_and_are_reported():
@@ -165,8 +166,9 @@ def test_scans_that_share_nothing_go_by_odometry_and_are_reported():
     np.testing.assert_allclose(
         np.linalg.inv(alignment.T_map_sensor[1]) @ alignment.T_map_sensor[2],
         np.linalg.inv(before[1]) @ before[2],
-        rtol=0, atol=1e-6,
-    )  # fmt: skip
+        rtol=0,
+        atol=1e-6,
+    )
 
 
 @pytest.mark.parametrize(

@@ -13,15 +13,28 @@ import json
 from pathlib import Path
 import sys
 
-from surfel_mapper.io.heap import keep_freed_memory
+from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
 
 BENCHES = (
-    'mapping', 'threads', 'scaling', 'live', 'offline', 'compare', 'filters', 'lum', 'align',
-    'accuracy', 'registration', 'outputs', 'tsdf', 'models', 'workers',
-)  # fmt: skip
+    'mapping',
+    'threads',
+    'scaling',
+    'live',
+    'offline',
+    'compare',
+    'filters',
+    'lum',
+    'align',
+    'accuracy',
+    'registration',
+    'outputs',
+    'tsdf',
+    'models',
+    'workers',
+)
 """Modules of this folder that have run(options) -> list of rows, in the order to run them."""
 
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from surfel_mapper.io.raw_cloud import RawCloud
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.messages.raw_cloud import RawCloud
 from surfel_mapper.simulation.recording import POINT
 from test.bench.machine import one_core
 from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW
@@ -79,9 +79,7 @@ def check_equal(numpy_map: NumpyMap, surfel_map: SurfelMap) -> None:
             raise RuntimeError('the maps of numpy and of surfel_mapper differ: one has a bug')
 
 
-def peer_rows(
-    options: Options, street: Street, size_m: float, reference_ms: float
-) -> list[Row]:
+def peer_rows(options: Options, street: Street, size_m: float, reference_ms: float) -> list[Row]:
     """Return a row for each peer; of one that cannot be had or fails, only why."""
     rows: list[Row] = []
     for peer in PEERS:

@@ -33,7 +33,7 @@ def main(arguments):
     from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import PointCloud2
 
-    from surfel_mapper.io.heap import keep_freed_memory
+    from surfel_mapper.memory import keep_freed_memory
     from surfel_mapper.ros.shared_memory import enlarge_shared_memory
     from surfel_mapper.simulation.recording import BASE, ODOM
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 from time import perf_counter
 
 from surfel_mapper.config import Config
-from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from test.bench.machine import one_core

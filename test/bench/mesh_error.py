@@ -74,9 +74,7 @@ def mesh_error(
     }
 
 
-def spread_over(
-    corners: FloatArray, spacing_m: float
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+def spread_over(corners: FloatArray, spacing_m: float) -> tuple[FloatArray, npt.NDArray[np.int64]]:
     """Return points spread evenly at random over (T, 3, 3) triangles, and which each is on."""
     sides = corners[:, 1:] - corners[:, :1]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2.0

@@ -115,9 +115,7 @@ def accuracy(points: npt.NDArray[np.float32], config: ModelsConfig) -> dict[str,
     }
 
 
-def peer(
-    name: str, points: npt.NDArray[np.float32], voxel_size_m: float, cache: Path
-) -> Row:
+def peer(name: str, points: npt.NDArray[np.float32], voxel_size_m: float, cache: Path) -> Row:
     """Return one row of Open3D."""
     row: dict[str, Any] = {'cloud': name, 'who': OPEN3D_PLANES.name, 'voxel_m': voxel_size_m}
     try:

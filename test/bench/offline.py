@@ -22,12 +22,12 @@ import sys
 import tempfile
 from time import perf_counter
 
+from surfel_mapper.bags.reader import BagReader
+from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import load_config
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_topics import CLOUD
-from surfel_mapper.io.heap import keep_freed_memory
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.raw_pose import raw_poses
+from surfel_mapper.memory import keep_freed_memory
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_pose import raw_poses
 from surfel_mapper.offline.pose_topics import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.replay import replay as replay_bag
@@ -70,9 +70,7 @@ def recorded(street: Street, options: Options) -> Path:
     return path
 
 
-def row(
-    part: Callable[[Path, Path], None], options: Options, bag: Path, config: Path
-) -> Row:
+def row(part: Callable[[Path, Path], None], options: Options, bag: Path, config: Path) -> Row:
     """Return the fastest of some runs."""
     seconds, on_core = [], []
     for _ in range(RUNS):

@@ -15,10 +15,10 @@ from time import perf_counter
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.raw_cloud import RawCloud
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_cloud import RawCloud
 
 STAGES = ('decode', 'reduce', 'insert', 'evict', 'normals')
 

@@ -21,23 +21,23 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.config import Config, GridConfig, ModelsLayerConfig
-from surfel_mapper.depth import depth_points, PinholeCamera
-from surfel_mapper.deskew import deskewed, point_times
-from surfel_mapper.io.cdr import marker_array
-from surfel_mapper.io.heap import keep_freed_memory
-from surfel_mapper.io.map_cloud import moment_cloud
-from surfel_mapper.io.markers import disc_colors, surfel_markers
-from surfel_mapper.io.mirror import MapMirror
-from surfel_mapper.io.model_cloud import primitive_columns, surfel_primitive_columns
-from surfel_mapper.io.model_markers import model_markers
-from surfel_mapper.io.pointcloud2 import from_columns, to_scan
-from surfel_mapper.io.scan_normals import scan_with_normals
-from surfel_mapper.io.surfel_columns import surfel_columns
 from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.traversability import traversability
+from surfel_mapper.memory import keep_freed_memory
+from surfel_mapper.messages.cdr import marker_array
+from surfel_mapper.messages.map_cloud import moment_cloud
+from surfel_mapper.messages.markers import disc_colors, surfel_markers
+from surfel_mapper.messages.mirror import MapMirror
+from surfel_mapper.messages.model_cloud import primitive_columns, surfel_primitive_columns
+from surfel_mapper.messages.model_markers import model_markers
+from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
+from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.models.shapes import Shapes
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.sensors.depth import depth_points, PinholeCamera
+from surfel_mapper.sensors.deskew import deskewed, point_times
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from test.bench.machine import one_core
 from test.bench.options import Options
@@ -103,9 +103,7 @@ def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
     def draw(kind: str) -> bytes:
         surfels = mapper.map.surfels(MIN_POINTS, DISCS)
         colors = disc_colors(kind, surfels, mapper.window, ages)
-        return marker_array(
-            surfel_markers(surfels, VOXEL_M, colors, stamp_ns=0, frame_id='odom')
-        )
+        return marker_array(surfel_markers(surfels, VOXEL_M, colors, stamp_ns=0, frame_id='odom'))
 
     kinds = ('planarity', 'normal', 'age')
     return {f'markers by {kind}': partial(draw, kind) for kind in kinds}
@@ -147,9 +145,7 @@ def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
         '~/scan_normals': lambda: scan_with_normals(
             update.scan, update.T_fixed_sensor, surfel_map, MIN_POINTS
         ),
-        '~/grid': lambda: traversability(
-            surfel_map.surfels(MIN_POINTS), VOXEL_M, center, limits
-        ),
+        '~/grid': lambda: traversability(surfel_map.surfels(MIN_POINTS), VOXEL_M, center, limits),
     }
 
 

@@ -27,11 +27,11 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.trajectory_errors import absolute_errors, drift, relative_errors
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.pose_messages import poses_in
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import Scan

@@ -37,9 +37,7 @@ def table(rows: Sequence[Row]) -> str:
     names = list(dict.fromkeys(name for row in rows for name in row))
     cells = [[text(row.get(name)) for name in names] for row in rows]
     numeric = [any(isinstance(row.get(name), (int, float)) for row in rows) for name in names]
-    widths = [
-        max(len(line[place]) for line in [names, *cells]) for place in range(len(names))
-    ]
+    widths = [max(len(line[place]) for line in [names, *cells]) for place in range(len(names))]
     return '\n'.join(
         '  '.join(
             cell.rjust(width) if right else cell.ljust(width)

@@ -18,13 +18,13 @@ from time import perf_counter
 import numpy as np
 
 from surfel_mapper.config import Config
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.raw_cloud import RawCloud
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.threads import pool
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_cloud import RawCloud
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
+from surfel_mapper.threads import pool
 from test.bench.options import Options
 from test.bench.ours import Ours
 from test.bench.report import Row

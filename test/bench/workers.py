@@ -28,8 +28,8 @@ from surfel_mapper.cluster.engines import Engine, engine
 from surfel_mapper.cluster.running import map_bags, Mapped
 from surfel_mapper.cluster.shards import cut, peak_bytes, shard_length_s
 from surfel_mapper.config import Config
-from surfel_mapper.io.heap import keep_freed_memory
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.offline.recording import open_recording, Request
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.pipeline import Mapper

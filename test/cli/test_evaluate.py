@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.ply import write_points
+from surfel_mapper.files.ply import write_points
 from surfel_mapper.simulation import load_simulation
 
 FORMATS = 'ply,pcd,parquet,npz'
@@ -42,8 +42,10 @@ def test_a_map_of_a_simulated_street_is_near_its_truth(street, capsys):
     assert 0.0 < result['position_m']['median'] < 0.005
     assert 0.0 < result['normal_deg']['median'] < 3.0
     assert 0.5 < result['completeness'] <= 1.0
-    assert result == {**evaluated(capsys, output, '--truth', bag / 'world.json'),
-                      'truth': str(bag)}  # fmt: skip
+    assert result == {
+        **evaluated(capsys, output, '--truth', bag / 'world.json'),
+        'truth': str(bag),
+    }
 
 
 def test_every_format_has_the_same_errors(street, capsys):
@@ -111,9 +113,13 @@ def test_the_report_says_it_in_a_few_lines(street, capsys):
 
 @pytest.mark.parametrize(
     ('name', 'text'),
-    [('nothing', 'expected a directory'), ('empty', 'no map in this directory'),
-     ('a.json', 'No such file'), ('other.ply', 'No such file')],
-)  # fmt: skip
+    [
+        ('nothing', 'expected a directory'),
+        ('empty', 'no map in this directory'),
+        ('a.json', 'No such file'),
+        ('other.ply', 'No such file'),
+    ],
+)
 def test_what_is_no_map_and_no_truth_is_refused_by_name(street, tmp_path, capsys, name, text):
     bag, output = street
     (tmp_path / 'empty').mkdir()

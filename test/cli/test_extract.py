@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io import ply
-from surfel_mapper.io.map_state import save_map
+from surfel_mapper.files import ply
+from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.models.scenes import room, sheet, VIEW
 

@@ -10,7 +10,7 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.filters.registry import all_filters
-from test.io.recorded import drive, write_rosbag2
+from test.bags.recorded import drive, write_rosbag2
 
 
 def listed(capsys, *arguments):

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from surfel_mapper.cli.main import main
-from test.io.recorded import (
+from test.bags.recorded import (
     CLOUD,
     cut,
     drive,

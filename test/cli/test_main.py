@@ -14,7 +14,7 @@ import surfel_mapper
 from surfel_mapper.cli import replay
 from surfel_mapper.cli.main import main, VERBS
 from surfel_mapper.errors import BagError
-from test.io.recorded import drive, write_rosbag2
+from test.bags.recorded import drive, write_rosbag2
 
 
 def usage_code(*arguments):

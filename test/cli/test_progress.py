@@ -21,9 +21,9 @@ import pytest
 from surfel_mapper.cli import progress as progress_module
 from surfel_mapper.cli.main import main
 from surfel_mapper.cli.progress import finished_first, progress, stopped_by_interrupt
-from surfel_mapper.io.parquet import read_map
+from surfel_mapper.files.parquet import read_map
 from surfel_mapper.viz import picture
-from test.io.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.bags.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
 
 MANY = 5000
 WAIT_S = 300.0
@@ -98,8 +98,11 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
     assert summary == json.loads(capsys.readouterr().out)
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
-        'map.ply', 'map.png', 'report.html', 'summary.json',
-    }  # fmt: skip
+        'map.ply',
+        'map.png',
+        'report.html',
+        'summary.json',
+    }
 
 
 def test_in_another_thread_nothing_is_caught():
@@ -158,8 +161,12 @@ def test_ctrl_c_ends_the_replay_and_what_was_mapped_is_written(command, tmp_path
     assert 0 < summary['scans']['mapped'] < MANY
     assert read_map(output / 'map.parquet').digest() == summary['digest']
     assert {path.name for path in output.iterdir()} == {
-        'map.parquet', 'normals', 'map.png', 'report.html', 'summary.json',
-    }  # fmt: skip
+        'map.parquet',
+        'normals',
+        'map.png',
+        'report.html',
+        'summary.json',
+    }
 
 
 def test_a_terminal_shows_a_bar_with_rate_and_time_left(command):

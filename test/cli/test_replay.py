@@ -12,7 +12,7 @@ from plyfile import PlyData
 import pytest
 
 from surfel_mapper.cli.main import main
-from test.io.recorded import cut, drive, NUM_SCANS, write_rosbag2
+from test.bags.recorded import cut, drive, NUM_SCANS, write_rosbag2
 
 FILES = {'map.ply', 'map.png', 'report.html', 'summary.json'}
 PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
@@ -141,9 +141,7 @@ def test_a_damaged_bag_leaves_an_earlier_result_whole(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('name', ['out', 'out/a/b'])
-def test_an_output_that_cannot_be_a_directory_is_refused_before_the_work(
-    tmp_path, capsys, name
-):
+def test_an_output_that_cannot_be_a_directory_is_refused_before_the_work(tmp_path, capsys, name):
     (tmp_path / 'out').write_text('mine')
 
     assert main(['replay', str(tmp_path / 'no.bag'), '--output', str(tmp_path / name)]) == 1

@@ -9,10 +9,10 @@ import json
 import numpy as np
 import pytest
 
+from surfel_mapper.bags.writer import BagWriter, StampedPose
 from surfel_mapper.cli.main import main
+from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.geometry import pose_matrix, q_xyzw
-from surfel_mapper.io.bag_writer import BagWriter, StampedPose
-from surfel_mapper.io.trajectory import read_trajectory
 from surfel_mapper.simulation.recording import cloud_bytes
 from test.alignment.street import drifted, relative_errors, street_scans
 
@@ -56,10 +56,7 @@ def test_map_and_poses_lose_their_drift(bag, settings, tmp_path, capsys):
 
     after, found = replayed(bag, settings, tmp_path, '--align')
 
-    errors = [
-        relative_errors(path, true[:NUM_SCANS], NUM_SCANS - 1)[0]
-        for path in (drift, found)
-    ]
+    errors = [relative_errors(path, true[:NUM_SCANS], NUM_SCANS - 1)[0] for path in (drift, found)]
     assert errors[1] < errors[0] / 10.0
     assert after['digest'] != before['digest']
     assert after['points'] == before['points']

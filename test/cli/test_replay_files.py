@@ -10,11 +10,10 @@ import pytest
 from rosbags.highlevel import AnyReader
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.map_state import load_map
-from surfel_mapper.io.parquet import read_map
-from surfel_mapper.io.trajectory import read_trajectory
-from test.cli.small_disk import run_on_small_disk
-from test.io.recorded import (
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.parquet import read_map
+from surfel_mapper.files.trajectory import read_trajectory
+from test.bags.recorded import (
     cut,
     drive,
     HEIGHT_M,
@@ -25,6 +24,7 @@ from test.io.recorded import (
     write_ros1,
     write_rosbag2,
 )
+from test.cli.small_disk import run_on_small_disk
 
 ALL = 'ply,pcd,parquet,npz,bag'
 
@@ -194,7 +194,7 @@ def names(bag):
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
 def test_a_cut_bag_is_mapped_as_far_as_it_goes_and_strict_says_so(tmp_path, capsys, caplog, kind):
     if kind == 'ros1':
-        from test.io.recorded import ROS1
+        from test.bags.recorded import ROS1
 
         path = file = write_ros1(tmp_path / 'drive.bag', drive(ROS1))
     else:

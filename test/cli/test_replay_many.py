@@ -11,12 +11,12 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.cluster import shard_run, shards
 from surfel_mapper.cluster.engines import InProcess
 from surfel_mapper.cluster.shards import map_shard
-from surfel_mapper.io.parquet import read_map
-from surfel_mapper.io.parquet_tiles import dataset_digest
+from surfel_mapper.files.parquet import read_map
+from surfel_mapper.files.parquet_tiles import dataset_digest
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.bags.recorded import cut
 from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
-from test.io.recorded import cut
 
 FILES = {'map', 'map.png', 'report.html', 'summary.json'}
 TF = ['--pose-topic', '/tf']
@@ -209,7 +209,7 @@ ON_A_SMALL_DISK = """
 import sys
 from pathlib import Path
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.parquet_tiles import dataset_digest
+from surfel_mapper.files.parquet_tiles import dataset_digest
 from test.cli.small_disk import filled
 
 disk, bag = Path(sys.argv[1]), sys.argv[2]

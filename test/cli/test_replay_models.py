@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
-from test.io.recorded import drive, HEIGHT_M, MOUNT_M, write_rosbag2
+from test.bags.recorded import drive, HEIGHT_M, MOUNT_M, write_rosbag2
 from test.viz.test_report import Parsed
 
 FORMATS = 'ply,parquet,dxf'

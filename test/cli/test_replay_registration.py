@@ -9,12 +9,12 @@ import pytest
 
 from surfel_mapper.alignment.trajectory_errors import compare
 from surfel_mapper.cli.main import main
+from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw
-from surfel_mapper.io.map_state import save_map
-from surfel_mapper.io.trajectory import read_trajectory
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.alignment.test_registration import map_of, ROOM, TRUE
-from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.pipeline.test_registered_poses import pose_at, scan_at
 
 NUM_SCANS = 5
@@ -88,9 +88,7 @@ def test_a_map_of_another_voxel_size_is_refused(bag, tmp_path, capsys):
 
 
 @pytest.mark.parametrize(('name', 'num_scans'), [('hall_os0_full', 22), ('hall_os0_long', 118)])
-def test_real_scans_of_a_hand_that_turns_fast_are_followed(
-    data_folder, tmp_path, name, num_scans
-):
+def test_real_scans_of_a_hand_that_turns_fast_are_followed(data_folder, tmp_path, name, num_scans):
     # up to 48 deg and 0.8 m between two scans, and no time that would help
     bag = data_folder / 'data' / 'bags' / name
     recorded, found = tmp_path / 'recorded.tum', tmp_path / 'found.tum'

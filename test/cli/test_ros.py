@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from surfel_mapper.cli.main import main
-from test.io.recorded import drive, write_rosbag2
+from test.bags.recorded import drive, write_rosbag2
 
 WITHOUT_ROS = """
 import sys

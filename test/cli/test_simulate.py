@@ -7,9 +7,9 @@ import json
 
 import pytest
 
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli import simulate
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.bag import BagReader
 from surfel_mapper.simulation import Drive, Lidar, load_simulation, World
 
 SMALL = ('--beams', '8', '--columns', '64')
@@ -43,9 +43,22 @@ def test_the_report_for_machines_adds_up(tmp_path, capsys):
 
 def test_every_option_reaches_the_simulation(tmp_path):
     options = (
-        '--scans', '2', '--speed', '3', '--rate', '5', '--noise', '0.02', '--seed', '4',
-        '--max-range', '50', '--rolling', '--storage', 'sqlite3',
-    )  # fmt: skip
+        '--scans',
+        '2',
+        '--speed',
+        '3',
+        '--rate',
+        '5',
+        '--noise',
+        '0.02',
+        '--seed',
+        '4',
+        '--max-range',
+        '50',
+        '--rolling',
+        '--storage',
+        'sqlite3',
+    )
     assert run(tmp_path / 'street', *options) == 0
     assert (tmp_path / 'street' / 'street.db3').exists()
     simulation = load_simulation(tmp_path / 'street')
@@ -102,11 +115,13 @@ def test_values_out_of_bounds_are_refused_and_nothing_is_written(options, says, 
 @pytest.mark.parametrize(
     'arguments',
     [
-        ('moon', '--output', 'x'), ('street',), ('street', '--output', 'x', '--storage', 'tape'),
+        ('moon', '--output', 'x'),
+        ('street',),
+        ('street', '--output', 'x', '--storage', 'tape'),
         ('street', '--output', 'x', '--scans', '3', '--duration', '1'),
         ('street', '--output', 'x', '--scans', 'many'),
     ],
-)  # fmt: skip
+)
 def test_wrong_usage_exits_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as stopped:
         main(['simulate', *arguments])

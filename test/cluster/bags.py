@@ -9,7 +9,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.offline.recording import open_recording, Request
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.pipeline import Mapper
-from test.io.recorded import drive, START_NS, write_rosbag2
+from test.bags.recorded import drive, START_NS, write_rosbag2
 
 NUM_SCANS = 60
 RECORDED_S = 5.9
@@ -78,12 +78,14 @@ BAGS = {
     'odometry': (plain, {'pose.source': 'odometry'}),
     'identity': (plain, {'pose.source': 'identity', 'frames.fixed': 'lidar'}),
     'late poses': (late_poses, {}),
-    'slow transforms': (slow_transforms, {'frames.fixed': 'map', 'pose.max_wait_s': 9.0,
-                                          'pose.max_waiting_scans': 100}),
+    'slow transforms': (
+        slow_transforms,
+        {'frames.fixed': 'map', 'pose.max_wait_s': 9.0, 'pose.max_waiting_scans': 100},
+    ),
     'faults': (with_faults, {}),
     'time set back': (time_set_back, {}),
     'gate': (plain, {'window.gate_distance_m': 0.8}),
-}  # fmt: skip
+}
 """Bags by what is hard about them, and settings."""
 
 
@@ -116,8 +118,9 @@ def in_one_go(bag, config, **part):
 def counted(summary):
     """Return those counts of a summary that have to be the same however bags are cut."""
     return {
-        name: value if not isinstance(value, dict) else
-        {k: v for k, v in value.items() if v and not isinstance(v, dict)}
+        name: value
+        if not isinstance(value, dict)
+        else {k: v for k, v in value.items() if v and not isinstance(v, dict)}
         for name, value in summary.items()
         if name in ('scans', 'points', 'points_left_out', 'messages_ignored')
-    }  # fmt: skip
+    }

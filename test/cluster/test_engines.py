@@ -77,7 +77,6 @@ def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
     made = []
 
     class Interrupted(distributed.LocalCluster):
-
         def __init__(self, *args, **kwargs):
             made.append(self)
             signal.raise_signal(signal.SIGINT)

@@ -20,7 +20,7 @@ from surfel_mapper.cluster.shards import (
 )
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError, MapError
-from surfel_mapper.io.parquet_tiles import dataset_digest
+from surfel_mapper.files.parquet_tiles import dataset_digest
 from test.cluster.bags import BAGS, counted, in_one_go, RECORDED_S, shards_of, written
 
 

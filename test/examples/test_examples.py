@@ -22,8 +22,8 @@ import pytest
 import yaml
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.map_state import save_map
-from surfel_mapper.io.ply import read_points
+from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.ply import read_points
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 ROOT = Path(__file__).parents[2]

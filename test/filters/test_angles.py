@@ -32,9 +32,7 @@ THETA = np.degrees(np.arccos(Z / np.sqrt(X * X + Y * Y + Z * Z)))
     ],
 )
 def test_angle_limit_keeps_what_is_beyond_or_within_the_angles(phi, theta):
-    limits = dict(
-        zip(('phiMin', 'phiMax', 'thetaMin', 'thetaMax'), (*phi, *theta), strict=True)
-    )
+    limits = dict(zip(('phiMin', 'phiMax', 'thetaMin', 'thetaMax'), (*phi, *theta), strict=True))
     inside = (phi[0] < PHI) & (phi[1] > PHI) & (theta[0] < THETA) & (theta[1] > THETA)
     outside = (phi[1] < PHI) | (phi[0] > PHI) | (theta[1] < THETA) | (theta[0] > THETA)
     name = 'AngleLimitDataPointsFilter'
@@ -72,9 +70,12 @@ def test_field_of_view_keeps_what_a_sensor_would_see(azimuth, elevation, dtype):
     height = np.degrees(np.arctan2(z, np.hypot(x, y)))
     seen = (turn <= azimuth[1] - azimuth[0]) & (elevation[0] <= height) & (height <= elevation[1])
     found = kept(
-        'field_of_view', points,
-        azimuth_min_deg=azimuth[0], azimuth_max_deg=azimuth[1],
-        elevation_min_deg=elevation[0], elevation_max_deg=elevation[1],
+        'field_of_view',
+        points,
+        azimuth_min_deg=azimuth[0],
+        azimuth_max_deg=azimuth[1],
+        elevation_min_deg=elevation[0],
+        elevation_max_deg=elevation[1],
     )
     assert found == np.flatnonzero(seen).tolist()
 

@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.boxes import cut_into_boxes
-from surfel_mapper.kernels.cutting import cut
+from surfel_mapper.filters.kernels.cutting import cut
 from test.filters.examples import filter_of, random_scan, scan_of
 
 SAMPLING, ELLIPSOIDS = 'SamplingSurfaceNormalDataPointsFilter', 'ElipsoidsDataPointsFilter'
@@ -127,9 +127,9 @@ def test_one_point_for_each_box_is_the_mean_in_order_of_first_points(name):
 @pytest.mark.parametrize('method', [0, 1])
 def test_boxes_that_extend_too_far_are_dropped(name, method):
     points = np.concatenate([clusters([[0.0, 0, 0]]), clusters([[9.0, 0, 0]], size=1.0)])
-    found = filter_of(
-        name, knn=6, samplingMethod=method, maxBoxDim=0.1, ratio=0.9999999
-    ).apply(scan_of(points))
+    found = filter_of(name, knn=6, samplingMethod=method, maxBoxDim=0.1, ratio=0.9999999).apply(
+        scan_of(points)
+    )
     assert len(found) == (6, 1)[method]
     assert np.abs(found.points).max() < 0.1
 

@@ -37,11 +37,13 @@ def load(tmp_path, text, keys=''):
 def test_a_chain_runs_in_the_order_of_its_list(tmp_path):
     chain = load(tmp_path, MIXED)
     assert chain.names == (
-        '1 remove_nan', '2 voxel_grid', '3 add_descriptor', '4 voxel_grid', '5 identity',
+        '1 remove_nan',
+        '2 voxel_grid',
+        '3 add_descriptor',
+        '4 voxel_grid',
+        '5 identity',
     )
-    assert chain.filters[1] == VoxelGrid(
-        size_x_m=0.5, unit_normals=False, anchor='minimum'
-    )
+    assert chain.filters[1] == VoxelGrid(size_x_m=0.5, unit_normals=False, anchor='minimum')
     assert chain.filters[2].values == (2.2, 3.0, 6.1)
     assert chain.filters[3] == VoxelGrid(size_x_m=0.25, size_y_m=0.5)
 
@@ -51,7 +53,9 @@ def test_what_each_filter_did_is_told():
     points = [[np.nan, 0.0, 0.0], [0.5, 0.0, 0.0], [7.0, 0.0, 0.0], [0.0, 0.0, -9.0]]
     scan, steps = chain.run(scan_of(points, row=np.arange(4)))
     assert [(step.name, step.points_in, step.points_out) for step in steps] == [
-        ('1 remove_nan', 4, 3), ('2 bounding_box', 3, 2), ('3 max_dist', 2, 0),
+        ('1 remove_nan', 4, 3),
+        ('2 bounding_box', 3, 2),
+        ('3 max_dist', 2, 0),
     ]
     assert all(step.milliseconds >= 0.0 for step in steps)
     assert (len(scan), list(scan.columns)) == (0, ['row'])

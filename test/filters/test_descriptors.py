@@ -16,7 +16,9 @@ AXES = np.eye(3)
 def test_add_descriptor_gives_every_point_the_value():
     scan = scan_of(np.zeros((2, 3)), test=[7.0, 8.0])
     found = filter_of(
-        'AddDescriptorDataPointsFilter', descriptorName='test', descriptorDimension=3,
+        'AddDescriptorDataPointsFilter',
+        descriptorName='test',
+        descriptorDimension=3,
         descriptorValues='[2.2, 3.0, 6.1]',
     ).apply(scan)
     np.testing.assert_array_equal(found.columns['test'], [[2.2, 3.0, 6.1]] * 2)
@@ -35,7 +37,9 @@ def test_add_descriptor_wants_as_many_values_as_components_and_a_name():
 def test_cut_at_descriptor_threshold_keeps_what_equals_it_and_no_nan(above, rows):
     scan = scan_of(np.zeros((4, 3)), p=[[0.5, 9], [0.6, 9], [0.7, 9], [np.nan, 9]], row=range(4))
     found = filter_of(
-        'CutAtDescriptorThresholdDataPointsFilter', descName='p', useLargerThan=above,
+        'CutAtDescriptorThresholdDataPointsFilter',
+        descName='p',
+        useLargerThan=above,
         threshold=0.6,
     ).apply(scan)
     assert found.columns['row'].tolist() == rows
@@ -71,7 +75,10 @@ def test_normals_are_turned_to_the_sensor_or_away_and_stay_where_neither_is_mean
 
 def test_normals_may_come_as_three_fields():
     scan = scan_of(
-        np.zeros((1, 3)), normal_x=[0.0], normal_y=[-1.0], normal_z=[0.0],
+        np.zeros((1, 3)),
+        normal_x=[0.0],
+        normal_y=[-1.0],
+        normal_z=[0.0],
         observationDirections=[[0.0, 2.0, 0.0]],
     )
     found = filter_of('orient_normals').apply(scan).columns

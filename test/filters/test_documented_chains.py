@@ -217,7 +217,8 @@ def test_what_is_no_filter_of_points_is_refused_by_name(tmp_path):
 def test_the_deviation_of_points_is_added(tmp_path):
     found = run(tmp_path, DEVIATION)
     np.testing.assert_allclose(
-        found.columns['deviation'].reshape(-1, 3, 3), np.tile(0.0009 * np.eye(3), (3000, 1, 1)),
+        found.columns['deviation'].reshape(-1, 3, 3),
+        np.tile(0.0009 * np.eye(3), (3000, 1, 1)),
         rtol=1e-6,
     )
 

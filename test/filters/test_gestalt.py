@@ -90,7 +90,9 @@ def test_what_is_not_asked_for_is_not_added():
     flags = {'keepNormals': 0, 'keepGestaltFeatures': 0, 'keepMeans': 1, 'keepCovariances': 1}
     found = filter_of(NAME, **EVERY, **flags, keepEigenValues=1).apply(scan_of(steps())).columns
     assert {name: column.shape[1] for name, column in found.items()} == {
-        'means': 3, 'covariance': 9, 'eigValues': 3,
+        'means': 3,
+        'covariance': 9,
+        'eigValues': 3,
     }
     values = np.linalg.eigvalsh(found['covariance'].reshape(-1, 3, 3))
     np.testing.assert_allclose(found['eigValues'], values, atol=1e-12)
@@ -99,7 +101,10 @@ def test_what_is_not_asked_for_is_not_added():
 def test_features_are_rows_of_32():
     found = filter_of(NAME, **EVERY).apply(scan_of(steps())).columns
     assert {name: column.shape[1] for name, column in found.items()} == {
-        'normals': 3, 'gestaltMeans': 32, 'gestaltVariances': 32, 'warpedXYZ': 3,
+        'normals': 3,
+        'gestaltMeans': 32,
+        'gestaltVariances': 32,
+        'warpedXYZ': 3,
         'gestaltShapes': 2,
     }
     planarity, cylindricality = found['gestaltShapes'].T
@@ -108,9 +113,14 @@ def test_features_are_rows_of_32():
 
 
 @pytest.mark.parametrize(
-    ('settings', 'some'), [({'maxTimeWindow': 10}, False), ({'maxTimeWindow': 9999}, True),
-                           ({'maxBoxDim': 0.5}, False), ({'maxBoxDim': 4.0}, True),
-                           ({'knn': 3000}, False)]
+    ('settings', 'some'),
+    [
+        ({'maxTimeWindow': 10}, False),
+        ({'maxTimeWindow': 9999}, True),
+        ({'maxBoxDim': 0.5}, False),
+        ({'maxBoxDim': 4.0}, True),
+        ({'knn': 3000}, False),
+    ],
 )
 def test_keypoints_whose_neighbours_are_too_few_or_spread_are_dropped(settings, some):
     scan = scan_of(steps(), t=np.arange(3600))

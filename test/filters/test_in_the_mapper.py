@@ -23,12 +23,16 @@ LEVEL = (0.0, 0.0, 0.0, 1.0)
 def mapper_with(tmp_path, chain, mount=(0.0, 0.0, 1.0, *LEVEL)):
     path = tmp_path / 'filters.yaml'
     path.write_text(chain, encoding='utf-8')
-    mapper = Mapper(Config.from_mapping({
-        'pose.source': 'odometry',
-        'frames.base_to_sensor': mount,
-        'filters': str(path),
-        'map.min_points': 1,
-    }))
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                'pose.source': 'odometry',
+                'frames.base_to_sensor': mount,
+                'filters': str(path),
+                'map.min_points': 1,
+            }
+        )
+    )
     mapper.add_pose('odom', 'base_link', 0, (0.0, 0.0, 0.0), LEVEL)
     mapper.add_pose('odom', 'base_link', 5 * S, (0.0, 0.0, 0.0), LEVEL)
     return mapper

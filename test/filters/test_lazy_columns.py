@@ -64,11 +64,15 @@ def test_new_columns_stand_in_place_of_old_ones_of_the_same_name():
     scan = select(scan_of(np.zeros((3, 3)), a=[1, 2, 3], b=[4, 5, 6]), np.array([0, 2]))
     found = with_columns(scan, a=np.array([7, 8]), c=np.array([9, 9]))
     assert {name: column.tolist() for name, column in found.columns.items()} == {
-        'a': [7, 8], 'b': [4, 6], 'c': [9, 9],
+        'a': [7, 8],
+        'b': [4, 6],
+        'c': [9, 9],
     }
     again = select(found, np.array([1]))
     assert {name: column.tolist() for name, column in again.columns.items()} == {
-        'a': [8], 'b': [6], 'c': [9],
+        'a': [8],
+        'b': [6],
+        'c': [9],
     }
     assert scan.columns['a'].tolist() == [1, 3]
 
@@ -83,8 +87,13 @@ def test_a_column_of_another_length_is_refused():
 
 def test_a_chain_gives_what_taking_at_once_gives():
     scan = random_scan(400)
-    steps = [{'range_limit': {'max_m': 4.0}}, 'random_sampling', 'surface_normal',
-             {'label_mask': {'labels': [1]}}, {'max_point_count': {'max_points': 50}}]
+    steps = [
+        {'range_limit': {'max_m': 4.0}},
+        'random_sampling',
+        'surface_normal',
+        {'label_mask': {'labels': [1]}},
+        {'max_point_count': {'max_points': 50}},
+    ]
     lazy = Chain.from_list(steps).apply(scan)
     at_once = scan
     for step in steps:

@@ -137,5 +137,9 @@ def test_random_numbers_follow_seed_and_stamp_alone():
     one, two = scan_of(np.zeros((1, 3)), stamp_ns=1), scan_of(np.ones((2, 3)), stamp_ns=1)
     later = scan_of(np.zeros((1, 3)), stamp_ns=-1)
     assert generator(one, 5).random() == generator(two, 5).random()
-    assert len({generator(one, 5).random(), generator(one, -1).random(),
-                generator(later, 5).random()}) == 3
+    assert (
+        len(
+            {generator(one, 5).random(), generator(one, -1).random(), generator(later, 5).random()}
+        )
+        == 3
+    )

@@ -127,10 +127,19 @@ def test_on_a_sphere_normals_are_radial():
 
 def test_what_else_neighbours_say_is_added_where_asked():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 2.0, 0], [10.0, 0, 0]])
-    found = filter_of(
-        'SurfaceNormalDataPointsFilter', knn=3, keepNormals=0, keepDensities=1,
-        keepEigenVectors=1, keepMatchedIds=1, keepMeanDist=1,
-    ).apply(scan_of(points)).columns
+    found = (
+        filter_of(
+            'SurfaceNormalDataPointsFilter',
+            knn=3,
+            keepNormals=0,
+            keepDensities=1,
+            keepEigenVectors=1,
+            keepMatchedIds=1,
+            keepMeanDist=1,
+        )
+        .apply(scan_of(points))
+        .columns
+    )
     assert set(found) == {'densities', 'eigVectors', 'matchedIds', 'meanDists'}
     assert found['matchedIds'][0].tolist() == [0, 1, 2]
     mean = points[:3].mean(axis=0)
@@ -142,9 +151,11 @@ def test_what_else_neighbours_say_is_added_where_asked():
 
 def test_neighbours_beyond_the_distance_do_not_count():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 1.0, 0], [50.0, 0, 0]])
-    found = filter_of(
-        'SurfaceNormalDataPointsFilter', knn=4, maxDist=2, keepMatchedIds=1
-    ).apply(scan_of(points)).columns
+    found = (
+        filter_of('SurfaceNormalDataPointsFilter', knn=4, maxDist=2, keepMatchedIds=1)
+        .apply(scan_of(points))
+        .columns
+    )
     assert found['matchedIds'].tolist()[3] == [3, -1, -1, -1]
     assert np.isnan(found['normals'][3]).all()  # one point has no normal
     np.testing.assert_allclose(found['normals'][0], [0.0, 0.0, 1.0], atol=1e-12)
@@ -156,7 +167,8 @@ def test_smoothed_normals_are_means_of_their_neighbours_and_of_unit_length():
     noisy = points + 0.03 * rng.normal(size=(2000, 1)) * normal
     raw, smooth = (
         filter_of('SurfaceNormalDataPointsFilter', knn=12, smoothNormals=flag)
-        .apply(scan_of(noisy)).columns['normals']
+        .apply(scan_of(noisy))
+        .columns['normals']
         for flag in (0, 1)
     )
     np.testing.assert_allclose(np.linalg.norm(smooth, axis=1), 1.0)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.kernels.stable_sampling import choose
 from surfel_mapper.filters.normal_sampling import buckets, resistance
-from surfel_mapper.kernels.stable_sampling import choose
 from test.filters.examples import filter_of, random_scan, scan_of
 
 SPACE, COVARIANCE = 'NormalSpaceDataPointsFilter', 'CovarianceSamplingDataPointsFilter'
@@ -66,8 +66,10 @@ def test_without_normals_there_is_nothing_to_choose_by(name):
 def test_rare_directions_are_all_kept_and_the_common_one_is_thinned():
     found = filter_of(SPACE, nbSample=150).apply(floor_and_groove())
     # 50 turns through three buckets: all points of the walls, 50 of the floor
-    kinds = [np.count_nonzero((found.columns['normals'] == n).all(axis=1)) for n in (
-        [0, 0, 1], [0, 1, 0], [0, -1, 0])]
+    kinds = [
+        np.count_nonzero((found.columns['normals'] == n).all(axis=1))
+        for n in ([0, 0, 1], [0, 1, 0], [0, -1, 0])
+    ]
     assert kinds == [50, 50, 50]
 
 
@@ -75,9 +77,11 @@ def test_directions_are_drawn_evenly_where_there_are_as_many_everywhere():
     rng = np.random.default_rng(8)
     normals = rng.normal(size=(200_000, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    found = filter_of(SPACE, nbSample=20_000, epsilon=0.3).apply(
-        scan_of(np.zeros((200_000, 3)), normals=normals)
-    ).columns['normals']
+    found = (
+        filter_of(SPACE, nbSample=20_000, epsilon=0.3)
+        .apply(scan_of(np.zeros((200_000, 3)), normals=normals))
+        .columns['normals']
+    )
     assert np.abs(found.mean(axis=0)).max() < 0.02
     np.testing.assert_allclose(found.T @ found / 20_000, np.eye(3) / 3.0, atol=0.02)
 

@@ -68,7 +68,8 @@ def test_the_first_point_stands_for_its_leaf():
 def test_a_random_point_stands_for_its_leaf_and_any_may():
     found = {
         filter_of(NAME, maxSizeByNode=1.0, samplingMethod=1, seed=seed)
-        .apply(scan_of(SQUARE, row=range(6))).columns['row'][0]
+        .apply(scan_of(SQUARE, row=range(6)))
+        .columns['row'][0]
         for seed in range(60)
     }
     assert found == {0, 1, 2, 4}

@@ -126,5 +126,10 @@ def test_a_parameter_says_its_type_and_what_it_allows():
 
 def test_values_are_written_without_noise():
     assert [plain(v) for v in (True, 0.1, 1e-7, (1.0, 2.5), 'a', math.inf)] == [
-        '1', '0.1', '1e-07', '[1, 2.5]', 'a', 'inf',
+        '1',
+        '0.1',
+        '1e-07',
+        '[1, 2.5]',
+        'a',
+        'inf',
     ]

@@ -57,9 +57,7 @@ def test_seen_at_a_right_angle_a_surface_has_no_bias_and_more_the_more_slanted(s
 def test_points_move_along_the_line_of_sight_and_those_too_slanted_go(sensor):
     points = np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0], [10.0, 0.0, 0.0]])
     angles = np.radians([0.0, 60.0, 89.0, np.nan])
-    scan = scan_of(
-        points, incidenceAngles=angles, observationDirections=-points, row=range(4)
-    )
+    scan = scan_of(points, incidenceAngles=angles, observationDirections=-points, row=range(4))
     found = filter_of('RemoveSensorBiasDataPointsFilter', sensorType=sensor).apply(scan)
     assert found.columns['row'].tolist() == [0, 1]
     shift = bias_m(np.array([10.0]), np.radians([60.0]), *BIASED[sensor])[0]

@@ -9,10 +9,10 @@ import math
 import numpy as np
 import pytest
 
+from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.shapes import as_matrices, PAIRS
 from surfel_mapper.filters.spectral_decomposition import mean_decay
 from surfel_mapper.filters.tensor_voting import Voting
-from surfel_mapper.kernels.tensor_voting import closed_form_votes, first_votes
 from test.filters.examples import filter_of, scan_of
 
 SALIENCY, SPECTRAL = 'SaliencyDataPointsFilter', 'SpectralDecompositionDataPointsFilter'

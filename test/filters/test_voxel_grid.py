@@ -82,16 +82,12 @@ def test_centroids_columns_and_order_are_libpointmatchers(name, arrays):
     assert len(found) == case['n_out'] == case['n_out_f64_arithmetic']
     # their sums in float32 err by what the case states, and each rounds the result once
     tolerance = case['max_abs_centroid_diff_vs_f64'] + np.spacing(np.float32(abs(expected).max()))
-    np.testing.assert_allclose(
-        found.points[:, : case['dim']], expected, rtol=0.0, atol=tolerance
-    )
+    np.testing.assert_allclose(found.points[:, : case['dim']], expected, rtol=0.0, atol=tolerance)
     descriptors = split(arrays[f'out/{name}/descriptors'], case['descriptor_labels'])
     for column, values in descriptors.items():
         np.testing.assert_allclose(found.columns[column], values, rtol=2e-6, atol=1e-6)
     if case['has_times']:
-        np.testing.assert_array_equal(
-            found.columns['times'], arrays[f'out/{name}/times'][:, 0]
-        )
+        np.testing.assert_array_equal(found.columns['times'], arrays[f'out/{name}/times'][:, 0])
 
 
 @needs_golden
@@ -146,8 +142,12 @@ def test_it_does_what_its_slow_twin_does(anchor, centroid, dtype, number):
     scan = random_scan(number, dtype=dtype)
     size = (0.5, 0.3, 0.7)
     found = filter_of(
-        'voxel_grid', size_x_m=size[0], size_y_m=size[1], size_z_m=size[2],
-        use_centroid=centroid, anchor=anchor,
+        'voxel_grid',
+        size_x_m=size[0],
+        size_y_m=size[1],
+        size_z_m=size[2],
+        use_centroid=centroid,
+        anchor=anchor,
     ).apply(scan)
     expected = slow(scan, size, anchor, centroid)
     tolerance = 4 * np.finfo(dtype).eps * 4.0  # coordinates are below 4 m

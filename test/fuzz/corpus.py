@@ -13,14 +13,14 @@ import tempfile
 import numpy as np
 
 from surfel_mapper.config import Config, TsdfConfig
-from surfel_mapper.io import pcd, ply
-from surfel_mapper.io.map_state import save_map
-from surfel_mapper.io.tsdf_state import save_tsdf
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.tsdf_state import save_tsdf
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
-from test.io import recorded
+from test.bags import recorded
 
 NUM_POINTS = 7
 
@@ -47,8 +47,13 @@ def packed_images() -> list[bytes]:
     depth = np.arange(12, dtype=np.uint16).reshape(3, 4) * 900
     color = np.random.default_rng(4).integers(0, 256, (8, 8, 3)).astype(np.uint8)
     header = np.int32(0).tobytes() + np.array([1e4, -900.0], np.float32).tobytes()
-    ways = ((0, header, depth, 'PNG'), (1, header, depth, 'PNG'), (2, b'', color, 'JPEG'),
-            (2, b'', color, 'PNG'), (3, b'', color[..., 0].copy(), 'PNG'))  # fmt: skip
+    ways = (
+        (0, header, depth, 'PNG'),
+        (1, header, depth, 'PNG'),
+        (2, b'', color, 'JPEG'),
+        (2, b'', color, 'PNG'),
+        (3, b'', color[..., 0].copy(), 'PNG'),
+    )
     found = []
     for way, before, pixels, kind in ways:
         file = io.BytesIO()
@@ -144,7 +149,7 @@ def metadata() -> list[bytes]:
 
 def packed() -> list[bytes]:
     """Return bytes that zstd packed."""
-    from surfel_mapper.io.bag_compression import import_zstd
+    from surfel_mapper.bags.compression import import_zstd
 
     return [import_zstd().compress(content) for content in (b'', b'abc' * 99, bytes(200_000))]
 
@@ -195,7 +200,7 @@ def small_map() -> tuple[SurfelMap, list[WindowedScan]]:
 
 def parquet() -> list[bytes]:
     """Return a map in Parquet."""
-    from surfel_mapper.io.parquet import write_map
+    from surfel_mapper.files.parquet import write_map
 
     return [written(lambda path: write_map(path, small_map()[0]), 'a.parquet')]
 

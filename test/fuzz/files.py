@@ -13,19 +13,19 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from surfel_mapper.bags.compression import unpack_file, unpacked_message
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import load_config, TsdfConfig
 from surfel_mapper.errors import ConfigError, SurfelMapperError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.parquet import read_map
+from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.chain import example as example_scan
-from surfel_mapper.io import pcd, ply
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_compression import unpack_file, unpacked_message
-from surfel_mapper.io.map_state import load_map
-from surfel_mapper.io.parquet import read_map
-from surfel_mapper.io.scan_files import read_scan
-from surfel_mapper.io.state import load_state, save_state
-from surfel_mapper.io.trajectory import read_trajectory
-from surfel_mapper.io.tsdf_state import load_tsdf
 from test.fuzz.source import Source
 
 MOST_MESSAGES = 10_000

@@ -11,10 +11,10 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, SurfelMapperError
-from surfel_mapper.io.compressed_image import unpacked
-from surfel_mapper.io.depth_image import camera_in, CameraImage, depth_scan
-from surfel_mapper.io.pointcloud2 import Field, to_scan
-from surfel_mapper.io.raw_cloud import parse_cloud
+from surfel_mapper.messages.compressed_image import unpacked
+from surfel_mapper.messages.depth_image import camera_in, CameraImage, depth_scan
+from surfel_mapper.messages.pointcloud2 import Field, to_scan
+from surfel_mapper.messages.raw_cloud import parse_cloud
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.fuzz.source import Source
@@ -99,8 +99,12 @@ def depth_image(data: bytes) -> None:
 
 def packed_image(data: bytes) -> None:
     """Read an image that a transport has packed; the first byte says how."""
-    ways = (('16UC1; compressedDepth png', True), ('32FC1; compressedDepth png', True),
-            ('rgb8; jpeg compressed', False), ('png', True))  # fmt: skip
+    ways = (
+        ('16UC1; compressedDepth png', True),
+        ('32FC1; compressedDepth png', True),
+        ('rgb8; jpeg compressed', False),
+        ('png', True),
+    )
     format_, exact = ways[data[0] % 4 if data else 0]
     message = SimpleNamespace(header=None, format=format_, data=data[1:])
     with contextlib.suppress(CloudFormatError):

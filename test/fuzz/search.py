@@ -17,7 +17,7 @@ import tempfile
 
 import atheris
 
-import surfel_mapper.kernels
+import surfel_mapper
 
 MOST_MB = 2048
 SLOWEST_S = 60
@@ -26,8 +26,9 @@ SLOWEST_S = 60
 
 def main(name: str, corpus: str, seconds: str) -> None:
     """Search from a corpus on with the harness of a name."""
-    for module in pkgutil.iter_modules(surfel_mapper.kernels.__path__):
-        importlib.import_module(f'surfel_mapper.kernels.{module.name}')
+    for module in pkgutil.walk_packages(surfel_mapper.__path__, 'surfel_mapper.'):
+        if '.kernels.' in module.name:
+            importlib.import_module(module.name)
     with atheris.instrument_imports(
         include=['surfel_mapper', 'rosbags.rosbag1', 'rosbags.rosbag2'],
         enable_loader_override=False,

@@ -12,19 +12,20 @@ import tracemalloc
 import numpy as np
 import pytest
 
+from surfel_mapper.bags import compression as bag_compression
+from surfel_mapper.bags.compression import import_zstd, unpack_file, unpacked
+from surfel_mapper.bags.paths import files_of
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import load_config, TsdfConfig
 from surfel_mapper.errors import BagError, ConfigError, FileFormatError, PoseError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.io import bag_compression, pcd, ply
-from surfel_mapper.io.bag import BagReader
-from surfel_mapper.io.bag_compression import import_zstd, unpack_file, unpacked
-from surfel_mapper.io.bag_files import files_of
-from surfel_mapper.io.map_state import load_map, save_map
-from surfel_mapper.io.state import load_state, save_state
-from surfel_mapper.io.tsdf_state import load_tsdf
 from surfel_mapper.poses import buffer as buffer_module
+from test.bags import recorded
 from test.fuzz import corpus
-from test.io import recorded
 
 LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
     f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]\n' for i in range(1, 40)

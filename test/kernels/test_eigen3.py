@@ -117,9 +117,24 @@ def test_matrices_too_small_for_all_digits_stay_finite(call, tiny):
 @both
 @pytest.mark.parametrize(
     'diagonal',
-    [(1, 2, 3), (3, 1, 2), (2, 3, 1), (0, 1, 2), (0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 1, 1),
-     (1, 0, 1), (1, 1, 0), (2, 2, 2), (1, 1, 2), (2, 1, 1), (1e-9, 1, 1), (1, 1e-18, 1)],
-)  # fmt: skip
+    [
+        (1, 2, 3),
+        (3, 1, 2),
+        (2, 3, 1),
+        (0, 1, 2),
+        (0, 0, 1),
+        (0, 1, 0),
+        (1, 0, 0),
+        (0, 1, 1),
+        (1, 0, 1),
+        (1, 1, 0),
+        (2, 2, 2),
+        (1, 1, 2),
+        (2, 1, 1),
+        (1e-9, 1, 1),
+        (1, 1e-18, 1),
+    ],
+)
 def test_diagonal_matrices_are_their_own_answer(call, diagonal):
     eigenvalues, normals = decomposed(np.diag(np.array(diagonal, float))[None], call)
     assert np.abs(eigenvalues[0] - np.sort(diagonal)).max() <= 1e-15 * max(diagonal)

@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map made without the compiler, in a process of its own, equals one made with it."""
 
-
 from test.kernels.modes import printed_alike
 
 SHORT_MAPPING = """

@@ -107,8 +107,10 @@ def test_runs_add_count_sums_and_products_to_their_voxels(call):
     call(add_runs, places, starts, 3, np.array([1, -1, 2, 0], np.int32), sums)
     for row, first, last, before in ((1, 4, 9, 5), (2, 10, 17, 0)):
         x, y, z = places[:, first:last].astype(int).tolist()
-        products = [sum(a * b for a, b in zip(*p, strict=True))
-                    for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]]  # fmt: skip
+        products = [
+            sum(a * b for a, b in zip(*p, strict=True))
+            for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]
+        ]
         found = [last - first, sum(x), sum(y), sum(z), *products]
         assert sums[row].tolist() == [value + before for value in found]
     assert not sums[[0, 3]].any()

@@ -134,9 +134,7 @@ def test_many_voxels_come_and_go_as_in_a_dict():
         if step < 20 or (step % 2 and live):
             points = rng.uniform([-30.0, 9970.0, -30.0], [30.0, 10030.0, 30.0], (12_000, 3))
             live.append(surfel_map.add(points))
-            for voxel, count in zip(
-                live[-1].key.tolist(), live[-1].count.tolist(), strict=True
-            ):
+            for voxel, count in zip(live[-1].key.tolist(), live[-1].count.tolist(), strict=True):
                 expected[voxel] = expected.get(voxel, 0) + count
         else:
             moments = live.pop(rng.integers(len(live)))

@@ -59,9 +59,7 @@ def test_removing_twice_is_refused():
     moments = surfel_map.add(*first)
     surfel_map.add(second[0] + 2.0, second[1])  # shares many voxels, not all
     surfel_map.remove(moments)
-    assert_unchanged_by(
-        surfel_map, NotInMapError, 'only removed once', surfel_map.remove, moments
-    )
+    assert_unchanged_by(surfel_map, NotInMapError, 'only removed once', surfel_map.remove, moments)
 
 
 def test_removing_the_same_number_of_other_points_is_refused():

@@ -167,8 +167,9 @@ def test_a_plane_turned_into_a_line_loses_its_planarity_as_defined():
     # points on the two half axes of an ellipse: variances in the ratio of the half axes squared
     for ratio in (1.0, 0.5, 0.1, 0.01):
         a, b = 0.25, 0.25 * ratio
-        row = one_surfel([[0.5 + a, 0.5, 0.5], [0.5 - a, 0.5, 0.5], [0.5, 0.5 + b, 0.5],
-                          [0.5, 0.5 - b, 0.5]])  # fmt: skip
+        row = one_surfel(
+            [[0.5 + a, 0.5, 0.5], [0.5 - a, 0.5, 0.5], [0.5, 0.5 + b, 0.5], [0.5, 0.5 - b, 0.5]]
+        )
         assert row['planarity'] == pytest.approx(2 * ratio**2 / (1 + ratio**2), rel=1e-2)
 
 

@@ -72,8 +72,9 @@ def room(columns=640, rows=480, noise_per_range_sq=0.0, seed=3):
         ranges.append(round_hit(d[:, :2], VIEW[:2] - AXIS, CYLINDER_RADIUS))
         ranges.append(round_hit(d, VIEW - CENTRE, BALL_RADIUS))
     ranges = np.array(ranges)
-    ranges[CYLINDER] = np.where((VIEW + ranges[CYLINDER][:, None] * d)[:, 2] <= 1.2,
-                                ranges[CYLINDER], np.inf)  # fmt: skip
+    ranges[CYLINDER] = np.where(
+        (VIEW + ranges[CYLINDER][:, None] * d)[:, 2] <= 1.2, ranges[CYLINDER], np.inf
+    )
     which = ranges.argmin(axis=0)
     t = ranges.min(axis=0)
     seen = np.isfinite(t)

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.banded import solve_band
+from surfel_mapper.models.kernels.banded import solve_band
 
 
 @pytest.mark.parametrize(('number', 'width'), [(1, 1), (3, 8), (40, 1), (40, 7), (40, 40)])

@@ -13,10 +13,10 @@ from scipy.spatial.distance import cdist
 
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
-from surfel_mapper.kernels.joining import agree, gap
 from surfel_mapper.models import fit
 from surfel_mapper.models.clusters import clusters_of, surfaces_of
 from surfel_mapper.models.fitting import thin
+from surfel_mapper.models.kernels.joining import agree, gap
 from test.models.scenes import A, room, sheet, VIEW
 
 OFF_GRID = (0.011, 0.004, 0.007)
@@ -183,9 +183,9 @@ def test_components_are_those_of_the_whole_graph():
 
 def test_parallel_planes_merge_within_an_offset_and_not_beyond():
     def num_planes(step):
-        both = np.concatenate([
-            sheet(0.6, 0.6, A, centre=(-0.3, 0, 0.0)), sheet(0.6, 0.6, A, centre=(0.3, 0, step))
-        ])  # fmt: skip
+        both = np.concatenate(
+            [sheet(0.6, 0.6, A, centre=(-0.3, 0, 0.0)), sheet(0.6, 0.6, A, centre=(0.3, 0, step))]
+        )
         return len(fit(both, ModelsConfig(voxel_size_m=A), ABOVE).planes)
 
     assert num_planes(0.5 * A) == 1

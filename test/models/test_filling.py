@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.filling import fill_rings
 from surfel_mapper.models.filling import areas, filled, joined
+from surfel_mapper.models.kernels.filling import fill_rings
 from surfel_mapper.models.outlines import rings
 from test.kernels.modes import both
 from test.models.test_outlines import area
@@ -63,13 +63,13 @@ def area_of(p, q, points):
         ([SQUARE[::-1], HOLE], 12.0),
         ([SQUARE, HOLE, 0.25 * HOLE + 1.75], 12.25),  # an island in the hole
         ([SQUARE, np.array([9.0, 2.0]) + HOLE], 20.0),
-        ([polygon(100, 2.0), polygon(50, 1.0, (0.3, 0.2), 0.1)],
-         0.5 * (100 * 4 * math.sin(2 * math.pi / 100) - 50 * math.sin(2 * math.pi / 50))),
+        (
+            [polygon(100, 2.0), polygon(50, 1.0, (0.3, 0.2), 0.1)],
+            0.5 * (100 * 4 * math.sin(2 * math.pi / 100) - 50 * math.sin(2 * math.pi / 50)),
+        ),
     ],
-)  # fmt: skip
-def test_the_area_of_the_triangles_is_that_of_what_is_enclosed_without_its_holes(
-    around, expected
-):
+)
+def test_the_area_of_the_triangles_is_that_of_what_is_enclosed_without_its_holes(around, expected):
     assert areas(filled(around)).sum() == pytest.approx(expected, rel=1e-12)
     assert (areas(filled(around)) > 0.0).all()
 

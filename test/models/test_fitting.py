@@ -11,7 +11,7 @@ import pytest
 
 from surfel_mapper.config.models import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
-from surfel_mapper.io.scan_files import read_scan
+from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit
 from surfel_mapper.models.clusters import clusters_of, folded, surfaces_of
 from surfel_mapper.models.fitting import thin

@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.folds import halve_part, percentile
 from surfel_mapper.models.folds import folded
+from surfel_mapper.models.kernels.folds import halve_part, percentile
 from test.kernels.modes import both
 
 LIMIT = math.cos(math.radians(60.0))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.cells import fill_cells
-from surfel_mapper.kernels.coverage import cover_parts, cover_places
 from surfel_mapper.models import fit
+from surfel_mapper.models.kernels.cells import fill_cells
+from surfel_mapper.models.kernels.coverage import cover_parts, cover_places
 from test.kernels.modes import compiled, interpreted
 from test.models.scenes import A, room, sheet, VIEW
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from surfel_mapper.kernels.halving import (
+from surfel_mapper.models.kernels.halving import (
     cluster_moments,
     MEANS_ITERATIONS,
     MEANS_SAMPLE,
@@ -16,7 +16,7 @@ from surfel_mapper.kernels.halving import (
     SETTLED_SHARE,
     split_means,
 )
-from surfel_mapper.kernels.mixture import ITERATIONS, SETTLED, split_mixture
+from surfel_mapper.models.kernels.mixture import ITERATIONS, SETTLED, split_mixture
 
 
 def two_sheets(number, seed):

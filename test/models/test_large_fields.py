@@ -56,9 +56,7 @@ def test_what_is_far_from_a_change_stays_to_the_bit():
     xy = places()
     far = np.hypot(*(xy - 3.0).T) > 1.0 + 14 * PITCH_M
     assert far.sum() > 500
-    np.testing.assert_array_equal(
-        after.field.heights(xy[far]), before.field.heights(xy[far])
-    )
+    np.testing.assert_array_equal(after.field.heights(xy[far]), before.field.heights(xy[far]))
     fresh = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), None)
     np.testing.assert_allclose(after.field.heights(xy), fresh.field.heights(xy), atol=2e-3)
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.kernels.rims import follow_sides, lay_sides, mark_corners
 from surfel_mapper.models import fit
+from surfel_mapper.models.kernels.rims import follow_sides, lay_sides, mark_corners
 from surfel_mapper.models.outlines import middles, outline, rings, simplified, TOLERANCE, triangles
 from test.kernels.modes import both
 from test.models.scenes import A, room, sheet, VIEW
@@ -141,10 +141,14 @@ def test_the_kernels_follow_an_eight_and_leave_out_what_is_straight(call):
 
 def test_points_on_a_side_of_a_ring_go_and_its_corners_stay():
     side = np.arange(10.0)
-    square = np.concatenate([
-        np.stack([side, 0 * side], 1), np.stack([0 * side + 10, side], 1),
-        np.stack([10 - side, 0 * side + 10], 1), np.stack([0 * side, 10 - side], 1),
-    ])  # fmt: skip
+    square = np.concatenate(
+        [
+            np.stack([side, 0 * side], 1),
+            np.stack([0 * side + 10, side], 1),
+            np.stack([10 - side, 0 * side + 10], 1),
+            np.stack([0 * side, 10 - side], 1),
+        ]
+    )
     assert area(simplified(square)) == 100.0
     assert len(simplified(square)) == 4
 

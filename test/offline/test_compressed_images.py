@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import BagError
-from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
-from test.io.test_compressed_image import packed, packed_depth
+from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.messages.test_compressed_image import packed, packed_depth
 from test.offline.test_depth import camera_info, IMAGE, image, replayed
 from test.offline.test_scene_feed import color_image, COLORED, RED
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from surfel_mapper import Config, Mapper
-from surfel_mapper.depth import PinholeCamera
 from surfel_mapper.errors import BagError
-from surfel_mapper.io.depth_image import CameraImage, depth_scan
+from surfel_mapper.messages.depth_image import CameraImage, depth_scan
 from surfel_mapper.offline.recording import open_recording, Request
-from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from surfel_mapper.sensors.depth import PinholeCamera
+from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 
 IMAGE, INFO = 'sensor_msgs/msg/Image', 'sensor_msgs/msg/CameraInfo'
 TOPIC, INFO_TOPIC = '/camera/depth/image', '/camera/depth/camera_info'
@@ -24,14 +24,26 @@ def camera_info(entries, record_ns, focal=35.0):
     K = np.array([focal, 0.0, 19.5, 0.0, focal, 14.5, 0.0, 0.0, 1.0])
     roi = entries.make(
         'sensor_msgs/msg/RegionOfInterest',
-        x_offset=0, y_offset=0, height=0, width=0, do_rectify=False,
-    )  # fmt: skip
+        x_offset=0,
+        y_offset=0,
+        height=0,
+        width=0,
+        do_rectify=False,
+    )
     message = entries.make(
         INFO,
         header=entries.header(record_ns, 'optical'),
-        height=30, width=40, distortion_model='plumb_bob', d=np.zeros(5), k=K,
-        r=np.eye(3).ravel(), p=np.zeros(12), binning_x=0, binning_y=0, roi=roi,
-    )  # fmt: skip
+        height=30,
+        width=40,
+        distortion_model='plumb_bob',
+        d=np.zeros(5),
+        k=K,
+        r=np.eye(3).ravel(),
+        p=np.zeros(12),
+        binning_x=0,
+        binning_y=0,
+        roi=roi,
+    )
     entries.append((INFO_TOPIC, INFO, record_ns, message))
 
 
@@ -41,9 +53,13 @@ def image(entries, number):
     message = entries.make(
         IMAGE,
         header=entries.header(stamp_ns, 'optical'),
-        height=30, width=40, encoding='16UC1', is_bigendian=0, step=80,
+        height=30,
+        width=40,
+        encoding='16UC1',
+        is_bigendian=0,
+        step=80,
         data=depth.view(np.uint8).ravel(),
-    )  # fmt: skip
+    )
     entries.append((TOPIC, IMAGE, stamp_ns, message))
     return message
 

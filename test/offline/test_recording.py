@@ -13,12 +13,12 @@ import pytest
 
 from surfel_mapper import Config, Mapper, SurfelMap
 from surfel_mapper.errors import BagError, FileFormatError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.trajectory import write_tum
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.io import pcd, ply
-from surfel_mapper.io.trajectory import write_tum
 from surfel_mapper.offline.recording import open_recording, Request
 from surfel_mapper.offline.replay import ALL_SCANS
-from test.io.recorded import (
+from test.bags.recorded import (
     CLOUD,
     cut,
     drive,

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from surfel_mapper import Config, Mapper, SurfelMap
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
-from surfel_mapper.io.bag import BagReader
 from surfel_mapper.offline.pose_topics import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS, replay
-from test.io.recorded import (
+from test.bags.recorded import (
     CLOUD,
     drive,
     HEIGHT_M,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import BagError
-from test.io.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
+from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.offline.test_depth import camera_info, IMAGE, image, replayed, SETTINGS
 
 TOPIC = '/camera/color/image'
@@ -27,8 +27,13 @@ def color_image(entries, number, late_ns, encoding='rgb8'):
     message = entries.make(
         IMAGE,
         header=entries.header(stamp_ns, 'optical'),
-        height=30, width=40, encoding=encoding, is_bigendian=0, step=120, data=pixels.ravel(),
-    )  # fmt: skip
+        height=30,
+        width=40,
+        encoding=encoding,
+        is_bigendian=0,
+        step=120,
+        data=pixels.ravel(),
+    )
     entries.append((TOPIC, IMAGE, stamp_ns + late_ns, message))
 
 

@@ -8,11 +8,11 @@ import sqlite3
 import pytest
 
 from surfel_mapper import Config, Mapper
-from surfel_mapper.io.bag import BagReader
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.offline.pose_topics import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS, replay
 from surfel_mapper.offline.survey import offers, survey
-from test.io.recorded import (
+from test.bags.recorded import (
     CLOUD,
     drive,
     MOUNT_M,

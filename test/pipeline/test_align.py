@@ -58,9 +58,13 @@ def rebuilt(mapper, reduced):
     for scan, windowed in zip(reduced, mapper.window, strict=True):
         pose = windowed.T_map_sensor
         moments = surfel_map.reduce(
-            scan.points, pose, origin=pose[:3, 3], columns=scan.columns,
-            min_range_m=limits.min_range_m, max_range_m=limits.max_range_m or math.inf,
-        )  # fmt: skip
+            scan.points,
+            pose,
+            origin=pose[:3, 3],
+            columns=scan.columns,
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m or math.inf,
+        )
         surfel_map.insert(moments)
     return surfel_map
 

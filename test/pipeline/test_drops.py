@@ -53,8 +53,11 @@ def test_points_that_cannot_be_mapped_are_left_out_and_counted_and_the_others_ma
     add_pose(mapper, 1.0)
     (update,) = insert(mapper, scan_at(1.0, points=points))
     assert dict(mapper.counters.points_left_out) == {
-        'not_finite': 3, 'too_near': 1, 'too_far': 1, 'beyond_map': 1,
-    }  # fmt: skip
+        'not_finite': 3,
+        'too_near': 1,
+        'too_far': 1,
+        'beyond_map': 1,
+    }
     assert update.num_points == mapper.counters.points == mapper.map.num_points == 34
     good = np.delete(points, [3, 9, 5, 7, 8, 20], axis=0)
     assert mapper.map.digest() == digest_of((scan_at(1.0, points=good), np.eye(4)))

@@ -14,11 +14,11 @@ import pytest
 
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.threads import share
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.look_ahead import LookAhead
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
+from surfel_mapper.threads import share
 
 S = 10**9
 LEVEL = (0.0, 0.0, 0.0, 1.0)
@@ -94,9 +94,7 @@ def test_scans_that_wait_together_are_mapped_together():
 
 
 def shorten(mapper):
-    mapper.reconfigure(
-        Config.from_mapping({**mapper.config.to_mapping(), 'window.max_scans': 2})
-    )
+    mapper.reconfigure(Config.from_mapping({**mapper.config.to_mapping(), 'window.max_scans': 2}))
 
 
 def gate(mapper):

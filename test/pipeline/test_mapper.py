@@ -220,15 +220,17 @@ def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
 COMPILED_BEFORE_THE_FIRST_SCAN = """
 import importlib, pkgutil
 import numpy as np
-from surfel_mapper import kernels
+import surfel_mapper
 from surfel_mapper.config import Config
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 
 def compiled():
     found = {}
-    for module in pkgutil.iter_modules(kernels.__path__):
-        module = importlib.import_module('surfel_mapper.kernels.' + module.name)
+    for module in pkgutil.walk_packages(surfel_mapper.__path__, 'surfel_mapper.'):
+        if '.kernels.' not in module.name:
+            continue
+        module = importlib.import_module(module.name)
         for name, kernel in vars(module).items():
             if hasattr(kernel, 'signatures'):
                 found[name] = list(map(str, kernel.signatures))

@@ -115,9 +115,7 @@ def test_two_sensors_serve_one_track():
     updates = feed(mapper, scans)
 
     np.testing.assert_allclose(updates[4].T_fixed_sensor, pose_at(4), atol=5e-3)
-    np.testing.assert_allclose(
-        updates[5].T_fixed_sensor, compose(pose_at(5), mount), atol=5e-3
-    )
+    np.testing.assert_allclose(updates[5].T_fixed_sensor, compose(pose_at(5), mount), atol=5e-3)
 
 
 def test_a_second_sensor_that_sits_nobody_knows_where_is_dropped():
@@ -150,9 +148,7 @@ def test_a_scan_that_does_not_fit_is_dropped_and_the_next_one_mapped():
 def test_what_cannot_be_known_is_said(caplog):
     mapper = mapper_with()
 
-    updates = feed(
-        mapper, [scan_at(n, TRUE, faces=CORRIDOR, reach_m=20.0) for n in range(3)]
-    )
+    updates = feed(mapper, [scan_at(n, TRUE, faces=CORRIDOR, reach_m=20.0) for n in range(3)])
 
     assert len(updates[2].alignment.degenerate) == 1
     assert mapper.summary()['registration']['degenerate'] == 2

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import Config
-from surfel_mapper.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.tsdf.labels import labels_of
 from test.pipeline.test_tsdf_layer import LIDAR, RING
 
@@ -103,10 +103,13 @@ def test_an_image_of_another_size_leaves_the_depth_without_colour(caplog):
 
 
 def test_labels_are_joined_like_colours():
-    mapper = mapper_with(**{
-        'layers.tsdf.label_topic': 'labels', 'layers.tsdf.semantics': 'single',
-        'layers.tsdf.color_topic': '',
-    })  # fmt: skip
+    mapper = mapper_with(
+        **{
+            'layers.tsdf.label_topic': 'labels',
+            'layers.tsdf.semantics': 'single',
+            'layers.tsdf.color_topic': '',
+        }
+    )
     mapper.add_image(image(1000 * MS, 3, 7, kind='label'))
     mapper.add_scan(wall(1000 * MS))
     mapped(mapper)
@@ -117,10 +120,15 @@ def test_labels_are_joined_like_colours():
 
 def test_points_of_a_lidar_are_coloured_where_a_camera_sees_them_and_only_there():
     optical = (-0.5, 0.5, -0.5, 0.5)  # x right, y down, z ahead
-    mapper = mapper_with(**{
-        'input.kind': 'cloud', 'pose.source': 'odometry', 'frames.base': 'base',
-        'layers.tsdf.voxel_size_m': 0.2, 'layers.tsdf.truncation_m': 0.6,
-    })  # fmt: skip
+    mapper = mapper_with(
+        **{
+            'input.kind': 'cloud',
+            'pose.source': 'odometry',
+            'frames.base': 'base',
+            'layers.tsdf.voxel_size_m': 0.2,
+            'layers.tsdf.truncation_m': 0.6,
+        }
+    )
     mapper.add_pose('base', 'lidar', 0, (0.0, 0.0, 1.0), (0.0, 0.0, 0.0, 1.0), static=True)
     mapper.add_pose('base', 'camera', 0, (0.1, 0.0, 1.0), optical, static=True)
     mapper.add_pose('odom', 'base', 1000 * MS, (7.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))

@@ -150,9 +150,7 @@ class Peer:
 
     def wait_until_read(self, *topics):
         """Return when the node reads what is published on topics that are advertised."""
-        self.spin_until(
-            lambda: all(self._publishers[t].get_subscription_count() for t in topics)
-        )
+        self.spin_until(lambda: all(self._publishers[t].get_subscription_count() for t in topics))
         self.meet()
 
     def publish(self, topic, message):

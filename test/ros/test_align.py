@@ -16,7 +16,7 @@ from nav_msgs.msg import Path
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import pose_matrix, q_xyzw
-from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from test.alignment.street import drifted, relative_errors, street_scans
 from test.ros.live import cloud, LATCHED, odometry, RELIABLE

@@ -16,10 +16,10 @@ import pytest
 from surfel_mapper import Mapper, Scan, SurfelMap
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.io.map_cloud import halves, moment_cloud, voxel_columns, whole
-from surfel_mapper.io.mirror import MapMirror, MAX_RECENT
-from surfel_mapper.io.pointcloud2 import from_columns, to_scan
 from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.messages.map_cloud import halves, moment_cloud, voxel_columns, whole
+from surfel_mapper.messages.mirror import MapMirror, MAX_RECENT
+from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.ros.changes import Changes
 
@@ -237,8 +237,13 @@ def test_a_voxel_that_is_gone_has_no_points_and_no_place():
 def test_removed_voxels_are_told_by_place_and_index():
     columns = voxel_columns(np.array([[0, -1, 3]], np.int32), 0.5)
     assert {name: values.tolist() for name, values in columns.items()} == {
-        'x': [0.25], 'y': [-0.25], 'z': [1.75], 'voxel_x': [0], 'voxel_y': [-1], 'voxel_z': [3],
-    }  # fmt: skip
+        'x': [0.25],
+        'y': [-0.25],
+        'z': [1.75],
+        'voxel_x': [0],
+        'voxel_y': [-1],
+        'voxel_z': [3],
+    }
 
 
 def test_clouds_that_cannot_be_mirrored_are_refused_and_change_nothing():

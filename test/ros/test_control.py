@@ -49,8 +49,8 @@ def feed(peer, num_scans):
 
 def go_on(peer, twin, first, num_scans):
     """Have more scans mapped, by the twin too, until all that were there before have left."""
-    from surfel_mapper.io.pointcloud2 import to_scan
-    from surfel_mapper.io.pose_messages import poses_in
+    from surfel_mapper.messages.pointcloud2 import to_scan
+    from surfel_mapper.messages.pose_messages import poses_in
 
     for points, pose in drive(first + num_scans)[first:]:
         send(peer, [(points, pose)])

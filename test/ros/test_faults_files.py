@@ -23,8 +23,8 @@ from std_srvs.srv import Trigger
 
 from surfel_mapper.cli.replay_files import Mapped, write_files
 from surfel_mapper.config import Config
-from surfel_mapper.io.map_state import load_map
-from surfel_mapper.io.ply import read_points
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.ply import read_points
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.saving import save_map
 from surfel_mapper.scan import Scan

@@ -20,12 +20,12 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
 from surfel_mapper import Mapper
 from surfel_mapper.config import Config
-from surfel_mapper.depth import PinholeCamera
-from surfel_mapper.io.depth_image import CameraImage, depth_scan
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.pose_messages import poses_in
+from surfel_mapper.messages.depth_image import CameraImage, depth_scan
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.pose_messages import poses_in
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.shared_memory import OWN_SETTINGS
+from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.ros.live import cloud, odometry, RELIABLE, reliably, room, stamp, START_NS
 

@@ -16,7 +16,7 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
-from surfel_mapper.io.map_state import load_map
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.node import MapperNode

@@ -13,7 +13,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.map_state import load_map
+from surfel_mapper.files.map_state import load_map
 from test.ros.live import Peer, ROOT, TIMEOUT_S
 
 EXAMPLES = ROOT / 'examples'

@@ -25,9 +25,9 @@ from std_srvs.srv import SetBool
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.io.ply import read_points
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.surfel_columns import surfel_columns
+from surfel_mapper.files.ply import read_points
+from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.messages.pointcloud2 import to_scan
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import (
     cloud,
@@ -279,9 +279,7 @@ def test_what_cannot_work_ends_the_node_with_a_message(domain, capfd, arguments,
     assert 'surfel-mapper node: ' in said
 
 
-def test_a_file_of_settings_alone_is_refused_with_what_to_put_around_them(
-    domain, capfd, tmp_path
-):
+def test_a_file_of_settings_alone_is_refused_with_what_to_put_around_them(domain, capfd, tmp_path):
     (tmp_path / 'my.yaml').write_text('map: {voxel_size_m: 1.0}\n', encoding='utf-8')
     assert main(['node', '--ros-args', '--params-file', str(tmp_path / 'my.yaml')]) == 1
     said = capfd.readouterr().err

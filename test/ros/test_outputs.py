@@ -19,11 +19,11 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper import MapMirror
-from surfel_mapper.io.markers import normal_colors, SEGMENTS, shades
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.scan_normals import ADDED
 from surfel_mapper.mapping.moments import pack_keys
-from test.io.test_scan_normals import cloud as odd_cloud
+from surfel_mapper.messages.markers import normal_colors, SEGMENTS, shades
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.scan_normals import ADDED
+from test.messages.test_scan_normals import cloud as odd_cloud
 from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
 

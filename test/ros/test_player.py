@@ -25,12 +25,12 @@ from rosbags.interfaces import (
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
+from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import DependencyError
-from surfel_mapper.io.bag import BagReader
 from surfel_mapper.ros import shared_memory
 from surfel_mapper.ros.player import message_type
-from test.io.recorded import (
+from test.bags.recorded import (
     drive,
     NUM_SCANS,
     PERIOD_NS,
@@ -86,6 +86,7 @@ def test_topics_are_chosen_and_remapped_and_the_clock_runs(start, peer, bag):
         *('play', bag, '--topics', '/pose', '--wait-for', '/pose', '--clock', '--json'),
         *('--ros-args', '-r', '/pose:=/other'),
     )
+
     def times():
         return [message.clock.sec * 10**9 + message.clock.nanosec for message in clock]
 

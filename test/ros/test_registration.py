@@ -15,9 +15,9 @@ from geometry_msgs.msg import PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry, Path
 
 from surfel_mapper.config import Config
+from surfel_mapper.files.map_state import save_map
 from surfel_mapper.geometry import pose_matrix, q_xyzw
-from surfel_mapper.io.map_state import save_map
-from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.registration import covariance
 from test.alignment.test_registration import map_of, ROOM

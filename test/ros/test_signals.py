@@ -45,7 +45,6 @@ def test_a_signal_interrupts_and_those_that_follow_do_not(number):
 
 
 class Freed:
-
     def __del__(self):
         send(signal.SIGINT)
 

@@ -16,9 +16,9 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import Marker
 
-from surfel_mapper.depth import PinholeCamera
+from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import Lidar
-from test.io.test_compressed_image import packed, packed_depth
+from test.messages.test_compressed_image import packed, packed_depth
 from test.ros.live import cloud, LATCHED, odometry, reliably, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
 from test.ros.test_node import PERIOD_NS
@@ -143,10 +143,12 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
     peer.diagnosis({'scans.mapped': 1})
     assert not slices
     done = peer.result(
-        peer.parameters().set_parameters([
-            Parameter('layers.tsdf.slice_rate_hz', value=10.0),
-            Parameter('layers.tsdf.slice_height_m', value=2.5),
-        ])
+        peer.parameters().set_parameters(
+            [
+                Parameter('layers.tsdf.slice_rate_hz', value=10.0),
+                Parameter('layers.tsdf.slice_height_m', value=2.5),
+            ]
+        )
     )
     assert all(result.successful for result in done.results)
     peer.spin_until(lambda: len(slices) > 2)

@@ -119,10 +119,13 @@ def test_a_scan_does_not_depend_on_what_was_simulated_before(street):
 @pytest.mark.parametrize(
     'setting',
     [
-        dict(speed_m_s=-1.0), dict(speed_m_s=np.nan), dict(start_ns=-1),
-        dict(base_to_sensor=(0.0,) * 7), dict(start=(0.0, 0.0)),
+        dict(speed_m_s=-1.0),
+        dict(speed_m_s=np.nan),
+        dict(start_ns=-1),
+        dict(base_to_sensor=(0.0,) * 7),
+        dict(start=(0.0, 0.0)),
     ],
-)  # fmt: skip
+)
 def test_a_drive_that_cannot_be_is_refused_by_its_setting(setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
         Drive(**{'start': LEVEL, **setting})

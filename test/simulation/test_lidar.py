@@ -10,9 +10,7 @@ from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation import Lidar, Primitive, World
 
 FLOOR_M = 2.0
-FLOOR = World(
-    [Primitive(kind='rectangle', size_m=(1000.0, 1000.0), xyz=(0.0, 0.0, -FLOOR_M))]
-)  # fmt: skip
+FLOOR = World([Primitive(kind='rectangle', size_m=(1000.0, 1000.0), xyz=(0.0, 0.0, -FLOOR_M))])
 SMALL = Lidar(beams=8, columns=32, elevation_deg=(-30.0, 5.0))
 HERE = np.eye(4)
 
@@ -47,8 +45,11 @@ def test_the_columns_say_beam_time_and_how_bright_a_surface_is():
     scan = SMALL.scan(FLOOR, HERE)
     columns = {name: values.reshape(8, 32) for name, values in scan.columns.items()}
     assert {name: values.dtype for name, values in columns.items()} == {
-        'intensity': np.float32, 'ring': np.uint16, 'time': np.float32, 'surface': np.int64
-    }  # fmt: skip
+        'intensity': np.float32,
+        'ring': np.uint16,
+        'time': np.float32,
+        'surface': np.int64,
+    }
     assert (columns['ring'] == np.arange(8)[:, None]).all()
     assert (columns['time'] == 0.0).all()
     # half of the light comes back, times the sine of the angle to the floor
@@ -117,14 +118,25 @@ def test_with_a_pose_for_each_column_every_column_is_seen_from_its_own():
 @pytest.mark.parametrize(
     'setting',
     [
-        dict(beams=0), dict(beams=-1), dict(columns=0), dict(columns=10**6),
-        dict(rate_hz=0.0), dict(rate_hz=-10.0), dict(rate_hz=np.nan),
-        dict(range_noise_m=-0.1), dict(range_noise_m=np.inf), dict(range_noise_m=np.nan),
-        dict(min_range_m=200.0), dict(min_range_m=-1.0), dict(max_range_m=np.inf),
-        dict(max_range_m=np.nan), dict(elevation_deg=(10.0, -10.0)),
-        dict(elevation_deg=(-95.0, 0.0)), dict(seed=-1),
+        dict(beams=0),
+        dict(beams=-1),
+        dict(columns=0),
+        dict(columns=10**6),
+        dict(rate_hz=0.0),
+        dict(rate_hz=-10.0),
+        dict(rate_hz=np.nan),
+        dict(range_noise_m=-0.1),
+        dict(range_noise_m=np.inf),
+        dict(range_noise_m=np.nan),
+        dict(min_range_m=200.0),
+        dict(min_range_m=-1.0),
+        dict(max_range_m=np.inf),
+        dict(max_range_m=np.nan),
+        dict(elevation_deg=(10.0, -10.0)),
+        dict(elevation_deg=(-95.0, 0.0)),
+        dict(seed=-1),
     ],
-)  # fmt: skip
+)
 def test_a_lidar_that_cannot_be_is_refused_by_its_setting(setting):
     with pytest.raises(ConfigError) as refused:
         Lidar(**setting)

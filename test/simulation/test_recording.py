@@ -12,7 +12,7 @@ from rosbags.typesys import get_typestore, Stores
 
 from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.io.pointcloud2 import to_scan
+from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.simulation import Lidar, load_simulation, record, Simulation, World
 
 NUM_SCANS = 4
@@ -66,9 +66,13 @@ def test_the_clouds_are_the_scans(bag, simulation):
         assert not message.is_dense
         fields = [(f.name, f.offset, f.datatype, f.count) for f in message.fields]
         assert fields == [
-            ('x', 0, 7, 1), ('y', 4, 7, 1), ('z', 8, 7, 1),
-            ('intensity', 16, 7, 1), ('ring', 20, 4, 1), ('time', 24, 7, 1),
-        ]  # fmt: skip
+            ('x', 0, 7, 1),
+            ('y', 4, 7, 1),
+            ('z', 8, 7, 1),
+            ('intensity', 16, 7, 1),
+            ('ring', 20, 4, 1),
+            ('time', 24, 7, 1),
+        ]
         found = to_scan(message)
         assert found.stamp_ns == scan.stamp_ns
         np.testing.assert_array_equal(found.points, scan.points)
@@ -83,9 +87,7 @@ def test_odometry_and_tf_are_the_poses_of_the_drive_to_the_last_bit(bag, simulat
     for (record_ns, message), (_, tree) in zip(odometry, tf, strict=True):
         (transform,) = tree.transforms
         assert stamp_ns(message) == stamp_ns(transform) == record_ns
-        frames = [
-            (m.header.frame_id, m.child_frame_id) for m in (message, transform)
-        ]
+        frames = [(m.header.frame_id, m.child_frame_id) for m in (message, transform)]
         assert frames == [('odom', 'base_link')] * 2
         pose = message.pose.pose
         for xyz, q_xyzw in (

@@ -82,8 +82,12 @@ def test_a_street_is_the_same_for_the_same_seed_and_another_for_another():
 def test_a_street_has_every_kind_and_nothing_flat_along_the_grid():
     street = World.street(seed=1, length_m=60.0)
     assert {p.kind for p in street.primitives} == {
-        'rectangle', 'box', 'cylinder', 'tube', 'sphere'
-    }  # fmt: skip
+        'rectangle',
+        'box',
+        'cylinder',
+        'tube',
+        'sphere',
+    }
     labels = {'ground', 'building', 'pavement', 'car', 'pole', 'lamp', 'trunk', 'crown', 'bin'}
     assert labels <= {p.label for p in street.primitives}
     for primitive in street.primitives:

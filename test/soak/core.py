@@ -22,10 +22,10 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from surfel_mapper.config import Config
-from surfel_mapper.io.heap import keep_freed_memory
-from surfel_mapper.io.pointcloud2 import to_scan
-from surfel_mapper.io.raw_cloud import RawCloud
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.memory import keep_freed_memory
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_cloud import RawCloud
 from surfel_mapper.pipeline import Mapper
 from test.bench.machine import resident_bytes
 from test.bench.options import Options
@@ -43,9 +43,7 @@ CONFIG = {
 }
 
 
-def run(
-    num_scans: int, block: int, options: Options, most_s: float = math.inf
-) -> Iterator[Row]:
+def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
     """
     Yield a row for every block of scans, until there were so many or the time is up.
 

@@ -96,9 +96,7 @@ def test_distances_to_the_plane_itself_are_linear_and_leave_no_such_error():
 
 def test_the_zero_level_of_a_ball_lies_on_it_and_not_behind_its_silhouette():
     centre = np.array([0.0, 0.0, 2.0])
-    blocks = fused(
-        image_of(VGA, sphere(VGA, centre, 0.5)), voxel_size_m=0.05, truncation_m=0.15
-    )
+    blocks = fused(image_of(VGA, sphere(VGA, centre, 0.5)), voxel_size_m=0.05, truncation_m=0.15)
     vertices = zero_crossings(blocks)
     error = abs(np.linalg.norm(vertices - centre, axis=1) - 0.5)
     assert len(vertices) > 400

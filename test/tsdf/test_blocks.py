@@ -7,9 +7,9 @@ import pytest
 
 from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.blocks import VERSION
 from surfel_mapper.tsdf.block_content import block_index, block_keys
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.kernels.blocks import VERSION
 
 
 def every_channel(**settings):

@@ -226,8 +226,12 @@ def test_the_extra_band_closes_what_lies_behind_for_all_or_for_some_labels():
 def test_colours_of_the_extra_band_can_be_left_out():
     image = wall(SMALL, 2.0, color=np.full((60, 80, 3), 200, np.uint8))
     counts = [
-        (fused(image, **SIZES, color=True, extra_distance_m=0.5, skip_extra_channels=skip)
-         .color[:, 3] > 0).sum()
+        (
+            fused(
+                image, **SIZES, color=True, extra_distance_m=0.5, skip_extra_channels=skip
+            ).color[:, 3]
+            > 0
+        ).sum()
         for skip in (False, True)
     ]
     assert counts[0] > counts[1] > 0
@@ -243,8 +247,15 @@ def test_a_tiny_budget_is_kept_and_counted():
 
 
 @pytest.mark.parametrize(
-    'T', [np.full((4, 4), np.nan), np.eye(3), np.diag([1, 1, -1, 1]), np.diag([2, 2, 2, 1]),
-          np.diag([1.0, 1, 1, 2]), np.diag([1, 1, np.inf, 1])],
+    'T',
+    [
+        np.full((4, 4), np.nan),
+        np.eye(3),
+        np.diag([1, 1, -1, 1]),
+        np.diag([2, 2, 2, 1]),
+        np.diag([1.0, 1, 1, 2]),
+        np.diag([1, 1, np.inf, 1]),
+    ],
 )
 def test_what_is_no_pose_is_refused(T):
     one = integrator(**SIZES)
@@ -260,9 +271,7 @@ def test_what_the_map_cannot_index_is_refused_and_changes_nothing():
     with pytest.raises(MapLimitError, match='local frame'):
         one.integrate(wall(SMALL, 3.0), far)
     with pytest.raises(MapLimitError, match='larger voxels'):
-        integrator(voxel_size_m=0.001, truncation_m=0.003).integrate(
-            wall(LIDAR, 9.9), np.eye(4)
-        )
+        integrator(voxel_size_m=0.001, truncation_m=0.003).integrate(wall(LIDAR, 9.9), np.eye(4))
     assert one.blocks.num_blocks == 0
     one.integrate(wall(SMALL, 2.0), np.eye(4))
     assert len(zero_crossings(one.blocks)) > 0

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config.tsdf import TsdfConfig
-from surfel_mapper.kernels.tsdf_labels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.kernels.labels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
 from surfel_mapper.tsdf.labels import labels_at, labels_of, log_odds
 from test.tsdf.scenes import image_of, integrator, SMALL
 

@@ -48,9 +48,7 @@ def test_where_one_voxel_of_eight_is_missing_nothing_is_known():
 
 
 def test_states_are_those_of_the_voxel_that_a_point_is_in():
-    blocks = fused(
-        image_of(SMALL, np.full((60, 80), 2.0)), voxel_size_m=0.1, truncation_m=0.3
-    )
+    blocks = fused(image_of(SMALL, np.full((60, 80), 2.0)), voxel_size_m=0.1, truncation_m=0.3)
     centres, D, _ = voxels(blocks)
     aside = np.random.default_rng(2).uniform(-0.049, 0.049, centres.shape)
     found = states(blocks, centres + aside)
@@ -61,9 +59,7 @@ def test_states_are_those_of_the_voxel_that_a_point_is_in():
 
 
 def test_the_gradient_points_to_the_sensor():
-    blocks = fused(
-        image_of(SMALL, 2.0 * SMALL.ray_length), voxel_size_m=0.05, truncation_m=0.15
-    )
+    blocks = fused(image_of(SMALL, 2.0 * SMALL.ray_length), voxel_size_m=0.05, truncation_m=0.15)
     found = sample(blocks, [[0.01, 0.02, 1.97], [0.3, 0.1, 2.03]])
     np.testing.assert_allclose(found.distance, [0.03, -0.03], atol=1e-3)
     assert (found.gradient[:, 2] < -0.99).all()

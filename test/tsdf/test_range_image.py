@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError, ConfigError
-from surfel_mapper.kernels import tsdf_lookup as kernels
 from surfel_mapper.kernels.projection import OUTSIDE, project
+from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
 from surfel_mapper.tsdf.sensors import Camera, Lidar
 from test.tsdf import twin

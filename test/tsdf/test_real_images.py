@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import Config
-from surfel_mapper.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.tsdf.queries import FREE, sample, states
 from surfel_mapper.tsdf.range_image import from_depth
 from surfel_mapper.tsdf.sensors import Camera
@@ -74,19 +74,23 @@ def test_images_between_those_fused_lie_on_the_surface_and_have_its_colour(data_
 
 def fused(data_folder, numbers):
     """Return the mesh that a mapper makes of images, with the colours joined by stamp."""
-    mapper = Mapper(Config.from_mapping({
-        'input.kind': 'depth',
-        'pose.source': 'odometry',
-        'frames.base': 'kinect',
-        'layers.tsdf.enabled': True,
-        'layers.tsdf.voxel_size_m': 0.02,
-        'layers.tsdf.truncation_m': 0.08,
-        'layers.tsdf.min_range_m': 0.4,
-        'layers.tsdf.max_range_m': 4.0,
-        'layers.tsdf.carve': False,
-        'layers.tsdf.color': True,
-        'layers.tsdf.color_topic': 'color',
-    }))  # fmt: skip
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                'input.kind': 'depth',
+                'pose.source': 'odometry',
+                'frames.base': 'kinect',
+                'layers.tsdf.enabled': True,
+                'layers.tsdf.voxel_size_m': 0.02,
+                'layers.tsdf.truncation_m': 0.08,
+                'layers.tsdf.min_range_m': 0.4,
+                'layers.tsdf.max_range_m': 4.0,
+                'layers.tsdf.carve': False,
+                'layers.tsdf.color': True,
+                'layers.tsdf.color_topic': 'color',
+            }
+        )
+    )
     camera = PinholeCamera(640, 480, 585.0, 585.0, 320.0, 240.0)
     for depth, color, pose in frames(data_folder, numbers):
         stamp_ns = (len(mapper.window) + 1) * 10**8

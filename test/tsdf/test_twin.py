@@ -18,7 +18,11 @@ from test.tsdf.scenes import SMALL
 POSE = pose_matrix([3.2, -7.1, 0.4], [0.1, -0.2, 0.3, 0.927361849549570])
 COARSE = Lidar(rows=8, columns=60, vertical_fov_deg=40.0, max_range_m=9.0)
 NARROW = Lidar(
-    rows=6, columns=40, vertical_fov_deg=20.0, vertical_fov_top_deg=5.0, horizontal_fov_deg=120.0,
+    rows=6,
+    columns=40,
+    vertical_fov_deg=20.0,
+    vertical_fov_top_deg=5.0,
+    horizontal_fov_deg=120.0,
     max_range_m=9.0,
 )
 TABLE = Lidar(

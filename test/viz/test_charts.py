@@ -19,7 +19,7 @@ from surfel_mapper.viz.charts import (
     thinned,
     ticks,
     WIDTH,
-)  # fmt: skip
+)
 
 NASTY = '</svg><script>"&'
 

@@ -55,8 +55,9 @@ def test_a_reduced_mesh_keeps_shape_and_colours(most):
     cell_m = np.sqrt(4 * np.pi * 4.0 / len(small))
     assert np.abs(np.linalg.norm(small.vertices, axis=1) - 2.0).max() < 0.3 * cell_m
     # No hole: every edge is there once in either direction.
-    edges = np.concatenate([small.triangles[:, [0, 1]], small.triangles[:, [1, 2]],
-                            small.triangles[:, [2, 0]]])  # fmt: skip
+    edges = np.concatenate(
+        [small.triangles[:, [0, 1]], small.triangles[:, [1, 2]], small.triangles[:, [2, 0]]]
+    )
     once = {tuple(edge) for edge in edges.tolist()}
     assert np.mean([(b, a) in once for a, b in once]) > 0.99
     top = small.vertices[:, 2] > 0.2

@@ -12,7 +12,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
-from test.io.recorded import drive, write_rosbag2
+from test.bags.recorded import drive, write_rosbag2
 from test.pipeline.test_tsdf_layer import insert, mapper_with
 
 pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')

@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+An mcap file read from its beginning: for files without an index, or without an end.
+
+A file is a magic, records, and the magic again; a record is an opcode, the length of its content
+(uint64) and the content. Messages lie among the records or in chunks, which are records of
+packed records. Of a chunk that is cut off, the messages before the cut are had too.
+
+Source: the specification of the format, mcap.dev/spec.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import struct
+from zlib import crc32
+
+from surfel_mapper.bags.profiles import profiles_in
+from surfel_mapper.bags.scanning import Chunk, ChunkedFile, Entry, Place
+
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
+
+RECORD = struct.Struct('<BQ')
+MESSAGE_HEAD = struct.Struct('<HIQQ')
+CHUNK_HEAD = struct.Struct('<QQQI')
+
+
+class McapScan(ChunkedFile):
+    """The messages of an mcap file, found without its index."""
+
+    MAGIC = b'\x89MCAP0\r\n'
+
+    def _scan(self) -> Iterator[Entry]:
+        """Yield the messages up to the end of the data, or to the first record that is broken."""
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        at = len(self.MAGIC)
+        while True:
+            head = self._at(at, RECORD.size)
+            kind, size = RECORD.unpack(head.ljust(RECORD.size, b'\0'))
+            start, end = at + RECORD.size, at + RECORD.size + size
+            is_whole = kind > 0 and end <= self.size
+            if is_whole and kind in (DATA_END, FOOTER):
+                self.cut_at = None if self._ends() else self.size
+                return
+            try:
+                if kind == CHUNK:
+                    yield from self._in_chunk(start, min(end, self.size) - start, is_whole)
+                elif is_whole:
+                    yield from self._note(kind, None, start, size)
+            except (struct.error, ValueError, KeyError):
+                is_whole = False
+            if not is_whole:
+                self.cut_at = at
+                return
+            at = end
+
+    def _ends(self) -> bool:
+        """Return whether the file ends as it should."""
+        return self._at(self.size - len(self.MAGIC), len(self.MAGIC)) == self.MAGIC
+
+    def _in_chunk(self, start: int, size: int, is_whole: bool) -> Iterator[Entry]:
+        """Yield the messages in a chunk of which so many bytes are there."""
+        head = self._at(start, min(size, 64))
+        _, _, unpacked_size, checksum = CHUNK_HEAD.unpack_from(head)
+        compression, after = text(head, CHUNK_HEAD.size)
+        (packed_size,) = struct.unpack_from('<Q', head, after)
+        if is_whole and after + 8 + packed_size > size:
+            raise ValueError('sizes of a chunk that do not fit')
+        left = min(packed_size, size - after - 8)
+        chunk = Chunk(start + after + 8, left, compression, unpacked_size)
+        records = self._unpacked(chunk)
+        if is_whole and (
+            len(records) != unpacked_size or (checksum and crc32(records) != checksum)
+        ):
+            raise ValueError('a chunk of another content than it states')
+        at = 0
+        while at + RECORD.size <= len(records):
+            kind, length = RECORD.unpack_from(records, at)
+            at += RECORD.size
+            if at + length > len(records):
+                return  # cut off in this record
+            yield from self._note(kind, chunk, at, length)
+            at += length
+
+    def _note(self, kind: int, chunk: Chunk | None, start: int, size: int) -> Iterator[Entry]:
+        """Take note of one record: yield a message, keep a schema or a channel."""
+        if kind not in (SCHEMA, CHANNEL, MESSAGE):
+            return
+        wanted = min(size, MESSAGE_HEAD.size) if kind == MESSAGE else size
+        content = self._read(Place(chunk, start, wanted))
+        if kind == SCHEMA:
+            (key,) = struct.unpack_from('<H', content)
+            name, at = text(content, 2)
+            encoding, at = text(content, at)
+            self._schemas[key] = (name, encoding, text(content, at)[0])
+        elif kind == CHANNEL:
+            self._note_channel(content)
+        else:
+            channel, _, record_ns, _ = MESSAGE_HEAD.unpack(content)
+            if channel not in self._found:
+                raise ValueError(f'a message of the unknown channel {channel}')
+            place = Place(chunk, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size)
+            yield Entry(record_ns, channel, place)
+
+    def _note_channel(self, content: bytes) -> None:
+        """Keep a channel as rosbags states it."""
+        from rosbags.interfaces import (
+            Connection,
+            ConnectionExtRosbag2,
+            MessageDefinition,
+            MessageDefinitionFormat,
+        )
+
+        key, schema = struct.unpack_from('<HH', content)
+        topic, at = text(content, 4)
+        encoding, at = text(content, at)
+        name, kind, definition = self._schemas.get(schema, ('', '', ''))
+        formats = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
+        stated = MessageDefinition(formats.get(kind, MessageDefinitionFormat.NONE), definition)
+        ext = ConnectionExtRosbag2(encoding, profiles_in(content[at:].decode(errors='replace')))
+        self._found.setdefault(key, Connection(key, topic, name, stated, '', 0, ext, self))
+
+
+def text(content: bytes, at: int) -> tuple[str, int]:
+    """Return the string at an offset, and the offset behind it."""
+    (size,) = struct.unpack_from('<I', content, at)
+    end = at + 4 + size
+    if end > len(content):
+        raise ValueError('a string longer than its record')
+    return content[at + 4 : end].decode(), end

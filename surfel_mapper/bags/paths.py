@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which files make up a bag, and what its metadata.yaml states about them.
+
+A rosbag2 recording is a directory of one or more files and a metadata.yaml, which is written last
+and so is missing where the recorder was killed. Files compressed as a whole end in .zstd.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from surfel_mapper.config.yaml_files import read_yaml
+from surfel_mapper.errors import BagError
+from surfel_mapper.files.atomic import by_number
+
+STORAGE_SUFFIXES = ('.mcap', '.db3')
+PACKED_SUFFIX = '.zstd'
+ROS1_SUFFIXES = ('.bag', '.bag.active')
+METADATA = 'metadata.yaml'
+
+
+def files_of(path: Path) -> list[Path]:
+    """
+    Return the files of a bag, in the order of recording.
+
+    That is the file itself, or the files of a directory.
+
+    Raises
+    ------
+    BagError
+        If there is no bag at the path.
+
+    """
+    if path.is_dir():
+        information = metadata(path)
+        return loose_files(path) if information is None else listed_files(path, information)
+    if not path.is_file():
+        raise BagError(f'{path}: no such file or directory; expected a bag')
+    if not is_storage(path) and not is_ros1(path):
+        raise BagError(
+            f'{path}: not a bag; expected a rosbag2 directory, or a file ending in .mcap, .db3 '
+            '(perhaps .zstd) or .bag'
+        )
+    return [path]
+
+
+def is_ros1(path: Path) -> bool:
+    """Return whether a path is that of a ROS 1 bag, closed or not."""
+    return path.name.endswith(ROS1_SUFFIXES)
+
+
+def is_storage(path: Path) -> bool:
+    """Return whether a path is that of a file of rosbag2, packed or not."""
+    return unpacked_name(path).endswith(STORAGE_SUFFIXES)
+
+
+def is_packed(path: Path) -> bool:
+    """Return whether a file is compressed as a whole."""
+    return path.suffix == PACKED_SUFFIX
+
+
+def unpacked_name(path: Path) -> str:
+    """Return the name of a file without what says that it is packed."""
+    return path.name.removesuffix(PACKED_SUFFIX)
+
+
+def stated_counts(path: Path) -> dict[str, int]:
+    """Return how many messages of each topic the metadata.yaml of a directory states."""
+    information = metadata(path) if path.is_dir() else None
+    if information is None:
+        return {}
+    try:
+        return {
+            str(row['topic_metadata']['name']): int(row['message_count'])
+            for row in information['topics_with_message_count']
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise damaged_metadata(path / METADATA, error) from error
+
+
+def metadata(directory: Path) -> Mapping[str, Any] | None:
+    """Return the content of metadata.yaml in a directory, or nothing where there is none."""
+    path = directory / METADATA
+    if not path.is_file():
+        return None
+    try:
+        state = path.stat()
+        return information_in(path.absolute(), state.st_mtime_ns, state.st_size)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise damaged_metadata(path, error) from error
+
+
+@lru_cache(maxsize=16)
+def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
+    """Return what metadata.yaml says, read once: 10 ms each time that a bag is opened else."""
+    information = read_yaml(path)['rosbag2_bagfile_information']
+    if not isinstance(information, Mapping):
+        raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
+    return information
+
+
+def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
+    """
+    Return the files that metadata.yaml lists.
+
+    Their directory is this one whatever is written there: early versions put the name of the
+    bag before them, a bag may have been renamed since, and no name may lead elsewhere.
+    """
+    names = information.get('relative_file_paths')
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise BagError(
+            f'{directory / METADATA}: relative_file_paths is {names!r}, expected a list of names'
+        )
+    files = [directory / Path(name).name for name in names]
+    missing = [file.name for file in files if not file.is_file()]
+    if missing:
+        raise BagError(f'{directory}: {", ".join(missing)} of its {METADATA} is missing')
+    foreign = [file.name for file in files if not is_storage(file)]
+    if foreign:
+        raise BagError(
+            f'{directory / METADATA}: lists {", ".join(foreign)}, expected .mcap or .db3 files'
+        )
+    return files
+
+
+def loose_files(directory: Path) -> list[Path]:
+    """Return the storage files in a directory without metadata.yaml, bag_2 before bag_10."""
+    files = [file for file in directory.iterdir() if is_storage(file) and file.is_file()]
+    if not files:
+        raise BagError(
+            f'{directory}: not a bag: neither {METADATA} nor an .mcap or .db3 file in it'
+        )
+    return sorted(files, key=by_number)
+
+
+def damaged_metadata(path: Path, error: Exception) -> BagError:
+    """Return the error for a metadata.yaml that does not read."""
+    return BagError(
+        f'{path}: not the metadata of a bag: {type(error).__name__}: {error}; '
+        'without this file the .mcap and .db3 files beside it are read as they are'
+    )

@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Messages from a bag: rosbag2 (mcap, sqlite3, zstd) and ROS 1.
+
+The files of a rosbag2 directory are opened one by one and merged in record time. So a recording
+that was killed before its metadata.yaml was written still reads, and messages do not go missing
+where the descriptions of a topic in metadata.yaml and in the file differ: rosbags 0.11 then
+yields none, in silence. For the same reason all that is read is counted against what the indexes
+state. A file whose end is missing yields what is whole, and a warning says where it ends.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import ExitStack
+import heapq
+import logging
+from pathlib import Path
+import tempfile
+from typing import Any, NamedTuple, TYPE_CHECKING
+
+from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
+from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
+from surfel_mapper.bags.scanning import ScannedFile
+from surfel_mapper.bags.storage import (
+    damaged,
+    described,
+    is_cdr,
+    latches,
+    open_storage,
+    Storage,
+    type_name,
+)
+from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
+from surfel_mapper.errors import BagError, DependencyError
+from surfel_mapper.messages.raw_cloud import parse_cloud
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+    from rosbags.typesys.store import Typestore
+
+log = logging.getLogger(__name__)
+
+
+class BagMessage(NamedTuple):
+    """A message as it lies in the bag; ``BagReader.decode`` makes an object of it."""
+
+    topic: str
+    type: str
+    record_ns: int
+    raw: bytes | memoryview
+
+
+class BagReader:
+    """
+    The messages of a bag in the order of their record time.
+
+    Parameters
+    ----------
+    path : str or Path
+        A rosbag2 directory, one of its .mcap or .db3 files, or a ROS 1 .bag.
+
+    Attributes
+    ----------
+    topics : Topics
+        By name, with the number of messages that the index states.
+    is_ros1 : bool
+        Whether messages are serialised as in ROS 1; else they are CDR.
+    cuts : list of str
+        Which files end too early, and where; each is warned about once.
+
+    Raises
+    ------
+    BagError
+        If there is no such bag, it cannot be read, or it holds no messages.
+
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        """Open the bag and read its index."""
+        self.path = Path(path)
+        self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
+        self.cuts: list[str] = []
+        self._decoders: dict[str, tuple[Typestore, str]] = {}
+        self._storages: list[tuple[Path, Storage]] = []
+        with ExitStack() as files:
+            self._open(files_of(self.path), files)
+            self.topics = Topics(self.path, self._indexed_topics())
+            if not any(topic.count for topic in self.topics):
+                raise BagError(f'{self.path}: a bag without messages')
+            self._files = files.pop_all()
+        for cut in self.cuts:
+            log.warning(cut)
+
+    def __enter__(self) -> BagReader:
+        """Return the reader, to be closed at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the files."""
+        self._files.close()
+
+    @property
+    def start_ns(self) -> int:
+        """Record time of the first message."""
+        return min(s.start_time for _, s in self._storages if s.message_count)
+
+    @property
+    def end_ns(self) -> int:
+        """Record time of the last message."""
+        return max(s.end_time for _, s in self._storages if s.message_count) - 1
+
+    def is_latched(self, name: str) -> bool:
+        """Return whether the publisher of a topic kept messages for those who came later."""
+        return any(latches(c) for c in self._connections() if c.topic == name)
+
+    def messages(
+        self,
+        names: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[BagMessage]:
+        """
+        Yield messages in the order of their record time.
+
+        Parameters
+        ----------
+        names : collection of str, optional
+            The topics to read; all without.
+        start_ns, stop_ns : int, optional
+            Record time of the first message wanted, and of the first not wanted any more.
+
+        Raises
+        ------
+        BagError
+            If the bag turns out to be damaged, or yields nothing of a topic that should hold
+            messages. Where it yields fewer than stated, a warning says so.
+
+        """
+        read: Counter[str] = Counter()
+        streams = [
+            self._stream(path, storage, names, start_ns, stop_ns)
+            for path, storage in self._storages
+        ]
+        for message in heapq.merge(*streams, key=lambda message: message.record_ns):
+            read[message.topic] += 1
+            yield message
+        if start_ns is None and stop_ns is None and not self.cuts:
+            self._check_complete(read, names)
+
+    def decode(self, message: BagMessage) -> Any:
+        """
+        Return a message as an object with the attributes of its ROS type.
+
+        Raises
+        ------
+        CloudFormatError
+            If it should be a PointCloud2 and is none.
+        BagError
+            If it cannot be read as its type.
+
+        """
+        if message.type == CLOUD:
+            return parse_cloud(message.raw, ros1=self.is_ros1, topic=message.topic)
+        try:
+            store, type_ = self._decoder(message.type)
+            if self.is_ros1:
+                return store.deserialize_ros1(message.raw, type_)
+            return store.deserialize_cdr(message.raw, type_)
+        except Exception as error:
+            raise BagError(
+                f'{self.path}: {message.topic}: {len(message.raw)} bytes that are no '
+                f'{message.type}: {described(error)}'
+            ) from error
+
+    def _open(self, paths: list[Path], files: ExitStack) -> None:
+        """Open the files of the bag; of several the last may hold nothing, as after a crash."""
+        for number, path in enumerate(paths, 1):
+            file = self._unpacked(path, files) if is_packed(path) else path
+            try:
+                storage = open_storage(file, path)
+            except BagError as error:
+                if number == 1 or number < len(paths):
+                    raise
+                self.cuts.append(f'left out, nothing of it can be read: {error}')
+                continue
+            files.callback(storage.close)
+            self._storages.append((path, storage))
+            if isinstance(storage, ScannedFile) and storage.cut_at is not None:
+                self.cuts.append(
+                    f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
+                    f'{storage.size}; the {storage.message_count} messages found are read'
+                )
+            journal = path.with_name(f'{path.name}-wal')
+            if journal.is_file() and journal.stat().st_size:
+                self.cuts.append(
+                    f'{journal}: holds messages that are not read; merge them with '
+                    f'`sqlite3 {path} "PRAGMA wal_checkpoint(TRUNCATE)"`'
+                )
+
+    def _unpacked(self, path: Path, files: ExitStack) -> Path:
+        """Return a packed file unpacked into a temporary directory."""
+        directory = files.enter_context(tempfile.TemporaryDirectory(prefix='surfel_mapper-'))
+        target = Path(directory, unpacked_name(path))
+        if not unpack_file(path, target):
+            size = path.stat().st_size
+            self.cuts.append(f'{path}: the compressed file is cut off at byte {size}')
+        return target
+
+    def _connections(self) -> Iterator[Connection]:
+        """Yield the connections of all files."""
+        for _, storage in self._storages:
+            yield from storage.connections
+
+    def _indexed_topics(self) -> list[Topic]:
+        """Return the topics in all files with the counts of index or metadata.yaml."""
+        types: dict[str, set[str]] = {}
+        counts: Counter[str] = Counter()
+        for connection in self._connections():
+            types.setdefault(connection.topic, set()).add(type_name(connection))
+            counts[connection.topic] += connection.msgcount
+        if not self.cuts:
+            counts |= Counter(stated_counts(self.path))
+        return [
+            Topic(name, ', '.join(sorted(names)), counts[name])
+            for name, names in sorted(types.items())
+        ]
+
+    def _stream(
+        self,
+        path: Path,
+        storage: Storage,
+        names: Collection[str] | None,
+        start_ns: int | None,
+        stop_ns: int | None,
+    ) -> Iterator[BagMessage]:
+        """Yield the messages of one file; packed ones unpacked."""
+        wanted = [c for c in storage.connections if is_cdr(c)]
+        if names is not None:
+            wanted = [c for c in wanted if c.topic in names]
+        if not wanted:  # of an empty list rosbags would make all
+            return
+        messages, done = iter(storage.messages(wanted, start_ns, stop_ns)), 0
+        while True:
+            try:
+                connection, record_ns, raw = next(messages)
+                if raw[:4] == ZSTD_MAGIC and not self.is_ros1:
+                    raw = unpacked_message(raw)
+            except StopIteration:
+                return
+            except DependencyError:
+                raise
+            except Exception as error:
+                raise damaged(path, f'damaged after {done} messages', error) from error
+            done += 1
+            type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
+            yield BagMessage(connection.topic, type_, record_ns, raw)
+
+    def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
+        """Compare what was read of every topic with what the index states."""
+        asked = [topic for topic in self.topics if names is None or topic.name in names]
+        short = [topic for topic in asked if read[topic.name] < topic.count]
+        text = ', '.join(f'{topic.name} {read[topic.name]} of {topic.count}' for topic in short)
+        message = f'{self.path}: fewer messages than its index states: {text}'
+        if any(not read[topic.name] for topic in short):
+            raise BagError(f'{message}; try a single file of the bag, or `ros2 bag reindex`')
+        if short:
+            log.warning(message)
+
+    def _decoder(self, type_: str) -> tuple[Typestore, str]:
+        """Return who decodes a type, and the name it knows it by."""
+        if type_ not in self._decoders:
+            self._decoders[type_] = self._new_decoder(type_)
+        return self._decoders[type_]
+
+    def _new_decoder(self, type_: str) -> tuple[Typestore, str]:
+        """Return a decoder from rosbags' own definitions, or from the bag's for ROS 1."""
+        from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+
+        if not self.is_ros1:
+            return get_typestore(Stores.ROS2_JAZZY), type_
+        found = next(c for c in self._connections() if type_name(c) == type_)
+        store = get_typestore(Stores.EMPTY)
+        store.register(get_types_from_msg(found.msgdef.data, found.msgtype))
+        return store, found.msgtype

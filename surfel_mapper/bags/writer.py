@@ -1,0 +1,267 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Write rosbag2 directories, as mcap or sqlite3, through rosbags.
+
+A bag appears under its name once it is whole. Until then it grows in a hidden directory beside
+it, which is removed if anything fails; a bag that is overwritten stays until then too. rosbags
+writes the storage file under the name of its directory, so the hidden one holds a directory of
+the final name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+import shutil
+import tempfile
+from typing import Any, TYPE_CHECKING
+
+import numpy as np
+
+from surfel_mapper.bags.profiles import latched_profile
+from surfel_mapper.errors import BagError
+from surfel_mapper.messages.pointcloud2 import CloudBytes
+from surfel_mapper.messages.pose_messages import StampedPose
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+STORAGES = ('mcap', 'sqlite3')
+
+METADATA = 'metadata.yaml'
+"""The file that makes a directory a bag."""
+
+
+class BagWriter:
+    """
+    A bag being written, to be used in a with-block: whole at its end, or not there.
+
+    Parameters
+    ----------
+    path : str or Path
+        Directory of the bag; missing parents are made.
+    storage : str
+        mcap or sqlite3.
+    overwrite : bool
+        Whether a bag, or an empty directory, of that name gives way.
+
+    Attributes
+    ----------
+    directory : Path
+        Inside the with-block: where the bag is being written. Files put there go with it.
+
+    Raises
+    ------
+    BagError
+        If the storage is unknown, or something is there that may not be overwritten; later, if
+        it cannot be written.
+
+    """
+
+    def __init__(
+        self, path: str | Path, storage: str = 'mcap', *, overwrite: bool = False
+    ) -> None:
+        self.path = Path(path).absolute()
+        self.storage = storage
+        self.overwrite = overwrite
+        self.directory = self.path
+        self._connections: dict[str, Connection] = {}
+        if storage not in STORAGES:
+            raise BagError(f'storage {storage!r}: expected {" or ".join(STORAGES)}')
+        self._check_free()
+
+    def __enter__(self) -> BagWriter:
+        """Begin the bag in a hidden directory beside its path."""
+        from rosbags.rosbag2 import StoragePlugin, Writer
+        from rosbags.typesys import get_typestore, Stores
+
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        with self._refusing():
+            self._missing = [p for p in self.path.parents if not p.exists()]
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            prefix = f'.{self.path.name}.'
+            self._hidden = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
+            self.directory = self._hidden / self.path.name
+            plugin = StoragePlugin[self.storage.upper()]
+            self._writer = Writer(self.directory, version=9, storage_plugin=plugin)
+            try:
+                self._writer.open()
+            except BaseException:
+                shutil.rmtree(self._hidden, ignore_errors=True)
+                raise
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        """Give the bag its name, or remove what there is of it after an error."""
+        try:
+            if kind is not None:
+                self._writer.abort()
+                return
+            with self._refusing():
+                self._writer.close()
+                self._check_free()
+                self._take_name()
+        finally:
+            shutil.rmtree(self._hidden, ignore_errors=True)
+            self.directory = self.path
+            if not self.path.exists():
+                self._remove_parents()
+
+    def _remove_parents(self) -> None:
+        """Remove the parents that were made for the bag, as far as nothing else is in them."""
+        for directory in self._missing:
+            with suppress(OSError):
+                directory.rmdir()
+
+    def write(
+        self,
+        topic: str,
+        type_: str,
+        record_ns: int,
+        raw: bytes | memoryview,
+        *,
+        latched: bool = False,
+    ) -> None:
+        """
+        Append a message; the first of a topic adds the topic.
+
+        Parameters
+        ----------
+        topic, type_ : str
+            A type of ROS 2 Jazzy, such as sensor_msgs/msg/PointCloud2.
+        record_ns : int
+            When it is recorded; messages are expected in this order.
+        raw : bytes
+            The message as CDR.
+        latched : bool
+            Whether late subscribers still get the last message: transient local.
+
+        """
+        with self._refusing():
+            if topic not in self._connections:
+                profiles = [latched_profile()] if latched else []
+                self._connections[topic] = self._writer.add_connection(
+                    topic, type_, typestore=self._store, offered_qos_profiles=profiles
+                )
+            self._writer.write(self._connections[topic], record_ns, raw)
+
+    def write_cloud(
+        self,
+        topic: str,
+        record_ns: int,
+        stamp_ns: int,
+        frame_id: str,
+        cloud: CloudBytes,
+        *,
+        latched: bool = False,
+    ) -> None:
+        """Append a sensor_msgs/PointCloud2."""
+        fields = [
+            self._new('sensor_msgs/msg/PointField', f.name, f.offset, f.datatype, f.count)
+            for f in cloud.fields
+        ]
+        message = self._new(
+            'sensor_msgs/msg/PointCloud2',
+            self._header(stamp_ns, frame_id),
+            cloud.height,
+            cloud.width,
+            fields,
+            cloud.is_bigendian,
+            cloud.point_step,
+            cloud.row_step,
+            cloud.data,
+            cloud.is_dense,
+        )
+        self._write_message(topic, record_ns, message, latched=latched)
+
+    def write_transform(
+        self, topic: str, record_ns: int, pose: StampedPose, *, latched: bool = False
+    ) -> None:
+        """Append a tf2_msgs/TFMessage of one transform; latched for static ones."""
+        transform = self._new(
+            'geometry_msgs/msg/TransformStamped',
+            self._header(pose.stamp_ns, pose.parent),
+            pose.child,
+            self._new(
+                'geometry_msgs/msg/Transform', self._vector(pose.xyz), self._turn(pose.q_xyzw)
+            ),
+        )
+        message = self._new('tf2_msgs/msg/TFMessage', [transform])
+        self._write_message(topic, record_ns, message, latched=latched)
+
+    def write_odometry(
+        self, topic: str, record_ns: int, pose: StampedPose, twist: Iterable[float]
+    ) -> None:
+        """Append a nav_msgs/Odometry; the twist in the child's frame, m/s and then rad/s."""
+        unknown = np.zeros(36)
+        place = self._new('geometry_msgs/msg/Point', *map(float, pose.xyz))
+        where = self._new('geometry_msgs/msg/Pose', place, self._turn(pose.q_xyzw))
+        v = tuple(twist)
+        motion = self._new('geometry_msgs/msg/Twist', self._vector(v[:3]), self._vector(v[3:]))
+        message = self._new(
+            'nav_msgs/msg/Odometry',
+            self._header(pose.stamp_ns, pose.parent),
+            pose.child,
+            self._new('geometry_msgs/msg/PoseWithCovariance', where, unknown),
+            self._new('geometry_msgs/msg/TwistWithCovariance', motion, unknown),
+        )
+        self._write_message(topic, record_ns, message)
+
+    def _take_name(self) -> None:
+        """Put the bag under its name; what had the name comes back if that fails."""
+        replaced = self._hidden / 'replaced'
+        if self.path.exists():
+            self.path.rename(replaced)
+        try:
+            self.directory.rename(self.path)
+        except OSError:
+            if replaced.exists():
+                replaced.rename(self.path)
+            raise
+
+    def _write_message(
+        self, topic: str, record_ns: int, message: Any, *, latched: bool = False
+    ) -> None:
+        """Serialise a message and append it."""
+        type_ = message.__msgtype__
+        raw = self._store.serialize_cdr(message, type_)
+        self.write(topic, type_, record_ns, raw, latched=latched)
+
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
+        """Return a std_msgs/Header."""
+        stamp = self._new('builtin_interfaces/msg/Time', *divmod(stamp_ns, 10**9))
+        return self._new('std_msgs/msg/Header', stamp, frame_id)
+
+    def _vector(self, xyz: Iterable[float]) -> Any:
+        """Return a geometry_msgs/Vector3."""
+        return self._new('geometry_msgs/msg/Vector3', *map(float, xyz))
+
+    def _turn(self, q_xyzw: Iterable[float]) -> Any:
+        """Return a geometry_msgs/Quaternion."""
+        return self._new('geometry_msgs/msg/Quaternion', *map(float, q_xyzw))
+
+    def _new(self, type_: str, *values: Any) -> Any:
+        """Return a message with its fields in the order of its definition."""
+        return self._store.types[type_](*values)
+
+    def _check_free(self) -> None:
+        """Refuse to write over anything that may not go."""
+        if not self.path.exists() and not self.path.is_symlink():
+            return
+        if not self.overwrite:
+            raise BagError(f'{self.path}: exists; name another directory or overwrite it')
+        if self.path.is_symlink() or not self.path.is_dir():
+            raise BagError(f'{self.path}: not a directory, so not a bag to overwrite')
+        if not (self.path / METADATA).exists() and any(self.path.iterdir()):
+            raise BagError(f'{self.path}: holds files but no {METADATA}: no bag to overwrite')
+
+    @contextmanager
+    def _refusing(self) -> Iterator[None]:
+        """Turn errors of the system into a BagError that names the bag."""
+        try:
+            yield
+        except OSError as error:
+            reason = error.strerror or error
+            raise BagError(f'{self.path}: cannot be written: {reason}') from error

@@ -1,0 +1,206 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A whole map with its window in one file, exact: what is loaded has the digest of what was saved.
+
+The integers of every voxel are stored, and for each scan of the window its moments, stamp, pose
+and, where kept, points; so a map that is loaded goes on as if it had never stopped. Nothing in a
+file is believed: voxels have to be sorted and their numbers possible, and the digest has to
+come out right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.kernels.layout import HALF, MAX_MAP_COUNT
+from surfel_mapper.mapping.channels import channel_names
+from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
+
+KIND = 'surfel map'
+NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
+
+
+def save_map(
+    path: str | Path,
+    surfel_map: SurfelMap,
+    window: Iterable[WindowedScan] = (),
+    *,
+    compress: bool = False,
+) -> str:
+    """
+    Write a map, and the scans of its window, to a file; return the digest of the map.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, by custom with the extension npz; written whole or not at all.
+    surfel_map : SurfelMap
+        The map.
+    window : iterable of WindowedScan
+        The scans that can still leave it, oldest first: its SlidingWindow.
+    compress : bool
+        Pack: 1.7 times smaller, 4 times slower.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    digest = surfel_map.digest()
+    moments = surfel_map.moments()
+    arrays: dict[str, npt.NDArray[Any]] = {f'map.{n}': getattr(moments, n) for n in NAMES}
+    scans = list(window)
+    for number, scan in enumerate(scans):
+        for name in NAMES:
+            arrays[f'scan{number}.{name}'] = getattr(scan.moments, name)
+        if scan.points is not None:
+            arrays[f'scan{number}.points'] = scan.points
+    arrays['scans.stamp_ns'] = np.array([scan.stamp_ns for scan in scans], np.int64)
+    arrays['scans.pose'] = np.array([scan.T_map_sensor for scan in scans]).reshape(-1, 4, 4)
+    attributes = {
+        'kind': KIND,
+        'voxel_size_m': surfel_map.voxel_size_m,
+        'level': surfel_map.level,
+        'columns': surfel_map.columns,
+        'digest': digest,
+    }
+    save_state(path, arrays, attributes, compress=compress)
+    return digest
+
+
+def load_map(
+    path: str | Path, *, voxel_size_m: float | None = None
+) -> tuple[SurfelMap, list[WindowedScan]]:
+    """
+    Return a map and the scans of its window, as they were saved.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that save_map wrote.
+    voxel_size_m : float, optional
+        The voxel size that the map has to have.
+
+    Returns
+    -------
+    SurfelMap
+        Its digest equals that of the map saved.
+    list of WindowedScan
+        For SlidingWindow.restore.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, of another kind or version, or of another voxel
+        size.
+
+    """
+    arrays, attributes = load_state(path)
+    if attributes.get('kind') != KIND:
+        raise FileFormatError(f'{path}: holds {attributes.get("kind")!r}, expected a {KIND}')
+    found_m: Any = attributes.get('voxel_size_m')
+    if voxel_size_m is not None and found_m != voxel_size_m:
+        raise FileFormatError(
+            f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
+        )
+    try:
+        surfel_map = SurfelMap(
+            found_m, columns=tuple(attributes['columns']), level=attributes['level']
+        )
+        surfel_map.insert(_moments(arrays, 'map', surfel_map))
+        scans = [_scan(arrays, number, surfel_map) for number in range(_num_scans(arrays))]
+        held = SurfelMap(found_m, columns=surfel_map.columns, level=surfel_map.level)
+        for scan in scans:
+            held.insert(scan.moments)
+        surfel_map.copy().subtract(held)  # so that every scan can leave
+    except (MapError, ValueError, TypeError, LookupError) as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+    digest = surfel_map.digest()
+    if digest != attributes.get('digest'):
+        raise FileFormatError(
+            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
+        )
+    return surfel_map, scans
+
+
+def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
+    return len(arrays['scans.stamp_ns'])
+
+
+def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMap) -> WindowedScan:
+    """Return one scan of the window."""
+    pose = arrays['scans.pose'][number]
+    if pose.shape != (4, 4) or pose.dtype != np.float64 or not np.isfinite(pose).all():
+        raise ValueError(f'scan {number}: no finite (4, 4) pose')
+    return WindowedScan(
+        moments=_moments(arrays, f'scan{number}', surfel_map),
+        stamp_ns=int(arrays['scans.stamp_ns'][number]),
+        T_map_sensor=pose,
+        points=arrays.get(f'scan{number}.points'),
+    )
+
+
+def _moments(
+    arrays: dict[str, npt.NDArray[Any]], prefix: str, surfel_map: SurfelMap
+) -> ScanMoments:
+    """Return the moments under a prefix."""
+    parts = {name: arrays[f'{prefix}.{name}'] for name in NAMES}
+    return checked_moments(parts, surfel_map, prefix)
+
+
+def checked_moments(
+    parts: dict[str, npt.NDArray[Any]], surfel_map: SurfelMap, prefix: str
+) -> ScanMoments:
+    """
+    Return moments from a file, which have to be possible: the kernels rely on it.
+
+    Parameters
+    ----------
+    parts : dict of str to array
+        The arrays of ScanMoments by name.
+    surfel_map : SurfelMap
+        The map that they are for.
+    prefix : str
+        What errors call them.
+
+    Raises
+    ------
+    ValueError
+        If shapes or types are wrong, a voxel stands twice or its numbers cannot be.
+
+    """
+    key, count = parts['key'], parts['count']
+    names = channel_names(surfel_map.columns)
+    widths = {'total': (3,), 'product': (6,), 'view': (3,), 'channels': (len(names),)}
+    for name, array in parts.items():
+        if array.shape != (len(key), *widths.get(name, ())) or array.dtype.kind != 'i':
+            raise ValueError(f'{prefix}.{name}: {array.dtype} {array.shape}')
+    if any(parts[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
+        raise ValueError(f'{prefix}: keys, products or channels are not int64')
+    if len(np.unique(key)) < len(key) or (key < 0).any():
+        raise ValueError(f'{prefix}: a voxel stands twice, or is none')
+    most = np.abs(parts['total']).max(axis=1, initial=0) / (HALF << surfel_map.level)
+    if (count < 1).any() or (count > MAX_MAP_COUNT).any() or (most > count).any():
+        raise ValueError(f'{prefix}: impossible numbers of points')
+    return ScanMoments(
+        voxel_size_m=surfel_map.voxel_size_m,
+        level=surfel_map.level,
+        key=key,
+        count=count,
+        total=parts['total'],
+        product=parts['product'],
+        view=parts['view'],
+        channel_names=names,
+        channels=parts['channels'],
+    )

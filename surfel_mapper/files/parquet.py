@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Maps as Parquet, one row a surfel: what it is, and the integers that it is made of.
+
+Every voxel has a row, however few its points, sorted by voxel: its index i j k, what SurfelMap
+derives (x y z nx ny nz planarity curvature), and the exact moments as int64 (num_points, sum_*,
+sum_**, view_*). From the moments the map is built again with the same digest, which stands in
+the file and is checked, so a file that was changed is refused. Tools that know nothing of this
+package read the columns by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import DependencyError, FileFormatError, MapError
+from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.map_state import checked_moments
+from surfel_mapper.mapping.channels import channel_names
+from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+KIND, VERSION = 'surfel_mapper surfels', 1
+
+METADATA = b'surfel_mapper'
+"""Where in the file the attributes are, as JSON."""
+
+INDEX = ('i', 'j', 'k')
+SUMS = ('sum_x', 'sum_y', 'sum_z')
+PRODUCTS = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
+VIEWS = ('view_x', 'view_y', 'view_z')
+
+Columns = dict[str, npt.NDArray[Any]]
+
+
+def write_map(path: str | Path, surfel_map: SurfelMap) -> str:
+    """
+    Write a map as Parquet, whole or not at all; return its digest.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    surfel_map : SurfelMap
+        The map.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+    DependencyError
+        If pyarrow is not installed.
+
+    """
+    arrow, parquet = import_pyarrow()
+    attributes = attributes_of(surfel_map)
+    table = arrow.table(map_columns(surfel_map))
+    table = table.replace_schema_metadata({METADATA: json.dumps(attributes)})
+    with replace_file(path) as file:
+        parquet.write_table(table, file, compression='zstd')
+    return str(attributes['digest'])
+
+
+def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMap:
+    """
+    Return the map in a Parquet file, exactly as it was written.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that write_map wrote.
+    voxel_size_m : float, optional
+        The voxel size that the map has to have.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, of another kind or version, or of another voxel
+        size.
+    DependencyError
+        If pyarrow is not installed.
+
+    """
+    arrow, parquet = import_pyarrow()
+    try:
+        with open(path, 'rb') as file, parquet.ParquetFile(file) as content:
+            num_rows = content.metadata.num_rows
+            if num_rows > os.fstat(file.fileno()).st_size:  # no two rows are alike
+                raise FileFormatError(f'{path}: damaged: {num_rows} rows in so small a file')
+            attributes = read_attributes(path, content.schema_arrow.metadata or {})
+            surfel_map = map_of(attributes, voxel_size_m, path)
+            names = moment_names(surfel_map)
+            table = content.read(columns=list(names))
+            columns = {name: int64_column(table, name) for name in names}
+    except FileFormatError:
+        raise
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    except (arrow.ArrowException, ValueError, LookupError, TypeError) as error:
+        raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
+    fill(surfel_map, columns, path)
+    digest = surfel_map.digest()
+    if digest != attributes.get('digest'):
+        raise FileFormatError(
+            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
+        )
+    return surfel_map
+
+
+def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, Any]:
+    """Return what a file says of its map; the digest only where wanted."""
+    return {
+        'kind': KIND,
+        'version': VERSION,
+        'voxel_size_m': surfel_map.voxel_size_m,
+        'level': surfel_map.level,
+        'columns': surfel_map.columns,
+        **({'digest': surfel_map.digest()} if digest else {}),
+    }
+
+
+def map_columns(surfel_map: SurfelMap, *, derived: bool = True) -> Columns:
+    """Return every column of the file, sorted by voxel; those derived only where wanted."""
+    moments = surfel_map.moments()
+    columns: Columns = {
+        **named(INDEX, moments.voxel_index),
+        **(derived_columns(surfel_map) if derived else {}),
+        'num_points': moments.count,
+        **named(SUMS, moments.total),
+        **named(PRODUCTS, moments.product),
+        **named(VIEWS, moments.view),
+        **named(channel_columns(surfel_map), moments.channels),
+    }
+    return {name: np.ascontiguousarray(values) for name, values in columns.items()}
+
+
+def derived_columns(surfel_map: SurfelMap) -> Columns:
+    """Return what a map derives from its moments, sorted by voxel."""
+    surfels = surfel_map.surfels()
+    surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
+    return {
+        **named(('x', 'y', 'z'), surfels.position),
+        **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
+        'planarity': surfels.planarity.astype(np.float32),
+        'curvature': surfels.curvature.astype(np.float32),
+    }
+
+
+def named(names: tuple[str, ...], table: npt.NDArray[Any]) -> Columns:
+    """Return the columns of a table (K, C) by name."""
+    return dict(zip(names, table.T, strict=True))
+
+
+def channel_columns(surfel_map: SurfelMap) -> tuple[str, ...]:
+    """Return what the sums of intensity and colour are called."""
+    return tuple(f'sum_{name}' for name in channel_names(surfel_map.columns))
+
+
+def moment_names(surfel_map: SurfelMap) -> tuple[str, ...]:
+    """Return the columns from which a map is built."""
+    return (*INDEX, 'num_points', *SUMS, *PRODUCTS, *VIEWS, *channel_columns(surfel_map))
+
+
+def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
+    """Return what a file says of its map."""
+    if METADATA not in metadata:
+        raise FileFormatError(f'{path}: no map of surfel_mapper, but another Parquet file')
+    attributes: dict[str, Any] = json.loads(metadata[METADATA])
+    found = (attributes['kind'], attributes['version'])
+    if found != (KIND, VERSION):
+        raise FileFormatError(
+            f'{path}: kind {found[0]!r}, version {found[1]!r}, expected {KIND!r}, '
+            f'version {VERSION}'
+        )
+    return attributes
+
+
+def map_of(
+    attributes: Mapping[str, Any], voxel_size_m: float | None, path: str | Path
+) -> SurfelMap:
+    """Return an empty map as the attributes state it."""
+    found_m = attributes['voxel_size_m']
+    if voxel_size_m is not None and found_m != voxel_size_m:
+        raise FileFormatError(
+            f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
+        )
+    return SurfelMap(found_m, columns=tuple(attributes['columns']), level=attributes['level'])
+
+
+def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
+    """Return a column of whole numbers, refusing anything else."""
+    column = table.column(name)
+    if column.null_count or str(column.type) not in ('int64', 'int32'):
+        raise ValueError(f'column {name}: {column.type} with {column.null_count} missing')
+    return np.asarray(column.to_numpy(), np.int64)
+
+
+def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
+    """Insert the moments in the columns of a file into a map."""
+
+    def table(names: tuple[str, ...]) -> npt.NDArray[np.int64]:
+        stacked = [columns[name] for name in names]
+        return np.stack(stacked, axis=1) if stacked else np.empty((len(columns['i']), 0), np.int64)
+
+    try:
+        parts = {
+            'key': pack_keys(table(INDEX)),
+            'count': columns['num_points'],
+            'total': table(SUMS),
+            'product': table(PRODUCTS),
+            'view': table(VIEWS),
+            'channels': table(channel_columns(surfel_map)),
+        }
+        surfel_map.insert(checked_moments(parts, surfel_map, 'rows'))
+    except (MapError, ValueError, TypeError) as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+
+
+def import_pyarrow() -> tuple[Any, Any]:
+    """Return pyarrow and its Parquet part."""
+    try:
+        import pyarrow
+        from pyarrow import parquet
+    except ImportError as error:
+        raise DependencyError(
+            f'pyarrow cannot be loaded ({error}). It reads and writes Parquet; install it with '
+            "`pip install 'surfel_mapper[formats]'` or `pip install pyarrow`"
+        ) from error
+    return pyarrow, parquet

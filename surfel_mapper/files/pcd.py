@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Surfels and points as PCD, for PCL and what is built on it.
+
+Written binary with the columns of ~/normals, among them normal_x normal_y normal_z curvature, the
+names of PCL's PointNormal. All are float32, as PCL's point types are: a field x of doubles it
+leaves out in silence. That rounds by 0.5 mm at 10 km from the origin; PLY and Parquet keep
+doubles. Read in every encoding: ascii, binary, and binary_compressed, where each column is packed
+with LZF, which the extra ``formats`` brings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+import os
+from pathlib import Path
+import struct
+from typing import Any, BinaryIO, TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.mapping.surfel_columns import surfel_columns
+
+if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfels import Surfels
+
+KINDS = {'f': 'F', 'i': 'I', 'u': 'U'}
+
+SIZES = {'F': (4, 8), 'I': (1, 2, 4, 8), 'U': (1, 2, 4, 8)}
+"""Bytes that a number of each type may have."""
+
+MAX_HEADER_BYTES = 65536
+
+MAX_COUNT = 4096
+"""Numbers of one field in a point; feature histograms have some hundreds."""
+
+MAX_RATIO = 100
+"""LZF packs at most 88 times; what claims more is not unpacked."""
+
+Columns = dict[str, npt.NDArray[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """What the text before the points states."""
+
+    layout: np.dtype[Any]
+    num_points: int
+    encoding: str
+
+
+def write_surfels(path: str | Path, surfels: Surfels) -> None:
+    """
+    Write surfels as a binary PCD, whole or not at all.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    write_points(path, surfel_columns(surfels))
+
+
+def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
+    """
+    Write columns of equal length K as a binary PCD, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    columns : mapping of str to (K,) array
+        At least one, of integers, float32 or float64.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
+    table = np.empty(len(next(iter(columns.values()))), layout)
+    for name, values in columns.items():
+        table[name] = values
+    types = [values.dtype for values in columns.values()]
+    header = (
+        '# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n'
+        f'FIELDS {" ".join(columns)}\n'
+        f'SIZE {" ".join(str(type_.itemsize) for type_ in types)}\n'
+        f'TYPE {" ".join(KINDS[type_.kind] for type_ in types)}\n'
+        f'COUNT {" ".join("1" for _ in types)}\n'
+        f'WIDTH {len(table)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\n'
+        f'POINTS {len(table)}\nDATA binary\n'
+    )
+    with replace_file(path) as file:
+        file.write(header.encode('ascii'))
+        file.write(table.view(np.uint8).data)
+
+
+def read_points(path: str | Path) -> Columns:
+    """
+    Return the fields of the points of a PCD file, each (K,), or (K, C) where its count is C.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is no PCD, is truncated or damaged.
+    DependencyError
+        If it is binary_compressed and no module lzf is installed.
+
+    """
+    try:
+        with open(path, 'rb') as file:
+            size = os.fstat(file.fileno()).st_size
+            header = read_header(path, file)
+            if header.encoding == 'binary':
+                table = binary_table(path, header, file, size - file.tell())
+            elif header.encoding == 'binary_compressed':
+                table = compressed_table(path, header, file)
+            else:
+                table = ascii_table(path, header, file)
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    return {name: np.ascontiguousarray(table[name]) for name in header.layout.names or ()}
+
+
+def read_header(path: str | Path, file: BinaryIO) -> Header:
+    """Return what the header states; leave the file at the first point."""
+    words: dict[str, list[str]] = {}
+    while 'DATA' not in words:
+        line = file.readline(MAX_HEADER_BYTES)
+        if not line or file.tell() > MAX_HEADER_BYTES:
+            raise FileFormatError(f'{path}: no header of a PCD file')
+        keyword, *values = line.decode('ascii', 'replace').partition('#')[0].split() or ['']
+        words[keyword] = values
+    try:
+        names, kinds = words['FIELDS'], words['TYPE']
+        sizes = [int(word) for word in words['SIZE']]
+        counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
+        num_points = int(words['POINTS'][0])
+        (encoding,) = words['DATA']
+        fields = [
+            field_of(*stated, place)
+            for place, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
+        ]
+        layout = np.dtype(fields)
+        if not fields:
+            raise ValueError('no fields')
+    except (LookupError, ValueError) as error:
+        raise FileFormatError(f'{path}: a PCD header that does not fit: {error}') from error
+    if num_points < 0 or encoding not in ('ascii', 'binary', 'binary_compressed'):
+        raise FileFormatError(
+            f'{path}: {num_points} points, DATA {encoding}, expected ascii, binary or '
+            'binary_compressed'
+        )
+    return Header(layout, num_points, encoding)
+
+
+def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[Any, ...]:
+    """Return a field as numpy states it; padding, which is called _, gets a name of its own."""
+    if size not in SIZES[kind] or not 1 <= count <= MAX_COUNT:
+        raise ValueError(f'field {name} of type {kind}, size {size}, count {count}')
+    unique = f'_{place}' if name == '_' else name
+    code = f'<{kind.lower()}{size}'
+    return (unique, code) if count == 1 else (unique, code, (count,))
+
+
+def binary_table(path: str | Path, header: Header, file: BinaryIO, left: int) -> npt.NDArray[Any]:
+    """Return the points of an uncompressed file."""
+    size = header.num_points * header.layout.itemsize
+    if size > left:
+        raise FileFormatError(
+            f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
+            'points; truncated?'
+        )
+    return np.frombuffer(file.read(size), header.layout)
+
+
+def compressed_table(path: str | Path, header: Header, file: BinaryIO) -> npt.NDArray[Any]:
+    """Return the points of a compressed file, in which every field lies on its own."""
+    try:
+        import lzf
+    except ImportError as error:
+        raise DependencyError(
+            f'{path}: lzf cannot be loaded ({error}). It unpacks compressed PCD files; install it '
+            "with `pip install 'surfel_mapper[formats]'` or `pip install python-neo-lzf`"
+        ) from error
+    sizes = file.read(8)
+    packed_size, size = struct.unpack('<II', sizes.ljust(8, b'\0'))
+    packed = file.read(packed_size)
+    expected = header.num_points * header.layout.itemsize
+    is_whole = len(packed) == packed_size and len(sizes) == 8
+    if not is_whole or size != expected or size > MAX_RATIO * packed_size:
+        raise FileFormatError(
+            f'{path}: {len(packed)} of {packed_size} packed bytes, for {size} bytes of points, '
+            f'expected {expected}; truncated?'
+        )
+    try:
+        content = lzf.decompress(packed, size) if size else b''
+    except ValueError as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+    if content is None or len(content) != size:
+        raise FileFormatError(f'{path}: damaged: its points do not unpack')
+    table = np.empty(header.num_points, header.layout)
+    at = 0
+    for name in header.layout.names or ():
+        column = table[name]
+        column[...] = np.frombuffer(content, column.dtype, column.size, at).reshape(column.shape)
+        at += column.nbytes
+    return table
+
+
+def ascii_table(path: str | Path, header: Header, file: BinaryIO) -> npt.NDArray[Any]:
+    """Return the points of a text file."""
+    numbers = header.layout.itemsize and sum(
+        int(np.prod(header.layout[name].shape)) for name in header.layout.names or ()
+    )
+    words = file.read().split()
+    if len(words) != header.num_points * numbers:
+        raise FileFormatError(
+            f'{path}: {len(words)} numbers, expected {header.num_points * numbers} for '
+            f'{header.num_points} points; truncated?'
+        )
+    table = np.empty(header.num_points, header.layout)
+    rows = np.array(words, object).reshape(header.num_points, numbers)
+    at = 0
+    try:
+        for name in header.layout.names or ():
+            column = table[name]
+            width = int(np.prod(header.layout[name].shape))
+            values = rows[:, at : at + width].reshape(column.shape)
+            column[...] = values.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
+            at += width
+    except (ValueError, OverflowError) as error:
+        raise FileFormatError(f'{path}: {error}') from error
+    return table

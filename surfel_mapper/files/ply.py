@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Surfels and points as PLY, for CloudCompare and MeshLab.
+
+Written binary, little endian, one row a surfel: x y z nx ny nz planarity curvature num_points.
+Positions are doubles: float32 rounds by 0.5 mm at 10 km from the origin and by 0.25 m at the
+northings of UTM, where the map itself still knows 8 micrometres; programs that draw in float32
+shift such coordinates on import. All else is float32, which holds a normal to 1e-5 deg, and
+uint32 for the counts.
+
+The format is a text header and a table, so numpy alone reads and writes it. (plyfile, the usual
+library, is under the GPL, which this package is not; the tests read the files with it.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+import os
+from pathlib import Path
+from typing import Any, BinaryIO, TYPE_CHECKING
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.atomic import replace_file
+
+if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfels import Surfels
+    from surfel_mapper.tsdf.mesh import Mesh
+
+TYPES = {
+    'char': 'i1',
+    'uchar': 'u1',
+    'short': 'i2',
+    'ushort': 'u2',
+    'int': 'i4',
+    'uint': 'u4',
+    'float': 'f4',
+    'double': 'f8',
+    'int8': 'i1',
+    'uint8': 'u1',
+    'int16': 'i2',
+    'uint16': 'u2',
+    'int32': 'i4',
+    'uint32': 'u4',
+    'float32': 'f4',
+    'float64': 'f8',
+}
+"""Numpy's name of every scalar type of PLY; it has an old and a new name for each."""
+
+NAMES = {np.dtype(TYPES[name]): name for name in list(TYPES)[:8]}
+
+ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
+
+MAX_HEADER_BYTES = 65536
+
+
+def write_surfels(path: str | Path, surfels: Surfels) -> None:
+    """
+    Write surfels as a binary PLY, whole or not at all.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    values = {
+        **dict(zip('xyz', surfels.position.T, strict=True)),
+        **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
+        'planarity': surfels.planarity.astype(np.float32),
+        'curvature': surfels.curvature.astype(np.float32),
+        'num_points': surfels.num_points.astype(np.uint32),
+        **channel_columns(surfels),
+    }
+    write_points(path, values)
+
+
+def channel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
+    """Return the mean intensity, float32, and colour, a byte a channel, where there are any."""
+    columns: dict[str, npt.NDArray[Any]] = {}
+    for name, values in surfels.channels.items():
+        is_colour = name != 'intensity'
+        columns[name] = np.rint(values).astype(np.uint8) if is_colour else np.float32(values)
+    return columns
+
+
+def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
+    """
+    Write columns of equal length K as the vertices of a binary PLY, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    columns : mapping of str to (K,) array
+        At least one, of integers of up to 32 bits, float32 or float64.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    properties, table = as_table(columns)
+    header = (
+        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        f'element vertex {len(table)}\n{properties}end_header\n'
+    )
+    with replace_file(path) as file:
+        file.write(header.encode('ascii'))
+        file.write(table.view(np.uint8).data)
+
+
+def write_mesh(path: str | Path, mesh: Mesh) -> None:
+    """
+    Write a mesh as a binary PLY, with the colours of the vertices where there are any.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    columns = dict(zip('xyz', mesh.vertices.T, strict=True))
+    if len(mesh.colors):
+        columns.update(zip(('red', 'green', 'blue'), mesh.colors.T, strict=True))
+    layout = np.dtype([('count', 'u1'), ('corners', '<i4', (3,))])
+    faces = np.empty(len(mesh), layout)
+    faces['count'], faces['corners'] = 3, mesh.triangles
+    properties, vertices = as_table(columns)
+    header = (
+        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        f'element vertex {len(vertices)}\n{properties}'
+        f'element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n'
+    )
+    with replace_file(path) as file:
+        file.write(header.encode('ascii'))
+        file.write(vertices.view(np.uint8).data)
+        file.write(faces.view(np.uint8).data)
+
+
+def as_table(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, npt.NDArray[Any]]:
+    """Return columns as the lines of a header and as a structured array."""
+    layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
+    table = np.empty(len(next(iter(columns.values()))), layout)
+    for name, values in columns.items():
+        table[name] = values
+    properties = ''.join(
+        f'property {NAMES[values.dtype.newbyteorder("=")]} {name}\n'
+        for name, values in columns.items()
+    )
+    return properties, table
+
+
+def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
+    """
+    Return the properties of the vertices of a PLY file, each an array of length K.
+
+    Parameters
+    ----------
+    path : str or Path
+        A PLY file, binary or ascii. Its first element has to be the vertices, and these have to
+        be plain numbers; elements after them (faces) are not read.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is no PLY, is of another structure or truncated.
+
+    """
+    try:
+        with open(path, 'rb') as file:
+            count, layout, is_text = read_header(path, file)
+            if is_text:
+                return text_columns(path, count, layout, file)
+            size, left = count * layout.itemsize, os.fstat(file.fileno()).st_size - file.tell()
+            if size > left:
+                raise FileFormatError(
+                    f'{path}: {left} bytes after the header, expected {size} for {count} '
+                    'vertices; truncated?'
+                )
+            table = np.frombuffer(file.read(size), layout)
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    return {
+        name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
+        for name in layout.names or ()
+    }
+
+
+def text_columns(
+    path: str | Path, count: int, layout: np.dtype[Any], file: BinaryIO
+) -> dict[str, npt.NDArray[Any]]:
+    """Return the properties of the vertices of an ascii file."""
+    names = layout.names or ()
+    words = file.read().split()[: count * len(names)]
+    if len(words) < count * len(names):
+        raise FileFormatError(
+            f'{path}: {len(words)} numbers, expected {count * len(names)} for {count} vertices; '
+            'truncated?'
+        )
+    try:
+        # one by one: as an array of texts every number takes the room of the longest
+        table = np.array([float(word) for word in words]).reshape(count, len(names))
+    except ValueError as error:
+        raise FileFormatError(f'{path}: {error}') from error
+    with np.errstate(invalid='ignore'):  # what is no whole number of its type becomes any
+        return {name: table[:, at].astype(layout[name]) for at, name in enumerate(names)}
+
+
+def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool]:
+    """
+    Return the number and layout of the vertices, and whether they are text.
+
+    The file is left at the first of them.
+    """
+    header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
+    lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
+    if not found or not lines or lines[0] != ['ply']:
+        raise FileFormatError(f'{path}: no header of a PLY file')
+    file.seek(len(header))
+    file.readline()
+    lines = [line for line in lines[1:] if line and line[0] not in ('comment', 'obj_info')]
+    try:
+        (_, encoding, version), (_, element, count), *others = lines
+        after = [i for i, line in enumerate(others) if line[0] == 'element']
+        properties = others[: after[0]] if after else others
+        layout = np.dtype([(name, ORDERS[encoding] + TYPES[kind]) for _, kind, name in properties])
+        number = int(count)
+    except (ValueError, KeyError) as error:
+        raise FileFormatError(
+            f'{path}: not a PLY whose first element has plain numbers alone'
+        ) from error
+    if version != '1.0' or element != 'vertex' or number < 0 or not properties:
+        raise FileFormatError(
+            f'{path}: version {version}, first element {count} x {element} of {len(properties)} '
+            'properties, expected 1.0 and vertices of at least one'
+        )
+    return number, layout, encoding == 'ascii'

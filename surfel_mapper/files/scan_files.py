@@ -1,0 +1,89 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scans that lie in files of their own: PLY, PCD, and the raw float32 of KITTI and nuScenes.
+
+A file knows neither its time nor its frame; who reads a folder of them says both.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.atomic import by_number
+
+SUFFIXES = ('.ply', '.pcd', '.bin')
+
+RAW_COLUMNS = {'.bin': 4, '.pcd.bin': 5}
+"""Float32 numbers a point: KITTI x y z intensity, nuScenes x y z intensity ring."""
+
+EXTRA = ('intensity', 'ring')
+
+ALIASES = {'scalar_intensity': 'intensity', 'scalar_Intensity': 'intensity'}
+"""What CloudCompare calls columns."""
+
+Columns = dict[str, npt.NDArray[Any]]
+
+
+def scan_files(directory: Path) -> list[Path]:
+    """Return the files of scans in a directory, scan2 before scan10."""
+    files = [file for file in directory.iterdir() if file.suffix in SUFFIXES and file.is_file()]
+    return sorted(files, key=by_number)
+
+
+def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
+    """
+    Return the points (N, 3) of a file of one scan, m, and what else they carry.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .ply, a .pcd, a .bin of four or a .pcd.bin of five float32 a point.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, or has no x, y and z of floating point.
+
+    """
+    suffix = Path(path).suffix
+    if suffix == '.bin':
+        return read_raw(Path(path))
+    if suffix not in SUFFIXES:
+        raise FileFormatError(f'{path}: expected a scan ending in {", ".join(SUFFIXES)}')
+    columns = ply.read_points(path) if suffix == '.ply' else pcd.read_points(path)
+    missing = [name for name in 'xyz' if name not in columns]
+    if missing:
+        raise FileFormatError(
+            f'{path}: no {", ".join(missing)} among {", ".join(columns)}; expected points'
+        )
+    xyz = [columns.pop(name) for name in 'xyz']
+    if any(values.dtype.kind != 'f' or values.ndim != 1 for values in xyz):
+        kinds = ', '.join(str(values.dtype) for values in xyz)
+        raise FileFormatError(f'{path}: x, y, z of {kinds}, expected float or double')
+    if {'red', 'green', 'blue'} <= columns.keys():
+        columns['rgb'] = np.stack([columns.pop(n) for n in ('red', 'green', 'blue')], axis=1)
+    return np.stack(xyz, axis=1), {ALIASES.get(n, n): values for n, values in columns.items()}
+
+
+def read_raw(path: Path) -> tuple[npt.NDArray[Any], Columns]:
+    """Return points and columns of a file of bare float32."""
+    width = RAW_COLUMNS['.pcd.bin' if path.name.endswith('.pcd.bin') else '.bin']
+    try:
+        size = os.stat(path).st_size
+        if size % (4 * width):
+            raise FileFormatError(
+                f'{path}: {size} bytes, expected {4 * width} for every point ({width} float32)'
+            )
+        table = np.fromfile(path, '<f4').reshape(-1, width)
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    extra = {name: table[:, 3 + at].copy() for at, name in enumerate(EXTRA[: width - 3])}
+    return np.asfortranarray(table[:, :3]), extra

@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Trajectories as text: TUM, KITTI and CSV read, TUM written.
+
+Stamps are decimal text to nanoseconds and back without a float between, because a float64 has
+only 240 ns at the seconds of this century; coordinates are written with the digits that give the
+same float64 back. Nothing is put in order or filled in: a pose of the wrong time maps a scan to
+the wrong place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.geometry import pose_matrix, q_xyzw
+
+FORMATS = ('tum', 'kitti', 'csv')
+
+TUM_HEADER = '# stamp_s x y z qx qy qz qw\n'
+
+KITTI_TIMES = 'times.txt'
+"""The file beside KITTI poses with the seconds of each."""
+
+POSE_COLUMNS = (
+    ('x', 'tx', 'px', 'p_x', 'p_rs_r_x', 'position_x', 'pos_x'),
+    ('y', 'ty', 'py', 'p_y', 'p_rs_r_y', 'position_y', 'pos_y'),
+    ('z', 'tz', 'pz', 'p_z', 'p_rs_r_z', 'position_z', 'pos_z'),
+    ('qx', 'q_x', 'q_rs_x', 'orientation_x'),
+    ('qy', 'q_y', 'q_rs_y', 'orientation_y'),
+    ('qz', 'q_z', 'q_rs_z', 'orientation_z'),
+    ('qw', 'q_w', 'q_rs_w', 'orientation_w'),
+)
+"""What the seven numbers of a pose are called in CSV files (those with RS are EuRoC's)."""
+
+STAMP_COLUMNS = ('stamp', 'timestamp', 'time', 't')
+
+UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
+
+MOST_SECONDS = 10**11
+"""A larger stamp without a unit is not in seconds: these are 3000 years."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Trajectory:
+    """
+    Poses of one frame in another over time, by ascending stamp.
+
+    Attributes
+    ----------
+    stamp_ns : (S,) int64, or None
+        None for KITTI poses without a times.txt: pose i is that of scan i.
+    xyz : (S, 3) float64, m
+    q_xyzw : (S, 4) float64
+        Of norm 1 within 1e-3.
+
+    """
+
+    stamp_ns: npt.NDArray[np.int64] | None
+    xyz: npt.NDArray[np.float64]
+    q_xyzw: npt.NDArray[np.float64]
+
+    def __len__(self) -> int:
+        """Return the number of poses."""
+        return len(self.xyz)
+
+
+def write_tum(
+    path: str | Path,
+    stamp_ns: Sequence[int] | npt.NDArray[np.int64],
+    T_fixed_sensor: npt.ArrayLike,
+) -> None:
+    """
+    Write poses as TUM text, a line ``stamp_s x y z qx qy qz qw`` each; whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    stamp_ns : (S,) int
+        Their times.
+    T_fixed_sensor : (S, 4, 4) float64
+        The poses.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    poses = np.asarray(T_fixed_sensor, np.float64).reshape(-1, 4, 4)
+    with replace_file(path) as file:
+        file.write(TUM_HEADER.encode())
+        for stamp, pose in zip(stamp_ns, poses, strict=True):
+            numbers = [*pose[:3, 3].tolist(), *q_xyzw(pose).tolist()]
+            file.write(f'{seconds(int(stamp))} {" ".join(map(repr, numbers))}\n'.encode())
+
+
+def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
+    """
+    Return the poses in a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file. KITTI poses take their stamps from a times.txt beside it, where there is one.
+    format_ : str, optional
+        tum, kitti or csv; without it told by the first line: 8 numbers, 12 numbers, or commas.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, holds no poses, or a line is no pose of the format, or its
+        stamp is not after that of the line before.
+
+    """
+    lines = numbered_lines(path)
+    if not lines:
+        raise FileFormatError(f'{path}: no poses in it, expected a line for each')
+    format_ = format_ or guessed(path, lines[0][1])
+    if format_ not in FORMATS:
+        raise FileFormatError(f'{path}: format {format_!r}, expected one of {", ".join(FORMATS)}')
+    if format_ == 'kitti':
+        return kitti_poses(path, lines)
+    rows = csv_rows(path, lines) if format_ == 'csv' else tum_rows(path, lines)
+    stamps, numbers = list[int](), list[list[float]]()
+    for where, stamp_ns, values in rows:
+        if stamps and stamp_ns <= stamps[-1]:
+            raise FileFormatError(f'{where}: stamp is not after that of the pose before')
+        check_pose(where, values)
+        stamps.append(stamp_ns)
+        numbers.append(values)
+    if not stamps:
+        raise FileFormatError(f'{path}: no poses in it, only a header')
+    table = np.array(numbers)
+    return Trajectory(np.array(stamps, np.int64), table[:, :3], table[:, 3:])
+
+
+def numbered_lines(path: str | Path) -> list[tuple[str, str]]:
+    """Return the lines that say something, each with where it is; a commented header is one."""
+    try:
+        text = Path(path).read_text(encoding='utf-8-sig')
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    except UnicodeDecodeError as error:
+        raise FileFormatError(f'{path}: no text, expected a file of poses') from error
+    lines = ((f'{path}:{n}', line.strip()) for n, line in enumerate(text.splitlines(), 1))
+    return [(where, line) for where, line in lines if line and not is_comment(line)]
+
+
+def is_comment(line: str) -> bool:
+    """Return whether a line is a comment, and not the header of a CSV with # before it."""
+    return line.startswith(('#', '%')) and ',' not in line
+
+
+def guessed(path: str | Path, line: str) -> str:
+    """Return the format that a first line looks like."""
+    if ',' in line:
+        return 'csv'
+    formats = {8: 'tum', 12: 'kitti'}
+    count = len(line.split())
+    if count not in formats:
+        raise FileFormatError(
+            f'{path}: {count} columns in the first line, expected 8 (TUM), 12 (KITTI) or commas '
+            '(CSV)'
+        )
+    return formats[count]
+
+
+def tum_rows(
+    path: str | Path, lines: list[tuple[str, str]]
+) -> Iterator[tuple[str, int, list[float]]]:
+    """Yield where it is, stamp and numbers of every pose of a TUM file."""
+    for where, line in lines:
+        columns = line.split()
+        if len(columns) != 8:
+            raise FileFormatError(f'{where}: {len(columns)} columns, expected 8: stamp x y z q')
+        yield where, nanoseconds(columns[0], where), floats(columns[1:], where)
+
+
+def csv_rows(
+    path: str | Path, lines: list[tuple[str, str]]
+) -> Iterator[tuple[str, int, list[float]]]:
+    """Yield where it is, stamp and numbers of every pose of a CSV file with a header."""
+    header = [column_name(text) for text in lines[0][1].lstrip('# ').split(',')]
+    names = [name for name, _ in header]
+    stamps = [place for place, name in enumerate(names) if name in STAMP_COLUMNS]
+    places = [[names.index(alias) for alias in known if alias in names] for known in POSE_COLUMNS]
+    if not stamps or not all(places):
+        raise FileFormatError(
+            f'{lines[0][0]}: columns {", ".join(names)}; expected a header with stamp_s or '
+            'stamp_ns, x, y, z, qx, qy, qz, qw'
+        )
+    wanted = [found[0] for found in places]
+    for where, line in lines[1:]:
+        row = line.split(',')
+        if len(row) != len(names):
+            raise FileFormatError(f'{where}: {len(row)} columns, expected {len(names)}')
+        stamp_ns = nanoseconds(row[stamps[0]], where, header[stamps[0]][1])
+        yield where, stamp_ns, floats([row[place] for place in wanted], where)
+
+
+def column_name(text: str) -> tuple[str, str]:
+    """Return name and unit of a CSV column: ``stamp_ns``, or ``timestamp [ns]`` as EuRoC has."""
+    name, _, bracket = text.strip().strip('"').lower().partition('[')
+    name, unit = name.strip(), bracket.partition(']')[0].strip()
+    for suffix in UNITS_NS:
+        if name.removesuffix(f'_{suffix}') in STAMP_COLUMNS:
+            return name.removesuffix(f'_{suffix}'), unit or name.rpartition('_')[2] * ('_' in name)
+    return name, unit
+
+
+def kitti_poses(path: str | Path, lines: list[tuple[str, str]]) -> Trajectory:
+    """Return the poses of a KITTI file, each the upper three rows of a matrix."""
+    matrices = []
+    for where, line in lines:
+        columns = line.split()
+        if len(columns) != 12:
+            raise FileFormatError(f'{where}: {len(columns)} columns, expected 12: 3 rows of 4')
+        matrix = np.eye(4)
+        matrix[:3] = np.array(floats(columns, where)).reshape(3, 4)
+        if not is_rotation(matrix[:3, :3]):
+            raise FileFormatError(f'{where}: its first three columns are no rotation')
+        matrices.append(matrix)
+    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(matrices))
+    poses = np.array(matrices)
+    return Trajectory(stamps, poses[:, :3, 3].copy(), np.array([q_xyzw(m) for m in matrices]))
+
+
+def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
+    """Return whether a (3, 3) matrix is a rotation, to the few digits that such files have."""
+    if not np.isfinite(matrix).all() or np.abs(matrix).max() > 2.0:
+        return False
+    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(skew < 1e-3 and np.linalg.det(matrix) > 0.0)
+
+
+def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
+    """Return the stamps in a times.txt, which has to have as many lines as there are poses."""
+    if not path.is_file():
+        return None
+    stamps = [nanoseconds(line, where) for where, line in numbered_lines(path)]
+    if len(stamps) != number or any(b <= a for a, b in pairwise(stamps)):
+        raise FileFormatError(
+            f'{path}: {len(stamps)} stamps for {number} poses, expected one for each, ascending'
+        )
+    return np.array(stamps, np.int64)
+
+
+def check_pose(where: str, values: list[float]) -> None:
+    """Refuse seven numbers that are no pose."""
+    try:
+        pose_matrix(values[:3], values[3:])
+    except ValueError as error:
+        raise FileFormatError(f'{where}: {error}') from error
+
+
+def floats(texts: Sequence[str], where: str) -> list[float]:
+    """Return finite numbers from text."""
+    try:
+        values = [float(text) for text in texts]
+    except ValueError as error:
+        raise FileFormatError(f'{where}: {error}, expected a number') from error
+    if not np.isfinite(values).all():
+        raise FileFormatError(f'{where}: {", ".join(texts)}: not all are finite')
+    return values
+
+
+def nanoseconds(text: str, where: str, unit: str = '') -> int:
+    """Return a time as the nearest whole nanoseconds."""
+    try:
+        number = Decimal(text.strip())
+    except InvalidOperation as error:
+        raise FileFormatError(f'{where}: {text!r} is no time') from error
+    if unit and unit not in UNITS_NS:
+        raise FileFormatError(f'{where}: unit {unit!r}, expected one of {", ".join(UNITS_NS)}')
+    most = 2**63 if unit else MOST_SECONDS
+    if not number.is_finite() or not -most <= number <= most:
+        raise FileFormatError(
+            f'{where}: time {text!r}, expected seconds (or a CSV column stamp_ns, stamp_us)'
+        )
+    stamp_ns = int((number * UNITS_NS[unit or 's']).to_integral_value())
+    if not 0 <= stamp_ns < 2**63:
+        raise FileFormatError(f'{where}: time {text!r}, expected 0 to 292 years')
+    return stamp_ns
+
+
+def seconds(stamp_ns: int) -> str:
+    """Return a time in seconds with all nine digits."""
+    whole, rest = divmod(stamp_ns, 10**9)
+    return f'{whole}.{rest:09d}'

@@ -1,0 +1,139 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A whole TSDF in one file: what is loaded goes on as if it had never stopped.
+
+Blocks are written in the order of their index, so that equal maps give equal bytes. Nothing in a
+file is believed: blocks have to be there once each, distances within the truncation, weights not
+negative.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.errors import FileFormatError, MapLimitError
+from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.tsdf.block_content import block_keys, Blocks
+from surfel_mapper.tsdf.blocks import BlockMap
+
+KIND = 'tsdf'
+SHAPE = (
+    'voxel_size_m',
+    'voxels_per_side',
+    'truncation_m',
+    'color',
+    'tracking',
+    'semantics',
+    'votes_per_voxel',
+)
+"""What a configuration has to share with a file."""
+
+ARRAYS = {
+    'index': np.int64,
+    'stamp_ns': np.int64,
+    'field': np.float32,
+    'color': np.float32,
+    'votes': np.float32,
+    'stamps': np.int64,
+}
+
+
+def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> None:
+    """
+    Write a TSDF to a file.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, by custom with the extension npz; written whole or not at all.
+    blocks : BlockMap
+        The map.
+    compress : bool
+        Pack: smaller, and slower.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+
+    """
+    rows = blocks.rows()
+    rows = rows[np.argsort(block_keys(blocks.index(rows)))]
+    content = blocks.copied(rows)
+    arrays = {name: getattr(content, name) for name in ARRAYS}
+    attributes: dict[str, Any] = {name: getattr(blocks.config, name) for name in SHAPE}
+    save_state(path, arrays, {'kind': KIND, **attributes}, compress=compress)
+
+
+def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
+    """
+    Return a TSDF as it was saved.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file that save_tsdf wrote.
+    config : TsdfConfig
+        How the map goes on; what shapes its arrays has to be that of the file.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, of another kind or version, or of another voxel
+        size, block, truncation or channels.
+    MapLimitError
+        If the map does not fit into max_blocks.
+
+    """
+    arrays, attributes = load_state(path)
+    if attributes.get('kind') != KIND:
+        raise FileFormatError(f'{path}: holds {attributes.get("kind")!r}, expected a {KIND}')
+    for name in SHAPE:
+        found, wanted = attributes.get(name), getattr(config, name)
+        if found != wanted:
+            raise FileFormatError(
+                f'{path}: {name} {found}, expected layers.tsdf.{name} = {wanted}'
+            )
+    blocks = BlockMap(config)
+    try:
+        content = checked(blocks, arrays)
+    except (ValueError, LookupError, TypeError) as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+    if config.max_blocks and len(content) > config.max_blocks:
+        raise MapLimitError(
+            f'{path}: {len(content)} blocks, expected at most layers.tsdf.max_blocks = '
+            f'{config.max_blocks}'
+        )
+    blocks.insert(content)
+    return blocks
+
+
+def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
+    """Return the content of a file, which has to be possible; otherwise raise ValueError."""
+    count = len(arrays['index'])
+    for name, dtype in ARRAYS.items():
+        array, channel = arrays[name], getattr(blocks, name, None)
+        shape: tuple[int, ...] = (count, 3) if name == 'index' else (count,)
+        if name in ('field', 'color', 'votes', 'stamps') and channel is not None:
+            shape = (count * (len(channel) > 0), *channel.shape[1:])
+        if array.shape != shape or array.dtype != dtype:
+            raise ValueError(f'{name}: {array.dtype} {array.shape}, expected {shape}')
+    keys = block_keys(arrays['index'])
+    if (keys < 0).any() or len(np.unique(keys)) < count:
+        raise ValueError('a block stands twice, or is none')
+    distance, weight = arrays['field'][:, 0], arrays['field'][:, 1]
+    limit = np.float32(blocks.config.truncation_m * (1.0 + 1e-6))
+    if not (np.abs(distance) <= limit).all():
+        raise ValueError('distances beyond the truncation')
+    if not ((weight >= 0.0) & (weight < np.inf)).all():
+        raise ValueError('weights negative or not finite')
+    for name in ('color', 'votes'):
+        if not ((arrays[name] >= 0.0) & (arrays[name] < np.inf)).all():
+            raise ValueError(f'{name}: negative or not finite')
+    return Blocks(**{name: arrays[name] for name in ARRAYS})

@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The cloud that came in, with what the map says of each of its points.
+
+Points are copied as they are, whatever fields they have, and get further fields behind: normal,
+planarity and number of points of the surfel that they are part of. Normals are in the frame of
+the cloud, as everything else in it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.geometry import inverse, Transform
+from surfel_mapper.kernels.layout import BITS
+from surfel_mapper.kernels.queries import build_table
+from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.messages.appended import appended
+from surfel_mapper.messages.kernels.attach import attach_surfels
+from surfel_mapper.messages.pointcloud2 import CloudBytes, FLOAT32, from_columns, UINT32
+from surfel_mapper.scan import Scan
+
+ADDED = ('normal_x', 'normal_y', 'normal_z', 'planarity', 'num_points')
+"""The further fields, four bytes each; uint32 the last, float32 the others."""
+
+
+def scan_with_normals(
+    scan: Scan, T_fixed_sensor: Transform, surfel_map: SurfelMap, min_points: int
+) -> CloudBytes:
+    """
+    Return the cloud of a scan with what a map says of each point.
+
+    Parameters
+    ----------
+    scan : Scan
+        Deskewed, if its sensor moved; in the map or not.
+    T_fixed_sensor : (4, 4) float64
+        Its pose.
+    surfel_map : SurfelMap
+        In the fixed frame.
+    min_points : int
+        Voxels with fewer points are no surfels.
+
+    """
+    seen = surfel_map.reduce(scan.points, T_fixed_sensor, columns=scan.columns).key
+    rows = surfel_map.find(seen)
+    surfels = surfel_map.surfels_of(rows[rows >= 0])
+    surfels = surfels.select(surfels.num_points >= min_points)
+    added = surfels_of_points(scan, T_fixed_sensor, surfels, surfel_map.voxel_size_m)
+    return cloud_of_scan(scan, added) if scan.msg is None else extended_cloud(scan.msg, added)
+
+
+def surfels_of_points(
+    scan: Scan, T_fixed_sensor: Transform, surfels: Surfels, voxel_size_m: float
+) -> npt.NDArray[np.float32]:
+    """
+    Return what the surfel of each point of a scan says.
+
+    Parameters
+    ----------
+    scan : Scan
+        Deskewed, if its sensor moved.
+    T_fixed_sensor : (4, 4) float64
+        Its pose.
+    surfels : Surfels
+        In the fixed frame, those in which points may lie.
+    voxel_size_m : float
+        Edge of a voxel.
+
+    Returns
+    -------
+    (N, 5) float32
+        Normal x y z in the sensor frame, planarity, and the number of points, which is a uint32
+        of the same bytes. nan and 0 where there is no surfel.
+
+    """
+    keys = pack_keys(surfels.voxel_index)
+    table = np.empty(1 << max(2 * len(keys) - 1, 1).bit_length(), np.int32)
+    build_table(keys, table)
+    R = inverse(T_fixed_sensor)[:3, :3]
+    normal = np.ascontiguousarray(surfels.normal @ R.T)
+    pose = np.ascontiguousarray(T_fixed_sensor[:3])
+    quantisation = (pose, (1 << BITS) / voxel_size_m, np.array([0.0, np.inf]))
+    added = np.empty((len(scan), len(ADDED)), np.float32)
+    points = np.require(scan.points, None, ['F', 'A', 'W'])
+    values = (normal, surfels.planarity, surfels.num_points)
+    attach_surfels(points.T, quantisation, values, keys, table, added, added.view(np.uint32))
+    return added
+
+
+def extended_cloud(msg: Any, added: npt.NDArray[np.float32]) -> CloudBytes:
+    """
+    Return a cloud with the fields of ``ADDED`` behind those that it has.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        One that could be decoded. A field of the same name as a new one stays, and the new one
+        is called ``surfel_`` and its name.
+    added : (N, 5) float32
+        From surfels_of_points, one row a point.
+
+    """
+    taken = {field.name for field in msg.fields}
+    types = [FLOAT32] * (len(ADDED) - 1) + [UINT32]
+    names = [f'surfel_{name}' if name in taken else name for name in ADDED]
+    fields = [(name, type_, 1) for name, type_ in zip(names, types, strict=True)]
+    return replace(appended(msg, added.view(np.uint32), fields), is_dense=False)
+
+
+def cloud_of_scan(scan: Scan, added: npt.NDArray[np.float32]) -> CloudBytes:
+    """Return the same for a scan that was no cloud but a depth image."""
+    columns = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
+    columns.update(zip(ADDED[:-1], added.T[:-1], strict=True))
+    return from_columns({**columns, ADDED[-1]: added.view(np.uint32)[:, -1]})

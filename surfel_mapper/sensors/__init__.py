@@ -1,0 +1,3 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""From raw sensor data to points: deskewing, depth images, rays without a return."""

@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fuse a range image into blocks of a truncated signed distance field.
+
+Every voxel of a block is projected into the image, not every pixel into the voxels: no voxel is
+written twice, so blocks can be divided among threads and the result does not depend on how many
+there are. A block is done in passes over all of its voxels, each a plain loop over a few rows of
+float32, which the compiler turns into vector instructions; only the look-up in the image is done
+voxel by voxel. The rows of one block stay in the first cache.
+
+The field of a block is two rows of float32: the distance, positive in front of a surface and
+negative behind it, and the weight, 0 where a voxel was never observed.
+"""
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.projection import project
+from surfel_mapper.tsdf.kernels.channels import apply_mask, fuse_color, fuse_stamps, SKIP
+from surfel_mapper.tsdf.kernels.labels import fuse_labels, keep_labels, NONE, vote_labels
+from surfel_mapper.tsdf.kernels.lookup import (
+    drop_far,
+    DROPOFF,
+    EXTRA,
+    gather,
+    locate,
+    MAX_OFFSET,
+    MAX_RANGE,
+    MAX_WEIGHT,
+    MIN_WEIGHT,
+    mix,
+    row_gaps,
+    slant,
+    TAU,
+    WEIGHT,
+)
+
+_ZERO = np.float32(0.0)
+_ONE = np.float32(1.0)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def integrate_blocks(
+    rows, corners, offsets, field, sensor, images, settings, modes, channels, observed
+):
+    """
+    Fuse a range image into blocks; return how many labels found no slot.
+
+    rows      (K,) int64, row of each block
+    corners   (K, 3) float32 m, centre of the first voxel of each block, in the sensor's frame
+    offsets   (3, N) float32 m, from there to every voxel, x fastest
+    field     (R, 2, N) float32, distance and weight of all blocks
+    sensor    (kind, parameters, elevations), see kernels/projection.py
+    images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
+              subtract, fuse_color, vote_labels, apply_mask; those that are missing have no rows
+    settings  (NUM_SETTINGS,) float32
+    modes     (interpolation, power): weights fall by depth^-(2 power)
+    channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
+              blocks, none where they are not kept; how labels are fused; labels that the extra
+              band is for, none for all; whether it is for distances alone; the stamp, ns
+    observed  (K,) int64, out: how many voxels of each block were fused
+    """
+    num_voxels = offsets.shape[1]
+    scratch = np.empty((13, num_voxels), np.float32)
+    x, y, z, distance = scratch[0], scratch[1], scratch[2], scratch[3]
+    u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
+    pixels, value = scratch[8:12], scratch[12]
+    place = np.empty(num_voxels, np.int32)
+    mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
+    kind, parameters, elevations = sensor
+    image, cosine, color_image, label_image, mask = images
+    color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
+    tau, overflow = settings[TAU], 0
+    for b in range(len(rows)):
+        row = rows[b]
+        shift(offsets[0], corners[b, 0], x)
+        shift(offsets[1], corners[b, 1], y)
+        shift(offsets[2], corners[b, 2], z)
+        project(x, y, z, kind, parameters, elevations, distance, u, v)
+        locate(distance, u, v, image.shape[1], settings, place)
+        gather(image.ravel(), image.shape[1], place, pixels)
+        mix(pixels[0], pixels[1], pixels[2], pixels[3], u, v, modes[0], settings, value)
+        if settings[MAX_OFFSET] > _ZERO:
+            row_gaps(kind, parameters, elevations, v, weight)
+            drop_far(x, y, u, v, distance, weight, settings, value)
+        slant(cosine, image.shape[1], place, u, v, weight)
+        subtract(value, distance, weight, settings, signed)
+        count = count_observed(signed)
+        if count > 0 and mask.shape[0] > 0:
+            flag_mixed(value, mixed)
+            count -= apply_mask(mask, tau, u, v, mixed, signed)
+        if count > 0 and label_image.shape[0] > 0:
+            flag_mixed(value, mixed)
+            vote_labels(label_image, tau, u, v, mixed, signed, label)
+            if len(extra_labels) > 0:
+                count -= keep_labels(extra_labels, tau, label, signed)
+        observed[b] = count
+        if count == 0:
+            continue
+        weigh(distance if kind > 0 else z, signed, settings, modes[1], weight)
+        if label_image.shape[0] > 0 and semantics != NONE:
+            overflow += fuse_labels(semantics, tau, skip_extra, label, signed, weight, votes[row])
+        if color.shape[0] > 0 and color_image.shape[0] > 0:
+            flag_mixed(value, mixed)
+            fuse_color(color_image, tau, skip_extra, u, v, mixed, signed, weight, color[row])
+        if stamps.shape[0] > 0:
+            fuse_stamps(stamp, weight, field[row, 1], stamps[row])
+        fuse(signed, weight, settings[MAX_WEIGHT], field[row, 0], field[row, 1])
+    return overflow
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def shift(values, by, shifted):
+    """Add a number to all values."""
+    for n in range(len(values)):
+        shifted[n] = values[n] + by
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def subtract(value, distance, factor, settings, signed):
+    """Find the signed distance of every voxel, (N,) float32 m; SKIP if it is not observed."""
+    tau, extra, reach = settings[TAU], settings[EXTRA], settings[MAX_RANGE]
+    for n in range(len(value)):
+        range_m, d = abs(value[n]), distance[n]
+        s = (range_m - d) * factor[n]
+        # A pixel that clears knows nothing beyond the reach of the sensor.
+        seen = (range_m > _ZERO) & (s >= -tau - extra) & ((range_m <= reach) | (d <= reach))
+        signed[n] = min(max(s, -tau), tau) if seen else SKIP
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def count_observed(signed):
+    """Return how many voxels are observed."""
+    count = np.int32(0)
+    for n in range(len(signed)):
+        count += np.int32(signed[n] > SKIP)
+    return np.int64(count)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def flag_mixed(value, mixed):
+    """Find which voxels had four pixels mixed."""
+    for n in range(len(value)):
+        mixed[n] = value[n] > _ZERO
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def weigh(depth, signed, settings, power, weight):
+    """
+    Find the weight of every measurement, 0 for a voxel that is not observed.
+
+    depth, signed, weight  (N,) float32; weight is written
+    """
+    constant, least = settings[WEIGHT], settings[MIN_WEIGHT]
+    tau, dropoff = settings[TAU], settings[DROPOFF]
+    if power == 0:
+        for n in range(len(weight)):
+            weight[n] = constant
+    elif power == 1:
+        for n in range(len(weight)):
+            weight[n] = constant / (depth[n] * depth[n])
+    else:
+        for n in range(len(weight)):
+            square = depth[n] * depth[n]
+            weight[n] = constant / (square * square)
+    if dropoff < tau:
+        per_metre = _ONE / (tau - dropoff)
+        for n in range(len(weight)):
+            s = signed[n]
+            weight[n] = weight[n] * ((tau + s) * per_metre) if s < -dropoff else weight[n]
+    for n in range(len(weight)):
+        w = weight[n] if weight[n] > least else least
+        weight[n] = w if signed[n] > SKIP else _ZERO
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def fuse(signed, weight, max_weight, mean, total):
+    """
+    Take weighted measurements into the mean distance and the total weight, in place.
+
+    signed, weight, mean, total  (N,) float32
+    """
+    for n in range(len(mean)):
+        # So written, a first measurement and one equal to the mean leave no rounding.
+        gain = weight[n] / (total[n] + weight[n])
+        value = mean[n] + (signed[n] - mean[n]) * gain
+        mean[n] = value if weight[n] > _ZERO else mean[n]
+    for n in range(len(mean)):
+        together = total[n] + weight[n]
+        total[n] = together if together < max_weight else max_weight

@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Read the field at points: distance and gradient between eight voxels, state of the nearest one.
+
+Blocks are found by hash; points next to each other mostly ask for the same block, which is
+remembered.
+"""
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.hashing import DEPTH, find_row
+from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_OFFSET
+
+UNKNOWN = 0
+FREE = 1
+OCCUPIED = 2
+
+
+@njit(cache=True, nogil=True)
+def block_row(a, b, c, head, table, depth):
+    """Return the row of a block, -1 where the map has none."""
+    low, high = -INDEX_OFFSET, INDEX_OFFSET
+    if a < low or b < low or c < low or a >= high or b >= high or c >= high:
+        return np.int64(-1)
+    x, y, z = a + INDEX_OFFSET, b + INDEX_OFFSET, c + INDEX_OFFSET
+    return find_row(x << 2 * INDEX_BITS | y << INDEX_BITS | z, head, table, depth)
+
+
+@njit(cache=True, nogil=True)
+def find_voxel(i, j, k, bits, recent, head, table, depth):
+    """
+    Return row and number of a voxel; row -1 where the map has no such block.
+
+    i, j, k  int64, index of the voxel in the map
+    bits     a block has 2^bits voxels a side
+    recent   (4,) int64: the block asked for last and its row, in and out
+    """
+    a, b, c = i >> bits, j >> bits, k >> bits
+    if a != recent[0] or b != recent[1] or c != recent[2]:
+        recent[0], recent[1], recent[2] = a, b, c
+        recent[3] = block_row(a, b, c, head, table, depth)
+    mask = (1 << bits) - 1
+    return recent[3], (i & mask) | (j & mask) << bits | (k & mask) << 2 * bits
+
+
+@njit(cache=True, nogil=True)
+def sample(points, scale, bits, least, field, head, table, state, distance, gradient):
+    """
+    Interpolate the distance at points and its gradient.
+
+    points    (P, 3) float64, voxels; those not finite are nowhere
+    scale     float64, voxels a metre
+    least     float32, what each of the eight voxels has to weigh
+    field     (R, 2, N) float32
+    distance  (P,) float32 m, out; nan where a voxel is missing
+    gradient  (P, 3) float32, out; nan likewise
+    """
+    recent = np.array([1 << 40, 0, 0, -1])
+    corner = np.empty(8)
+    depth = state[DEPTH]
+    for p in range(len(points)):
+        distance[p] = np.nan
+        gradient[p, :] = np.nan
+        x, y, z = points[p, 0] - 0.5, points[p, 1] - 0.5, points[p, 2] - 0.5
+        if not (abs(x) < 1e12 and abs(y) < 1e12 and abs(z) < 1e12):
+            continue
+        i, j, k = np.floor(x), np.floor(y), np.floor(z)
+        u, v, w = x - i, y - j, z - k
+        known = True
+        for n in range(8):
+            di, dj, dk = n & 1, n >> 1 & 1, n >> 2
+            row, voxel = find_voxel(
+                np.int64(i) + di,
+                np.int64(j) + dj,
+                np.int64(k) + dk,
+                bits,
+                recent,
+                head,
+                table,
+                depth,
+            )
+            if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
+                known = False
+                break
+            corner[n] = field[row, 0, voxel]
+        if not known:
+            continue
+        # Along x first, then y, then z; the gradient from the same four and two values.
+        c00, c10 = corner[0] + u * (corner[1] - corner[0]), corner[2] + u * (corner[3] - corner[2])
+        c01, c11 = corner[4] + u * (corner[5] - corner[4]), corner[6] + u * (corner[7] - corner[6])
+        c0, c1 = c00 + v * (c10 - c00), c01 + v * (c11 - c01)
+        distance[p] = c0 + w * (c1 - c0)
+        low = (corner[1] - corner[0]) * (1.0 - v) + (corner[3] - corner[2]) * v
+        high = (corner[5] - corner[4]) * (1.0 - v) + (corner[7] - corner[6]) * v
+        gradient[p, 0] = (low + w * (high - low)) * scale
+        gradient[p, 1] = ((c10 - c00) * (1.0 - w) + (c11 - c01) * w) * scale
+        gradient[p, 2] = (c1 - c0) * scale
+
+
+@njit(cache=True, nogil=True)
+def classify(points, bits, least, occupied, field, head, table, state, found):
+    """
+    Say of each point whether its voxel is unknown, free or occupied.
+
+    points    (P, 3) float64, voxels
+    occupied  float32 m, distances up to this are
+    found     (P,) uint8, out
+    """
+    recent = np.array([1 << 40, 0, 0, -1])
+    depth = state[DEPTH]
+    for p in range(len(points)):
+        x, y, z = np.floor(points[p, 0]), np.floor(points[p, 1]), np.floor(points[p, 2])
+        found[p] = UNKNOWN
+        if not (abs(x) < 1e12 and abs(y) < 1e12 and abs(z) < 1e12):
+            continue
+        row, voxel = find_voxel(
+            np.int64(x), np.int64(y), np.int64(z), bits, recent, head, table, depth
+        )
+        if row < 0 or not field[row, 1, voxel] >= least or field[row, 1, voxel] <= 0.0:
+            continue
+        found[p] = OCCUPIED if field[row, 0, voxel] <= occupied else FREE

@@ -1,0 +1,142 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels of the registration against plain numpy."""
+
+import math
+
+import numpy as np
+
+from surfel_mapper.alignment.kernels.registration import (
+    cell_keys,
+    number_rows,
+    PLANE,
+    SIGMAS_SQ,
+    sum_equations,
+)
+from surfel_mapper.geometry import se3_exp
+from surfel_mapper.kernels.layout import BITS
+from surfel_mapper.kernels.queries import keys_in_box
+from surfel_mapper.mapping.moments import pack_keys, unpack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.kernels.modes import both
+
+POSE = se3_exp(np.array([3.0, -2.0, 1.0, 0.2, -0.3, 1.5]))[:3].copy()
+
+
+@both
+def test_cells_lie_in_the_voxels_of_their_places(call):
+    rng = np.random.default_rng(1)
+    cells = rng.uniform(-30.0, 30.0, (200, 3))
+    keys = np.empty(200, np.int64)
+
+    call(cell_keys, cells, POSE, (1 << BITS) / 0.5, BITS, keys)
+
+    expected = np.floor((cells @ POSE[:, :3].T + POSE[:, 3]) / 0.5)
+    np.testing.assert_array_equal(unpack_keys(keys), expected)
+
+
+@both
+def test_cells_beyond_the_map_and_those_that_are_nowhere_have_no_voxel(call):
+    cells = np.array([[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, -1e9, 0.0], [0.0, 0.0, np.nan]])
+    keys = np.empty(4, np.int64)
+
+    call(cell_keys, cells, np.eye(4)[:3].copy(), (1 << BITS) / 0.5, BITS, keys)
+
+    assert keys.tolist() == [pack_keys(np.zeros((1, 3), int))[0], -1, -1, -1]
+
+
+@both
+def test_rows_are_numbered_in_the_order_they_are_met(call):
+    found = np.array([7, -1, 3, 7, 5, 3], np.int32)
+    number = np.full(9, -1, np.int32)
+    number[5] = 0  # known before
+    known = np.full(7, -1, np.int32)
+
+    num_known = call(number_rows, found, number, known, 1)
+
+    assert num_known == 3
+    assert found.tolist() == [1, -1, 2, 1, 0, 2]
+    assert known[1:3].tolist() == [7, 3]
+
+
+def equations(cells, place, planes, width_sq):
+    """Return what sum_equations gives, cell by cell in numpy."""
+    hessian, gradient, met, fit = np.zeros((6, 6)), np.zeros(6), 0, 0.0
+    for cell, row in zip(cells, place, strict=True):
+        if row < 0 or not planes[row, 6] < math.inf:
+            continue
+        mean, normal, variance, spread = np.split(planes[row], [3, 6, 7])
+        lever = POSE[:, :3] @ cell
+        step = lever + POSE[:, 3] - mean
+        distance = normal @ step
+        along = step - distance * normal
+        variance = variance[0] + spread[0] * (along @ along)
+        weight = (width_sq / (width_sq + distance**2)) ** 2 / variance
+        jacobian = np.concatenate([normal, np.cross(lever, normal)])
+        hessian += weight * np.outer(jacobian, jacobian)
+        gradient += weight * distance * jacobian
+        met += 1
+        fit += 1.0 / (1.0 + distance**2 / (SIGMAS_SQ * variance))
+    return hessian, gradient, met, fit
+
+
+@both
+def test_equations_are_those_of_the_twin(call):
+    rng = np.random.default_rng(2)
+    cells = rng.uniform(-10.0, 10.0, (50, 3))
+    place = rng.integers(-1, 12, 50).astype(np.int32)
+    planes = np.empty((12, PLANE))
+    normals = rng.normal(size=(12, 3))
+    planes[:, :3] = rng.uniform(-10.0, 10.0, (12, 3))
+    planes[:, 3:6] = normals / np.linalg.norm(normals, axis=1, keepdims=True)
+    planes[:, 6:] = rng.uniform(0.01, 0.1, (12, 2))
+    planes[4, 6] = math.inf
+    hessian, gradient = np.empty((6, 6)), np.empty(6)
+
+    met, fit = call(sum_equations, cells, POSE, place, planes, 4.0, hessian, gradient)
+
+    expected = equations(cells, place, planes, 4.0)
+    np.testing.assert_allclose(hessian, expected[0], rtol=1e-10, atol=1e-9)
+    np.testing.assert_allclose(gradient, expected[1], rtol=1e-10, atol=1e-9)
+    assert met == expected[2]
+    assert math.isclose(fit, expected[3], rel_tol=1e-12)
+
+
+@both
+def test_the_gradient_is_that_of_the_robust_cost(call):
+    # Geman and McClure: cost = k r^2 / (k + r^2) / 2, here for one cell and a flat variance
+    planes = np.array([[0.0, 0.0, 0.0, 0.6, 0.0, 0.8, 0.04, 0.0]])
+    cell, width_sq, delta = np.array([[1.0, 2.0, 3.0]]), 0.5, 1e-6
+    place = np.zeros(1, np.int32)
+    hessian, gradient = np.empty((6, 6)), np.empty(6)
+    call(sum_equations, cell, POSE, place, planes, width_sq, hessian, gradient)
+
+    def cost(pose):
+        r = planes[0, 3:6] @ (pose[:, :3] @ cell[0] + pose[:, 3])
+        return 0.5 * width_sq * r**2 / (width_sq + r**2) / 0.04
+
+    for axis in range(6):
+        step = np.zeros(6)
+        step[axis] = delta
+        moved = POSE.copy()
+        turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3]
+        moved[:, :3], moved[:, 3] = turn @ POSE[:, :3], POSE[:, 3] + step[:3]
+        assert math.isclose(gradient[axis], (cost(moved) - cost(POSE)) / delta, rel_tol=1e-3)
+
+
+@both
+def test_the_voxels_in_a_box_are_found(call):
+    rng = np.random.default_rng(3)
+    surfel_map = SurfelMap(1.0)
+    gone = surfel_map.add(rng.uniform(-8.0, 8.0, (100, 3)))
+    surfel_map.add(rng.uniform(-8.0, 8.0, (300, 3)))
+    used = surfel_map.num_voxels
+    surfel_map.remove(gone)
+    low, high = np.array([-3, -8, 0]), np.array([2, 8, 4])
+
+    rows = surfel_map._table.rows
+    found = call(keys_in_box, rows, used, low, high)
+
+    index = surfel_map.moments().voxel_index
+    inside = ((index >= low) & (index <= high)).all(axis=1)
+    assert sorted(found.tolist()) == pack_keys(index[inside]).tolist()

@@ -1,0 +1,285 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Bags of every kind read the same; damaged and foolish ones are refused with a clear word."""
+
+from contextlib import suppress
+import logging
+import os
+from pathlib import Path
+import shutil
+import sqlite3
+
+import numpy as np
+import pytest
+
+from surfel_mapper.bags.reader import BagReader
+from surfel_mapper.bags.topics import CLOUD, ODOMETRY, POSE, TF
+from surfel_mapper.errors import BagError
+from test.bags import recorded
+from test.bags.recorded import drive, NUM_SCANS, ROS1, write_ros1, write_rosbag2
+
+KINDS = [
+    ('mcap', 'none'),
+    ('mcap', 'storage'),
+    ('mcap', 'file'),
+    ('mcap', 'message'),
+    ('sqlite3', 'none'),
+    ('sqlite3', 'file'),
+    ('sqlite3', 'message'),
+]
+
+
+def read(path):
+    with BagReader(path) as reader:
+        return [(message, reader.decode(message)) for message in reader.messages()]
+
+
+def assert_is_the_drive(found):
+    written = drive()
+    assert [(m.topic, m.type, m.record_ns) for m, _ in found] == [row[:3] for row in written]
+    for (_, got), (_, type_, _, expected) in zip(found, written, strict=True):
+        if type_ == TF:
+            got, expected = got.transforms[0], expected.transforms[0]
+            assert got.transform.translation.x == expected.transform.translation.x
+            assert got.child_frame_id == expected.child_frame_id
+        if type_ == CLOUD:
+            np.testing.assert_array_equal(got.data, expected.data)
+        if type_ == ODOMETRY:
+            assert got.pose.pose.position.x == expected.pose.pose.position.x
+        if type_ == POSE:
+            assert got.pose.position.x == expected.pose.position.x
+        assert got.header.stamp.sec == expected.header.stamp.sec
+        assert got.header.stamp.nanosec == expected.header.stamp.nanosec
+        assert got.header.frame_id == expected.header.frame_id
+
+
+@pytest.mark.parametrize(('storage', 'compression'), KINDS)
+def test_a_rosbag2_directory_yields_what_was_written(tmp_path, storage, compression):
+    path = write_rosbag2(tmp_path / 'drive', drive(), storage, compression)
+
+    assert_is_the_drive(read(path))
+
+
+@pytest.mark.parametrize(('storage', 'compression'), KINDS)
+def test_the_only_file_of_a_directory_reads_like_the_directory(tmp_path, storage, compression):
+    path = write_rosbag2(tmp_path / 'drive', drive(), storage, compression)
+    (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
+
+    assert_is_the_drive(read(file))
+
+
+def test_a_rosbag2_directory_may_be_called_as_a_ros1_bag(tmp_path):
+    assert_is_the_drive(read(write_rosbag2(tmp_path / 'drive.bag', drive())))
+
+
+@pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
+def test_a_ros1_bag_yields_what_was_written(tmp_path, compression):
+    path = write_ros1(tmp_path / 'drive.bag', drive(ROS1), compression)
+
+    assert_is_the_drive(read(path))
+
+
+def test_a_recording_without_metadata_yields_all_its_files_in_order(tmp_path):
+    messages = drive()
+    path = tmp_path / 'drive'
+    path.mkdir()
+    for number, part in enumerate((messages[:9], messages[9:]), start=9):
+        write_rosbag2(tmp_path / f'drive_{number}', part)
+        shutil.copy(tmp_path / f'drive_{number}' / f'drive_{number}.mcap', path)
+
+    assert_is_the_drive(read(path))
+
+
+def test_files_that_overlap_in_time_are_merged(tmp_path):
+    messages = drive()
+    path = tmp_path / 'drive'
+    path.mkdir()
+    for name, part in (('a', messages[::2]), ('b', messages[1::2])):
+        write_rosbag2(tmp_path / name, part)
+        shutil.copy(tmp_path / name / f'{name}.mcap', path)
+
+    times = [message.record_ns for message, _ in read(path)]
+
+    assert times == sorted(row[2] for row in messages)
+
+
+def test_only_the_topics_asked_for_are_read(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+
+    with BagReader(path) as reader:
+        found = [message.topic for message in reader.messages(['/odom', '/pose'])]
+        assert found == ['/odom', '/pose'] * NUM_SCANS
+        assert reader.topics.num_messages(['/odom', '/tf_static']) == NUM_SCANS + 1
+        assert list(reader.messages(['/none'])) == []
+
+
+def test_record_times_are_stated_to_the_nanosecond(tmp_path):
+    with BagReader(write_rosbag2(tmp_path / 'drive', drive())) as reader:
+        assert reader.start_ns == recorded.START_NS
+        assert reader.end_ns == recorded.START_NS + (NUM_SCANS - 1) * recorded.PERIOD_NS + 1000
+
+
+def test_a_topic_is_chosen_by_name_else_default_else_for_being_alone(tmp_path):
+    messages = drive()
+    messages.odometry('/wheel_odom', messages[-1][2] + 1, (0.0, 0.0, 0.0))
+    with BagReader(write_rosbag2(tmp_path / 'drive', messages)) as reader:
+        assert reader.topics.choose(CLOUD) == '/points'
+        assert reader.topics.choose(ODOMETRY, '/wheel_odom') == '/wheel_odom'
+        assert reader.topics.choose(ODOMETRY, default='/odom') == '/odom'
+        assert reader.topics.choose(POSE, default='/not_there') == '/pose'
+
+
+@pytest.mark.parametrize(
+    ('type_', 'name', 'says'),
+    [
+        (ODOMETRY, None, 'several topics .* Odometry topics: /odom, /wheel_odom'),
+        (CLOUD, '/pionts', 'no topic /pionts; PointCloud2 topics: /points'),
+        (CLOUD, '/odom', '/odom is of type nav_msgs/msg/Odometry, not PointCloud2; .*: /points'),
+        ('sensor_msgs/msg/Imu', None, 'no topic of type sensor_msgs/msg/Imu; its topics: /odom, '),
+        ('sensor_msgs/msg/Imu', '/imu', 'no topic /imu; Imu topics: none'),
+    ],
+)
+def test_a_choice_that_cannot_be_made_names_the_candidates(tmp_path, type_, name, says):
+    messages = drive()
+    messages.odometry('/wheel_odom', messages[-1][2] + 1, (0.0, 0.0, 0.0))
+    path = write_rosbag2(tmp_path / 'drive', messages)
+    with BagReader(path) as reader, pytest.raises(BagError, match=f'drive: {says}'):
+        reader.topics.choose(type_, name)
+
+
+def test_a_path_that_is_no_bag_is_refused(tmp_path):
+    (tmp_path / 'notes.txt').write_text('no bag')
+    (tmp_path / 'empty').mkdir()
+    for name, says in (
+        ('nothing', 'no such file or directory'),
+        ('notes.txt', 'not a bag; expected a rosbag2 directory'),
+        ('empty', 'neither metadata.yaml nor'),
+    ):
+        with pytest.raises(BagError, match=f'{name}: .*{says}'):
+            BagReader(tmp_path / name)
+
+
+@pytest.mark.parametrize('name', ['a.mcap', 'a.db3', 'a.bag'])
+@pytest.mark.parametrize('content', [b'', b'\x89MCAP0\r\n', b'#ROSBAG V2.0\n', bytes(1000)])
+def test_a_file_of_something_else_is_refused(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+
+    with pytest.raises(BagError, match=f'{name}: cannot be read: .*; if it was cut off'):
+        BagReader(tmp_path / name)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_a_rosbag2_without_messages_is_refused(tmp_path, storage):
+    path = write_rosbag2(tmp_path / 'drive', drive(num_scans=0)[:0], storage)
+
+    with pytest.raises(BagError, match='drive: a bag without messages'):
+        BagReader(path)
+
+
+def test_a_ros1_bag_without_messages_is_refused(tmp_path):
+    path = write_ros1(tmp_path / 'drive.bag', [])
+
+    with pytest.raises(BagError, match=r'drive\.bag: a bag without messages'):
+        BagReader(path)
+
+
+@pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
+def test_bytes_overwritten_in_the_middle_never_make_anything_but_a_bag_error(tmp_path, storage):
+    path = write_rosbag2(tmp_path / 'drive', drive(num_scans=2), storage)
+    (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
+    content = file.read_bytes()
+    rng = np.random.default_rng(11)
+    for _ in range(100):
+        spoiled = bytearray(content)
+        start = int(rng.integers(len(content) - 64))
+        spoiled[start : start + 64] = rng.bytes(64)
+        file.write_bytes(spoiled)
+        with suppress(BagError), BagReader(path) as reader:
+            list(reader.messages())
+
+
+@pytest.mark.parametrize(
+    ('content', 'says'),
+    [
+        (': : :', 'not the metadata of a bag'),
+        ('{}', 'not the metadata of a bag: KeyError'),
+        ('rosbag2_bagfile_information: 3', 'not the metadata of a bag: TypeError'),
+        ('rosbag2_bagfile_information: {relative_file_paths: 3}', 'expected a list of names'),
+        ('rosbag2_bagfile_information: {relative_file_paths: [../x.mcap]}', 'x.mcap .*is missing'),
+        ('rosbag2_bagfile_information: {relative_file_paths: [drive.mcap]}', 'KeyError'),
+    ],
+)
+def test_damaged_metadata_is_refused(tmp_path, content, says):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    (tmp_path / 'x.mcap').touch()
+    (path / 'metadata.yaml').write_text(content)
+
+    with pytest.raises(BagError, match=f'drive.*: .*{says}'):
+        BagReader(path)
+
+
+def test_metadata_that_describes_a_topic_otherwise_than_the_file_loses_no_message(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('RIHS01_', 'RIHS01_0'))
+
+    assert_is_the_drive(read(path))
+
+
+NOTHING_READ = r'fewer messages than its index states: .*/pose 0 of 6'
+
+
+def test_a_topic_of_which_nothing_is_read_is_an_error(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
+    with sqlite3.connect(path / 'drive.db3') as database:
+        for raw in raw_of(path, '/pose'):
+            database.execute('DELETE FROM messages WHERE data = ?', (raw,))
+
+    with pytest.raises(BagError, match=NOTHING_READ):
+        read(path)
+
+
+def raw_of(path, topic):
+    with BagReader(path) as reader:
+        return [bytes(message.raw) for message in reader.messages([topic])]
+
+
+def test_compressed_messages_of_a_topic_described_otherwise_are_read(tmp_path):
+    path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3', 'message')
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace('RIHS01_', 'RIHS01_0'))
+
+    assert_is_the_drive(read(path))
+
+
+def test_fewer_messages_than_stated_are_said(tmp_path, caplog):
+    path = write_rosbag2(tmp_path / 'drive', drive())
+    metadata = path / 'metadata.yaml'
+    metadata.write_text(metadata.read_text().replace(f'count: {NUM_SCANS}\n', 'count: 50\n'))
+
+    with caplog.at_level(logging.WARNING):
+        read(path)
+
+    assert f'fewer messages than its index states: /odom {NUM_SCANS} of 50, ' in caplog.text
+
+
+def test_a_message_that_is_not_of_its_type_is_a_bag_error(tmp_path):
+    with BagReader(write_rosbag2(tmp_path / 'drive', drive())) as reader:
+        message = next(iter(reader.messages(['/odom'])))
+        for raw in (b'', message.raw[:100]):
+            with pytest.raises(BagError, match=f'/odom: {len(raw)} bytes that are no nav_msgs'):
+                reader.decode(message._replace(raw=raw))
+        with pytest.raises(BagError, match='/odom: 724 bytes that are no my_msgs/msg/Unknown'):
+            reader.decode(message._replace(type='my_msgs/msg/Unknown'))
+
+
+@pytest.mark.parametrize('name', ['hall_os0_full', 'hall_os0_long'])
+def test_real_bags_yield_as_many_messages_as_they_state(name):
+    if 'SURFEL_MAPPER_TEST_DATA' not in os.environ:
+        pytest.skip('SURFEL_MAPPER_TEST_DATA is not set')
+    path = Path(os.environ['SURFEL_MAPPER_TEST_DATA'], 'data', 'bags', name)
+
+    with BagReader(path) as reader:
+        scans = [reader.decode(message) for message in reader.messages(['/points'])]
+        assert len(scans) == reader.topics.num_messages(['/points']) > 20
+    assert all(scan.width * scan.point_step == len(scan.data) for scan in scans)

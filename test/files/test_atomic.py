@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""A file is replaced whole or not at all, whatever goes wrong while it is written."""
+
+from contextlib import contextmanager
+import os
+import shutil
+import stat
+import subprocess
+import sys
+
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.atomic import replace_file
+
+
+def write(path, *chunks, then=None):
+    """Replace a file by some bytes, and raise an error at the end if there is one."""
+    with replace_file(path) as file:
+        for chunk in chunks:
+            file.write(chunk)
+        if then is not None:
+            raise then
+
+
+def test_the_file_appears_at_the_end_and_not_before(tmp_path):
+    path = tmp_path / 'map.ply'
+    path.write_bytes(b'old')
+    with replace_file(path) as file:
+        file.write(b'new and longer')
+        file.flush()
+        assert path.read_bytes() == b'old'
+    assert path.read_bytes() == b'new and longer'
+    assert os.listdir(tmp_path) == ['map.ply']
+
+
+def test_a_path_may_be_a_string_and_relative(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with replace_file('map.ply') as file:
+        file.write(b'new')
+    assert (tmp_path / 'map.ply').read_bytes() == b'new'
+
+
+@pytest.mark.parametrize('error', [RuntimeError, KeyboardInterrupt, SystemExit])
+def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path, error):
+    path = tmp_path / 'map.ply'
+    path.write_bytes(b'old')
+    with pytest.raises(error, match='stop'):
+        write(path, b'new', then=error('stop'))
+    assert path.read_bytes() == b'old'
+    assert os.listdir(tmp_path) == ['map.ply']
+
+
+def test_an_error_about_another_file_passes_as_it_is(tmp_path):
+    error = FileNotFoundError(2, 'No such file', 'absent')
+    with pytest.raises(FileNotFoundError, match='absent'):
+        write(tmp_path / 'map.ply', then=error)
+    assert os.listdir(tmp_path) == []
+
+
+def test_two_at_once_do_not_meet(tmp_path):
+    path = tmp_path / 'map.ply'
+    with replace_file(path) as first, replace_file(path) as second:
+        first.write(b'first')
+        second.write(b'second')
+    assert path.read_bytes() == b'first'  # its block ends last
+    assert os.listdir(tmp_path) == ['map.ply']
+
+
+def test_a_link_stays_and_leads_to_the_new_file(tmp_path):
+    (tmp_path / 'disk').mkdir()
+    path = tmp_path / 'map.ply'
+    path.symlink_to(tmp_path / 'disk' / 'map.ply')
+    with replace_file(path) as file:
+        file.write(b'new')
+    assert path.is_symlink()
+    assert (tmp_path / 'disk' / 'map.ply').read_bytes() == b'new'
+
+
+@pytest.mark.parametrize(('umask', 'mode'), [(0o022, 0o644), (0o077, 0o600), (0o002, 0o664)])
+def test_permissions_follow_the_umask(tmp_path, umask, mode):
+    before = os.umask(umask)
+    try:
+        write(tmp_path / 'map.ply')
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / 'map.ply').stat().st_mode) == mode
+
+
+def test_a_missing_directory_is_named(tmp_path):
+    path = tmp_path / 'absent' / 'map.ply'
+    with pytest.raises(FileFormatError, match=r'absent/map\.ply: cannot be written: No such'):
+        write(path)
+
+
+def test_a_name_too_long_is_refused_and_leaves_nothing(tmp_path):
+    with pytest.raises(FileFormatError, match='cannot be written: File name too long'):
+        write(tmp_path / ('m' * 300))
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize('path', ['.', '', os.devnull])
+def test_what_is_no_regular_file_is_never_replaced(tmp_path, monkeypatch, path):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FileFormatError, match='not a regular file'):
+        write(path)
+    assert os.listdir(tmp_path) == []
+
+
+@contextmanager
+def small_disk(directory, size):
+    """Mount a disk of so many bytes, where that is allowed."""
+    if shutil.which('mount') is None or not sys.platform.startswith('linux'):
+        pytest.skip('needs mount of Linux')
+    options = ['-t', 'tmpfs', '-o', f'size={size}', 'tmpfs', str(directory)]
+    if subprocess.run(['mount', *options], capture_output=True).returncode:
+        pytest.skip('not allowed to mount a small disk')
+    try:
+        yield
+    finally:
+        subprocess.run(['umount', str(directory)], check=True)
+
+
+@pytest.mark.parametrize('chunk', [100, 2**20], ids=['buffered', 'at once'])
+def test_a_full_disk_leaves_the_old_file_and_is_named(tmp_path, chunk):
+    with small_disk(tmp_path, 65536):
+        path = tmp_path / 'map.ply'
+        path.write_bytes(b'old')
+        with pytest.raises(FileFormatError, match=r'map\.ply: cannot be written: No space left'):
+            write(path, *[bytes(chunk)] * (2**20 // chunk))
+        assert path.read_bytes() == b'old'
+        assert os.listdir(tmp_path) == ['map.ply']
+
+
+def test_a_full_device_is_noticed_at_the_last_flush(tmp_path):
+    with small_disk(tmp_path, 4096):
+        (tmp_path / 'other').write_bytes(bytes(4096))
+        with pytest.raises(FileFormatError, match='No space left'):
+            write(tmp_path / 'map.ply', b'few')
+        assert os.listdir(tmp_path) == ['other']

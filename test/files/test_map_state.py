@@ -1,0 +1,151 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Maps in files: what comes back is the map and its window to the bit, or an error."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import WindowConfig
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
+
+
+def driven(num_scans=6, *, keep_points=False):
+    """Return a map and its window of three scans after a drive."""
+    rng = np.random.default_rng(3)
+    surfel_map = SurfelMap(0.5)
+    window = SlidingWindow(surfel_map, WindowConfig(max_scans=3, keep_points=keep_points))
+    for number in range(num_scans):
+        pose = np.eye(4)
+        pose[:3, 3] = number, 0.1, 0.2
+        points = rng.uniform(-4.0, 4.0, (500, 3)).astype(np.float32)
+        window.insert(
+            WindowedScan(
+                moments=surfel_map.reduce(points, pose, origin=pose[:3, 3]),
+                stamp_ns=number * 10**8,
+                T_map_sensor=pose,
+                points=points if keep_points else None,
+            )
+        )
+    return surfel_map, window
+
+
+@pytest.mark.parametrize('keep_points', [False, True])
+def test_a_map_comes_back_with_its_digest_and_its_window(tmp_path, keep_points):
+    surfel_map, window = driven(keep_points=keep_points)
+
+    digest = save_map(tmp_path / 'map.npz', surfel_map, window)
+    loaded, scans = load_map(tmp_path / 'map.npz', voxel_size_m=0.5)
+
+    assert digest == surfel_map.digest() == loaded.digest()
+    assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
+    for scan, kept in zip(scans, window, strict=True):
+        np.testing.assert_array_equal(scan.T_map_sensor, kept.T_map_sensor)
+        assert (scan.points is None) == (kept.points is None)
+        if keep_points:
+            np.testing.assert_array_equal(scan.points, kept.points)
+
+
+def test_a_loaded_map_goes_on_as_if_it_had_never_stopped(tmp_path):
+    surfel_map, window = driven()
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+    loaded, scans = load_map(tmp_path / 'map.npz')
+    resumed = SlidingWindow(loaded, window.config)
+    resumed.restore(scans)
+
+    new = WindowedScan(
+        moments=surfel_map.reduce(np.ones((9, 3))), stamp_ns=10**10, T_map_sensor=np.eye(4)
+    )
+    window.insert(new)
+    resumed.insert(new)
+
+    assert len(resumed) == len(window) == 3
+    assert loaded == surfel_map
+
+
+def test_an_empty_map_comes_back(tmp_path):
+    save_map(tmp_path / 'map.npz', SurfelMap(0.25))
+    loaded, scans = load_map(tmp_path / 'map.npz')
+    assert (loaded.num_voxels, loaded.voxel_size_m, scans) == (0, 0.25, [])
+
+
+def test_a_coarser_level_comes_back(tmp_path):
+    coarse = driven()[0].coarsen(2)
+    save_map(tmp_path / 'map.npz', coarse)
+    assert load_map(tmp_path / 'map.npz')[0] == coarse
+
+
+def test_another_voxel_size_is_refused(tmp_path):
+    save_map(tmp_path / 'map.npz', driven()[0])
+    with pytest.raises(FileFormatError, match=r'0\.5 m, expected map\.voxel_size_m = 0\.2'):
+        load_map(tmp_path / 'map.npz', voxel_size_m=0.2)
+
+
+def test_a_file_of_another_kind_is_refused(tmp_path):
+    save_state(tmp_path / 'map.npz', {}, {'kind': 'mesh'})
+    with pytest.raises(FileFormatError, match="holds 'mesh', expected a surfel map"):
+        load_map(tmp_path / 'map.npz')
+
+
+def damage_duplicate(arrays, attributes):
+    arrays['map.key'][1] = arrays['map.key'][0]
+
+
+def damage_count(arrays, attributes):
+    arrays['map.count'][0] = 0
+
+
+def damage_negative_count(arrays, attributes):
+    arrays['scan1.count'][0] = -4
+
+
+def damage_sum(arrays, attributes):
+    arrays['map.total'][0, 0] = 10**15
+
+
+def damage_shape(arrays, attributes):
+    arrays['map.product'] = arrays['map.product'][:, :5].copy()
+
+
+def damage_type(arrays, attributes):
+    arrays['map.total'] = arrays['map.total'].astype(np.float64)
+
+
+def damage_digest(arrays, attributes):
+    attributes['digest'] = '0' * 64
+
+
+def damage_missing(arrays, attributes):
+    del arrays['scan0.view']
+
+
+def damage_scan(arrays, attributes):
+    arrays['scan0.key'][0] = 1  # a voxel that the map does not have
+
+
+def damage_pose(arrays, attributes):
+    arrays['scans.pose'][0, 0, 0] = np.nan
+
+
+def damage_voxel_size(arrays, attributes):
+    attributes['voxel_size_m'] = 'large'
+
+
+@pytest.mark.parametrize(
+    'damage', [value for name, value in sorted(globals().items()) if name.startswith('damage_')]
+)
+def test_contents_that_no_map_can_have_are_refused(tmp_path, damage):
+    """The hash of a file says that it is what was written, not that a map wrote it."""
+    surfel_map, window = driven()
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    damage(arrays, attributes)
+    save_state(tmp_path / 'map.npz', arrays, attributes)
+
+    with pytest.raises(FileFormatError, match='damaged'):
+        load_map(tmp_path / 'map.npz')

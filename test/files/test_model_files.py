@@ -1,0 +1,93 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Models in files: what JSON, Parquet and OBJ hold is what the models say."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import json
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.model_files import write_json, write_models, write_obj, write_parquet
+from surfel_mapper.models import fit
+from test.models.scenes import A, room, VIEW
+
+
+@pytest.fixture(scope='module')
+def model():
+    return fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
+
+
+def test_json_holds_planes_surfaces_and_gaussians(model, tmp_path):
+    write_json(tmp_path / 'models.json', model)
+    found = json.loads((tmp_path / 'models.json').read_text())
+    assert [p['id'] for p in found['planes']] == [p.id for p in model.planes]
+    assert [s['id'] for s in found['surfaces']] == [s.id for s in model.surfaces]
+    assert len(found['gaussians']) == len(model.gaussians) > 0
+    for content, plane in zip(found['planes'], model.planes, strict=True):
+        ring = np.array(content['outline'][0])
+        np.testing.assert_allclose(ring @ content['normal'] + content['offset_m'], 0.0, atol=1e-9)
+        assert content['mean'] == plane.mean.tolist()
+    control = np.array(found['surfaces'][0]['control'])
+    assert (control == model.surfaces[0].spline.control).all()
+
+
+def test_parquet_has_a_row_a_primitive(model, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    write_parquet(tmp_path / 'models.parquet', model)
+    table = parquet.read_table(tmp_path / 'models.parquet').to_pydict()
+    kinds = ['plane'] * len(model.planes) + ['surface'] * len(model.surfaces)
+    assert table['kind'] == kinds + ['gaussian'] * len(model.gaussians)
+    assert sum(table['num_points']) == model.num_thinned
+    assert table['cov_xy'][0] == model.planes[0].covariance[0, 1]
+    assert np.isnan(table['area_m2'][-1])
+
+
+def test_obj_has_an_object_for_every_patch_and_faces_within_its_vertices(model, tmp_path):
+    write_obj(tmp_path / 'models.obj', model)
+    lines = (tmp_path / 'models.obj').read_text().splitlines()
+    names = [line[2:] for line in lines if line.startswith('o ')]
+    assert names == [f'plane_{p.id}' for p in model.planes] + [
+        f'surface_{s.id}' for s in model.surfaces
+    ]
+    num_vertices = 0
+    for line in lines:
+        if line.startswith('v '):
+            num_vertices += 1
+        elif line.startswith('f '):
+            assert all(1 <= int(n) <= num_vertices for n in line.split()[1:])
+
+
+def test_ids_and_versions_of_models_that_live_are_kept(model, tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    live = replace(
+        model,
+        planes=[replace(plane, id=plane.id + 1000) for plane in model.planes],
+        gaussians=replace(model.gaussians, id=model.gaussians.id + 2000),
+    )
+    ids = [p.id for p in live.patches] + live.gaussians.id.tolist()
+    versions = {number: number % 7 for number in ids}
+    written = write_models(tmp_path, live, ('json', 'parquet'), versions)
+    assert [path.name for path in written] == ['models.json', 'models.parquet']
+    found = json.loads(written[0].read_text())
+    for kind in ('planes', 'surfaces', 'gaussians'):
+        assert all(item['version'] == item['id'] % 7 for item in found[kind])
+    table = parquet.read_table(written[1]).to_pydict()
+    assert table['id'] == ids
+    assert table['version'] == [number % 7 for number in ids]
+
+
+def test_models_of_nothing_are_written_too(tmp_path):
+    empty = fit(np.empty((0, 3)))
+    write_json(tmp_path / 'a.json', empty)
+    write_obj(tmp_path / 'a.obj', empty)
+    assert json.loads((tmp_path / 'a.json').read_text())['planes'] == []
+
+
+def test_a_directory_that_is_not_there_is_refused(model, tmp_path):
+    with pytest.raises(FileFormatError, match='none'):
+        write_json(tmp_path / 'none' / 'models.json', model)

@@ -1,0 +1,171 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a map in files make the whole map again, and its digest is taken tile by tile."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import parquet_tiles
+from surfel_mapper.files.parquet import read_map, write_map
+from surfel_mapper.files.parquet_tiles import (
+    BLOCK_BITS,
+    dataset_digest,
+    Part,
+    read_part,
+    split_map,
+    Tile,
+    TILE_BITS,
+    tile_part,
+    tiles_in,
+    write_shard,
+    write_tile,
+)
+from surfel_mapper.mapping.moments import pack_keys, ScanMoments
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+
+def scattered(num=4000, seed=1, voxel_size_m=0.5, columns=()):
+    """Return a map whose points lie in several tiles on both sides of the origin."""
+    rng = np.random.default_rng(seed)
+    surfel_map = SurfelMap(voxel_size_m, columns=columns)
+    points = rng.normal(0.0, [150.0, 100.0, 5.0], (num, 3)) * voxel_size_m / 0.5
+    points = np.concatenate([points, points + 0.01])
+    intensity = rng.uniform(0.0, 255.0, len(points))
+    surfel_map.add(points, origin=[0.0, 0.0, 3.0], columns={'intensity': intensity})
+    return surfel_map
+
+
+def dataset(directory, surfel_map):
+    parts = write_shard(directory / 'shard.parquet', surfel_map)
+    for tile, part in parts.items():
+        write_tile(directory / 'map' / tile.path, read_part(part))
+    return directory / 'map'
+
+
+@pytest.mark.parametrize(('columns', 'rows_read'), [((), 1), ((), 900), (('intensity',), 10**6)])
+def test_the_digest_of_a_dataset_is_that_of_the_map(tmp_path, monkeypatch, columns, rows_read):
+    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', rows_read)
+    surfel_map = scattered(columns=columns)
+
+    directory = dataset(tmp_path, surfel_map)
+
+    assert len(tiles_in(directory)) > 8
+    assert dataset_digest(directory) == surfel_map.digest()
+
+
+def test_the_tiles_of_a_map_are_squares_and_together_the_map(tmp_path):
+    surfel_map = scattered()
+    again, most = SurfelMap(0.5), 0
+
+    for tile, path in tiles_in(dataset(tmp_path, surfel_map)).items():
+        part = read_map(path)  # which checks the digest of the tile
+        index = part.moments().voxel_index
+        assert (index[:, :2] >> TILE_BITS == tile).all()
+        again.merge(part)
+        most = max(most, len(part))
+
+    assert again == surfel_map
+    assert most < len(surfel_map) / 2
+
+
+def test_other_tools_read_a_dataset_by_tile(tmp_path):
+    from pyarrow import dataset as arrow_dataset
+
+    surfel_map = scattered()
+    directory = dataset(tmp_path, surfel_map)
+
+    table = arrow_dataset.dataset(directory, partitioning='hive').to_table()
+    index = np.stack([table.column(name).to_numpy() for name in 'ijk'], axis=1)
+    order = np.argsort(pack_keys(index))
+    moments = surfel_map.moments()
+    np.testing.assert_array_equal(index[order], moments.voxel_index)
+    np.testing.assert_array_equal(table.column('num_points').to_numpy()[order], moments.count)
+    np.testing.assert_array_equal(table.column('tile_i').to_numpy(), index[:, 0] >> TILE_BITS)
+
+
+def test_a_row_group_of_a_tile_holds_a_few_voxels_in_i(tmp_path):
+    from pyarrow import parquet
+
+    for path in tiles_in(dataset(tmp_path, scattered())).values():
+        blocks = []
+        with parquet.ParquetFile(path) as file:
+            for group in range(file.metadata.num_row_groups):
+                i = file.read_row_group(group, columns=['i']).column('i').to_numpy()
+                blocks.append(set(i >> BLOCK_BITS))
+        assert all(len(block) == 1 for block in blocks)
+        assert len(set.union(*blocks)) == len(blocks)
+
+
+def test_a_map_in_one_file_is_cut_without_reading_it_whole(tmp_path, monkeypatch):
+    surfel_map = scattered()
+    write_map(tmp_path / 'map.parquet', surfel_map)
+    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', 1000)
+
+    pieces = list(split_map(tmp_path / 'map.parquet'))
+
+    assert len(pieces) > 3
+    assert max(map(len, pieces)) <= 1000
+    again = SurfelMap(0.5)
+    for piece in pieces:
+        again.merge(piece)
+    assert again == surfel_map
+
+
+def test_a_tile_as_a_part_is_all_of_it(tmp_path):
+    (tile, path), *_ = tiles_in(dataset(tmp_path, scattered())).items()
+    part = tile_part(path)
+    assert read_part(part) == read_map(path)
+    assert part.num_voxels == len(read_map(path))
+    assert Tile(tile.i, tile.j).path == path.relative_to(tmp_path / 'map')
+
+
+def test_voxels_at_the_corners_of_space_have_tiles_too(tmp_path):
+    far = 2**20 - 1
+    index = np.array([[-far - 1, far, 0], [far, -far - 1, far], [0, -1, 0], [-1, 0, 0]])
+    num = len(index)
+    surfel_map = SurfelMap(0.5)
+    surfel_map.insert(
+        ScanMoments(
+            voxel_size_m=0.5,
+            key=np.sort(pack_keys(index)),
+            count=np.ones(num, np.int64),
+            total=np.zeros((num, 3), np.int64),
+            product=np.zeros((num, 6), np.int64),
+            view=np.zeros((num, 3), np.int64),
+        )
+    )
+    directory = dataset(tmp_path, surfel_map)
+    assert dataset_digest(directory) == surfel_map.digest()
+    assert Tile(-1, 0) in tiles_in(directory)
+
+
+def test_an_empty_map_makes_a_shard_without_tiles(tmp_path):
+    assert write_shard(tmp_path / 'shard.parquet', SurfelMap(0.5)) == {}
+
+
+def test_a_directory_without_tiles_and_tiles_of_two_maps_are_refused(tmp_path):
+    with pytest.raises(FileFormatError, match='no tiles of a map'):
+        dataset_digest(tmp_path)
+    first = dataset(tmp_path, scattered())
+    other = SurfelMap(0.2)
+    other.add(np.full((3, 3), 900.0))
+    write_tile(first / Tile(99, 99).path, other)
+    with pytest.raises(FileFormatError, match='tiles of different maps'):
+        dataset_digest(first)
+
+
+@pytest.mark.parametrize('damage', ['empty', 'cut', 'other', 'gone'])
+def test_a_damaged_file_is_refused_by_name(tmp_path, damage):
+    parts = write_shard(tmp_path / 'shard.parquet', scattered())
+    part = next(iter(parts.values()))
+    path = tmp_path / 'shard.parquet'
+    content = path.read_bytes()
+    if damage == 'gone':
+        path.unlink()
+    elif damage == 'other':
+        part = Part(str(path), (10_000,), 1)
+    else:
+        path.write_bytes(content[: len(content) // 2 if damage == 'cut' else 0])
+    with pytest.raises(FileFormatError, match=r'shard\.parquet'):
+        read_part(part)

@@ -1,0 +1,209 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""PLY: what is written is read back equal, by this package and by plyfile; damage is named."""
+
+import os
+from pathlib import Path
+import struct
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.ply import read_points, write_mesh, write_points, write_surfels
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+from test.messages.examples import make_surfels
+
+NAMES = ['x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature', 'num_points']
+
+
+def assert_equals_surfels(columns, surfels):
+    np.testing.assert_array_equal(np.stack([columns[n] for n in 'xyz'], 1), surfels.position)
+    normal = np.stack([columns[n] for n in ('nx', 'ny', 'nz')], 1)
+    np.testing.assert_array_equal(normal, surfels.normal.astype(np.float32))
+    for name in ('planarity', 'curvature'):
+        np.testing.assert_array_equal(columns[name], getattr(surfels, name).astype(np.float32))
+    np.testing.assert_array_equal(columns['num_points'], surfels.num_points)
+
+
+def test_a_file_is_a_text_header_and_a_little_endian_table(tmp_path):
+    surfels = make_surfels(1)
+    write_surfels(tmp_path / 'map.ply', surfels)
+    header = (
+        b'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
+        b'element vertex 1\nproperty double x\nproperty double y\nproperty double z\n'
+        b'property float nx\nproperty float ny\nproperty float nz\n'
+        b'property float planarity\nproperty float curvature\nproperty uint num_points\n'
+        b'end_header\n'
+    )
+    row = struct.pack(
+        '<3d5fI',
+        *surfels.position[0],
+        *surfels.normal[0],
+        surfels.planarity[0],
+        surfels.curvature[0],
+        surfels.num_points[0],
+    )
+    assert (tmp_path / 'map.ply').read_bytes() == header + row
+
+
+@pytest.mark.parametrize('number', [0, 1, 1000])
+def test_surfels_come_back_equal(tmp_path, number):
+    surfels = make_surfels(number, centre=(5e6, -4e5, 100.0))
+    write_surfels(tmp_path / 'map.ply', surfels)
+    columns = read_points(tmp_path / 'map.ply')
+    assert list(columns) == NAMES
+    assert_equals_surfels(columns, surfels)
+
+
+def test_plyfile_reads_the_same(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    surfels = make_surfels(100, centre=(5e6, -4e5, 100.0))
+    write_surfels(tmp_path / 'map.ply', surfels)
+    vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
+    assert [p.name for p in vertex.properties] == NAMES
+    assert_equals_surfels(vertex, surfels)
+
+
+@pytest.mark.parametrize('order', ['<', '>'])
+def test_what_plyfile_writes_is_read(tmp_path, order):
+    plyfile = pytest.importorskip('plyfile')
+    dtype = [('x', 'f4'), ('ring', 'u2'), ('t', 'f8'), ('a', 'i1'), ('b', 'u1'), ('c', 'i4')]
+    table = np.array([(1.5, 2, 3.25, -4, 5, -6), (-1.5, 65535, 1e300, 7, 255, 9)], dtype)
+    elements = [
+        plyfile.PlyElement.describe(table, 'vertex'),
+        plyfile.PlyElement.describe(np.array([([0, 1, 0],)], [('v', 'i4', (3,))]), 'face'),
+    ]
+    plyfile.PlyData(elements, byte_order=order, comments=['c'], obj_info=['i']).write(
+        tmp_path / 'points.ply'
+    )
+    columns = read_points(tmp_path / 'points.ply')
+    assert list(columns) == [name for name, _ in dtype]
+    for name in columns:
+        assert columns[name].dtype == table.dtype[name]
+        np.testing.assert_array_equal(columns[name], table[name])
+
+
+def test_columns_of_every_type_come_back_equal(tmp_path):
+    kinds = ['i1', 'u1', 'i2', 'u2', 'i4', 'u4', 'f4', 'f8', '>f4']
+    columns = {f'c{i}': np.arange(5).astype(kind) for i, kind in enumerate(kinds)}
+    write_points(tmp_path / 'points.ply', columns)
+    back = read_points(tmp_path / 'points.ply')
+    assert list(back) == list(columns)
+    for name in columns:
+        assert back[name].dtype == columns[name].dtype.newbyteorder('=')
+        np.testing.assert_array_equal(back[name], columns[name])
+
+
+HEADER = 'ply\nformat binary_little_endian 1.0\n'
+
+
+@pytest.mark.parametrize(
+    ('content', 'expected'),
+    [
+        ('', 'no header of a PLY file'),
+        ('solid stl\nend_header\n', 'no header'),
+        (HEADER + 'element vertex 1\nproperty float x\n', 'no header'),
+        (HEADER + 'end_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
+        (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex 1\nproperty list uchar int x\nend_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex one\nproperty float x\nend_header\n', 'not a PLY whose'),
+        (HEADER + 'element vertex -1\nproperty float x\nend_header\n', '-1 x vertex'),
+        (HEADER + 'element face 1\nproperty float x\nend_header\n', '1 x face'),
+        (HEADER + 'element vertex 1\n' + 'property float x\n' * 2 + 'end_header\n', 'not a '),
+        ('ply\nformat latin 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n', 'a PLY'),
+        (
+            'ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n1\n',
+            '1 numbers, expected 2 for 2 vertices',
+        ),
+        ('ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\na\n', 'float'),
+        (
+            'ply\nformat binary_big_endian 2.0\nelement vertex 1\nproperty int x\nend_header\n',
+            'version 2.0',
+        ),
+        (
+            HEADER + 'element vertex 2\nproperty float x\nend_header\n1234567',
+            '7 bytes after the header, expected 8 for 2 vertices',
+        ),
+        (HEADER + f'element vertex {10**30}\nproperty double x\nend_header\n', 'truncated'),
+    ],
+)
+def test_what_is_no_whole_file_of_points_is_refused(tmp_path, content, expected):
+    path = tmp_path / 'bad.ply'
+    path.write_bytes(content.encode())
+    with pytest.raises(FileFormatError, match=rf'bad\.ply: .*{expected}'):
+        read_points(path)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(FileFormatError, match=r'absent\.ply: cannot be read: No such file'):
+        read_points(tmp_path / 'absent.ply')
+
+
+def test_scans_of_real_lidars_are_read_like_plyfile_reads_them():
+    if 'SURFEL_MAPPER_TEST_DATA' not in os.environ:
+        pytest.skip('SURFEL_MAPPER_TEST_DATA is not set: no real scans')
+    plyfile = pytest.importorskip('plyfile')
+    paths = sorted(Path(os.environ['SURFEL_MAPPER_TEST_DATA'], 'data/scans').glob('*.ply'))
+    assert paths
+    for path in paths:
+        columns, vertex = read_points(path), plyfile.PlyData.read(path)['vertex']
+        assert list(columns) == [p.name for p in vertex.properties]
+        for name, values in columns.items():
+            np.testing.assert_array_equal(values, vertex[name])
+
+
+def test_intensity_and_colour_are_written_where_the_map_has_them(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
+    columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 1, 7]])}
+    surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
+    write_surfels(tmp_path / 'map.ply', surfel_map.surfels())
+    vertex = plyfile.PlyData.read(tmp_path / 'map.ply')['vertex']
+    assert vertex['intensity'].tolist() == [1.5]
+    assert [vertex[name].tolist() for name in ('red', 'green', 'blue')] == [[255], [0], [7]]
+    assert vertex['red'].dtype == np.uint8
+
+
+def test_an_ascii_file_of_plyfile_reads_like_its_binary(tmp_path):
+    plyfile = pytest.importorskip('plyfile')
+    rows = [(1.5, -2.25, 7), (np.nan, 1e30, 255)]
+    table = np.array(rows, [('x', 'f4'), ('y', 'f8'), ('ring', 'u1')])
+    found = []
+    for name, text in (('text.ply', True), ('binary.ply', False)):
+        vertices = plyfile.PlyElement.describe(table, 'vertex')
+        plyfile.PlyData([vertices], text=text).write(str(tmp_path / name))
+        found.append(read_points(tmp_path / name))
+
+    for name in table.dtype.names:
+        assert found[0][name].dtype == found[1][name].dtype
+        np.testing.assert_array_equal(found[0][name], found[1][name])
+
+
+@pytest.mark.parametrize('colored', [False, True])
+def test_a_mesh_is_read_back_by_plyfile(tmp_path, colored):
+    rng = np.random.default_rng(4)
+    mesh = Mesh(
+        vertices=rng.normal(scale=1e5, size=(30, 3)),
+        triangles=rng.integers(0, 30, (50, 3)).astype(np.int32),
+        colors=rng.integers(0, 256, (30 * colored, 3)).astype(np.uint8),
+    )
+    write_mesh(tmp_path / 'mesh.ply', mesh)
+    plyfile = pytest.importorskip('plyfile')
+    found = plyfile.PlyData.read(tmp_path / 'mesh.ply')
+    for axis, name in enumerate('xyz'):
+        assert found['vertex'][name].tolist() == mesh.vertices[:, axis].tolist()
+    assert np.array_equal(np.stack(found['face']['vertex_indices']), mesh.triangles)
+    names = [p.name for p in found['vertex'].properties]
+    assert names == ['x', 'y', 'z', *(['red', 'green', 'blue'] if colored else [])]
+    if colored:
+        assert found['vertex']['green'].tolist() == mesh.colors[:, 1].tolist()
+
+
+def test_a_mesh_of_nothing_is_a_file_of_nothing(tmp_path):
+    write_mesh(tmp_path / 'mesh.ply', EMPTY)
+    plyfile = pytest.importorskip('plyfile')
+    found = plyfile.PlyData.read(tmp_path / 'mesh.ply')
+    assert len(found['vertex'].data) == len(found['face'].data) == 0

@@ -1,0 +1,146 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Trajectories come back as they were written; files of others read; foolish ones are refused."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.trajectory import read_trajectory, write_tum
+from surfel_mapper.geometry import pose_matrix
+
+START_NS = 1_700_000_000_123_456_789
+
+
+def some_poses(number=20):
+    rng = np.random.default_rng(3)
+    q = rng.normal(size=(number, 4))
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    xyz = rng.uniform(-1e4, 1e4, (number, 3))
+    stamps = START_NS + np.arange(number) * 100_000_001
+    return stamps, np.array([pose_matrix(t, r) for t, r in zip(xyz, q, strict=True)])
+
+
+def text_file(tmp_path, text, name='poses.txt'):
+    path = tmp_path / name
+    path.write_text(text)
+    return path
+
+
+def test_tum_poses_come_back_to_the_nanosecond_and_the_last_digit(tmp_path):
+    stamps, poses = some_poses()
+    write_tum(tmp_path / 'a.tum', stamps, poses)
+
+    found = read_trajectory(tmp_path / 'a.tum')
+
+    np.testing.assert_array_equal(found.stamp_ns, stamps)
+    np.testing.assert_array_equal(found.xyz, poses[:, :3, 3])
+    turned = Rotation.from_quat(found.q_xyzw).as_matrix()
+    np.testing.assert_allclose(turned, poses[:, :3, :3], atol=1e-15)
+    assert len(found) == len(stamps)
+
+
+def test_tum_text_reads_in_numpy_as_eight_columns(tmp_path):
+    stamps, poses = some_poses()
+    write_tum(tmp_path / 'a.tum', stamps, poses)
+
+    table = np.loadtxt(tmp_path / 'a.tum')
+
+    np.testing.assert_allclose(table[:, 0], stamps / 1e9, rtol=1e-15)
+    np.testing.assert_array_equal(table[:, 1:4], poses[:, :3, 3])
+
+
+def test_no_poses_write_a_header_alone(tmp_path):
+    write_tum(tmp_path / 'a.tum', [], np.empty((0, 4, 4)))
+
+    assert (tmp_path / 'a.tum').read_text().startswith('# stamp_s x y z')
+    with pytest.raises(FileFormatError, match='no poses in it'):
+        read_trajectory(tmp_path / 'a.tum')
+
+
+KITTI = """\
+1 0 0 0.5 0 1 0 0 0 0 1 0
+0 -1 0 1.5 1 0 0 2 0 0 1 -1
+
+"""
+
+
+def test_kitti_rows_are_matrices_and_have_no_stamps_of_their_own(tmp_path):
+    found = read_trajectory(text_file(tmp_path, KITTI))
+
+    assert found.stamp_ns is None
+    np.testing.assert_array_equal(found.xyz, [[0.5, 0, 0], [1.5, 2, -1]])
+    np.testing.assert_allclose(found.q_xyzw[1], [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
+
+
+def test_kitti_stamps_come_from_the_times_beside_it(tmp_path):
+    text_file(tmp_path, '0.000000e+00\n1.036224e-01\n', 'times.txt')
+
+    found = read_trajectory(text_file(tmp_path, KITTI))
+
+    np.testing.assert_array_equal(found.stamp_ns, [0, 103_622_400])
+
+
+CSV = [
+    'stamp_ns,x,y,z,qx,qy,qz,qw\n1700000000000000001,1,2,3,0,0,0,1\n',
+    'qw,qx,qy,qz,z,y,x,label,time\n1,0,0,0,3,2,1,a,1700000000.000000001\n',
+    '#timestamp [ns], p_RS_R_x [m], p_RS_R_y [m], p_RS_R_z [m], q_RS_w [], q_RS_x [], q_RS_y [], '
+    'q_RS_z [], v_RS_R_x [m s^-1]\n1700000000000000001,1,2,3,1,0,0,0,9\n',
+    't_us,tx,ty,tz,qx,qy,qz,qw\r\n1700000000000000.001,1.0,2.0,3.0,0,0,0,-1\r\n',
+]
+
+
+@pytest.mark.parametrize('text', CSV)
+def test_csv_columns_are_found_by_name_and_stamps_by_unit(tmp_path, text):
+    found = read_trajectory(text_file(tmp_path, text))
+
+    assert found.stamp_ns.tolist() == [1_700_000_000_000_000_001]
+    assert found.xyz.tolist() == [[1.0, 2.0, 3.0]]
+    assert abs(found.q_xyzw[0, 3]) == 1.0
+
+
+@pytest.mark.parametrize(
+    ('text', 'format_', 'says'),
+    [
+        ('', None, 'no poses in it'),
+        ('1 2 3', None, '3 columns in the first line, expected 8 .TUM., 12'),
+        ('0 0 0 0 0 0 0 1', 'kitti', ':1: 8 columns, expected 12'),
+        ('0 0 0 0 0 0 0 1', 'tmu', "format 'tmu', expected one of tum, kitti, csv"),
+        ('0 0 0 0 0 0 0 1\n1 0 0', None, ':2: 3 columns, expected 8'),
+        ('0 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1', None, ':2: stamp is not after'),
+        ('0 0 0 0 0 0 0 2', None, ':1: .*norm'),
+        ('0 0 0 nan 0 0 0 1', None, ':1: .*finite'),
+        ('0 0 0 x 0 0 0 1', None, ":1: .*'x', expected a number"),
+        ('nan 0 0 0 0 0 0 1', None, ":1: time 'nan'"),
+        ('1700000000000000000 0 0 0 0 0 0 1', None, ':1: time .*, expected seconds'),
+        ('-1 0 0 0 0 0 0 1', None, ":1: time '-1'"),
+        ('2 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
+        ('1 0 0 0 0 1 0 0 0 0 -1 0', None, ':1: .* no rotation'),
+        ('stamp,x,y,z\n0,0,0,0', None, ':1: columns stamp, x, y, z; expected a header'),
+        ('stamp_s,x,y,z,qx,qy,qz,qw', None, 'only a header'),
+        ('stamp_s,x,y,z,qx,qy,qz,qw\n1,2', None, ':2: 2 columns, expected 8'),
+        ('stamp_ns,x,y,z,qx,qy,qz,qw\n1e99999999,0,0,0,0,0,0,1', None, ':2: time'),
+        ('stamp[h],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1', None, ":2: unit 'h'"),
+    ],
+)
+def test_what_is_no_trajectory_is_refused_with_its_line(tmp_path, text, format_, says):
+    with pytest.raises(FileFormatError, match=f'poses.txt.*{says}'):
+        read_trajectory(text_file(tmp_path, text), format_)
+
+
+def test_times_that_are_not_one_for_each_pose_are_refused(tmp_path):
+    text_file(tmp_path, '0\n', 'times.txt')
+
+    with pytest.raises(FileFormatError, match=r'times\.txt: 1 stamps for 2 poses'):
+        read_trajectory(text_file(tmp_path, KITTI))
+
+
+@pytest.mark.parametrize('content', [b'\xff\xfe\x00', None])
+def test_what_is_no_text_or_not_there_is_refused(tmp_path, content):
+    path = tmp_path / 'poses.txt'
+    if content is not None:
+        path.write_bytes(content)
+
+    with pytest.raises(FileFormatError, match=r'poses\.txt: '):
+        read_trajectory(path)

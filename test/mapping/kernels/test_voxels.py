@@ -1,0 +1,229 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The kernels that add moments to a map and take them away, against dicts of Python integers.
+
+The table has room for some voxels only, so that adding also stops half-way.
+"""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.kernels import hashing
+from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION, VIEW
+from surfel_mapper.mapping.kernels.voxels import (
+    add_moments,
+    find_rows,
+    first_missing,
+    subtract_moments,
+)
+from surfel_mapper.mapping.moments import pack_keys, unpack_keys
+from test import reference
+from test.kernels.modes import both
+
+
+class Memory:
+    """Rows and hash table of a map, of fixed size, and the kernels at work on them."""
+
+    def __init__(self, call, num_rows):
+        self.call = call
+        self.rows = np.full((num_rows, ROW), 99, np.int64)  # what an unused row holds is no matter
+        segments = 4
+        self.table = (
+            np.zeros(1, np.int32),
+            np.zeros(segments * hashing.SEGMENT, np.int64),
+            np.zeros(segments, np.int32),
+            np.zeros(segments, np.int8),
+        )
+        self.state = np.zeros(hashing.STATE, np.int64)
+        self.state[hashing.FREE_ROW] = -1
+        self.state[hashing.SEGMENTS] = 1
+
+    def add(self, moments, version, start=0, weight=1):
+        """Return how many rows of the moments are done, and the rows changed."""
+        changed = np.full(len(moments[0]), -1, np.int32)
+        self.state[hashing.CHANGED] = 0
+        done = self.call(
+            add_moments,
+            *(moments, weight, self.rows, self.table, self.state, version, start, changed),
+        )
+        return done, changed[: self.state[hashing.CHANGED]].tolist()
+
+    def find(self, keys):
+        found = np.full(len(keys), -9, np.int32)
+        self.call(find_rows, keys, self.rows, self.table, self.state, found)
+        return found
+
+    def missing(self, moments, weight=1):
+        return self.call(first_missing, moments, weight, self.rows, self.find(moments[0]))
+
+    def subtract(self, moments, version, min_points=1, weight=1):
+        """Return the voxels that fell below min_points."""
+        fallen = np.full(len(moments[0]), -1, np.int64)
+        found = self.find(moments[0])
+        num = self.call(
+            subtract_moments,
+            *(moments, weight, self.rows, self.table, self.state, version, found),
+            *(min_points, fallen),
+        )
+        return list(map(tuple, unpack_keys(fallen[:num]).tolist()))
+
+    def content(self):
+        """Return what the rows in the table hold, as a dict of the twins."""
+        entries = self.table[1][self.table[1] != 0]
+        rows = (entries & 0xFFFFFFFF) - 1
+        voxels = map(tuple, unpack_keys(self.rows[rows, KEY]).tolist())
+        columns = [
+            COUNT,
+            *range(SUM, SUM + 3),
+            *range(PRODUCT, PRODUCT + 6),
+            *range(VIEW, VIEW + 3),
+        ]
+        return dict(zip(voxels, self.rows[rows][:, columns].tolist(), strict=True))
+
+
+def arrays_of(twin, wide=np.int64):
+    """Return moments as the kernels take them, views summed."""
+    rows = np.array(list(twin.values()), np.int64).reshape(-1, 13)
+    keys = pack_keys(np.array(list(twin), np.int64).reshape(-1, 3))
+    return (
+        keys,
+        rows[:, 0].astype(wide),
+        rows[:, 1:4].astype(wide),
+        rows[:, 4:10].copy(),
+        rows[:, 10:].copy(),
+    )
+
+
+def some_moments(seed, num_points=120, spread_m=1.5):
+    rng = np.random.default_rng(seed)
+    return reference.scan_moments(
+        rng.uniform(-spread_m, spread_m, (num_points, 3)), 0.5, rng.uniform(-9.0, 9.0, 3)
+    )
+
+
+@both
+@pytest.mark.parametrize('wide', [np.int32, np.int64])
+def test_moments_are_added_and_subtracted_as_integers(call, wide):
+    memory, expected = Memory(call, 1000), {}
+    twins = [some_moments(seed) for seed in range(6)]
+    for version, twin in enumerate(twins, 1):
+        done, changed = memory.add(arrays_of(twin, wide), version)
+        reference.add_moments(expected, twin)
+        assert done == len(twin)
+        assert sorted(changed) == sorted(memory.find(arrays_of(twin)[0]).tolist())
+        assert (memory.rows[changed, VERSION] == version).all()
+        assert memory.content() == expected
+    assert memory.state[hashing.POINTS] == 6 * 120
+    assert memory.state[hashing.VOXELS] == len(expected)
+
+    for version, twin in enumerate(twins[::-1], 7):
+        assert memory.missing(arrays_of(twin)) == -1
+        before = set(expected)
+        fallen = memory.subtract(arrays_of(twin, wide), version)
+        reference.add_moments(expected, twin, -1)
+        assert sorted(fallen) == sorted(before - set(expected))
+        assert memory.content() == expected
+        assert memory.state[hashing.VOXELS] == len(expected)
+    assert memory.state[hashing.POINTS] == 0
+
+
+@both
+def test_a_view_of_one_point_counts_for_all_of_them(call):
+    voxels = {(0, 0, 0): [3, *range(9), 5, -6, 7], (1, 2, 3): [1, *range(9), -1, 0, 1]}
+    memory = Memory(call, 10)
+    keys, count, total, product, view = arrays_of(voxels)
+    moments = (keys, count.astype(np.int32), total, product, view.astype(np.int16))
+    memory.add(moments, 1, weight=0)
+    assert memory.content()[0, 0, 0][10:] == [15, -18, 21]
+    assert memory.missing(moments, weight=0) == -1
+    assert memory.missing(moments, weight=1) == 0
+    memory.subtract(moments, 2, weight=0)
+    assert memory.content() == {}
+
+
+@both
+def test_adding_stops_where_there_is_no_room_and_goes_on_from_there(call):
+    twin = some_moments(1, num_points=300, spread_m=2.0)
+    moments = arrays_of(twin)
+    memory = Memory(call, len(twin) - 40)
+    first = dict(list(twin.items())[:10])
+    memory.add(arrays_of(first), 1)
+    expected = {}
+    reference.add_moments(expected, first)
+
+    done, _ = memory.add(moments, 2)
+    assert done == len(twin) - 40
+    memory.rows = np.concatenate([memory.rows, np.full((40, ROW), -5)])
+    done, changed = memory.add(moments, 2, start=done)
+
+    reference.add_moments(expected, twin)
+    assert done == len(twin)
+    assert len(changed) == 40
+    assert memory.content() == expected
+
+
+@both
+def test_adding_stops_where_a_segment_cannot_split(call):
+    side = range(8)
+    twin = {(i, j, k): [1] * 13 for i in side for j in side for k in side}
+    memory = Memory(call, 1000)
+    done, _ = memory.add(arrays_of(twin), 1)
+    assert done == hashing.FULLEST
+    assert memory.state[hashing.ROWS_USED] == hashing.FULLEST
+    directory, *rest = memory.table
+    memory.table = (np.repeat(directory, 2), *rest)
+    memory.state[hashing.DEPTH] += 1
+    done, _ = memory.add(arrays_of(twin), 1, start=done)
+    assert done == 512
+    assert memory.content() == twin
+
+
+@both
+def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
+    memory, first, second = Memory(call, 400), some_moments(2), some_moments(3, num_points=30)
+    memory.add(arrays_of(first), 1)
+    used = memory.state[hashing.ROWS_USED]
+    memory.subtract(arrays_of(first), 2)
+    assert (memory.rows[:used, COUNT] == 0).all()
+    _, changed = memory.add(arrays_of(second), 3)
+    assert memory.state[hashing.ROWS_USED] == used
+    assert max(changed) < used
+    assert memory.content() == second
+
+
+@both
+@pytest.mark.parametrize('column', range(13))
+def test_moments_not_held_are_found_missing(call, column):
+    memory = Memory(call, 200)
+    twin = some_moments(4)
+    memory.add(arrays_of(twin), 1)
+    voxel = list(twin)[7]
+    one_off = {v: list(row) for v, row in twin.items()}
+    one_off[voxel][column] += 1
+    assert memory.missing(arrays_of(one_off)) == 7
+    absent = {(50, 50, 50): [1] * 13}
+    assert memory.missing(arrays_of({**dict(list(twin.items())[:4]), **absent})) == 4
+
+
+@both
+@pytest.mark.parametrize('min_points', [1, 2, 3, 4, 5])
+def test_voxels_fall_when_they_had_enough_points_and_have_no_more(call, min_points):
+    memory = Memory(call, 20)
+    counts = {(0, 0, n): n for n in range(1, 5)}
+    memory.add(arrays_of({v: [n] + [0] * 12 for v, n in counts.items()}), 1)
+    one_each = arrays_of({v: [1] + [0] * 12 for v in counts})
+    fallen = memory.subtract(one_each, 2, min_points)
+    assert fallen == ([(0, 0, min_points)] if min_points < 5 else [])
+
+
+@both
+def test_voxels_are_found_wherever_they_are(call):
+    memory, twin = Memory(call, 1000), some_moments(5, num_points=200)
+    memory.add(arrays_of(twin), 1)
+    keys = arrays_of(twin)[0]
+    absent = pack_keys(np.array([[100, 100, k] for k in range(40)]))
+    found = memory.find(np.concatenate([keys, absent]))
+    assert (memory.rows[found[: len(keys)], KEY] == keys).all()
+    assert (found[len(keys) :] == -1).all()
+    assert len(memory.find(keys[:0])) == 0

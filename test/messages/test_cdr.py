@@ -1,0 +1,228 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Serialised markers: equal to what rclpy writes, and to a twin that writes number by number.
+
+Bytes that only pad are compared with nothing: rclpy leaves in them what was in memory.
+"""
+
+from dataclasses import replace
+from itertools import product
+import struct
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from surfel_mapper.messages.cdr import (
+    ADD,
+    DELETE,
+    DELETE_ALL,
+    LINE_LIST,
+    Marker,
+    marker_array,
+    polygon_instance,
+    TEXT_VIEW_FACING,
+    TRIANGLE_LIST,
+)
+
+TEXTS = ['', 'a', 'ab', 'abc', 'odom', 'sensor', 'über', 'discs of a map']
+
+
+class Twin:
+    """Writes CDR one value at a time, and remembers which bytes are padding."""
+
+    def __init__(self):
+        self.content, self.padding = bytearray(), bytearray()
+
+    def put(self, code, *values):
+        for value in values:
+            size = struct.calcsize(code)
+            while len(self.content) % size:
+                self.content.append(0)
+                self.padding.append(1)
+            self.content += struct.pack('<' + code, value)
+            self.padding += bytes(size)
+
+    def text(self, value):
+        content = value.encode()
+        self.put('I', len(content) + 1)
+        self.put('B', *content, 0)
+
+
+def twin(markers):
+    """Return the bytes of a MarkerArray without encapsulation, and 1 for each that pads."""
+    out = Twin()
+    out.put('I', len(markers))
+    for m in markers:
+        out.put('i', m.stamp_ns // 10**9)
+        out.put('I', m.stamp_ns % 10**9)
+        out.text(m.frame_id)
+        out.text(m.ns)
+        out.put('i', m.id, m.type, m.action)
+        out.put('d', *m.pose, *m.scale)
+        out.put('f', *m.color)
+        out.put('i', 0)
+        out.put('I', 0)
+        out.put('B', 0)
+        out.put('I', len(m.points))
+        out.put('d', *m.points.ravel())
+        out.put('I', len(m.colors))
+        out.put('f', *m.colors.ravel())
+        out.text('')
+        out.put('i', 0)
+        out.put('I', 0)
+        out.text('')
+        out.text('')
+        out.put('I', 0, 0)
+        out.text(m.text)
+        out.text('')
+        out.text('')
+        out.put('I', 0)
+        out.put('B', 0)
+    return bytes(out.content), np.frombuffer(bytes(out.padding), np.uint8)
+
+
+def make_marker(frame_id='odom', ns='discs', points=3, coloured=True, seed=0, **changes):
+    rng = np.random.default_rng(seed)
+    values = {
+        'ns': ns,
+        'id': 7,
+        'type': TRIANGLE_LIST,
+        'action': ADD,
+        'frame_id': frame_id,
+        'stamp_ns': 1_700_000_000_123_456_789,
+        'pose': rng.normal(size=7),
+        'scale': (1.0, 2.0, 3.0),
+        'color': (0.25, 0.5, 0.75, 1.0),
+        'points': rng.normal(size=(points, 3)),
+        'colors': rng.uniform(size=(points * coloured, 4)).astype(np.float32),
+    }
+    return Marker(**{**values, **changes})
+
+
+@pytest.mark.parametrize(('frame_id', 'ns'), product(TEXTS, TEXTS))
+def test_strings_of_any_length_leave_everything_in_place(frame_id, ns):
+    markers = [make_marker(frame_id, ns), make_marker(ns, frame_id, points=0)]
+    assert marker_array(markers) == b'\x00\x01\x00\x00' + twin(markers)[0]
+
+
+NAMES = st.text(st.characters(exclude_characters='\0', exclude_categories=['Cs']), max_size=9)
+MARKERS = st.lists(
+    st.builds(
+        make_marker,
+        frame_id=NAMES,
+        ns=NAMES,
+        text=NAMES,
+        points=st.integers(0, 4),
+        coloured=st.booleans(),
+        seed=st.integers(0, 9),
+        id=st.integers(-(2**31), 2**31 - 1),
+        type=st.sampled_from([LINE_LIST, TEXT_VIEW_FACING, TRIANGLE_LIST]),
+        action=st.sampled_from([ADD, DELETE, DELETE_ALL]),
+        stamp_ns=st.integers(0, 2**31 * 10**9 - 1),
+    ),
+    max_size=4,
+)
+
+
+@given(MARKERS)
+@settings(max_examples=100, deadline=None)
+def test_any_markers_are_written_like_one_number_at_a_time(markers):
+    assert marker_array(markers) == b'\x00\x01\x00\x00' + twin(markers)[0]
+
+
+def ros_message(markers):
+    """Return the same MarkerArray made of the objects of rclpy."""
+    msgs = pytest.importorskip('visualization_msgs.msg')
+    from geometry_msgs.msg import Point
+    from std_msgs.msg import ColorRGBA
+
+    def ros_marker(m):
+        out = msgs.Marker(ns=m.ns, id=m.id, type=m.type, action=m.action, text=m.text)
+        out.header.frame_id = m.frame_id
+        out.header.stamp.sec, out.header.stamp.nanosec = divmod(m.stamp_ns, 10**9)
+        position, orientation = out.pose.position, out.pose.orientation
+        position.x, position.y, position.z = map(float, m.pose[:3])
+        orientation.x, orientation.y, orientation.z, orientation.w = map(float, m.pose[3:])
+        out.scale.x, out.scale.y, out.scale.z = m.scale
+        out.color.r, out.color.g, out.color.b, out.color.a = m.color
+        out.points = [Point(x=x, y=y, z=z) for x, y, z in m.points.tolist()]
+        out.colors = [ColorRGBA(r=r, g=g, b=b, a=a) for r, g, b, a in m.colors.tolist()]
+        return out
+
+    return msgs.MarkerArray(markers=[ros_marker(m) for m in markers])
+
+
+@pytest.mark.parametrize(('frame_id', 'ns'), product(TEXTS, TEXTS))
+def test_rclpy_writes_the_same_bytes(frame_id, ns):
+    serialization = pytest.importorskip('rclpy.serialization')
+    markers = [
+        make_marker(frame_id, ns),
+        make_marker(ns, frame_id, points=0),
+        make_marker(frame_id, ns, points=5, coloured=False, type=LINE_LIST, action=DELETE),
+    ]
+    expected = serialization.serialize_message(ros_message(markers))
+    found = marker_array(markers)
+    padding = twin(markers)[1].astype(bool)
+    assert found[:4] == expected[:4]
+    assert len(found) == len(expected)
+    differs = np.frombuffer(found[4:], np.uint8) != np.frombuffer(expected[4:], np.uint8)
+    assert not (differs & ~padding).any()
+
+
+@given(MARKERS)
+@settings(max_examples=30, deadline=None)
+def test_rclpy_reads_what_was_written(markers):
+    serialization = pytest.importorskip('rclpy.serialization')
+    expected = ros_message(markers)
+    found = serialization.deserialize_message(marker_array(markers), type(expected))
+    assert found == expected
+
+
+@pytest.mark.parametrize('frame_id', TEXTS)
+@pytest.mark.parametrize('corners', [0, 1, 5])
+def test_rclpy_reads_the_polygon_that_was_written(frame_id, corners):
+    serialization = pytest.importorskip('rclpy.serialization')
+    from geometry_msgs.msg import PolygonInstanceStamped
+
+    ring = np.random.default_rng(1).normal(size=(corners, 3))
+    content = polygon_instance(ring, 2**40 + 3, stamp_ns=5 * 10**9 + 7, frame_id=frame_id)
+    found = serialization.deserialize_message(content, PolygonInstanceStamped)
+    assert (found.header.stamp.sec, found.header.stamp.nanosec) == (5, 7)
+    assert found.header.frame_id == frame_id
+    assert found.polygon.id == 2**40 + 3
+    points = [(p.x, p.y, p.z) for p in found.polygon.polygon.points]
+    assert np.array_equal(np.array(points).reshape(-1, 3), ring.astype(np.float32))
+
+
+def test_arrays_of_other_types_and_layouts_are_converted():
+    marker = make_marker(points=4)
+    other = make_marker(
+        points=4,
+        colors=marker.colors.astype('>f8'),
+        pose=marker.pose.tolist(),
+    )
+    reversed_twice = make_marker(points=4, colors=np.asfortranarray(marker.colors))
+    assert marker_array([other]) == marker_array([marker])
+    assert marker_array([reversed_twice]) == marker_array([marker])
+
+
+@pytest.mark.parametrize(
+    'arrays',
+    [
+        {'points': np.zeros((3, 2))},
+        {'points': np.zeros(3)},
+        {'colors': np.zeros((2, 4), np.float32)},
+        {'colors': np.zeros((3, 3), np.float32)},
+    ],
+)
+def test_arrays_of_another_shape_are_refused(arrays):
+    with pytest.raises(ValueError, match='expected'):
+        replace(make_marker(), **arrays)
+
+
+def test_a_stamp_beyond_the_message_is_refused():
+    with pytest.raises(struct.error):
+        marker_array([make_marker(stamp_ns=2**31 * 10**9)])

@@ -1,0 +1,435 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+PointCloud2: any valid layout decodes, any invalid one is refused, columns encode.
+
+The twin reads one number at a time with struct. Layouts, contents and damage come from
+hypothesis; the layouts of real sensors stand by name. Messages are stand-ins with the attributes
+that rclpy and rosbags share, and once each the real ones.
+
+(Longer than other files: the layouts stand here by name, and decoding and encoding check each
+other.)
+"""
+
+import array
+from dataclasses import dataclass, replace
+import struct
+from types import SimpleNamespace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.messages.pointcloud2 import Field, from_columns, to_scan
+from test.messages.examples import make_surfels
+
+CODES = {1: 'b', 2: 'B', 3: 'h', 4: 'H', 5: 'i', 6: 'I', 7: 'f', 8: 'd'}
+NUMPY = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+
+
+@dataclass
+class Message:
+    """A PointCloud2 as rclpy and rosbags show it."""
+
+    height: int
+    width: int
+    fields: list
+    point_step: int
+    row_step: int
+    data: object
+    is_bigendian: bool = False
+    is_dense: bool = True
+    stamp: tuple = (1, 500)
+
+    @property
+    def header(self):
+        stamp = SimpleNamespace(sec=self.stamp[0], nanosec=self.stamp[1])
+        return SimpleNamespace(stamp=stamp, frame_id='lidar')
+
+
+def message(fields, point_step, height=1, width=3, padding=0):
+    """Return a message of random finite numbers with fields (name, offset, datatype[, count])."""
+    row_step = width * point_step + padding
+    data = np.random.default_rng(0).integers(0, 100, height * row_step, np.uint8)
+    fields = [Field(*field) if len(field) == 4 else Field(*field, 1) for field in fields]
+    return Message(height, width, fields, point_step, row_step, data)
+
+
+def twin(msg, field):
+    """Return one field of all points, a struct.unpack for every number."""
+    order, code = '>' if msg.is_bigendian else '<', CODES[field.datatype]
+    size, values = struct.calcsize(code), []
+    for row in range(msg.height):
+        for point in range(msg.width):
+            start = row * msg.row_step + point * msg.point_step + field.offset
+            numbers = [
+                struct.unpack_from(order + code, bytes(msg.data), start + i * size)[0]
+                for i in range(max(field.count, 1))
+            ]
+            values.append(numbers if field.count > 1 else numbers[0])
+    return np.array(values, NUMPY[field.datatype])
+
+
+def assert_decodes(msg):
+    scan = to_scan(msg, 'points')
+    first = {}
+    for field in msg.fields:
+        if field.name:
+            first.setdefault(field.name, field)
+    xyz = [twin(msg, first[name]) for name in 'xyz']
+    expected = np.stack(xyz, axis=1)  # float64 where one of them is
+    assert scan.points.dtype == expected.dtype
+    assert scan.points.flags.f_contiguous
+    np.testing.assert_array_equal(scan.points, expected)
+    assert set(scan.columns) == set(first) - {'x', 'y', 'z'}
+    for name, column in scan.columns.items():
+        expected = twin(msg, first[name])
+        assert column.dtype == expected.dtype
+        np.testing.assert_array_equal(column, expected)
+
+
+XYZ = [('x', 0, 7), ('y', 4, 7), ('z', 8, 7)]
+
+LAYOUTS = {
+    'packed': (XYZ, 12),
+    'padded to 16': ([*XYZ, ('intensity', 12, 7)], 16),
+    '22 bytes': ([*XYZ, ('intensity', 12, 7), ('ring', 16, 4), ('time', 18, 7)], 22),
+    '26 bytes, float64 time': ([*XYZ, ('intensity', 12, 7), ('ring', 16, 4), ('t', 18, 8)], 26),
+    '48 bytes': ([*XYZ, ('intensity', 16, 7), ('t', 20, 6), ('ring', 26, 2), ('n', 32, 6)], 48),
+    'float64': ([('x', 0, 8), ('y', 8, 8), ('z', 16, 8)], 24),
+    'float64, not aligned': ([('x', 1, 8), ('y', 9, 8), ('z', 17, 8), ('i', 0, 1)], 25),
+    'mixed': ([('x', 0, 7), ('y', 4, 8), ('z', 12, 7)], 16),
+    'float64 first': ([('x', 0, 8), ('y', 8, 7), ('z', 12, 7)], 16),
+    'unordered': ([('t', 0, 8), ('z', 8, 7), ('x', 16, 7), ('y', 12, 7)], 20),
+    'unordered, not aligned': ([('z', 1, 7), ('x', 9, 7), ('y', 5, 7)], 13),
+    'overlapping': ([*XYZ, ('rgb', 12, 7), ('rgba', 12, 6), ('b', 12, 2)], 16),
+    'vectors': ([*XYZ, ('normal', 12, 7, 3), ('histogram', 24, 2, 5)], 29),
+    'count 0': ([('x', 0, 7, 0), ('y', 4, 7, 0), ('z', 8, 7, 0), ('ring', 12, 4, 0)], 14),
+    'names missing': ([*XYZ, ('', 12, 7), ('', 16, 7), ('ring', 20, 4)], 24),
+    'names twice': ([*XYZ, ('x', 0, 7), ('time', 12, 6), ('time', 16, 8)], 24),
+    'name of two letters twice': ([*XYZ, ('xy', 0, 7), ('xy', 4, 7)], 12),
+}
+
+
+@pytest.mark.parametrize('big', [False, True], ids=['little', 'big'])
+@pytest.mark.parametrize('name', LAYOUTS)
+def test_a_layout_of_a_sensor_decodes(name, big):
+    assert_decodes(replace(message(*LAYOUTS[name], width=7), is_bigendian=big))
+
+
+@pytest.mark.parametrize('name', LAYOUTS)
+def test_padded_rows_decode_in_the_order_of_the_points(name):
+    assert_decodes(message(*LAYOUTS[name], height=4, width=5, padding=3))
+
+
+def test_organised_points_are_in_the_order_of_their_rows():
+    msg = message(XYZ, 12, width=6)
+    np.testing.assert_array_equal(
+        to_scan(replace(msg, height=2, width=3, row_step=36)).points, to_scan(msg).points
+    )
+
+
+@pytest.mark.parametrize(
+    'kind', [bytes, bytearray, memoryview, lambda b: array.array('B', b), lambda b: b]
+)
+def test_any_buffer_of_bytes_will_do(kind):
+    msg = message(*LAYOUTS['22 bytes'])
+    data = kind(msg.data if kind is memoryview else msg.data.tobytes())
+    assert_decodes(replace(msg, data=data))
+
+
+def test_columns_are_read_only_views_into_the_message_and_points_are_not():
+    msg = message(*LAYOUTS['48 bytes'])
+    scan = to_scan(msg)
+    for column in scan.columns.values():
+        assert np.shares_memory(column, msg.data)
+        assert not column.flags.writeable
+    assert not np.shares_memory(scan.points, msg.data)
+    assert scan.points.flags.writeable
+
+
+def test_header_goes_into_the_scan():
+    scan = to_scan(replace(message(XYZ, 12), stamp=(2**31 - 1, 999_999_999)))
+    assert scan.stamp_ns == (2**31 - 1) * 10**9 + 999_999_999
+    assert scan.frame_id == 'lidar'
+
+
+def test_nan_and_inf_stay_as_they_are():
+    points = np.array([[np.nan, np.inf, -np.inf], [1.0, -0.0, 1e38]], '<f4')
+    msg = replace(message(XYZ, 12, width=2), data=points.tobytes())
+    np.testing.assert_array_equal(to_scan(msg).points, points)
+
+
+@pytest.mark.parametrize(
+    ('height', 'width', 'row_step', 'data'),
+    [(0, 0, 0, b''), (1, 0, 0, b''), (0, 5, 60, b''), (2, 0, 3, b'123456')],
+)
+@pytest.mark.parametrize('fields', [[], [Field('x', 99, 99, 9)]])
+def test_a_cloud_of_no_points_is_an_empty_scan(height, width, row_step, data, fields):
+    scan = to_scan(Message(height, width, fields, 0, row_step, data))
+    assert scan.points.shape == (0, 3)
+    assert scan.points.dtype == np.float32
+    assert scan.stamp_ns == 1_000_000_500
+
+
+INVALID = {
+    'no x': ({'fields': [Field('y', 4, 7, 1), Field('z', 8, 7, 1)]}, 'no field x among .*y, z'),
+    'no field': ({'fields': []}, 'no field x among .*none'),
+    'datatype 0': ({'fields': [Field('x', 0, 0, 1)]}, 'datatype 0, expected one of 1 to 8'),
+    'datatype 9': ({'fields': [Field('x', 0, 9, 1)]}, "'x' has datatype 9"),
+    'integer x': ({'fields': [Field(n, 0, 5, 1) for n in 'xyz']}, 'x has datatype 5 and count 1'),
+    'count of x': ({'fields': [Field(n, 0, 7, 2) for n in 'xyz']}, 'x has datatype 7 and count 2'),
+    'x beyond': ({'fields': [Field('x', 9, 7, 1)]}, 'ends at byte 13 .* point_step = 12'),
+    'count beyond': ({'fields': [Field('i', 0, 2, 2**32 - 1)]}, 'ends at byte 4294967295'),
+    'two x': ({'fields': [Field('x', 0, 7, 1), Field('x', 4, 7, 1)]}, 'two fields .* differ'),
+    'data short': ({'data': bytes(35)}, '35 bytes of data, expected .* 36 \\* 1 = 36'),
+    'data long': ({'data': bytes(37)}, '37 bytes of data'),
+    'no data': ({'data': b''}, '0 bytes of data'),
+    'row_step': ({'row_step': 35, 'data': bytes(35)}, 'row_step is 35, expected .* 12 \\* 3 = 36'),
+    'height': ({'height': 2}, 'expected row_step \\* height = 36 \\* 2 = 72'),
+    'no point_step': ({'point_step': 0}, 'point_step is 0'),
+    'huge': (
+        {'height': 2**32 - 1, 'width': 2**32 - 1, 'row_step': 2**32 - 1},
+        '36 bytes of data',
+    ),
+    'list': ({'data': [0] * 36}, 'data is a list, expected a buffer of bytes'),
+    'nanosec': ({'stamp': (0, 10**9)}, 'stamp of 0 s and 1000000000 ns'),
+    'negative': ({'stamp': (-1, 0)}, 'stamp of -1 s'),
+}
+
+
+@pytest.mark.parametrize('name', INVALID)
+def test_an_invalid_message_is_refused_by_topic_found_and_expected(name):
+    changes, expected = INVALID[name]
+    with pytest.raises(CloudFormatError, match=f'/lidar: .*{expected}'):
+        to_scan(replace(message(XYZ, 12), **changes), '/lidar')
+
+
+def test_data_that_is_not_contiguous_is_refused():
+    with pytest.raises(CloudFormatError, match='expected a buffer of bytes'):
+        to_scan(replace(message(XYZ, 12), data=memoryview(bytes(72))[::2]))
+
+
+@st.composite
+def valid_messages(draw):
+    """Return a message of any layout: fields anywhere, rows padded, either byte order."""
+    names = [*'xyz', *draw(st.lists(st.sampled_from(['i', 'ring', 't', '', 'xy']), max_size=4))]
+    fields = []
+    for name in draw(st.permutations(names)):
+        coordinate = name in ('x', 'y', 'z')
+        datatype = draw(st.sampled_from([7, 8] if coordinate else sorted(CODES)))
+        count = draw(st.integers(0, 1 if coordinate else 3))
+        fields.append(Field(name, draw(st.integers(0, 30)), datatype, count))
+    ends = [f.offset + max(f.count, 1) * struct.calcsize(CODES[f.datatype]) for f in fields]
+    point_step = max(ends) + draw(st.integers(0, 9))
+    height, width = draw(st.integers(1, 3)), draw(st.integers(1, 4))
+    row_step = width * point_step + draw(st.integers(0, 9))
+    data = np.random.default_rng(draw(st.integers(0, 99))).integers(
+        0,
+        120,
+        row_step * height,
+        np.uint8,  # below 127, so that no float is nan
+    )
+    big = draw(st.booleans())
+    return Message(height, width, fields, point_step, row_step, data.tobytes(), is_bigendian=big)
+
+
+@given(valid_messages())
+@settings(max_examples=300, deadline=None)
+def test_any_valid_layout_decodes_like_one_number_at_a_time(msg):
+    assert_decodes(msg)
+
+
+SIZES = st.one_of(st.integers(0, 80), st.integers(0, 2**32 - 1))
+DAMAGE = st.fixed_dictionaries(
+    {},
+    optional={
+        'height': SIZES,
+        'width': SIZES,
+        'point_step': SIZES,
+        'row_step': SIZES,
+        'data': st.binary(max_size=200),
+        'is_bigendian': st.booleans(),
+        'stamp': st.tuples(st.integers(-(2**31), 2**31 - 1), st.integers(0, 2**32 - 1)),
+        'fields': st.lists(
+            st.builds(
+                Field, st.sampled_from([*'xyz', 'i', '']), SIZES, st.integers(0, 255), SIZES
+            ),
+            max_size=5,
+        ),
+    },
+)
+
+
+@given(valid_messages(), DAMAGE)
+@settings(max_examples=500, deadline=None)
+def test_damage_gives_a_scan_or_a_cloud_format_error(msg, damage):
+    msg = replace(msg, **damage)
+    try:
+        scan = to_scan(msg)
+    except CloudFormatError:
+        return
+    assert len(scan) == msg.height * msg.width
+
+
+def filled(cloud, stamp=(1, 500)):
+    """Return the columns of a message made of encoded bytes, as the decoder reads them."""
+    names = ('height', 'width', 'fields', 'point_step', 'row_step', 'data', 'is_bigendian')
+    return Message(**{name: getattr(cloud, name) for name in names}, stamp=stamp)
+
+
+def test_columns_of_every_type_come_back_equal():
+    rng = np.random.default_rng(3)
+    columns = {
+        name: rng.integers(0, 100, 50).astype(dtype)
+        for name, dtype in [
+            ('x', 'f4'),
+            ('u1', 'u1'),
+            ('y', 'f4'),
+            ('z', 'f4'),
+            ('i1', 'i1'),
+            ('u2', 'u2'),
+            ('f8', '>f8'),
+            ('i2', 'i2'),
+            ('i4', 'i4'),
+            ('u4', 'u4'),
+        ]
+    }
+    columns['normal'] = rng.normal(size=(50, 3)).astype(np.float32)
+    cloud = from_columns(columns)
+    msg = filled(cloud)
+    scan = to_scan(msg)
+
+    assert [field.name for field in cloud.fields] == [*columns]
+    assert cloud.is_dense
+    for field in cloud.fields:
+        assert field.offset % struct.calcsize(CODES[field.datatype]) == 0
+        np.testing.assert_array_equal(twin(msg, field), columns[field.name])
+    np.testing.assert_array_equal(scan.columns['normal'], columns['normal'])
+    np.testing.assert_array_equal(scan.points[:, 1], columns['y'])
+
+
+def test_four_byte_columns_are_packed_without_holes():
+    cloud = from_columns({name: np.ones(2, np.float32) for name in ('x', 'y', 'z', 'i')})
+    assert [field.offset for field in cloud.fields] == [0, 4, 8, 12]
+    assert (cloud.point_step, cloud.row_step, len(cloud.data)) == (16, 32, 32)
+    assert cloud.data.tobytes() == struct.pack('<8f', *[1.0] * 8)
+
+
+def test_columns_without_rows_give_a_cloud_without_points():
+    cloud = from_columns({name: np.empty(0, np.float32) for name in 'xyz'})
+    assert (cloud.height, cloud.width, cloud.point_step, cloud.row_step) == (1, 0, 12, 0)
+    assert len(to_scan(filled(cloud))) == 0
+
+
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_a_number_that_is_not_finite_makes_a_cloud_not_dense(value):
+    assert not from_columns({'x': np.array([0.0, value]), 'n': np.array([1, 2], 'u4')}).is_dense
+
+
+@pytest.mark.parametrize(
+    'columns',
+    [
+        {},
+        {'x': np.zeros(3), 'y': np.zeros(4)},
+        {'x': np.zeros((3, 1, 1))},
+        {'x': np.zeros((3, 0))},
+        {'x': np.float64(1.0)},
+        {'': np.zeros(3)},
+        {'x': np.zeros(3, np.int64)},
+        {'x': np.array(['a'])},
+    ],
+)
+def test_columns_that_are_no_table_are_refused(columns):
+    with pytest.raises(ValueError, match='column'):
+        from_columns(columns)
+
+
+def test_surfels_become_the_nine_columns_of_normals():
+    surfels = make_surfels(2)
+    cloud = from_columns(surfel_columns(surfels))
+    assert ' '.join(f.name for f in cloud.fields) == (
+        'x y z normal_x normal_y normal_z curvature planarity num_points'
+    )
+    assert [f.datatype for f in cloud.fields] == [7] * 8 + [6]
+    assert cloud.data.tobytes() == b''.join(
+        struct.pack(
+            '<8fI',
+            *surfels.position[i],
+            *surfels.normal[i],
+            surfels.curvature[i],
+            surfels.planarity[i],
+            surfels.num_points[i],
+        )
+        for i in range(2)
+    )
+
+
+def test_messages_of_rclpy_decode_and_take_the_bytes():
+    messages = pytest.importorskip('sensor_msgs.msg')
+    points = np.random.default_rng(1).normal(size=(20, 3))
+    ring = np.arange(20, dtype=np.uint16)
+    cloud = from_columns({**dict(zip('xyz', points.T, strict=True)), 'ring': ring})
+    msg = messages.PointCloud2()
+    msg.header.frame_id = 'lidar'
+    msg.header.stamp.sec, msg.header.stamp.nanosec = 5, 6
+    for name in ('height', 'width', 'point_step', 'row_step', 'is_bigendian', 'is_dense'):
+        setattr(msg, name, getattr(cloud, name))
+    msg.fields = [
+        messages.PointField(name=f.name, offset=f.offset, datatype=f.datatype, count=f.count)
+        for f in cloud.fields
+    ]
+    msg.data = array.array('B', cloud.data.tobytes())
+
+    scan = to_scan(msg)
+
+    np.testing.assert_array_equal(scan.points, points)
+    np.testing.assert_array_equal(scan.columns['ring'], ring)
+    assert (scan.stamp_ns, scan.frame_id) == (5_000_000_006, 'lidar')
+
+
+def test_messages_of_rosbags_decode():
+    typesys = pytest.importorskip('rosbags.typesys')
+    store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
+    types = store.types
+    points = np.random.default_rng(1).normal(size=(20, 3)).astype(np.float32)
+    cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
+    msg = types['sensor_msgs/msg/PointCloud2'](
+        header=types['std_msgs/msg/Header'](types['builtin_interfaces/msg/Time'](5, 6), 'lidar'),
+        fields=[
+            types['sensor_msgs/msg/PointField'](f.name, f.offset, f.datatype, f.count)
+            for f in cloud.fields
+        ],
+        **{
+            name: getattr(cloud, name)
+            for name in (
+                'height',
+                'width',
+                'is_bigendian',
+                'point_step',
+                'row_step',
+                'data',
+                'is_dense',
+            )
+        },
+    )
+    raw = store.serialize_cdr(msg, msg.__msgtype__)
+
+    scan = to_scan(store.deserialize_cdr(raw, msg.__msgtype__))
+
+    np.testing.assert_array_equal(scan.points, points)
+    assert (scan.stamp_ns, scan.frame_id) == (5_000_000_006, 'lidar')
+
+
+def test_surfels_have_intensity_and_colour_where_the_map_has_them():
+    surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
+    columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 0, 7]])}
+    surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
+    found = surfel_columns(surfel_map.surfels())
+    assert list(found)[-2:] == ['intensity', 'rgb']
+    assert found['intensity'].tolist() == [1.5]
+    assert found['rgb'].view(np.uint32).tolist() == [0xFF0007]

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Rays that met nothing: found by rows and columns, and free up to the range of the sensor.
+
+Points that are nan say nothing: what no ray is known of stays unknown.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import Config
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import depth_points, free_rays, PinholeCamera
+from surfel_mapper.sensors.free_rays import free_directions
+from surfel_mapper.tsdf.queries import FREE, states, UNKNOWN
+from surfel_mapper.tsdf.sensors import Lidar
+
+LIDAR = Lidar(rows=32, columns=360, vertical_fov_deg=40.0)
+S = 10**9
+
+
+def organised(nothing, where, staggered_deg=0.0, order=slice(None), transpose=False):
+    """Return a scan of a sphere, what some of its pixels hold, and their true directions."""
+    turn = np.radians(staggered_deg) * np.arange(LIDAR.rows)[:, None]
+    d = LIDAR.directions.astype(float)
+    rays = np.stack(
+        [
+            np.cos(turn) * d[..., 0] - np.sin(turn) * d[..., 1],
+            np.sin(turn) * d[..., 0] + np.cos(turn) * d[..., 1],
+            d[..., 2],
+        ],
+        axis=-1,
+    )[order]
+    points = (10.0 * rays).astype(np.float32)
+    points[where] = nothing
+    if transpose:
+        points = points.swapaxes(0, 1)
+    msg = SimpleNamespace(height=points.shape[0], width=points.shape[1])
+    scan = Scan(points=points.reshape(-1, 3), stamp_ns=S, frame_id='lidar', msg=msg)
+    return scan, rays[where]
+
+
+PATCH = np.zeros((32, 360), bool)
+PATCH[5:15, 100:140] = True
+
+
+@pytest.mark.parametrize(
+    'layout',
+    [{}, {'staggered_deg': 0.7}, {'order': slice(None, None, -1)}, {'transpose': True}],
+    ids=['plain', 'staggered', 'from below', 'a row for each azimuth'],
+)
+def test_the_directions_of_points_at_infinity_are_those_of_their_beams(layout):
+    scan, expected = organised(np.inf, PATCH, **layout)
+    found = free_directions(scan)
+    if 'transpose' in layout:
+        expected = expected.reshape(10, 40, 3).swapaxes(0, 1).reshape(-1, 3)
+        found = found.reshape(10, 40, 3).swapaxes(0, 1).reshape(-1, 3)
+    assert len(found) == 400
+    off = np.degrees(np.arccos(np.clip((found * expected).sum(axis=1), -1.0, 1.0)))
+    assert off.max() < 0.1
+
+
+def test_without_points_at_infinity_or_without_rows_there_are_none():
+    assert free_directions(organised(np.nan, PATCH)[0]) is None
+    scan, _ = organised(np.inf, PATCH)
+    assert free_directions(scan.select(np.arange(len(scan)))) is None
+
+
+def test_rows_that_are_no_beams_tell_nothing():
+    scan, _ = organised(np.inf, PATCH)
+    mixed = np.random.default_rng(3).permutation(len(scan))
+    shuffled = Scan(points=scan.points[mixed], stamp_ns=S, frame_id='lidar', msg=scan.msg)
+    assert free_directions(shuffled) is None
+
+
+def test_a_beam_without_points_tells_nothing():
+    where = np.zeros((32, 360), bool)
+    where[3], where[:, 50] = True, True
+    found = free_directions(organised(np.inf, where)[0])
+    assert found is None or not len(found)
+
+
+@pytest.mark.parametrize(('nothing', 'state'), [(np.inf, FREE), (np.nan, UNKNOWN)])
+def test_infinite_points_free_the_space_before_them_and_missing_ones_do_not(nothing, state):
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                'pose.source': 'identity',
+                'layers.tsdf.enabled': True,
+                'map.min_points': 1,
+                'layers.tsdf.voxel_size_m': 0.2,
+                'layers.tsdf.truncation_m': 0.6,
+                'layers.tsdf.max_range_m': 20.0,
+                'layers.tsdf.sensor_rows': 32,
+                'layers.tsdf.sensor_columns': 360,
+            }
+        )
+    )
+    scan, rays = organised(nothing, PATCH)
+    mapper.add_scan(scan)
+    assert len(list(mapper.insert_ready())) == 1
+    middle = rays.mean(axis=0)
+    points = np.outer([4.0, 8.0, 12.0, 16.0], middle / np.linalg.norm(middle))
+    assert set(states(mapper.tsdf.blocks, points)) == {state}
+
+
+def test_pixels_of_depth_at_infinity_are_free_up_to_the_range():
+    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    depth = np.full((60, 80), 2.0, np.float32)
+    depth[:, 40:], depth[:, 60:] = np.inf, np.nan
+    rays = free_rays(depth, camera)
+    assert len(rays) == 60 * 20
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                'pose.source': 'identity',
+                'layers.tsdf.enabled': True,
+                'map.min_points': 1,
+                'layers.tsdf.max_range_m': 6.0,
+            }
+        )
+    )
+    seen_by = (80, 60, 70.0, 70.0, 39.5, 29.5)
+    mapper.add_scan(
+        Scan(
+            points=depth_points(depth, camera), stamp_ns=S, frame_id='c', camera=seen_by, free=rays
+        )
+    )
+    assert len(list(mapper.insert_ready())) == 1
+    points = np.array([[-0.5, 0.0, 4.0], [0.5, 0.0, 4.0], [1.6, 0.0, 4.0]])
+    assert states(mapper.tsdf.blocks, points).tolist() == [UNKNOWN, FREE, UNKNOWN]
+    assert free_rays(np.full((60, 80), 65535, np.uint16), camera) is None

@@ -1,0 +1,41 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Several threads: the same bits as one, down to the order of the voxels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.threads import split
+
+
+@pytest.mark.parametrize('threads', [2, 3])
+def test_the_result_does_not_depend_on_the_number_of_threads(threads):
+    rng = np.random.default_rng(8)
+    one, several = SurfelMap(0.3), SurfelMap(0.3, threads=threads)
+    for num_points in (0, 1, 2, 500, 20_000):
+        points = rng.uniform(-6.0, 6.0, (num_points, 3))
+        points[::7] = np.nan
+        expected = one.add(points, origin=(0.0, 0.0, 5.0))
+        found = several.add(points, origin=(0.0, 0.0, 5.0))
+        for left, right in zip(found.arrays, expected.arrays, strict=True):
+            np.testing.assert_array_equal(left, right)
+        assert found.left_out == expected.left_out
+        for left, right in zip(
+            several.surfels_changed().arrays, one.surfels_changed().arrays, strict=True
+        ):
+            np.testing.assert_array_equal(left, right)
+    assert several == one
+
+
+def test_every_row_is_in_one_part():
+    for num_rows in range(7):
+        rows = [row for part in split(num_rows, 3) for row in range(num_rows)[part]]
+        assert rows == list(range(num_rows))
+
+
+def test_no_thread_at_all_is_refused():
+    with pytest.raises(ValueError, match='threads: 0'):
+        SurfelMap(0.5, threads=0)
