@@ -52,9 +52,9 @@ class Scan:
         The sensor's coordinate frame.
     columns : mapping of str to array of length N
         What else the points carry (intensity, ring, time, ...), one row a point.
-    T_base_sensor, T_fixed_sensor : (4, 4) float64, optional
-        Where the sensor is on the robot, and in the fixed frame at the stamp; None where that is
-        not known. Filters that look at the robot or at the vertical need them.
+    T_base_sensor, T_map_sensor : (4, 4) float64, optional
+        Pose of the sensor on the robot, and in the map at the stamp; None if unknown. Filters that
+        need the robot or the vertical use them.
     times : PointTimes, optional
         When the points were measured, for deskewing; None: all at the stamp.
     camera : tuple of float
@@ -77,7 +77,7 @@ class Scan:
     frame_id: str
     columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
     T_base_sensor: npt.NDArray[np.float64] | None = None
-    T_fixed_sensor: npt.NDArray[np.float64] | None = None
+    T_map_sensor: npt.NDArray[np.float64] | None = None
     times: PointTimes | None = None
     camera: tuple[float, ...] = ()
     free: npt.NDArray[Any] | None = None

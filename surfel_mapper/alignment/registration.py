@@ -48,7 +48,7 @@ SEARCH_STARTS = 3
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Alignment:
+class RegistrationResult:
     """
     Where a scan belongs.
 
@@ -129,7 +129,7 @@ class Registration:
         starts: Sequence[Transform],
         deviation_m: float,
         expected_support: float = 0.0,
-    ) -> Alignment:
+    ) -> RegistrationResult:
         """
         Return where a scan belongs on a map.
 
@@ -160,7 +160,7 @@ class Registration:
             found = max([found, *others], key=lambda other: (other.converged, other.support))
         return found
 
-    def fits(self, alignment: Alignment) -> bool:
+    def fits(self, alignment: RegistrationResult) -> bool:
         """Return whether an alignment may be right, by what it says itself."""
         config = self.config
         return (
@@ -173,7 +173,7 @@ class Registration:
         levels: PlaneLevels,
         start: Transform,
         deviation_m: float,
-    ) -> Alignment:
+    ) -> RegistrationResult:
         """Align from the level that a deviation asks for down to the map itself."""
         reach = max(3.0 * deviation_m / levels.voxel_size_m(0), 1.0)
         coarsest = min(self.config.coarse_levels, math.ceil(math.log2(reach)))
@@ -198,7 +198,7 @@ class Registration:
         start: Transform,
         width_m: float,
         tolerance_m: float,
-    ) -> Alignment:
+    ) -> RegistrationResult:
         """Take Gauss-Newton steps until they are small."""
         pose, iteration, moved_m = start, 0, math.inf
         least = self.config.min_information_ratio
@@ -210,7 +210,7 @@ class Registration:
             pose = moved(pose, step)
             moved_m = math.hypot(*step[:3], *(radius_m * step[3:]))
             iteration += 1
-        return Alignment(
+        return RegistrationResult(
             T_map_sensor=pose,
             num_cells=len(cells),
             overlap=overlap,

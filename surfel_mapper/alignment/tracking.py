@@ -18,7 +18,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Alignment, Registration
+from surfel_mapper.alignment.registration import Registration, RegistrationResult
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import (
     compose,
@@ -107,7 +107,7 @@ class Tracker:
         stamp_ns: int,
         surfel_map: SurfelMap,
         T_map_fixed: Transform,
-    ) -> Alignment:
+    ) -> RegistrationResult:
         """
         Align a scan, and go on from where it belongs.
 
@@ -144,7 +144,7 @@ class Tracker:
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
         return found
 
-    def _refusal(self, found: Alignment) -> str:
+    def _refusal(self, found: RegistrationResult) -> str:
         """Return why a scan was not followed."""
         config = self._registration.config
         said = (

@@ -70,7 +70,7 @@ class Mapped:
     def add(self, update: Update) -> None:
         """Take note of a scan."""
         self.stamps_ns.append(update.stamp_ns)
-        self.poses.append(update.T_fixed_sensor)
+        self.poses.append(update.T_map_sensor)
 
     def write(self, path: Path) -> None:
         """Write the poses as TUM text."""

@@ -196,7 +196,7 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
         mapper = ShardMapper(recording.config)
         recorded_s = recording.recorded_s
         if shard.is_whole:
-            places = [update.T_fixed_sensor[:3, 3] for update in recording.replay(mapper)]
+            places = [update.T_map_sensor[:3, 3] for update in recording.replay(mapper)]
         elif isinstance(recording, BagRecording):
             entry, places = map_middle(recording, mapper, shard)
             first_ns, last_ns = recording.bounds_ns
@@ -252,7 +252,7 @@ def map_middle(
             add_poses(reader, mapper, message, poses)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
-        places += [update.T_fixed_sensor[:3, 3] for update in mapper.insert_ready()]
+        places += [update.T_map_sensor[:3, 3] for update in mapper.insert_ready()]
     if mapper.passes_over:  # nothing was recorded since
         entry = Entry.of(mapper)
     if shard.stop_ns is None:

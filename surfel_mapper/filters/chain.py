@@ -204,7 +204,7 @@ def example(dtype: npt.DTypeLike) -> Scan:
             INCIDENCE_ANGLES: ones,
         },
         T_base_sensor=np.eye(4),
-        T_fixed_sensor=np.eye(4),
+        T_map_sensor=np.eye(4),
     )
 
 

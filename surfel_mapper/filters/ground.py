@@ -92,7 +92,7 @@ class Ground(Filter):
         """Return the rotation that takes the points to a frame whose z is up, (3, 3)."""
         if self.up == 'sensor':
             return np.eye(3)
-        pose = scan.T_fixed_sensor if self.up == 'fixed' else scan.T_base_sensor
+        pose = scan.T_map_sensor if self.up == 'fixed' else scan.T_base_sensor
         if pose is None:
             raise FilterError(
                 f'the pose of {scan.frame_id!r} in the {self.up} frame is not known, so up is '

@@ -32,7 +32,7 @@ ADDED = ('normal_x', 'normal_y', 'normal_z', 'planarity', 'num_points')
 
 
 def scan_with_normals(
-    scan: Scan, T_fixed_sensor: Transform, surfel_map: SurfelMap, min_points: int
+    scan: Scan, T_map_sensor: Transform, surfel_map: SurfelMap, min_points: int
 ) -> CloudBytes:
     """
     Return the cloud of a scan with what a map says of each point.
@@ -41,7 +41,7 @@ def scan_with_normals(
     ----------
     scan : Scan
         Deskewed, if its sensor moved; in the map or not.
-    T_fixed_sensor : (4, 4) float64
+    T_map_sensor : (4, 4) float64
         Its pose.
     surfel_map : SurfelMap
         In the fixed frame.
@@ -49,16 +49,16 @@ def scan_with_normals(
         Voxels with fewer points are no surfels.
 
     """
-    seen = surfel_map.reduce(scan.points, T_fixed_sensor, columns=scan.columns).key
+    seen = surfel_map.reduce(scan.points, T_map_sensor, columns=scan.columns).key
     rows = surfel_map.find(seen)
     surfels = surfel_map.surfels_of(rows[rows >= 0])
     surfels = surfels.select(surfels.num_points >= min_points)
-    added = surfels_of_points(scan, T_fixed_sensor, surfels, surfel_map.voxel_size_m)
+    added = surfels_of_points(scan, T_map_sensor, surfels, surfel_map.voxel_size_m)
     return cloud_of_scan(scan, added) if scan.msg is None else extended_cloud(scan.msg, added)
 
 
 def surfels_of_points(
-    scan: Scan, T_fixed_sensor: Transform, surfels: Surfels, voxel_size_m: float
+    scan: Scan, T_map_sensor: Transform, surfels: Surfels, voxel_size_m: float
 ) -> npt.NDArray[np.float32]:
     """
     Return what the surfel of each point of a scan says.
@@ -67,7 +67,7 @@ def surfels_of_points(
     ----------
     scan : Scan
         Deskewed, if its sensor moved.
-    T_fixed_sensor : (4, 4) float64
+    T_map_sensor : (4, 4) float64
         Its pose.
     surfels : Surfels
         In the fixed frame, those in which points may lie.
@@ -84,9 +84,9 @@ def surfels_of_points(
     keys = pack_keys(surfels.voxel_index)
     table = np.empty(1 << max(2 * len(keys) - 1, 1).bit_length(), np.int32)
     build_table(keys, table)
-    R = inverse(T_fixed_sensor)[:3, :3]
+    R = inverse(T_map_sensor)[:3, :3]
     normal = np.ascontiguousarray(surfels.normal @ R.T)
-    pose = np.ascontiguousarray(T_fixed_sensor[:3])
+    pose = np.ascontiguousarray(T_map_sensor[:3])
     quantisation = (pose, (1 << BITS) / voxel_size_m, np.array([0.0, np.inf]))
     added = np.empty((len(scan), len(ADDED)), np.float32)
     points = np.require(scan.points, None, ['F', 'A', 'W'])

@@ -4,6 +4,6 @@
 
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.update import Update
-from surfel_mapper.pipeline.window_aligner import Aligned
+from surfel_mapper.pipeline.window_aligner import Alignment
 
-__all__ = ['Aligned', 'Mapper', 'Update']
+__all__ = ['Alignment', 'Mapper', 'Update']

@@ -32,7 +32,7 @@ from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.pipeline.update import removed_voxels, Update
-from surfel_mapper.pipeline.window_aligner import Aligned, WindowAligner
+from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class Inserter:
         if self._moved is not None:
             self._moved.clear()
 
-    def align(self) -> Aligned:
+    def align(self) -> Alignment:
         """Move the scans of the window to where they agree; see Mapper.align."""
         with self._counters.timed('align'):
             return self.aligner.align(self.window, self._config)
@@ -158,7 +158,7 @@ class Inserter:
         scan : Scan
             As it came in.
         pose : (4, 4) float64
-            T_fixed_sensor.
+            T_map_sensor.
         following : Scan and pose, optional
             Of the next one, which another thread begins with; only where ``looks_ahead``.
 
@@ -187,9 +187,9 @@ class Inserter:
         cleared = self._clear_moved(filtered, pose, windowed.moments.key)
         if self._moved is not None:
             laps.end('clear')
-        aligned = self._align_when_due()
-        if aligned is not None:
-            pose = aligned.T_map_sensor[-1]
+        alignment = self._align_when_due()
+        if alignment is not None:
+            pose = alignment.T_map_sensor[-1]
             laps.end('align')
         changed = self._changed_since(version)
         laps.end('normals')
@@ -204,15 +204,15 @@ class Inserter:
             scan=scan,
             stamp_ns=scan.stamp_ns,
             frame_id=self.map_frame,
-            T_fixed_sensor=pose,
+            T_map_sensor=pose,
             num_points=windowed.moments.num_points,
             changed=changed,
-            removed_voxel_index=removed_voxels(evictions, cleared, aligned, changed),
+            removed_voxel_index=removed_voxels(evictions, cleared, alignment, changed),
             evictions=tuple(evictions),
             milliseconds=laps.milliseconds,
             models=models,
-            aligned=aligned,
-            alignment=prepared.alignment,
+            alignment=alignment,
+            registration=prepared.registration,
         )
 
     def _only_posed(self, prepared: Prepared, laps: Laps) -> Update:
@@ -224,13 +224,13 @@ class Inserter:
             scan=prepared.scan,
             stamp_ns=prepared.scan.stamp_ns,
             frame_id=self.map_frame,
-            T_fixed_sensor=prepared.T_map_sensor,
+            T_map_sensor=prepared.T_map_sensor,
             num_points=0,
             changed=self.map.surfels_changed(self.map.version),
             removed_voxel_index=np.empty((0, 3), np.int32),
             evictions=(),
             milliseconds=laps.milliseconds,
-            alignment=prepared.alignment,
+            registration=prepared.registration,
         )
 
     def _clear_moved(
@@ -250,17 +250,17 @@ class Inserter:
         self._counters.cleared_voxels += len(empty)
         return self.window.drop_voxels(empty, self._config.map.min_points)
 
-    def _align_when_due(self) -> Aligned | None:
+    def _align_when_due(self) -> Alignment | None:
         """Align the window if so many scans were mapped since; warn where that fails."""
         if not self.aligner.is_due(self._config.align.every_scans) or len(self.window) < 2:
             return None
         try:
-            aligned = self.aligner.align(self.window, self._config)
+            alignment = self.aligner.align(self.window, self._config)
         except (AlignmentError, MapError) as error:
             self._drops.warn('alignment', f'the window is not aligned: {error}')
             return None
-        _log.debug('aligned: %s', aligned)
-        return aligned
+        _log.debug('aligned: %s', alignment)
+        return alignment
 
     def _follow(
         self,

@@ -38,7 +38,7 @@ from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
 from surfel_mapper.pipeline.update import Update
-from surfel_mapper.pipeline.window_aligner import Aligned
+from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 from surfel_mapper.sensors.deskew import point_times
@@ -260,7 +260,7 @@ class Mapper:
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
-    def align(self) -> Aligned:
+    def align(self) -> Alignment:
         """
         Move the scans of the window to where they agree; see the settings ``align``.
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass, replace
 
-from surfel_mapper.alignment.registration import Alignment
+from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Counters, Laps
 from surfel_mapper.errors import (
@@ -49,7 +49,7 @@ class Prepared:
         What the filters left of it.
     T_map_sensor : (4, 4) float64
         Where it was taken.
-    alignment : Alignment, optional
+    registration : RegistrationResult, optional
         How it was aligned to the map, where poses come from there.
 
     """
@@ -57,7 +57,7 @@ class Prepared:
     scan: Scan
     filtered: Scan
     T_map_sensor: Transform
-    alignment: Alignment | None = None
+    registration: RegistrationResult | None = None
 
 
 class Preparation:
@@ -177,21 +177,21 @@ class Preparation:
         """Return a scan at the pose where it fits the map; None if it fits nowhere."""
         scan = prepared.scan
         try:
-            pose, alignment = registered.find(
+            pose, registration = registered.find(
                 prepared.filtered, times, self._map, self._aligner.T_map_fixed
             )
         except (AlignmentError, MapError, PoseError) as error:
             self._drops.scan(scan, 'not_aligned', str(error))
             return None
-        if alignment is not None and len(alignment.degenerate):
-            num = len(alignment.degenerate)
+        if registration is not None and len(registration.degenerate):
+            num = len(registration.degenerate)
             self._drops.warn(
                 'degenerate',
                 f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
                 'of motion open; there the prediction is kept',
             )
         T_map_sensor = self._aligner.to_map(pose)
-        return replace(prepared, T_map_sensor=T_map_sensor, alignment=alignment)
+        return replace(prepared, T_map_sensor=T_map_sensor, registration=registration)
 
     def _with_surroundings(self, scan: Scan) -> Scan:
         """Return a scan with what layers want beside its points, before any is left out."""
@@ -226,7 +226,7 @@ class Preparation:
         T_base_sensor = self._poses.of_base(scan)  # the filters that need it say if it lacks
         try:
             filtered, steps = self.chain.run(
-                replace(scan, T_base_sensor=T_base_sensor, T_fixed_sensor=pose)
+                replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose)
             )
         except FilterError as error:
             self._drops.scan(scan, 'filter', str(error))

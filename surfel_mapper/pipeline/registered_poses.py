@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Alignment, Registration
+from surfel_mapper.alignment.registration import Registration, RegistrationResult
 from surfel_mapper.alignment.tracking import Tracker
 from surfel_mapper.config import Config
 from surfel_mapper.counters import LATEST
@@ -127,7 +127,7 @@ class RegisteredPoses:
         times: PointTimes | None,
         surfel_map: SurfelMap,
         T_map_fixed: Transform,
-    ) -> tuple[Transform, Alignment | None]:
+    ) -> tuple[Transform, RegistrationResult | None]:
         """
         Align a scan, and go on from there.
 
@@ -146,7 +146,7 @@ class RegisteredPoses:
         -------
         T_fixed_sensor : (4, 4) float64
             Where the sensor was at the stamp.
-        alignment : Alignment or None
+        registration : RegistrationResult or None
             How the scan was aligned; None where the prediction holds.
 
         Raises
@@ -165,15 +165,16 @@ class RegisteredPoses:
         T_middle_body = compose(inverse(T_fixed_middle), tracker.predict(scan.stamp_ns))
         if surfel_map.num_voxels:
             cells = transformed(T_middle_body, self._cells(scan))
-            alignment = tracker.track(cells, middle_ns, surfel_map, T_map_fixed)
+            registration = tracker.track(cells, middle_ns, surfel_map, T_map_fixed)
             self._num_aligned += 1
-            self._num_degenerate += len(alignment.degenerate) > 0
-            self._fits.append(alignment.fit)
+            self._num_degenerate += len(registration.degenerate) > 0
+            self._fits.append(registration.fit)
         else:
-            alignment = None
+            registration = None
             tracker.advance(T_fixed_middle, middle_ns)
         self.T_fixed_body = compose(tracker.pose, T_middle_body)
-        return compose(self.T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns)), alignment
+        pose = compose(self.T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns))
+        return pose, registration
 
     def summary(self) -> dict[str, Any]:
         """Return how well scans fitted, for files and reports."""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Alignment
+from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
-from surfel_mapper.pipeline.window_aligner import Aligned
+from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:  # the models take 0.1 s to load
@@ -34,9 +34,9 @@ class Update:
     stamp_ns : int
         Stamp of the scan.
     frame_id : str
-        The fixed frame, in which the surfels are.
-    T_fixed_sensor : (4, 4) float64
-        Pose of the sensor.
+        The frame of the map, in which the surfels are.
+    T_map_sensor : (4, 4) float64
+        Pose of the sensor in the map, after the alignment if one was due.
     num_points : int
         Points of the scan that entered the map.
     changed : Surfels
@@ -46,10 +46,10 @@ class Update:
         through them, have too few points.
     evictions : tuple of Eviction
         The scans that left, oldest first.
-    aligned : Aligned, optional
-        What the alignment of the window did that was due after this scan.
     alignment : Alignment, optional
-        How the pose was found, where it comes from registration.
+        Result of the alignment of the window, if one was due after this scan.
+    registration : RegistrationResult, optional
+        Result of the registration to the map, if ``pose.source`` is ``registration``.
     models : ModelUpdate, optional
         What became of planes, surfaces and Gaussians, where they were brought up to date.
     milliseconds : dict of str to float
@@ -61,26 +61,26 @@ class Update:
     scan: Scan
     stamp_ns: int
     frame_id: str
-    T_fixed_sensor: npt.NDArray[np.float64]
+    T_map_sensor: npt.NDArray[np.float64]
     num_points: int
     changed: Surfels
     removed_voxel_index: npt.NDArray[np.int32]
     evictions: tuple[Eviction, ...]
     milliseconds: dict[str, float]
-    aligned: Aligned | None = None
     alignment: Alignment | None = None
+    registration: RegistrationResult | None = None
     models: ModelUpdate | None = None
 
 
 def removed_voxels(
     evictions: Sequence[Eviction],
     cleared: npt.NDArray[np.int32],
-    aligned: Aligned | None,
+    alignment: Alignment | None,
     changed: Surfels,
 ) -> npt.NDArray[np.int32]:
     """Return the voxels (K, 3) that were surfels before all these, and are none now."""
     fallen = [cleared, *(eviction.fallen for eviction in evictions)]
-    if aligned is None:
+    if alignment is None:
         return np.concatenate(fallen)
-    gone = np.unique(np.concatenate([*fallen, aligned.removed_voxel_index]), axis=0)
+    gone = np.unique(np.concatenate([*fallen, alignment.removed_voxel_index]), axis=0)
     return gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]

@@ -33,13 +33,13 @@ MIN_POINTS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class Aligned:
+class Alignment:
     """
     What an alignment did to the window.
 
     Attributes
     ----------
-    alignment : WindowAlignment
+    solution : WindowAlignment
         The poses found, and how well scans agree.
     stamps_ns : (S,) int64
         Of the scans of the window, oldest first.
@@ -56,7 +56,7 @@ class Aligned:
 
     """
 
-    alignment: WindowAlignment
+    solution: WindowAlignment
     stamps_ns: npt.NDArray[np.int64]
     T_map_sensor: npt.NDArray[np.float64]
     T_map_fixed: Transform
@@ -67,28 +67,28 @@ class Aligned:
 
     def summary(self) -> dict[str, Any]:
         """Return it as plain numbers, and in words."""
-        gaps = [gap for gap in self.alignment.residuals.values() if math.isfinite(gap)]
+        gaps = [gap for gap in self.solution.residuals.values() if math.isfinite(gap)]
         return {
             'scans': len(self.stamps_ns),
             'moved': self.num_moved,
             'largest_m': self.largest_m,
             'largest_deg': self.largest_deg,
-            'settled': self.alignment.settled,
-            'rounds': self.alignment.rounds,
-            'compared': len(self.alignment.residuals),
-            'dropped': len(self.alignment.dropped),
-            'unconnected': len(self.alignment.unconnected),
+            'settled': self.solution.settled,
+            'rounds': self.solution.rounds,
+            'compared': len(self.solution.residuals),
+            'dropped': len(self.solution.dropped),
+            'unconnected': len(self.solution.unconnected),
             'median_gap_m': float(np.median(gaps)) if gaps else None,
             'text': str(self),
         }
 
     def __str__(self) -> str:
         """Say it in a sentence, for logs and services."""
-        settled = 'settled' if self.alignment.settled else 'not settled'
+        settled = 'settled' if self.solution.settled else 'not settled'
         return (
             f'{self.num_moved} of {len(self.stamps_ns)} scans moved, by at most '
             f'{self.largest_m:.3f} m and {self.largest_deg:.3f} deg; {settled} after '
-            f'{self.alignment.rounds} rounds'
+            f'{self.solution.rounds} rounds'
         )
 
 
@@ -136,7 +136,7 @@ class WindowAligner:
         self._num_new += 1
         return 0 < every_scans <= self._num_new
 
-    def align(self, window: SlidingWindow, config: Config) -> Aligned:
+    def align(self, window: SlidingWindow, config: Config) -> Alignment:
         """
         Align the scans of a window and move them.
 
@@ -169,8 +169,8 @@ class WindowAligner:
         if len(scans) - 1 in moved:
             correction = compose(after[-1], inverse(before[-1]))  # in the map
             self.T_map_fixed = compose(correction, self.T_map_fixed)
-        return Aligned(
-            alignment=alignment,
+        return Alignment(
+            solution=alignment,
             stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),
             T_map_sensor=after,
             T_map_fixed=self.T_map_fixed,

@@ -22,7 +22,7 @@ from std_msgs.msg import Header
 
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.geometry import q_xyzw, Transform
-from surfel_mapper.pipeline import Aligned, Mapper, Update
+from surfel_mapper.pipeline import Alignment, Mapper, Update
 from surfel_mapper.ros.inputs import transform_message
 from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.publishing import LATCHED
@@ -61,8 +61,8 @@ class AlignmentOutputs:
 
     def publish(self, update: Update) -> None:
         """Publish what there is after a scan."""
-        if update.aligned is not None:
-            self.publish_path(update.aligned)
+        if update.alignment is not None:
+            self.publish_path(update.alignment)
         if self._transforms is not None:
             self._transforms.publish(self._message(transforms=[self._transform(update.stamp_ns)]))
 
@@ -75,7 +75,7 @@ class AlignmentOutputs:
         fill(message.transform.rotation, q_xyzw(mapper.T_map_fixed))
         return message
 
-    def publish_path(self, aligned: Aligned) -> None:
+    def publish_path(self, aligned: Alignment) -> None:
         """Publish where the scans are after an alignment."""
         stamps = aligned.stamps_ns.tolist()
         header = Header(stamp=time_message(stamps[-1]), frame_id=self._mapper.map_frame)

@@ -77,7 +77,7 @@ class Changes:
     def of(self, update: Update) -> Change:
         """Return what a scan changed, and whatever else happened since the last call."""
         num_resets = self._mapper.counters.resets
-        is_usual = update.aligned is None and num_resets == self._num_resets
+        is_usual = update.alignment is None and num_resets == self._num_resets
         self._num_resets = num_resets
         if not is_usual:
             return self.since_last()

@@ -38,7 +38,7 @@ from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import disc_colors, surfel_markers
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.messages.scan_normals import scan_with_normals
-from surfel_mapper.pipeline import Aligned, Mapper, Update
+from surfel_mapper.pipeline import Alignment, Mapper, Update
 from surfel_mapper.ros.alignment import AlignmentOutputs
 from surfel_mapper.ros.changes import Change, Changes
 from surfel_mapper.ros.mapping_thread import MappingThread
@@ -106,7 +106,7 @@ class Outputs:
 
     def publish_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
-        self._stamp_ns, self._center = update.stamp_ns, update.T_fixed_sensor[:2, 3]
+        self._stamp_ns, self._center = update.stamp_ns, update.T_map_sensor[:2, 3]
         self._alignment.publish(update)
         if self._tsdf is not None:
             self._tsdf.note(update)
@@ -119,7 +119,7 @@ class Outputs:
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
 
-    def publish_aligned(self, aligned: Aligned) -> None:
+    def publish_aligned(self, aligned: Alignment) -> None:
         """Publish what an alignment changed that was asked for; called in the mapping thread."""
         self._alignment.publish_path(aligned)
         self.expire()
@@ -216,7 +216,7 @@ class Outputs:
     def _publish_scan_normals(self, update: Update) -> None:
         scan, surfel_map = update.scan, self._mapper.map
         min_points = self._mapper.config.map.min_points
-        content = scan_with_normals(scan, update.T_fixed_sensor, surfel_map, min_points)
+        content = scan_with_normals(scan, update.T_map_sensor, surfel_map, min_points)
         self._scan_normals.publish(cloud_message(content, scan.stamp_ns, scan.frame_id))
 
     def _publish_normals(self) -> int:

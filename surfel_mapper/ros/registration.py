@@ -111,8 +111,8 @@ class RegistrationOutputs:
         """Return pose and velocity of what is followed."""
         message = Odometry(header=header, child_frame_id=self._registered.body)
         message.pose.pose = pose_message(self._registered.T_fixed_body)
-        if update.alignment is not None:
-            message.pose.covariance = covariance(update.alignment.information).ravel()
+        if update.registration is not None:
+            message.pose.covariance = covariance(update.registration.information).ravel()
         fill(message.twist.twist.linear, self._registered.twist[:3])
         fill(message.twist.twist.angular, self._registered.twist[3:])
         return message

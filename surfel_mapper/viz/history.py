@@ -59,7 +59,7 @@ class History:
             times.extend([np.nan] * (len(self) - len(times)))
         self._voxels.append(mapper.map.num_voxels)
         self._dropped.append(mapper.counters.dropped.total())
-        self._positions.extend(update.T_fixed_sensor[:3, 3])
+        self._positions.extend(update.T_map_sensor[:3, 3])
         if (len(self) - 1) % self._every == 0:
             self._count(mapper)
 

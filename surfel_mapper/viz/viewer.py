@@ -89,7 +89,7 @@ class Viewer:
 
     def add(self, update: Update) -> None:
         """Show what a scan did."""
-        rerun, pose = self._rerun, update.T_fixed_sensor
+        rerun, pose = self._rerun, update.T_map_sensor
         self._positions.append(pose[:3, 3])
         self._stream.set_time('stamp', timestamp=np.datetime64(update.stamp_ns, 'ns'))
         self._stream.log(

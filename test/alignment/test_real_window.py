@@ -54,8 +54,8 @@ def test_drift_goes_and_surfaces_get_no_thicker_than_recorded(recorded):
 
     last = len(poses) - 1
     found, before = (relative_errors(some, poses, last) for some in (aligned.T_map_sensor, drift))
-    assert aligned.alignment.settled
-    assert not aligned.alignment.unconnected
+    assert aligned.solution.settled
+    assert not aligned.solution.unconnected
     assert before[0] > 0.2
     assert found[0] < 0.06  # the recorded poses are an odometry's too
     assert found[1] < 0.1 * before[1]

@@ -117,7 +117,7 @@ def ours(name: str, points: Points, which: str) -> Row:
         frame_id='lidar',
         columns=columns.get(which, {}),
         T_base_sensor=np.eye(4),
-        T_fixed_sensor=np.eye(4),
+        T_map_sensor=np.eye(4),
     )
     chain = Chain.from_list([item])
     left = chain.apply(scan)

@@ -133,7 +133,7 @@ def models(mapper: Mapper) -> dict[str, Callable[[], Any]]:
 def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
     """Return what makes the clouds of one scan, and the grid."""
     surfel_map, changed = mapper.map, update.changed
-    center, limits = update.T_fixed_sensor[:2, 3], GridConfig()
+    center, limits = update.T_map_sensor[:2, 3], GridConfig()
 
     def with_moments() -> Any:
         moments = surfel_map.moments(changed.voxel_index)
@@ -143,7 +143,7 @@ def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
         f'~/changed, {len(changed)} surfels': lambda: from_columns(surfel_columns(changed)),
         '~/changed with moments': with_moments,
         '~/scan_normals': lambda: scan_with_normals(
-            update.scan, update.T_fixed_sensor, surfel_map, MIN_POINTS
+            update.scan, update.T_map_sensor, surfel_map, MIN_POINTS
         ),
         '~/grid': lambda: traversability(surfel_map.surfels(MIN_POINTS), VOXEL_M, center, limits),
     }

@@ -91,7 +91,7 @@ def ours(sequence: Recording, size_m: float) -> tuple[Times, npt.NDArray[np.floa
         updates = list(mapper.insert_ready())
         times['milliseconds'].append((perf_counter() - start) * 1e3)
         times['cpu_ms'].append((thread_time() - cpu_start) * 1e3)
-        poses += [update.T_fixed_sensor for update in updates]
+        poses += [update.T_map_sensor for update in updates]
     if len(poses) < len(sequence.paths):
         raise RuntimeError(f'{sequence.name}: {mapper.counters.dropped} of the scans dropped')
     return times, np.array(poses)

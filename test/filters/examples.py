@@ -21,7 +21,7 @@ def scan_of(points, stamp_ns=10**18, **columns):
         frame_id=FRAME,
         columns={name: np.asarray(column) for name, column in columns.items()},
         T_base_sensor=np.eye(4),
-        T_fixed_sensor=np.eye(4),
+        T_map_sensor=np.eye(4),
     )
 
 

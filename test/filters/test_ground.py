@@ -35,10 +35,10 @@ def room(tilt_deg=0.0, height_m=1.6, seed=1):
         np.stack([-12.0 + 2.0 * u[3], 2.0 * v[3], zero + 1.02], axis=1),
     ]
     points = np.concatenate(surfaces)
-    T_fixed_sensor = pose(tilt_deg, height_m)
-    in_sensor = (points - T_fixed_sensor[:3, 3]) @ T_fixed_sensor[:3, :3]
+    T_map_sensor = pose(tilt_deg, height_m)
+    in_sensor = (points - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]
     scan = scan_of(in_sensor.astype(np.float32), surface=np.repeat(range(4), 4000))
-    return replace(scan, T_fixed_sensor=T_fixed_sensor, T_base_sensor=pose(0.0, height_m))
+    return replace(scan, T_map_sensor=T_map_sensor, T_base_sensor=pose(0.0, height_m))
 
 
 def shares(scan, **settings):
@@ -63,7 +63,7 @@ def test_a_ramp_is_ground_where_the_slope_may_be_as_steep():
 @pytest.mark.parametrize('tilt_deg', [0.0, 30.0])
 def test_what_is_higher_than_the_limit_above_the_robot_is_no_ground(tilt_deg):
     scan = room(tilt_deg)
-    scan = replace(scan, T_base_sensor=scan.T_fixed_sensor)  # the robot stands on the floor
+    scan = replace(scan, T_base_sensor=scan.T_map_sensor)  # the robot stands on the floor
     floor, _, _, table = shares(scan, max_height_m=0.5)
     assert (floor > 0.97, table) == (True, 0.0)
 
@@ -82,7 +82,7 @@ def test_either_part_can_be_kept():
 def test_up_may_be_that_of_the_robot_or_of_the_sensor():
     scan = room(30.0)
     assert shares(scan, up='sensor')[FLOOR] == 0.0
-    assert shares(replace(scan, T_base_sensor=scan.T_fixed_sensor), up='base')[FLOOR] > 0.97
+    assert shares(replace(scan, T_base_sensor=scan.T_map_sensor), up='base')[FLOOR] > 0.97
 
 
 def test_a_thin_line_of_points_or_too_few_have_no_slope():
@@ -96,7 +96,7 @@ def test_a_thin_line_of_points_or_too_few_have_no_slope():
 def test_what_is_not_known_of_the_sensor_is_named():
     scan = room()
     with pytest.raises(FilterError, match="pose of 'sensor' in the fixed frame is not known"):
-        filter_of('ground').apply(replace(scan, T_fixed_sensor=None))
+        filter_of('ground').apply(replace(scan, T_map_sensor=None))
     with pytest.raises(FilterError, match='in the base frame is not known'):
         filter_of('ground', up='base').apply(replace(scan, T_base_sensor=None))
     with pytest.raises(FilterError, match=r'so max_height_m has no origin; set frames\.base_to'):

@@ -139,7 +139,7 @@ def test_later_scans_are_corrected_like_the_newest(drive):
 
     step = np.linalg.inv(drive[2][5]) @ drive[2][6]
     np.testing.assert_allclose(
-        update.T_fixed_sensor, aligned.T_map_sensor[-1] @ step, rtol=0, atol=1e-9
+        update.T_map_sensor, aligned.T_map_sensor[-1] @ step, rtol=0, atol=1e-9
     )
     np.testing.assert_allclose(
         aligned.T_map_fixed @ drive[2][5], aligned.T_map_sensor[-1], rtol=0, atol=1e-9
@@ -159,13 +159,13 @@ def test_aligning_again_moves_next_to_nothing(drive):
 def test_every_so_many_scans_the_window_is_aligned(drive):
     mapper, updates = mapped(drive, {'align.every_scans': 3})
 
-    assert [update.aligned is not None for update in updates] == [False, False, True] * 2 + [
+    assert [update.alignment is not None for update in updates] == [False, False, True] * 2 + [
         False,
         False,
     ]
     due = updates[5]
-    np.testing.assert_array_equal(due.T_fixed_sensor, due.aligned.T_map_sensor[-1])
-    assert len(due.aligned.stamps_ns) == 6
+    np.testing.assert_array_equal(due.T_map_sensor, due.alignment.T_map_sensor[-1])
+    assert len(due.alignment.stamps_ns) == 6
     assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
     assert 'align' in mapper.counters.milliseconds
 
@@ -177,7 +177,7 @@ def test_changes_and_removals_of_an_update_cover_the_alignment(drive):
 
     update = feed(mapper, drive, [NUM_SCANS - 1])[-1]
 
-    assert update.aligned is not None
+    assert update.alignment is not None
     known |= {tuple(i) for i in update.changed.voxel_index.tolist()}
     known -= {tuple(i) for i in update.removed_voxel_index.tolist()}
     assert known == {tuple(i) for i in mapper.map.surfels(5).voxel_index.tolist()}
@@ -199,7 +199,7 @@ def test_clearing_forgets_the_correction(drive):
 
     update = feed(mapper, drive, [6])[-1]
 
-    np.testing.assert_allclose(update.T_fixed_sensor, drive[2][6], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(update.T_map_sensor, drive[2][6], rtol=0, atol=1e-12)
 
 
 def test_the_map_has_the_frame_that_it_is_given(drive):
@@ -254,5 +254,5 @@ def test_scans_whose_columns_were_not_kept_are_refused(drive):
 def test_the_first_scan_alone_is_nothing_to_align_or_to_warn_of(drive, caplog):
     _, updates = mapped(drive, {'align.every_scans': 1}, number=2)
 
-    assert [update.aligned is not None for update in updates] == [False, True]
+    assert [update.alignment is not None for update in updates] == [False, True]
     assert not caplog.records

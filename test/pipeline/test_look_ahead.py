@@ -62,7 +62,7 @@ def same(found, expected):
     assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
     for left, right in zip(found, expected, strict=True):
         assert left.num_points == right.num_points
-        np.testing.assert_array_equal(left.T_fixed_sensor, right.T_fixed_sensor)
+        np.testing.assert_array_equal(left.T_map_sensor, right.T_map_sensor)
         np.testing.assert_array_equal(left.removed_voxel_index, right.removed_voxel_index)
         for one, other in zip(left.changed.arrays, right.changed.arrays, strict=True):
             np.testing.assert_array_equal(one, other)

@@ -43,7 +43,7 @@ def test_clouds_in_the_fixed_frame_need_no_pose():
     scans = [scan_at(1.0, 'odom'), scan_at(2.0, 'map')]
     updates = insert(mapper, *scans)
     assert [update.stamp_ns for update in updates] == [S, 2 * S]
-    assert (updates[0].T_fixed_sensor == np.eye(4)).all()
+    assert (updates[0].T_map_sensor == np.eye(4)).all()
     expected = SurfelMap(0.5)
     for scan in scans:
         expected.add(scan.points)  # from where they were seen is not known
@@ -62,7 +62,7 @@ def test_odometry_moves_the_base_and_the_sensor_on_it():
     at_scans = [first, interpolate(first, last, 0.25), last]
     poses = [compose(T_odom_base, T_base_sensor) for T_odom_base in at_scans]
     for update, pose in zip(updates, poses, strict=True):
-        assert (update.T_fixed_sensor == pose).all()
+        assert (update.T_map_sensor == pose).all()
         assert update.frame_id == 'odom'
         assert update.num_points == 40
     assert mapper.map.digest() == digest_of(*zip(scans, poses, strict=True))
@@ -90,8 +90,8 @@ def test_a_tree_of_transforms_is_followed_from_the_sensor_to_the_fixed_frame():
 
     base = compose(pose_matrix((2.0, 0, 0), LEVEL), pose_matrix((10.0, 0, 0), TURNED))
     pose = compose(base, pose_matrix(MOUNTED[:3], MOUNTED[3:]))
-    assert np.abs(update.T_fixed_sensor - pose).max() <= 1e-15 * 16
-    assert mapper.map.digest() == digest_of((scan, update.T_fixed_sensor))
+    assert np.abs(update.T_map_sensor - pose).max() <= 1e-15 * 16
+    assert mapper.map.digest() == digest_of((scan, update.T_map_sensor))
 
 
 def test_a_sensor_whose_frame_is_the_base_needs_no_mounting():

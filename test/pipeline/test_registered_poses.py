@@ -69,9 +69,9 @@ def test_a_sensor_without_any_odometry_is_followed_from_where_it_starts():
 
     for number, update in enumerate(updates):
         expected = compose(inverse(TRUE), pose_at(number))
-        np.testing.assert_allclose(update.T_fixed_sensor, expected, atol=5e-3)
-    assert updates[0].alignment is None
-    assert all(update.alignment.fit > 0.5 for update in updates[1:])
+        np.testing.assert_allclose(update.T_map_sensor, expected, atol=5e-3)
+    assert updates[0].registration is None
+    assert all(update.registration.fit > 0.5 for update in updates[1:])
     assert mapper.counters.mapped == 8
     assert mapper.summary()['registration']['aligned'] == 7
     assert mapper.summary()['registration']['body'] == 'lidar'
@@ -85,7 +85,7 @@ def test_the_map_is_that_of_the_scans_at_the_poses_found():
 
     expected = Mapper(Config.from_mapping({'pose.source': 'identity'})).map
     for scan, update in zip(scans, updates, strict=True):
-        pose = update.T_fixed_sensor
+        pose = update.T_map_sensor
         expected.insert(expected.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1))
     assert mapper.map.digest() == expected.digest()
 
@@ -98,7 +98,7 @@ def test_the_base_is_followed_where_the_sensor_is_mounted_on_it():
     updates = feed(mapper, [scan_at(number) for number in range(4)])
 
     for number, update in enumerate(updates):
-        np.testing.assert_allclose(update.T_fixed_sensor, pose_at(number), atol=5e-3)
+        np.testing.assert_allclose(update.T_map_sensor, pose_at(number), atol=5e-3)
     assert mapper.registered.body == 'base_link'
 
 
@@ -114,8 +114,8 @@ def test_two_sensors_serve_one_track():
 
     updates = feed(mapper, scans)
 
-    np.testing.assert_allclose(updates[4].T_fixed_sensor, pose_at(4), atol=5e-3)
-    np.testing.assert_allclose(updates[5].T_fixed_sensor, compose(pose_at(5), mount), atol=5e-3)
+    np.testing.assert_allclose(updates[4].T_map_sensor, pose_at(4), atol=5e-3)
+    np.testing.assert_allclose(updates[5].T_map_sensor, compose(pose_at(5), mount), atol=5e-3)
 
 
 def test_a_second_sensor_that_sits_nobody_knows_where_is_dropped():
@@ -140,9 +140,7 @@ def test_a_scan_that_does_not_fit_is_dropped_and_the_next_one_mapped():
     assert mapper.map.digest() == digest
 
     (update,) = feed(mapper, [scan_at(5)])
-    np.testing.assert_allclose(
-        update.T_fixed_sensor, compose(inverse(TRUE), pose_at(5)), atol=5e-3
-    )
+    np.testing.assert_allclose(update.T_map_sensor, compose(inverse(TRUE), pose_at(5)), atol=5e-3)
 
 
 def test_what_cannot_be_known_is_said(caplog):
@@ -150,7 +148,7 @@ def test_what_cannot_be_known_is_said(caplog):
 
     updates = feed(mapper, [scan_at(n, TRUE, faces=CORRIDOR, reach_m=20.0) for n in range(3)])
 
-    assert len(updates[2].alignment.degenerate) == 1
+    assert len(updates[2].registration.degenerate) == 1
     assert mapper.summary()['registration']['degenerate'] == 2
     assert 'leaves 1 of 6 directions of motion open' in caplog.text
 
@@ -162,7 +160,7 @@ def test_the_motion_gate_looks_at_the_pose_found():
 
     assert mapper.counters.gated == 10 - len(updates) == 6  # 0.08 m a scan
     np.testing.assert_allclose(
-        updates[-1].T_fixed_sensor, compose(inverse(TRUE), pose_at(9)), atol=5e-3
+        updates[-1].T_map_sensor, compose(inverse(TRUE), pose_at(9)), atol=5e-3
     )
 
 
@@ -173,7 +171,7 @@ def test_time_that_goes_back_starts_anew():
     (update,) = feed(mapper, [scan_at(3)])
 
     assert mapper.counters.resets == 1
-    np.testing.assert_array_equal(update.T_fixed_sensor, np.eye(4))
+    np.testing.assert_array_equal(update.T_map_sensor, np.eye(4))
 
 
 def rolling(num_scans):
@@ -197,7 +195,7 @@ def test_a_sweep_is_deskewed_by_the_motion_that_was_found():
     assert len(updates) == 12
     for update in updates:
         truth = compose(start, drive.T_odom_sensor(update.stamp_ns))
-        np.testing.assert_allclose(update.T_fixed_sensor[:3, 3], truth[:3, 3], atol=0.04)
+        np.testing.assert_allclose(update.T_map_sensor[:3, 3], truth[:3, 3], atol=0.04)
     fits = [m.summary()['registration']['fit']['median'] for m in (mapper, skewed)]
     assert fits[0] > fits[1]
 
@@ -218,7 +216,7 @@ def test_a_frozen_map_stays_as_it_is():
     mapper.clear()
 
     for number, update in enumerate(updates):
-        np.testing.assert_allclose(update.T_fixed_sensor, pose_at(number), atol=3e-3)
+        np.testing.assert_allclose(update.T_map_sensor, pose_at(number), atol=3e-3)
         assert (update.num_points, len(update.changed), update.evictions) == (0, 0, ())
     assert mapper.map.digest() == digest
     assert (mapper.counters.localised, mapper.counters.mapped) == (5, 0)
@@ -234,7 +232,7 @@ def test_on_a_frozen_map_somebody_may_say_where_the_robot_is():
     mapper.start_from('odom', near[:3, 3], q_xyzw(near))
 
     (update,) = feed(mapper, [scan_at(1)])
-    np.testing.assert_allclose(update.T_fixed_sensor, pose_at(1), atol=3e-3)
+    np.testing.assert_allclose(update.T_map_sensor, pose_at(1), atol=3e-3)
 
 
 @pytest.mark.parametrize(

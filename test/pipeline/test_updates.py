@@ -42,7 +42,7 @@ def test_updates_keep_a_copy_of_the_map_up_to_date(min_points):
         (update,) = insert(mapper, scan)
         changed = surfels_by_voxel(update.changed)
 
-        pose = update.T_fixed_sensor
+        pose = update.T_map_sensor
         twins = [reference.scan_moments(scan.points, 0.5, pose[:3, 3], pose)]
         reference.add_moments(moments, twins[0])
         for eviction in update.evictions:

@@ -44,7 +44,7 @@ def test_a_history_ends_where_the_map_does():
 def test_a_stage_that_comes_and_goes_leaves_gaps():
     mapper, history = Mapper(IDENTITY), History()
     for times in ({'total': 1.0}, {'total': 2.0, 'filter': 5.0}, {'filter': 6.0}):
-        update = SimpleNamespace(stamp_ns=0, milliseconds=times, T_fixed_sensor=np.eye(4))
+        update = SimpleNamespace(stamp_ns=0, milliseconds=times, T_map_sensor=np.eye(4))
         history.add(mapper, update)
 
     np.testing.assert_array_equal(history.milliseconds['total'], [1.0, 2.0, np.nan])
@@ -53,7 +53,7 @@ def test_a_stage_that_comes_and_goes_leaves_gaps():
 
 def test_surfels_are_counted_a_bounded_number_of_times_evenly_spread():
     mapper, history = Mapper(IDENTITY), History()
-    update = SimpleNamespace(stamp_ns=0, milliseconds={}, T_fixed_sensor=np.eye(4))
+    update = SimpleNamespace(stamp_ns=0, milliseconds={}, T_map_sensor=np.eye(4))
     for _ in range(5000):
         history.add(mapper, update)
 
