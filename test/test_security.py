@@ -157,7 +157,7 @@ def test_a_map_is_not_saved_through_a_link_that_leads_elsewhere(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
     from surfel_mapper.config import Config
     from surfel_mapper.pipeline import Mapper
-    from surfel_mapper.ros.saving import save_map
+    from surfel_mapper.ros.map_files import save_map
 
     outside, maps = tmp_path / 'precious', tmp_path / 'maps'
     outside.write_text('as it was')

@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 
 from surfel_mapper.cli.ros import loading_ros
-from surfel_mapper.ros.signals import Signals
+from surfel_mapper.ros.main_thread import Signals
 
 SUMMARY = 'Map clouds live from ROS 2 topics.'
 
@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     try:
         with Signals() as signals:
             with loading_ros():
-                from surfel_mapper.ros.running import run_node
+                from surfel_mapper.ros.main import run_node
             run_node(args.ros_args, signals)
     except KeyboardInterrupt:
         pass

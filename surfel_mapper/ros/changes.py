@@ -27,7 +27,7 @@ LIST_EVERY = 30
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class MapChange:
     """
     What clients do not know yet.
 
@@ -44,7 +44,7 @@ class Change:
     removed: npt.NDArray[np.int32]
 
 
-class Changes:
+class ChangeTracker:
     """
     Follows the map for clients.
 
@@ -58,7 +58,7 @@ class Changes:
     def __init__(self, mapper: Mapper) -> None:
         """Begin with clients who know nothing, of whom there are none."""
         self._mapper = mapper
-        self._known: KnownKeys | None = None
+        self._known: PublishedKeys | None = None
         self._version = mapper.map.version
         self._num_resets = mapper.counters.resets
 
@@ -74,7 +74,7 @@ class Changes:
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
 
-    def of(self, update: Update) -> Change:
+    def of(self, update: Update) -> MapChange:
         """Return what a scan changed, and whatever else happened since the last call."""
         num_resets = self._mapper.counters.resets
         is_usual = update.alignment is None and num_resets == self._num_resets
@@ -82,27 +82,27 @@ class Changes:
         if not is_usual:
             return self.since_last()
         if self._known is None:
-            self._known = KnownKeys(self._held())
+            self._known = PublishedKeys(self._held())
         if not self._mapper.config.publish.moments:
-            change = Change(update.changed, update.removed_voxel_index)
+            change = MapChange(update.changed, update.removed_voxel_index)
         else:
             surfels = self._mapper.map.surfels_changed(self._version, 1)
-            change = Change(surfels, self._emptied(update))
+            change = MapChange(surfels, self._emptied(update))
         self._version = self._mapper.map.version
         self._known.note(change)
         if len(self._known) >= LIST_EVERY:
-            self._known = KnownKeys(self._held())
+            self._known = PublishedKeys(self._held())
         return change
 
-    def since_last(self) -> Change:
+    def since_last(self) -> MapChange:
         """Return what has changed since the last call, in whatever way."""
         surfel_map = self._mapper.map
         surfels = surfel_map.surfels_changed(self._version, self.min_points)
         keys = self._held()
         before = np.empty(0, np.int64) if self._known is None else self._known.keys()
-        self._known = KnownKeys(keys)
+        self._known = PublishedKeys(keys)
         self._version = surfel_map.version
-        return Change(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
+        return MapChange(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
 
     def _held(self) -> Keys:
         """Return the voxels that clients should know of."""
@@ -117,7 +117,7 @@ class Changes:
         return unpack_keys(evicted[self._mapper.map.find(evicted) < 0])
 
 
-class KnownKeys:
+class PublishedKeys:
     """
     The voxels that clients know of.
 
@@ -134,13 +134,13 @@ class KnownKeys:
     def __init__(self, keys: Keys) -> None:
         """Know of some voxels."""
         self._keys = keys
-        self._changes: list[Change] = []
+        self._changes: list[MapChange] = []
 
     def __len__(self) -> int:
         """Return how many changes are remembered."""
         return len(self._changes)
 
-    def note(self, change: Change) -> None:
+    def note(self, change: MapChange) -> None:
         """Remember a change."""
         self._changes.append(change)
 

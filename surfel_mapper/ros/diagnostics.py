@@ -20,29 +20,17 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 import numpy as np
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from std_msgs.msg import Header
 
+from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
-from surfel_mapper.ros.publishing import steady_timer
 from surfel_mapper.ros.session import Session
 
 LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 
 BUSY_S = 5.0
 """A mapping thread that has not answered for so long is an error."""
-
-
-class CountedPublisher(Publisher):
-    """A publisher that counts its messages."""
-
-    num_published = 0
-
-    def publish(self, msg: Any) -> None:
-        """Publish a message, or the bytes of one."""
-        super().publish(msg)
-        self.num_published += 1
 
 
 class Diagnostics:

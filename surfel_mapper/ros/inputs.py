@@ -38,8 +38,8 @@ from surfel_mapper.messages.pose_messages import ODOMETRY, POSE, TF
 from surfel_mapper.messages.raw_cloud import parse_cloud
 from surfel_mapper.messages.raw_pose import raw_poses
 from surfel_mapper.messages.scene_image import SceneImages
-from surfel_mapper.ros.intake import Intake
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
@@ -107,7 +107,7 @@ class Inputs:
         self._node = node
         self._config = config
         self._thread = thread
-        self._intake = Intake(node, on_failure)
+        self._subscriptions = SubscriptionExecutor(node, on_failure)
 
     def subscribe(self) -> None:
         """
@@ -139,15 +139,15 @@ class Inputs:
             self._subscribe_clouds(topic)
         for kind, name in self._config.tsdf.image_topics.items():
             self._subscribe_images(kind, self._node.resolve_topic_name(name))
-        self._intake.start()
+        self._subscriptions.start()
 
     def unsubscribe(self) -> None:
         """Take no more messages."""
-        self._intake.stop()
+        self._subscriptions.stop()
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
-        return self._intake.topics()
+        return self._subscriptions.topics()
 
     def loss(self) -> str:
         """Return how many clouds were lost on the way and what to do about it, or nothing."""
@@ -177,7 +177,7 @@ class Inputs:
     def _subscribe_clouds(self, topic: str) -> None:
         """Subscribe to one sensor."""
         lost = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
-        subscribe = partial(self._intake.subscribe, qos=CLOUDS)
+        subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
         if self._config.input.kind == 'cloud':
             on_cloud = partial(self._on_cloud, topic)
             subscribe(PointCloud2, topic, on_cloud, events=lost, raw=True)
@@ -187,7 +187,7 @@ class Inputs:
 
     def _subscribe_images(self, kind: str, topic: str) -> None:
         """Subscribe to images of colours or labels, and to the calibration where needed."""
-        subscribe = partial(self._intake.subscribe, qos=CLOUDS)
+        subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
         if self._scenes.needs_cameras:
             on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
             subscribe(CameraInfo, camera_info_topic(topic), on_info)
@@ -217,7 +217,7 @@ class Inputs:
         """Subscribe to poses or transforms."""
         kind = TF if qos in (TRANSFORMS, STATIC_TRANSFORMS) else self._config.pose.source
         on_pose = partial(self._on_pose, kind, topic)
-        self._intake.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
+        self._subscriptions.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
 
     def _on_cloud(self, topic: str, raw: bytes) -> None:
         self._hear(topic, len(raw))

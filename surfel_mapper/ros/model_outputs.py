@@ -32,9 +32,9 @@ from surfel_mapper.models.filling import joined
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.models.shapes import PatchShape, Shapes
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.ros.base_node import LATCHED
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message
-from surfel_mapper.ros.publishing import LATCHED
 
 OUTLINES = QoSProfile(
     depth=1000,

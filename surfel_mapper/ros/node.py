@@ -30,27 +30,25 @@ from rclpy.lifecycle import (
 )
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.publisher import Publisher
 
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.ros.diagnostics import CountedPublisher, Diagnostics
-from surfel_mapper.ros.guarded import GuardedNode
-from surfel_mapper.ros.inbox import Inbox
+from surfel_mapper.ros.base_node import BaseNode, result_of
+from surfel_mapper.ros.diagnostics import Diagnostics
+from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.parameters import as_declared, changed_config, declare_settings, refusal
 from surfel_mapper.ros.session import Session
-from surfel_mapper.ros.waiting import result_of
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
 
 
-class MapperNode(LifecycleNodeMixin, GuardedNode):
+class MapperNode(LifecycleNodeMixin, BaseNode):
     """
     A managed node that maps clouds.
 
     Attributes
     ----------
-    inbox : Inbox
+    tasks : TaskQueue
         What the main thread has to do: transitions that were requested, errors to raise.
     refusal : Exception or None
         Why the last transition was refused.
@@ -68,7 +66,7 @@ class MapperNode(LifecycleNodeMixin, GuardedNode):
             Node.__init__(self, 'surfel_mapper')
         except ParameterException as error:  # one of rclpy's own, such as use_sim_time
             raise ConfigError(str(error)) from error
-        self.inbox = Inbox()
+        self.tasks = TaskQueue()
         self.refusal: Exception | None = None
         self._session: Session | None = None
         self._config = declare_settings(self)
@@ -102,10 +100,6 @@ class MapperNode(LifecycleNodeMixin, GuardedNode):
         if self.state in ('unconfigured', 'inactive', 'active'):
             self.trigger_shutdown()
         self._release(save=self._config.output.save_on_shutdown)
-
-    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
-        """Create a publisher whose messages are counted for the diagnostics."""
-        return super().create_publisher(*args, publisher_class=CountedPublisher, **kwargs)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters that someone sends; the reason of a refusal names what is wrong."""
@@ -141,7 +135,7 @@ class MapperNode(LifecycleNodeMixin, GuardedNode):
 
     def _configure(self) -> None:
         try:
-            self._session = Session(self, self._config, self.inbox)
+            self._session = Session(self, self._config, self.tasks)
         except BaseException:
             self._withdraw()
             raise
@@ -198,7 +192,7 @@ class MapperNode(LifecycleNodeMixin, GuardedNode):
             return TransitionCallbackReturn.FAILURE
         except Exception as error:
             self.refusal = error
-            self.inbox.fail(error)
+            self.tasks.fail(error)
             return TransitionCallbackReturn.ERROR
         return SUCCESS
 
@@ -207,7 +201,7 @@ class MapperNode(LifecycleNodeMixin, GuardedNode):
     ) -> ChangeState.Response:
         """Have the main thread make a transition; one that is not possible is refused."""
         action = partial(self._transit, request, response)
-        response.success = await result_of(self.inbox.ask(action), self.executor)
+        response.success = await result_of(self.tasks.submit(action), self.executor)
         return response
 
     def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:

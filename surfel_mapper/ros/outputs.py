@@ -39,14 +39,13 @@ from surfel_mapper.messages.markers import disc_colors, surfel_markers
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.pipeline import Alignment, Mapper, Update
-from surfel_mapper.ros.alignment import AlignmentOutputs
-from surfel_mapper.ros.changes import Change, Changes
+from surfel_mapper.ros.base_node import LATCHED, result_of, steady_timer
+from surfel_mapper.ros.changes import ChangeTracker, MapChange
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message, grid_message
 from surfel_mapper.ros.model_outputs import ModelOutputs
-from surfel_mapper.ros.publishing import LATCHED, steady_timer
+from surfel_mapper.ros.pose_outputs import AlignmentOutputs
 from surfel_mapper.ros.tsdf_outputs import TsdfOutputs
-from surfel_mapper.ros.waiting import result_of
 from surfel_mapper.scan import Scan
 
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -76,7 +75,7 @@ class Outputs:
         self._node = node
         self._mapper = mapper
         self._thread = thread
-        self._changes = Changes(mapper)
+        self._changes = ChangeTracker(mapper)
         self._ages = Ages()
         self._alignment = AlignmentOutputs(node, mapper)
         self._tsdf = TsdfOutputs(node, mapper, mapper.tsdf, thread) if mapper.tsdf else None
@@ -194,7 +193,7 @@ class Outputs:
             or self._removed.get_subscription_count()
         )
 
-    def _publish_change(self, change: Change) -> None:
+    def _publish_change(self, change: MapChange) -> None:
         mapper = self._mapper
         if mapper.config.publish.changed:
             self._changed.publish(self._surfel_cloud(change.surfels, change.removed))

@@ -25,9 +25,8 @@ from rosgraph_msgs.msg import Clock
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError, DependencyError, SubscriberError
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.ros.context import context
+from surfel_mapper.ros.context import context, enlarge_shared_memory
 from surfel_mapper.ros.messages import time_message
-from surfel_mapper.ros.shared_memory import enlarge_shared_memory
 
 log = logging.getLogger(__name__)
 

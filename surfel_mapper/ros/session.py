@@ -16,13 +16,13 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper, Update
-from surfel_mapper.ros.control import Control
-from surfel_mapper.ros.inbox import Inbox
 from surfel_mapper.ros.inputs import Inputs
+from surfel_mapper.ros.main_thread import TaskQueue
+from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
-from surfel_mapper.ros.registration import registration_outputs
-from surfel_mapper.ros.saving import save_map
+from surfel_mapper.ros.pose_outputs import registration_outputs
+from surfel_mapper.ros.services import Services
 
 LATEST = 200
 """Latencies of so many scans are kept for the percentiles, 10 s at 20 Hz."""
@@ -38,7 +38,7 @@ class Session:
         Whose topics and services they are.
     config : Config
         All settings.
-    inbox : Inbox
+    tasks : TaskQueue
         Gets the error if the mapping thread fails.
 
     Attributes
@@ -56,7 +56,7 @@ class Session:
 
     """
 
-    def __init__(self, node: Node, config: Config, inbox: Inbox) -> None:
+    def __init__(self, node: Node, config: Config, tasks: TaskQueue) -> None:
         """Compile the kernels, then offer topics to read, and services."""
         self._node = node
         self.config = config
@@ -67,11 +67,11 @@ class Session:
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, or half a minute the first time')
         self.mapper.warm_up()
-        self.thread = MappingThread(self.mapper, inbox.fail)
-        self.inputs = Inputs(node, config, self.thread, inbox.fail)
+        self.thread = MappingThread(self.mapper, tasks.fail)
+        self.inputs = Inputs(node, config, self.thread, tasks.fail)
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
-        self.control = Control(node, self.mapper, self.thread, self.outputs)
+        self.services = Services(node, self.mapper, self.thread, self.outputs)
         log.info(f'kernels ready after {time.monotonic() - start:.1f} s')
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self._changing = threading.Lock()  # transitions and settings come from two threads
@@ -95,7 +95,7 @@ class Session:
         with self._changing:
             self._is_active = False
             self.outputs.stop_timers()
-        with suppress(CancelledError):  # the thread may have failed, which the inbox tells
+        with suppress(CancelledError):  # the thread may have failed, which the tasks tells
             self.thread.call(lambda: None).result()
 
     def reconfigure(self, config: Config) -> None:

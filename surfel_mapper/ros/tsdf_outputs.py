@@ -14,9 +14,9 @@ from surfel_mapper.messages.cdr import marker_bytes
 from surfel_mapper.messages.mesh_marker import mesh_marker
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
+from surfel_mapper.ros.base_node import LATCHED, steady_timer
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import grid_message
-from surfel_mapper.ros.publishing import LATCHED, steady_timer
 from surfel_mapper.tsdf.obstacles import slice_at
 
 

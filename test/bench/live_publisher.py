@@ -34,7 +34,7 @@ def main(arguments):
     from sensor_msgs.msg import PointCloud2
 
     from surfel_mapper.memory import keep_freed_memory
-    from surfel_mapper.ros.shared_memory import enlarge_shared_memory
+    from surfel_mapper.ros.context import enlarge_shared_memory
     from surfel_mapper.simulation.recording import BASE, ODOM
 
     settings = json.loads(arguments[0])

@@ -214,7 +214,7 @@ def chain(data: bytes) -> None:
 
 def map_url(data: bytes) -> None:
     """Ask for a map by any name: what is answered is inside the directory, or nothing."""
-    from surfel_mapper.ros.saving import path_inside
+    from surfel_mapper.ros.map_files import path_inside
 
     directory = Path(folder().name, 'maps')
     directory.mkdir(exist_ok=True)

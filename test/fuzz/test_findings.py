@@ -203,7 +203,7 @@ def test_a_bag_of_ros_1_with_a_bomb_in_a_chunk_is_refused_before_it_goes_off(lit
 
 def test_a_map_without_a_name_is_refused_as_any_other_place(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
-    from surfel_mapper.ros.saving import path_inside
+    from surfel_mapper.ros.map_files import path_inside
 
     for url in ('/', 'file:///', '.', '../../x'):
         with pytest.raises(ConfigError, match='map_url'):

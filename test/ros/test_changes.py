@@ -21,7 +21,7 @@ from surfel_mapper.messages.map_cloud import halves, moment_cloud, voxel_columns
 from surfel_mapper.messages.mirror import MapMirror, MAX_RECENT
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.pipeline.regions import Ball
-from surfel_mapper.ros.changes import Changes
+from surfel_mapper.ros.changes import ChangeTracker
 
 SECOND = 10**9
 NO_VOXELS = np.empty((0, 3), np.int32)
@@ -44,7 +44,7 @@ class Node:
 
     def __init__(self, **changes):
         self.mapper = Mapper(config_with(**changes))
-        self.changes = Changes(self.mapper)
+        self.changes = ChangeTracker(self.mapper)
         self.stamp_ns = 0
         self._rng = np.random.default_rng(1)
 
@@ -61,7 +61,7 @@ class Node:
         return self.message(self.mapper.map.surfels(1))
 
     def map_scan(self, stamp_ns, num=300):
-        """Map a random scan somewhere; return what changed, as (Change, message)."""
+        """Map a random scan somewhere; return what changed, as (MapChange, message)."""
         center = self._rng.integers(-3, 3, 3)
         points = self._rng.normal(scale=0.8, size=(num, 3)) + center
         colors = self._rng.integers(0, 2**24, num).astype(np.uint32)

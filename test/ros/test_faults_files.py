@@ -26,7 +26,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.ply import read_points
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.ros.saving import save_map
+from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.scan import Scan
 from surfel_mapper.viz.history import History
 from test.ros.driving import ARGUMENTS, drive, send

@@ -23,8 +23,8 @@ from surfel_mapper.config import Config
 from surfel_mapper.messages.depth_image import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.ros.context import FASTDDS_VARIABLES
 from surfel_mapper.ros.inputs import Inputs
-from surfel_mapper.ros.shared_memory import OWN_SETTINGS
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.ros.live import cloud, odometry, RELIABLE, reliably, room, stamp, START_NS
@@ -238,7 +238,7 @@ def inputs_that_lost(size):
     return inputs
 
 
-@pytest.mark.skipif(any(map(os.environ.get, OWN_SETTINGS)), reason='Fast DDS is configured')
+@pytest.mark.skipif(any(map(os.environ.get, FASTDDS_VARIABLES)), reason='Fast DDS is configured')
 def test_large_clouds_that_get_lost_are_noticed_and_the_remedy_named(start, peer):
     node = start('node', *arguments([], **{'pose.source': 'identity'}))
     publisher = peer.node.create_publisher(PointCloud2, '/points', BEST_EFFORT)

@@ -19,8 +19,8 @@ from sensor_msgs.msg import PointCloud2
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.context import context
+from surfel_mapper.ros.main import executing
 from surfel_mapper.ros.node import MapperNode
-from surfel_mapper.ros.running import executing
 from test.ros.driving import ARGUMENTS, drive, mapped, send
 from test.ros.live import LATCHED, NODE, RVIZ
 

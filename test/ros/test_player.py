@@ -28,7 +28,7 @@ from sensor_msgs.msg import PointCloud2
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import DependencyError
-from surfel_mapper.ros import shared_memory
+from surfel_mapper.ros import context
 from surfel_mapper.ros.player import message_type
 from test.bags.recorded import (
     drive,
@@ -163,12 +163,12 @@ def test_a_type_that_is_not_installed_is_named(domain, name):
 
 
 def test_shared_memory_is_left_as_the_user_configured_it(monkeypatch):
-    for name in shared_memory.OWN_SETTINGS:
+    for name in context.FASTDDS_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-    shared_memory.enlarge_shared_memory()
-    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in shared_memory.os.environ
+    context.enlarge_shared_memory()
+    assert 'FASTRTPS_DEFAULT_PROFILES_FILE' not in context.os.environ
 
 
 def test_the_profile_of_shared_memory_is_installed_beside_the_code():
-    assert shared_memory.PROFILE.read_text(encoding='utf-8').startswith('<?xml')
+    assert context.PROFILE.read_text(encoding='utf-8').startswith('<?xml')

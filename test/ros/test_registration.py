@@ -19,7 +19,7 @@ from surfel_mapper.files.map_state import save_map
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.ros.registration import covariance
+from surfel_mapper.ros.pose_outputs import covariance
 from test.alignment.test_registration import map_of, ROOM
 from test.pipeline.test_registered_poses import pose_at, scan_at
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS
@@ -99,7 +99,7 @@ def test_on_a_frozen_map_an_initial_pose_tells_where_to_begin(start, peer, tmp_p
     p.x, p.y, p.z = (pose_at(0)[:3, 3] + [0.4, -0.3, 0.0]).tolist()
     q.x, q.y, q.z, q.w = q_xyzw(pose_at(0)).tolist()
     peer.publish('/initialpose', message)
-    node.wait_for_output('goes on from the initial pose at ')
+    node.wait_for_output('continues from the initial pose ')
     send(peer, clouds([1, 2]))
     peer.spin_until(lambda: len(found) == 2, what=lambda: node.output)
 

@@ -20,9 +20,8 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import PoseError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.regions import Ball, Box, Prism
-from surfel_mapper.ros.control import Control, MAX_WAITING
 from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.polygons import prism
+from surfel_mapper.ros.services import MAX_WAITING, prism, Services
 from test.ros.driving import ARGUMENTS, drive, mapped, PERIOD_NS, send
 from test.ros.live import NODE, odometry, stamp, START_NS, TIMEOUT_S
 
@@ -239,7 +238,7 @@ def test_of_too_many_requests_that_wait_the_last_are_refused_at_once(peer):
     thread.start(lambda update: None)
     thread.call(lambda: (busy.set(), released.wait(TIMEOUT_S)))
     assert busy.wait(TIMEOUT_S)
-    Control(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
+    Services(peer.node, mapper, thread, SimpleNamespace(expire=lambda: None))
     client = peer.node.create_client(Trigger, '/peer/clear')
     peer.spin_until(client.service_is_ready)
     answers = []

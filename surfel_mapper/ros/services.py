@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The services of a node, and the topic that clears: what to do with the map, at whose word.
+The services of the node, and ~/clear_polygon: commands that change, save or load the map.
 
-What is asked for is done in the mapping thread, behind the clouds that came before the request,
-so an answer is about all of them. The executor goes on meanwhile (waiting.py). Every answer says
-what was done and where, in the log too: nav_msgs/LoadMap has no room for a word.
+Requests are carried out in the mapping thread, behind the clouds that arrived before them, so the
+answer covers all of these. The executor runs other callbacks meanwhile. Every answer states the
+result and where it is; it is logged too, because nav_msgs/LoadMap has no field for text.
 """
 
 from __future__ import annotations
@@ -18,65 +18,65 @@ from typing import Any
 
 from geometry_msgs.msg import PolygonStamped
 from nav_msgs.srv import LoadMap
+import numpy as np
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
 from surfel_mapper.errors import FileFormatError, MapError, PoseError, SurfelMapperError
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.regions import Ball, Box, Region
+from surfel_mapper.pipeline.regions import Ball, Box, Prism, Region
+from surfel_mapper.ros.base_node import result_of
+from surfel_mapper.ros.map_files import load_map, save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import time_message
 from surfel_mapper.ros.outputs import Outputs
-from surfel_mapper.ros.polygons import prism
-from surfel_mapper.ros.saving import load_map, save_map
-from surfel_mapper.ros.waiting import result_of
 
 LOADED = LoadMap.Response.RESULT_SUCCESS
-UNLOADED: tuple[tuple[type[Exception], int], ...] = (
+LOAD_ERRORS: tuple[tuple[type[Exception], int], ...] = (
     (FileNotFoundError, LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST),
     (FileFormatError, LoadMap.Response.RESULT_INVALID_MAP_DATA),
     (MapError, LoadMap.Response.RESULT_INVALID_MAP_METADATA),
     (Exception, LoadMap.Response.RESULT_UNDEFINED_FAILURE),
 )
-"""What the answer to ~/load_map is, by the error that loading ended with; the first that fits."""
+"""Result code of ~/load_map by the error raised; the first match counts."""
 
 MAX_WAITING = 10
 """
-Requests that may wait, as many as a client holds answers to; more are refused.
+Most requests that may wait; more are refused. A service client holds as many answers.
 
-Polygons likewise; the oldest gives way.
+Polygons have a queue of the same length, which drops the oldest.
 """
 
 
-class Control:
+class Services:
     """
-    Services ~/align, ~/clear, ~/clear_box, ~/clear_radius, ~/save_map, ~/load_map, ~/pause.
+    The services ~/align, ~/clear, ~/clear_box, ~/clear_radius, ~/save_map, ~/load_map, ~/pause.
 
     Parameters
     ----------
     node : Node
-        Whose services they are.
+        The node that offers them.
     mapper : Mapper
-        What they are about.
+        The mapper they act on.
     thread : MappingThread
         The thread that owns the mapper.
     outputs : Outputs
-        Told when the map is not what was published.
+        Publishes the map again after a change.
 
     """
 
     def __init__(
         self, node: Node, mapper: Mapper, thread: MappingThread, outputs: Outputs
     ) -> None:
-        """Offer the services and listen for polygons."""
+        """Create the services and the subscription to ~/clear_polygon."""
         self._node = node
         self._mapper = mapper
         self._thread = thread
         self._outputs = outputs
         self._num_waiting = 0
         self._polygons: deque[PolygonStamped] = deque(maxlen=MAX_WAITING)
-        group = ReentrantCallbackGroup()  # one may wait while the others go on
+        group = ReentrantCallbackGroup()  # a request may wait while others are answered
         for name, action in (
             ('~/align', self._align),
             ('~/clear', self._clear),
@@ -90,14 +90,14 @@ class Control:
         node.create_subscription(PolygonStamped, '~/clear_polygon', self._on_polygon, 10)
 
     def _trigger(self, action: Callable[[], str]) -> Callable[..., Any]:
-        """Return the callback of a service that does something in the mapping thread."""
+        """Return a service callback that runs an action in the mapping thread."""
 
         async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.message = await self._done(action)
+                response.message = await self._run(action)
                 response.success = True
             except (SurfelMapperError, OSError, ValueError, CancelledError) as error:
-                response.message = self._refused(error)
+                response.message = self._log_failure(error)
             return response
 
         return answer
@@ -106,10 +106,10 @@ class Control:
         self, request: LoadMap.Request, response: LoadMap.Response
     ) -> LoadMap.Response:
         try:
-            await self._done(partial(self._load, request.map_url))
+            await self._run(partial(self._load, request.map_url))
         except (SurfelMapperError, OSError, ValueError, CancelledError) as error:
-            self._refused(error)
-            response.result = next(code for kind, code in UNLOADED if isinstance(error, kind))
+            self._log_failure(error)
+            response.result = next(code for kind, code in LOAD_ERRORS if isinstance(error, kind))
             return response
         response.result = LOADED
         config = self._mapper.config
@@ -130,57 +130,57 @@ class Control:
         self._polygons.append(msg)
         self._thread.post(self._clear_polygons)
 
-    async def _done(self, action: Callable[[], str]) -> str:
-        """Do something in the mapping thread; return what it says, and log it."""
+    async def _run(self, action: Callable[[], str]) -> str:
+        """Run an action in the mapping thread; log its answer and return it."""
         if self._num_waiting >= MAX_WAITING:
             raise MapError(f'{MAX_WAITING} requests wait already; try again')
         self._num_waiting += 1
         try:
-            said = await result_of(self._thread.call(action), self._node.executor)
+            answer = await result_of(self._thread.call(action), self._node.executor)
         finally:
             self._num_waiting -= 1
-        self._node.get_logger().info(said)
-        return said
+        self._node.get_logger().info(answer)
+        return answer
 
-    def _refused(self, error: BaseException) -> str:
-        """Return why something was not done, and log it."""
-        said = 'the node is about to end' if isinstance(error, CancelledError) else str(error)
-        self._node.get_logger().error(said)
-        return said
+    def _log_failure(self, error: BaseException) -> str:
+        """Log why a request failed; return the text."""
+        text = 'the node is about to end' if isinstance(error, CancelledError) else str(error)
+        self._node.get_logger().error(text)
+        return text
 
-    # What follows is called in the mapping thread.
+    # The methods below run in the mapping thread.
 
     def _align(self) -> str:
-        """Move the scans of the window to where they agree; return by how much."""
+        """Align the scans of the window with each other; return the corrections."""
         aligned = self._mapper.align()
         self._outputs.publish_aligned(aligned)
         return str(aligned)
 
     def _clear(self) -> str:
-        """Empty the map; return what was in it."""
+        """Remove all voxels and scans; return their numbers."""
         mapper = self._mapper
-        said = f'cleared {mapper.map.num_voxels} voxels of {len(mapper.window)} scans'
+        answer = f'cleared {mapper.map.num_voxels} voxels of {len(mapper.window)} scans'
         mapper.clear()
         self._outputs.expire()
-        return said
+        return answer
 
     def _clear_box(self) -> str:
-        """Empty the box of the settings."""
+        """Clear the box given by the setting ``clear.box``."""
         x0, y0, z0, x1, y1, z1 = self._mapper.config.clear.box
         box = Box((x0, y0, z0), (x1, y1, z1))
         return self._clear_region(box, f'clear.box from {box.low} to {box.high}')
 
     def _clear_radius(self) -> str:
-        """Empty all about the sensor."""
+        """Clear the ball of ``clear.radius_m`` about the newest position of the sensor."""
         newest, radius_m = self._mapper.window.newest, self._mapper.config.clear.radius_m
         if newest is None:
-            raise MapError('no scan in the map yet, so that the sensor is nowhere')
+            raise MapError('no scan in the map yet, so the position of the sensor is not known')
         x, y, z = newest.T_map_sensor[:3, 3].tolist()
         where = f'{radius_m:g} m about the sensor at ({x:.2f}, {y:.2f}, {z:.2f})'
         return self._clear_region(Ball((x, y, z), radius_m), where)
 
     def _clear_polygons(self) -> None:
-        """Empty all above and below the polygons that came on the topic."""
+        """Clear the regions of all polygons received on ~/clear_polygon."""
         while self._polygons:
             self._clear_polygon(self._polygons.popleft())
 
@@ -197,7 +197,7 @@ class Control:
             )
 
     def _clear_region(self, region: Region, where: str) -> str:
-        """Empty a part of space; return what was in it."""
+        """Clear a region of the map; return the number of voxels removed."""
         before = self._mapper.map.num_voxels
         self._mapper.clear_region(region)
         self._outputs.expire()
@@ -208,7 +208,35 @@ class Control:
         return save_map(self._mapper)
 
     def _load(self, url: str) -> str:
-        """Put the map of a file in the place of the one there is."""
-        said = load_map(self._mapper, url)
+        """Replace the map by the one in a file."""
+        answer = load_map(self._mapper, url)
         self._outputs.expire()
-        return said
+        return answer
+
+
+def prism(msg: Any, mapper: Mapper) -> Prism:
+    """
+    Return the vertical prism over a polygon: the region above and below it in the map.
+
+    Parameters
+    ----------
+    msg : geometry_msgs/PolygonStamped
+        The polygon. A stamp of zero, as RViz sends it, means the newest transform.
+    mapper : Mapper
+        Looks up the transform from the polygon's frame to the map.
+
+    Raises
+    ------
+    PoseError
+        If the frame_id is empty, or there is no transform to the fixed frame at the stamp.
+    ValueError
+        If it has fewer than three corners, or one is not finite.
+
+    """
+    if not msg.header.frame_id:
+        raise PoseError('its frame_id is empty')
+    stamp_ns = msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec
+    T_map_frame = mapper.T_map_of(msg.header.frame_id, stamp_ns)
+    corners = np.array([(p.x, p.y, p.z) for p in msg.polygon.points]).reshape(-1, 3)
+    moved = corners @ T_map_frame[:3, :3].T + T_map_frame[:3, 3]
+    return Prism(tuple((float(x), float(y)) for x, y, _ in moved))

@@ -16,7 +16,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Int32, String
 
-from surfel_mapper.ros.intake import Intake
+from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from test.ros.live import cloud, odometry, RELIABLE, room, START_NS, TIMEOUT_S
 
 ARGUMENTS = (
@@ -77,7 +77,7 @@ class Bench:
     def __init__(self, peer):
         self.taken = []
         self.failures = []
-        self.intake = Intake(peer.node, self.failures.append)
+        self.intake = SubscriptionExecutor(peer.node, self.failures.append)
 
     def take(self, message):
         self.taken.append(message.data)
@@ -160,7 +160,7 @@ def test_what_has_arrived_is_taken_before_the_end(peer, bench):
 
 
 def test_it_can_be_stopped_while_messages_keep_coming(peer, bench, monkeypatch):
-    monkeypatch.setattr('surfel_mapper.ros.intake.LAST_S', 0.1)
+    monkeypatch.setattr('surfel_mapper.ros.subscription_executor.LAST_S', 0.1)
     publisher = peer.node.create_publisher(String, 'others', ALL)
 
     def answer_with_another(message):

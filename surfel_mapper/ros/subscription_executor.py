@@ -53,7 +53,7 @@ class KeptFromExecutor(ReentrantCallbackGroup):
         return False
 
 
-class Intake:
+class SubscriptionExecutor:
     """
     Subscriptions, and the thread that calls their callbacks.
 

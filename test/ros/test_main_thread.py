@@ -12,8 +12,7 @@ import time
 from llvmlite import binding as llvm
 import pytest
 
-from surfel_mapper.ros.inbox import Inbox
-from surfel_mapper.ros.signals import NUMBERS, Signals
+from surfel_mapper.ros.main_thread import NUMBERS, Signals, TaskQueue
 
 TIMEOUT_S = 120
 HANDLED = (*NUMBERS, signal.SIGALRM)
@@ -93,36 +92,36 @@ def nothing():
 
 
 def test_a_request_is_answered_by_the_thread_that_serves_and_an_error_ends_it():
-    inbox = Inbox()
+    tasks = TaskQueue()
     names = []
 
     def act():
         names.append(threading.current_thread().name)
         return True
 
-    answers = [inbox.ask(act), inbox.ask(lambda: False)]
-    inbox.fail(RuntimeError('the end'))
+    answers = [tasks.submit(act), tasks.submit(lambda: False)]
+    tasks.fail(RuntimeError('the end'))
     with pytest.raises(RuntimeError, match='the end'):
-        inbox.serve(nothing)
+        tasks.run(nothing)
     assert [answer.result(TIMEOUT_S) for answer in answers] == [True, False]
     assert names == [threading.current_thread().name]
 
 
 def test_a_request_that_raises_is_answered_and_raises_where_it_is_served():
-    inbox = Inbox()
-    answer = inbox.ask(lambda: 1 // 0)
+    tasks = TaskQueue()
+    answer = tasks.submit(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
-        inbox.serve(nothing)
+        tasks.run(nothing)
     assert answer.result(TIMEOUT_S) is False
 
 
 def test_what_is_asked_for_at_the_end_or_after_it_is_answered_with_no():
-    inbox = Inbox()
-    before = inbox.ask(lambda: True)
-    inbox.fail(RuntimeError('unheard'))
-    inbox.close()
+    tasks = TaskQueue()
+    before = tasks.submit(lambda: True)
+    tasks.fail(RuntimeError('unheard'))
+    tasks.close()
     assert before.result(TIMEOUT_S) is False
-    assert inbox.ask(lambda: True).result(TIMEOUT_S) is False
+    assert tasks.submit(lambda: True).result(TIMEOUT_S) is False
 
 
 def test_a_signal_that_does_not_wake_whoever_waits_ends_the_service():
@@ -133,12 +132,12 @@ def test_a_signal_that_does_not_wake_whoever_waits_ends_the_service():
         time.sleep(0.1)  # until the main thread waits
         signal.pthread_kill(asleep.ident, signal.SIGTERM)
 
-    inbox = Inbox()
-    alarm = threading.Timer(TIMEOUT_S, inbox.ask, [nothing])
+    tasks = TaskQueue()
+    alarm = threading.Timer(TIMEOUT_S, tasks.submit, [nothing])
     alarm.start()
     threading.Thread(target=strike).start()
     with Signals() as signals, pytest.raises(KeyboardInterrupt):
-        inbox.serve(signals.check)
+        tasks.run(signals.check)
     assert alarm.is_alive(), 'heard only when something else woke it'
     alarm.cancel()
 
@@ -148,4 +147,4 @@ def test_an_interruption_is_noticed_before_the_next_wait():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        Inbox().serve(check)
+        TaskQueue().run(check)

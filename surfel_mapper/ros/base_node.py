@@ -1,0 +1,123 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The rclpy features that the node builds on: a guarded Node, timers, and waiting in a callback.
+
+rclpy raises if a time on /clock is negative, or if a parameter is set to a value of an unknown
+type. Either error ends the executor and with it the node, so any process in the ROS domain could
+end it. ``BaseNode`` ignores or refuses such messages.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from concurrent.futures import Future
+from functools import partial
+import types
+from typing import Any, TypeVar
+
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from rclpy.clock import Clock, ClockType
+from rclpy.executors import Executor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.service import Service
+from rclpy.subscription import Subscription
+from rclpy.timer import Timer
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+PARAMETER_TYPES = {kind.value for kind in Parameter.Type}
+
+LATCHED = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
+)
+"""The last message is kept for subscribers that come later."""
+
+Result = TypeVar('Result')
+
+
+class CountedPublisher(Publisher):
+    """A publisher that counts its messages, for the diagnostics."""
+
+    num_published = 0
+
+    def publish(self, msg: Any) -> None:
+        """Publish a message, or its serialized bytes."""
+        super().publish(msg)
+        self.num_published += 1
+
+
+class BaseNode(Node):
+    """A node that survives malformed clock and parameter messages, and counts its publications."""
+
+    def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
+        """Create a publisher that counts its messages."""
+        return super().create_publisher(*args, publisher_class=CountedPublisher, **kwargs)
+
+    def create_subscription(
+        self, msg_type: Any, topic: str, callback: Callable[[Any], None], *args: Any, **kwargs: Any
+    ) -> Subscription:
+        """Create a subscription; the one to /clock ignores negative times."""
+        if msg_type is ClockMessage:
+            callback = partial(self._on_clock, callback)
+        return super().create_subscription(msg_type, topic, callback, *args, **kwargs)
+
+    def create_service(
+        self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
+    ) -> Service:
+        """Create a service; those that set parameters refuse values of unknown types."""
+        if srv_type in (SetParameters, SetParametersAtomically):
+            callback = partial(_on_set_parameters, callback)
+        return super().create_service(srv_type, srv_name, callback, **kwargs)
+
+    def _on_clock(self, set_time: Callable[[ClockMessage], None], msg: ClockMessage) -> None:
+        if msg.clock.sec >= 0:
+            set_time(msg)
+            return
+        self.get_logger().warning(
+            f'message on /clock ignored: {msg.clock.sec} s, expected a time that is not negative',
+            throttle_duration_sec=10.0,
+        )
+
+
+def _on_set_parameters(set_parameters: Callable[..., Any], request: Any, response: Any) -> Any:
+    """Set parameters, or refuse the whole request if one value is of an unknown type."""
+    unknown = [p for p in request.parameters if p.value.type not in PARAMETER_TYPES]
+    if not unknown:
+        return set_parameters(request, response)
+    found = unknown[0].value.type
+    reason = f'{unknown[0].name}: a value of type {found}, expected 1 to {max(PARAMETER_TYPES)}'
+    refused = SetParametersResult(successful=False, reason=reason)
+    if isinstance(response, SetParametersAtomically.Response):
+        response.result = refused
+    else:
+        response.results = [refused] * len(request.parameters)
+    return response
+
+
+def steady_timer(node: Node, rate_hz: float, callback: Callable[[], None]) -> Timer:
+    """Create a timer on the steady clock, which simulated time neither stops nor sets back."""
+    steady = Clock(clock_type=ClockType.STEADY_TIME)
+    return node.create_timer(1.0 / rate_hz, callback, clock=steady)
+
+
+async def result_of(future: Future[Result], executor: Executor) -> Result:
+    """
+    Return the result of another thread's future, or raise its error.
+
+    For callbacks: the executor runs other callbacks meanwhile. Saving a large map takes a second;
+    a callback that blocked that long would let the queues of the middleware overflow.
+    """
+    future.add_done_callback(lambda _: executor.wake())
+    while not future.done():
+        await _next_turn()
+    return future.result()
+
+
+@types.coroutine
+def _next_turn() -> Generator[None, None, None]:
+    """Yield to other callbacks until the executor wakes up again."""
+    yield

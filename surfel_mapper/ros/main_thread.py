@@ -1,0 +1,147 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The main thread of the node: signals that end it, and the tasks that other threads hand to it.
+
+A signal raises KeyboardInterrupt in the main thread, wherever that is. Python prints and swallows
+exceptions raised in a ``__del__`` or in a function called back from C, both of which compiling
+does often; there the interrupt is postponed by a moment.
+
+Transitions of the life cycle run in the main thread, because only there a signal can interrupt
+them: compiling kernels takes half a minute the first time.
+
+This module imports no ROS, since a signal may arrive while ROS is being imported.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future
+from queue import Empty, SimpleQueue
+import signal
+import threading
+from types import FrameType
+from typing import Any, NamedTuple
+
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+RETRY_S = 0.01
+"""An interrupt that would be swallowed is tried again after this time."""
+
+MAX_WAIT_S = 0.2
+"""A signal that arrives just before a wait does not end it; this bounds the delay."""
+
+
+class Signals:
+    """In a with-block, SIGINT and SIGTERM raise KeyboardInterrupt, once."""
+
+    def __init__(self) -> None:
+        self._received = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Signals:
+        """Install the signal handlers."""
+        numbers = (*NUMBERS, signal.SIGALRM)
+        self._before = {number: signal.signal(number, self._interrupt) for number in numbers}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Restore the previous handlers; after an interrupt, signals stay ignored."""
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        if not self._received:
+            for number, handler in self._before.items():
+                signal.signal(number, handler)
+
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a signal was received, even if its interrupt is pending."""
+        if self._received:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+            raise KeyboardInterrupt
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        """
+        Interrupt the main thread, and ignore all further signals.
+
+        A terminal and a launch file both send one; the second must not interrupt the shutdown
+        that the first began.
+        """
+        self._received = True
+        for ignored in NUMBERS:
+            signal.signal(ignored, signal.SIG_IGN)
+        if swallows(frame):
+            signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+        else:
+            raise KeyboardInterrupt
+
+
+def swallows(frame: FrameType | None) -> bool:
+    """Whether an exception raised in a frame is lost: in a finalizer or a callback of LLVM."""
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == '__del__' or '/llvmlite/' in code.co_filename:
+            return True
+        frame = frame.f_back
+    return False
+
+
+class Task(NamedTuple):
+    """A function for the main thread, and the future that takes its result."""
+
+    action: Callable[[], bool]
+    done: Future[bool]
+
+
+class TaskQueue:
+    """Functions for the main thread to call, and errors for it to raise."""
+
+    def __init__(self) -> None:
+        self._items: SimpleQueue[Task | BaseException] = SimpleQueue()
+        self._lock = threading.Lock()
+        self._closed = False
+
+    def submit(self, action: Callable[[], bool]) -> Future[bool]:
+        """Queue a function for the main thread; once closed, the result is False."""
+        task = Task(action, Future())
+        with self._lock:
+            if self._closed:
+                task.done.set_result(False)
+            else:
+                self._items.put(task)
+        return task.done
+
+    def fail(self, error: BaseException) -> None:
+        """Queue an error for the main thread to raise."""
+        self._items.put(error)
+
+    def run(self, check: Callable[[], None]) -> None:
+        """
+        Call the queued functions until an error is queued, and raise that.
+
+        Parameters
+        ----------
+        check : callable
+            Called before every wait, at least every ``MAX_WAIT_S``; may raise to end the loop.
+
+        """
+        while True:
+            check()
+            try:
+                item = self._items.get(timeout=MAX_WAIT_S)
+            except Empty:
+                continue
+            if isinstance(item, BaseException):
+                raise item
+            done = False
+            try:
+                done = item.action()
+            finally:
+                item.done.set_result(done)
+
+    def close(self) -> None:
+        """Answer all queued and all later tasks with False."""
+        with self._lock:
+            self._closed = True
+        while not self._items.empty():
+            item = self._items.get()
+            if isinstance(item, Task):
+                item.done.set_result(False)
