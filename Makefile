@@ -82,7 +82,7 @@ dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/, and install the wheel 
 	cd "$$check" && venv/bin/surfel-mapper simulate street --output street --scans 3 --columns 256 && \
 	venv/bin/surfel-mapper replay street --output mapped
 
-settings: $(STAMP)  ## write default.yaml and the table of README.md from config.py
+settings: $(STAMP)  ## write default.yaml and the table of docs/settings.md from config/
 	$(BIN)/python -m test.settings
 
 clean:  ## remove the environment and everything built

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The texts that repeat the settings: launch_configs/default.yaml and a table in README.md.
+The texts that repeat the settings: launch_configs/default.yaml and the table in docs/settings.md.
 
 Both are written from the declarations in surfel_mapper/config/ by ``make settings``, and
 test_configs.py compares them, so that a new setting cannot stay undocumented.
@@ -12,11 +12,10 @@ from __future__ import annotations
 from pathlib import Path
 import textwrap
 
-from surfel_mapper.config import declarations
-from surfel_mapper.config.table import allowed, settings_table, yaml_value
+from surfel_mapper.config import allowed, declarations, settings_table, yaml_value
 
 ROOT = Path(__file__).parents[1]
-README = ROOT / 'README.md'
+PAGE = ROOT / 'docs' / 'settings.md'
 DEFAULT_YAML = ROOT / 'launch_configs' / 'default.yaml'
 BEGIN = '<!-- settings: begin (written by `make settings`) -->\n'
 END = '<!-- settings: end -->\n'
@@ -50,15 +49,15 @@ def default_yaml() -> str:
     return text
 
 
-def with_table(readme: str) -> str:
-    """Return the README with the table as it should be between its markers."""
-    before, _, rest = readme.partition(BEGIN)
+def with_table(page: str) -> str:
+    """Return the page with the current table between its markers."""
+    before, _, rest = page.partition(BEGIN)
     _, found, after = rest.partition(END)
     if not found:
-        raise ValueError(f'{README}: markers of the settings not found')
+        raise ValueError(f'{PAGE}: markers of the settings not found')
     return before + BEGIN + settings_table() + END + after
 
 
 if __name__ == '__main__':
     DEFAULT_YAML.write_text(default_yaml(), encoding='utf-8')
-    README.write_text(with_table(README.read_text(encoding='utf-8')), encoding='utf-8')
+    PAGE.write_text(with_table(PAGE.read_text(encoding='utf-8')), encoding='utf-8')

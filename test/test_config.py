@@ -6,15 +6,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 
 import pytest
 
-from surfel_mapper.config import Config, declarations, load_config, MapConfig, WindowConfig
-from surfel_mapper.config.configuration import stage_fields
+from surfel_mapper.config import (
+    Config,
+    declarations,
+    load_config,
+    MapConfig,
+    stage_fields,
+    WindowConfig,
+)
 from surfel_mapper.errors import ConfigError
 
 DECLARATIONS = {declared.name: declared for declared in declarations()}
-BOUNDED = [declared for declared in declarations() if declared.low is not None]
+BOUNDED = [declared for declared in declarations() if declared.is_number]
 QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
 UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
@@ -35,6 +42,15 @@ COMPANIONS = {
 def configured(name, value):
     """Return the configuration with one setting, and what it needs beside it."""
     return Config.from_mapping({**COMPANIONS.get(name, {}), name: value})
+
+
+def refusal(function, *args, **kwargs):
+    """Return the message of the ConfigError that a call raises."""
+    try:
+        function(*args, **kwargs)
+    except ConfigError as error:
+        return str(error)
+    return 'not refused'
 
 
 def written(tmp_path, text):
@@ -108,34 +124,43 @@ def test_a_stage_checks_itself_without_the_rest():
     assert WindowConfig(max_scans=3).max_scans == 3
 
 
-@pytest.mark.parametrize('declared', declarations(), ids=lambda declared: declared.name)
-def test_every_declaration_is_complete(declared):
-    assert declared.name == f'{declared.stage}.{declared.key}'.removeprefix('.')
-    assert declared.meaning.endswith('.')
-    numeric = isinstance(declared.default, (int, float)) and not isinstance(declared.default, bool)
-    assert (declared.low is not None, declared.high is not None) == (numeric, numeric)
-    if isinstance(declared.default, float):
-        assert declared.key.rpartition('_')[2] in UNITS
+def test_every_declaration_is_complete():
+    faults = []
+    for declared in declarations():
+        if not declared.meaning.endswith('.'):
+            faults.append(f'{declared.name}: the meaning is no sentence')
+        if declared.is_number and math.isinf(declared.high - declared.low):
+            faults.append(f'{declared.name}: a number without bounds')
+        unit = declared.key.rpartition('_')[2]
+        if isinstance(declared.default, float) and unit not in UNITS:
+            faults.append(f'{declared.name}: a float without a unit')
+    assert faults == []
 
 
-@pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
-def test_a_bound_is_allowed_and_what_lies_beyond_is_not(declared):
-    stage, key = declared.stage, declared.key
-    whole = isinstance(declared.default, int)
-    for bound, outwards in ((declared.low, -math.inf), (declared.high, math.inf)):
-        value = bound
-        assert configured(declared.name, value).to_mapping()[declared.name] == bound
-        beyond = bound + (1 if outwards > 0 else -1) if whole else math.nextafter(bound, outwards)
-        with pytest.raises(ConfigError, match=rf'^{stage}\.{key}: .* expected a value in \['):
-            configured(declared.name, beyond)
+def test_bounds_are_allowed_and_values_beyond_are_refused_by_name():
+    faults = []
+    for declared in BOUNDED:
+        for bound, outwards in ((declared.low, -math.inf), (declared.high, math.inf)):
+            if configured(declared.name, bound).to_mapping()[declared.name] != bound:
+                faults.append(f'{declared.name}: bound {bound} not taken')
+            whole = isinstance(declared.default, int)
+            step = 1 if outwards > 0 else -1
+            beyond = bound + step if whole else math.nextafter(bound, outwards)
+            message = refusal(configured, declared.name, beyond)
+            if not re.match(rf'{declared.name}: .* expected a value in \[', message):
+                faults.append(f'{declared.name} = {beyond}: {message}')
+    assert faults == []
 
 
-@pytest.mark.parametrize('declared', BOUNDED, ids=lambda declared: declared.name)
-@pytest.mark.parametrize('value', [math.nan, math.inf, -math.inf, '1', None, True, [1.0], {}])
-def test_what_is_no_finite_number_is_refused_by_name(declared, value):
-    stage = stage_fields()[declared.stage].default_factory
-    with pytest.raises(ConfigError, match=rf'^{declared.stage}\.{declared.key}: .*expected a'):
-        stage(**{declared.key: value})
+def test_values_that_are_no_finite_number_are_refused_by_name():
+    faults = []
+    for declared in BOUNDED:
+        stage = stage_fields()[declared.stage].default_factory
+        for value in (math.nan, math.inf, -math.inf, '1', None, True, [1.0], {}):
+            message = refusal(stage, **{declared.key: value})
+            if not re.match(rf'{declared.name}: .*expected a', message):
+                faults.append(f'{declared.name} = {value!r}: {message}')
+    assert faults == []
 
 
 @pytest.mark.parametrize('name', ['map.min_points', 'window.max_scans', 'publish.max_markers'])

@@ -34,7 +34,7 @@ from surfel_mapper.alignment.correspondences import (
 from surfel_mapper.alignment.edge_terms import MIN_PAIRS
 from surfel_mapper.alignment.lum import LUM, LumResult
 from surfel_mapper.alignment.solver import components
-from surfel_mapper.config.align import AlignConfig
+from surfel_mapper.config import AlignConfig
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import compose, interpolate, inverse, rotation_angle, Transform
 

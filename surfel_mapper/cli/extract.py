@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Fit, write the files, report."""
-    from surfel_mapper.config.models import ModelsConfig
+    from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.model_files import write_models
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.models import draw_models
@@ -96,7 +96,7 @@ def read(
     args: argparse.Namespace,
 ) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64]]:
     """Return points (N, 3), the size of voxels and the viewpoint (3,), m."""
-    from surfel_mapper.config.models import ModelsConfig
+    from surfel_mapper.config import ModelsConfig
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files import map_state, parquet
     from surfel_mapper.files.scan_files import read_scan, SUFFIXES

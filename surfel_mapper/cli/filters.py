@@ -40,23 +40,23 @@ def run(args: argparse.Namespace) -> int:
 
 def as_mapping(cls: type[Filter]) -> dict[str, Any]:
     """Return everything about a filter as plain values; infinite ones as text."""
-    from surfel_mapper.filters.parameters import parameters_of, plain
+    from surfel_mapper.config import plain, settings_of
 
     return {
         'name': cls.name,
-        'libpointmatcher': cls.theirs,
+        'libpointmatcher': cls.libpointmatcher,
         'meaning': (inspect.getdoc(cls) or '').partition('\n')[0],
         'parameters': [
             {
                 'name': each.name,
-                'libpointmatcher': each.theirs,
+                'libpointmatcher': each.libpointmatcher,
                 'type': each.kind,
                 'default': plain(each.default),
-                'libpointmatcher_default': plain(each.their_default),
+                'libpointmatcher_default': plain(each.libpointmatcher_default),
                 'allowed': each.allowed,
                 'meaning': each.meaning,
             }
-            for each in parameters_of(cls)
+            for each in settings_of(cls)
         ],
     }
 

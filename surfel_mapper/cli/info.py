@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Read a bag and report, or tell the settings."""
     if args.parameters:
-        from surfel_mapper.config.table import settings_table
+        from surfel_mapper.config import settings_table
 
         print(settings_table(), end='')
         return 0

@@ -4,22 +4,46 @@
 The one configuration of node and replay: a frozen dataclass for every stage.
 
 A setting states its default, unit, bounds and meaning once, here; the ROS parameters, the YAML
-files and the table of the README are made from it or compared with it. A setting is called
-``stage.name`` everywhere, or by its name alone where it is of no stage. Values keep to the types
+files and the table in docs/settings.md are made from it or compared with it. A setting is called
+``stage.name`` everywhere, or by its name alone if it belongs to no stage. Values keep to the types
 of ROS parameters, so that one YAML serves both. Nothing is repaired in silence: an unknown name,
 a wrong type or a value out of bounds is a ConfigError.
 """
 
-from surfel_mapper.config.align import AlignConfig
-from surfel_mapper.config.configuration import Config, declarations, load_config
-from surfel_mapper.config.deskew import DeskewConfig
-from surfel_mapper.config.dynamic import DynamicConfig
-from surfel_mapper.config.grid import GridConfig
-from surfel_mapper.config.models_layer import ModelsLayerConfig
-from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
-from surfel_mapper.config.registration import RegistrationConfig
-from surfel_mapper.config.settings import Declaration, flatten, near, setting, Stage
+from surfel_mapper.config.configuration import (
+    allowed,
+    Config,
+    declarations,
+    load_config,
+    settings_table,
+    stage_fields,
+    yaml_value,
+)
+from surfel_mapper.config.layers import (
+    DynamicConfig,
+    GridConfig,
+    INTERPOLATIONS,
+    ModelsConfig,
+    ModelsLayerConfig,
+    SEMANTICS,
+    TsdfConfig,
+    WEIGHT_MODES,
+)
+from surfel_mapper.config.registration import AlignConfig, RegistrationConfig
+from surfel_mapper.config.settings import (
+    Declaration,
+    flatten,
+    near,
+    plain,
+    setting,
+    Settings,
+    settings_of,
+    Stage,
+)
 from surfel_mapper.config.stages import (
+    ClearConfig,
+    DeskewConfig,
+    DiagnosticsConfig,
     FramesConfig,
     InputConfig,
     MapConfig,
@@ -28,7 +52,7 @@ from surfel_mapper.config.stages import (
     PublishConfig,
     WindowConfig,
 )
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config.yaml_files import read_yaml
 
 __all__ = [
     'AlignConfig',
@@ -40,19 +64,31 @@ __all__ = [
     'DynamicConfig',
     'FramesConfig',
     'GridConfig',
+    'INTERPOLATIONS',
     'InputConfig',
     'MapConfig',
+    'ModelsConfig',
     'ModelsLayerConfig',
     'OutputConfig',
     'PoseConfig',
     'PublishConfig',
     'RegistrationConfig',
+    'SEMANTICS',
+    'Settings',
     'Stage',
     'TsdfConfig',
+    'WEIGHT_MODES',
     'WindowConfig',
+    'allowed',
     'declarations',
     'flatten',
     'load_config',
     'near',
+    'plain',
+    'read_yaml',
     'setting',
+    'settings_of',
+    'settings_table',
+    'stage_fields',
+    'yaml_value',
 ]

@@ -1,31 +1,36 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""All settings together, and how they are read from a file."""
+"""Config: all settings together, read from a file, and listed as a table."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass, field
+import json
 from pathlib import Path
 from typing import Any
 
-from surfel_mapper.config.align import AlignConfig
-from surfel_mapper.config.deskew import DeskewConfig
-from surfel_mapper.config.dynamic import DynamicConfig
-from surfel_mapper.config.grid import GridConfig
-from surfel_mapper.config.models_layer import ModelsLayerConfig
-from surfel_mapper.config.operation import ClearConfig, DiagnosticsConfig
-from surfel_mapper.config.registration import RegistrationConfig
+from surfel_mapper.config.layers import (
+    DynamicConfig,
+    GridConfig,
+    ModelsLayerConfig,
+    TsdfConfig,
+)
+from surfel_mapper.config.registration import AlignConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
     checked,
     Declaration,
     flatten,
     near,
     setting,
+    settings_of,
     stage_name,
 )
 from surfel_mapper.config.stages import (
+    ClearConfig,
+    DeskewConfig,
+    DiagnosticsConfig,
     FramesConfig,
     InputConfig,
     MapConfig,
@@ -34,9 +39,11 @@ from surfel_mapper.config.stages import (
     PublishConfig,
     WindowConfig,
 )
-from surfel_mapper.config.tsdf import TsdfConfig
 from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import ConfigError
+
+LARGE = 1e6
+"""Upper bounds from here on only keep numbers representable; the table leaves them out."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,21 +68,20 @@ class Config:
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
     filters: str = setting(
         '',
-        'YAML file of the filters that every scan passes before it is mapped; empty: none.',
+        'YAML file of the chain of filters applied to every scan before mapping; empty: none.',
         live=True,
     )
     autostart: bool = setting(
-        True, 'The node configures and activates itself; else it waits to be told to.'
+        True, 'The node configures and activates itself; false: a lifecycle manager does.'
     )
 
     def __post_init__(self) -> None:
-        """Check the settings of no stage; each stage has checked its own."""
-        for declared in dataclasses.fields(self):
-            if 'meaning' in declared.metadata:
-                checked(declared.name, getattr(self, declared.name), declared)
+        """Check the settings of no stage, and conditions on several stages."""
+        for declared in settings_of(type(self)):
+            checked(declared.name, getattr(self, declared.key), declared)
         if self.deskew.enabled and self.pose.source == 'identity':
             raise ConfigError(
-                'deskew.enabled: true, but clouds that are in the fixed frame already '
+                'deskew.enabled: true, but clouds that already are in the fixed frame '
                 '(pose.source identity) cannot be deskewed'
             )
         if self.align.every_scans and not self.window.keep_points:
@@ -142,13 +148,8 @@ def declarations() -> list[Declaration]:
     """Return the declaration of every setting, in order."""
     rows = []
     for stage, holder in stage_fields().items():
-        for key in dataclasses.fields(holder.default_factory):  # type: ignore[arg-type]
-            name = f'{stage}.{key.name}'
-            rows.append(Declaration(name, stage, key.name, key.default, **key.metadata))
-    for key in dataclasses.fields(Config):
-        if 'meaning' in key.metadata:
-            rows.append(Declaration(key.name, '', key.name, key.default, **key.metadata))
-    return rows
+        rows += settings_of(holder.default_factory, stage)  # type: ignore[arg-type]
+    return rows + settings_of(Config)
 
 
 def load_config(path: str | Path | None = None) -> Config:
@@ -159,12 +160,12 @@ def load_config(path: str | Path | None = None) -> Config:
     ----------
     path : str or Path, optional
         A YAML file of ROS parameters (``/**: ros__parameters: ...``), or of the stages alone.
-        ``use_sim_time`` and ``qos_overrides`` are for the node and passed over here.
+        ``use_sim_time`` and ``qos_overrides`` belong to rclpy and are ignored.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read, is not YAML, or holds something that is no setting.
+        If the file cannot be read, is not YAML, or a setting is unknown or refused.
 
     """
     if path is None:
@@ -184,7 +185,7 @@ def load_config(path: str | Path | None = None) -> Config:
 
 
 def ros_parameters(content: Any) -> dict[str, Any]:
-    """Return the settings in the content of a parameters file, whichever way it is laid out."""
+    """Return the settings in a parameters file with or without ``ros__parameters``."""
     if not isinstance(content, Mapping):
         raise ConfigError(f'a {type(content).__name__}, expected a mapping of settings')
     settings: dict[str, Any] = {}
@@ -195,3 +196,27 @@ def ros_parameters(content: Any) -> dict[str, Any]:
             settings.update(flatten({name: value}))
     for_node = ('use_sim_time', 'qos_overrides.')
     return {name: value for name, value in settings.items() if not name.startswith(for_node)}
+
+
+def settings_table() -> str:
+    """Return the table in Markdown; * marks settings that can change while the node runs."""
+    rows = ['| setting | default | meaning |', '|---|---|---|']
+    for declared in declarations():
+        meaning = ' '.join(part for part in (declared.meaning, allowed(declared)) if part)
+        name = f'`{declared.name}`{" *" if declared.live else ""}'
+        rows.append(f'| {name} | `{yaml_value(declared.default)}` | {meaning} |')
+    return '\n'.join(rows) + '\n'
+
+
+def allowed(declared: Declaration) -> str:
+    """Return the bounds of a number as a sentence; empty if its meaning states them."""
+    if not declared.is_number:
+        return ''
+    if declared.high >= LARGE:
+        return f'From {declared.low:g}.'
+    return f'From {declared.low:g} to {declared.high:g}.'
+
+
+def yaml_value(value: Any) -> str:
+    """Return a default in a form that ROS and YAML both read: JSON."""
+    return value if isinstance(value, str) and value else json.dumps(value)

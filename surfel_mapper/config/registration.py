@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings of the registration, which finds poses where none come in (pose.source)."""
+"""
+Settings of registration, which finds poses if none are given, and of alignment.
+
+Registration aligns each scan to the map as it comes (``pose.source: registration``). Alignment
+moves all scans of the window until they agree.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +18,11 @@ from surfel_mapper.errors import ConfigError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegistrationConfig(Stage):
-    """How a scan is aligned to the map."""
+    """Registration of a scan to the map."""
 
     start: tuple[float, ...] = setting(
         (),
-        'Where it begins: pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: at '
-        'the origin.',
+        'Initial pose of the base in the fixed frame, x y z in m, qx qy qz qw; empty: the origin.',
     )
     cell_m: float = setting(
         0.0,
@@ -30,75 +34,75 @@ class RegistrationConfig(Stage):
     )
     max_cells: int = setting(
         40_000,
-        'Of more cells than this only some, evenly chosen, are aligned.',
+        'At most this many cells of a scan are aligned, an even selection of them.',
         low=100,
         high=10**7,
         live=True,
     )
     min_points: int = setting(
-        5, 'Surfels of fewer points are not aligned to.', low=3, high=2**31 - 1, live=True
+        5, 'Scans are not aligned to surfels of fewer points.', low=3, high=2**31 - 1, live=True
     )
     noise_m: float = setting(
         0.02,
-        'Standard deviation of a range; surfaces are no sharper, m.',
+        'Standard deviation of a range, m; the least assumed thickness of a surface.',
         low=1e-5,
         high=10.0,
         live=True,
     )
     max_deviation_m: float = setting(
         1.0,
-        'How far points may be from where the prediction has them as long as nothing is known, '
-        'm; afterwards the last deviations tell.',
+        'Largest initial distance of points from their prediction, m; later scans use the '
+        'deviations of the last ones.',
         low=0.001,
         high=1000.0,
         live=True,
     )
     coarse_levels: int = setting(
         2,
-        'Where deviations exceed a voxel, alignment begins with voxels up to 2^this times larger.',
+        'If deviations exceed a voxel, registration starts with voxels up to 2^this times larger.',
         low=0,
         high=3,
         live=True,
     )
     max_iterations: int = setting(
-        30, 'Steps at most, of each level.', low=1, high=10_000, live=True
+        30, 'At most this many iterations on each level.', low=1, high=10_000, live=True
     )
     min_overlap_ratio: float = setting(
         0.03,
-        'A scan is dropped unless this share of its cells meet surfels that say something.',
+        'A scan is dropped unless this share of its cells match surfels that constrain them.',
         low=0.0,
         high=1.0,
         live=True,
     )
     min_fit_ratio: float = setting(
         0.6,
-        'A scan is dropped unless this share of these fit.',
+        'A scan is dropped unless this share of the matched cells fit.',
         low=0.0,
         high=1.0,
         live=True,
     )
     search_deg: float = setting(
         60.0,
-        'Where a scan fits less than is usual, headings so far to both sides are tried, deg.',
+        'If a scan fits worse than usual, headings up to this to both sides are tried, deg.',
         low=0.0,
         high=180.0,
         live=True,
     )
     min_information_ratio: float = setting(
         0.003,
-        'A direction of motion of which the surfaces seen say less than this, as a share of all '
-        'they say, is degenerate: there the prediction stays.',
+        'A direction of motion with less than this share of the total information is degenerate: '
+        'the prediction is kept along it.',
         low=0.0,
         high=1.0,
         live=True,
     )
 
     publish_tf: bool = setting(
-        True, 'The node publishes the transform from the fixed frame to what it follows.'
+        True, 'The node publishes the transform from the fixed frame to the frame it localises.'
     )
 
     def check(self, stage: str) -> None:
-        """Refuse a start that is no pose."""
+        """Refuse a start that is not a pose."""
         if self.start and (
             len(self.start) != 7 or not abs(math.hypot(*self.start[3:]) - 1.0) <= 1e-3
         ):
@@ -106,3 +110,88 @@ class RegistrationConfig(Stage):
                 f'{stage}.start: {list(self.start)}, expected x y z and a unit quaternion '
                 'qx qy qz qw, or nothing'
             )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlignConfig(Stage):
+    """Consistent poses for the scans of the window."""
+
+    every_scans: int = setting(
+        0,
+        'Align the scans of the window after this many new ones; needs window.keep_points. '
+        '0: only on request.',
+        low=0,
+        high=2**31 - 1,
+        live=True,
+    )
+    voxel_size_m: float = setting(
+        1.0, 'Edge of the voxels whose surfels are matched between scans, m.', low=0.01, high=100.0
+    )
+    key_distance_m: float = setting(
+        1.0,
+        'Distance travelled between keyframes, m; scans between them move with them. '
+        '0: every scan is a keyframe.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    max_distance_m: float = setting(
+        1.0, 'Surfels farther apart are not matched, m.', low=1e-3, high=1e3, live=True
+    )
+    max_angle_deg: float = setting(
+        30.0,
+        'Surfels whose normals differ by more are not matched, deg.',
+        low=1.0,
+        high=180.0,
+        live=True,
+    )
+    min_overlap: float = setting(
+        0.2,
+        'Two scans are compared if at least this share of the surfels of one match the other.',
+        low=0.0,
+        high=1.0,
+        live=True,
+    )
+    loop_distance_m: float = setting(
+        10.0,
+        'Scans nearer to each other than this are compared as loop closures, m; 0: no loops.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    max_rounds: int = setting(
+        20, 'At most this many rounds of matching.', low=1, high=1000, live=True
+    )
+    settled_m: float = setting(
+        0.002,
+        'Poses have converged when none moves by more in a round, m.',
+        low=1e-6,
+        high=1.0,
+        live=True,
+    )
+    settled_deg: float = setting(
+        0.01,
+        'Poses have converged when none turns by more in a round, deg.',
+        low=1e-6,
+        high=10.0,
+        live=True,
+    )
+    move_m: float = setting(
+        0.002,
+        'Scans that the alignment moves by more are moved in the map, m.',
+        low=0.0,
+        high=1e3,
+        live=True,
+    )
+    move_deg: float = setting(
+        0.01,
+        'Scans that it turns by more are moved in the map too, deg.',
+        low=0.0,
+        high=180.0,
+        live=True,
+    )
+    map_frame: str = setting(
+        '',
+        'Frame of the map if alignment moves scans; its transform to frames.fixed is published. '
+        'Empty: the map stays in frames.fixed, without such a transform.',
+    )

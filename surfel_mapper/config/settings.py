@@ -1,10 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How a setting is declared, and what checks its value.
+Typed settings: how one is declared, and how its value is checked.
 
-A stage is a frozen dataclass whose fields are made by ``setting``; its name in files is that of
-its class without Config, or what ``STAGE`` says.
+The stages of the configuration and the filters of a chain are frozen dataclasses whose fields are
+made by ``setting``. Both derive from ``Settings``, which checks every value when an instance is
+made. They differ in one point. A stage takes the types of ROS parameters as they are. A filter
+also takes text, because libpointmatcher casts the text of its YAML: ``'0.5'``, ``5e-1`` and
+``inf`` are numbers there, while YAML itself takes the last two for text and ``010`` for eight.
 """
 
 from __future__ import annotations
@@ -18,34 +21,45 @@ from typing import Any, ClassVar
 
 from surfel_mapper.errors import ConfigError
 
+SAME = object()
+"""Stands for a default that is the same in libpointmatcher."""
+
+BOOLEANS = {'true': True, 'false': False}
+
 
 def setting(
     default: Any,
     meaning: str,
     *,
-    low: float | None = None,
-    high: float | None = None,
+    low: float = -math.inf,
+    high: float = math.inf,
     choices: tuple[str, ...] = (),
     items: type = float,
     live: bool = False,
+    libpointmatcher: str = '',
+    libpointmatcher_default: Any = SAME,
 ) -> Any:
     """
-    Declare a setting: its default, what it means and which values it may have.
+    Declare a setting: its default, its meaning and the values it may have.
 
     Parameters
     ----------
     default : bool, int, float, str or tuple
         Also gives the type.
     meaning : str
-        One sentence for ``ros2 param describe`` and the table of the README.
-    low, high : float, optional
-        Bounds, both allowed.
+        One sentence for ``ros2 param describe``, ``surfel-mapper filters`` and the docs.
+    low, high : float
+        Bounds of a number, or of each number of a tuple; both allowed. nan never is.
     choices : tuple of str
-        The only values allowed, where given.
-    items : type
-        Of what the tuple is, where it is one: float or str.
+        The only texts allowed; empty: any text.
+    items : int, float or str
+        Type of the items of a tuple.
     live : bool
         Whether a running node takes a new value.
+    libpointmatcher : str
+        Name of a filter's parameter in libpointmatcher; empty if it has none there.
+    libpointmatcher_default : optional
+        The default under libpointmatcher's name of the filter, if it differs.
 
     """
     metadata = {
@@ -55,44 +69,114 @@ def setting(
         'choices': choices,
         'items': items,
         'live': live,
+        'libpointmatcher': libpointmatcher,
+        'libpointmatcher_default': default
+        if libpointmatcher_default is SAME
+        else libpointmatcher_default,
     }
     return field(default=default, metadata=metadata)
 
 
-class Stage:
-    """Base of the stages: checks every setting against its declaration."""
-
-    __slots__ = ()
-    STAGE: ClassVar[str] = ''
-    """Name of the stage where it is not that of the class: ``layers.tsdf``."""
-
-    def __post_init__(self) -> None:
-        """Check every value; a whole number becomes a float where a float is declared."""
-        stage = stage_name(type(self))
-        for declared in dataclasses.fields(self):  # type: ignore[arg-type]
-            name = f'{stage}.{declared.name}'
-            value = checked(name, getattr(self, declared.name), declared)
-            object.__setattr__(self, declared.name, value)
-        self.check(stage)
-
-    def check(self, stage: str) -> None:
-        """Check what concerns several settings of the stage."""
-
-
 @dataclass(frozen=True, slots=True)
 class Declaration:
-    """One setting as declared: its full name, and what ``setting`` was told; stage may be ''."""
+    """One setting as declared: its stage, its key within it, and the arguments of ``setting``."""
 
-    name: str
     stage: str
+    """Stage of the configuration; empty for a setting of no stage and for those of filters."""
+
     key: str
     default: Any
     meaning: str
-    low: float | None
-    high: float | None
+    low: float
+    high: float
     choices: tuple[str, ...]
     items: type
     live: bool
+    libpointmatcher: str
+    libpointmatcher_default: Any
+
+    @property
+    def name(self) -> str:
+        """Full name: ``stage.key``, or the key alone."""
+        return f'{self.stage}.{self.key}' if self.stage else self.key
+
+    @property
+    def kind(self) -> str:
+        """The type in words."""
+        if isinstance(self.default, tuple):
+            return f'list of {self.items.__name__}'
+        return type(self.default).__name__
+
+    @property
+    def is_number(self) -> bool:
+        """Whether the value is one number."""
+        return type(self.default) in (int, float)
+
+    @property
+    def allowed(self) -> str:
+        """The choices or bounds in words; empty if the type says all."""
+        if self.choices:
+            return ', '.join(self.choices)
+        is_bounded = self.low > -math.inf or self.high < math.inf
+        return f'[{plain(self.low)}, {plain(self.high)}]' if is_bounded else ''
+
+
+class Settings:
+    """Base of stages and filters: checks every field against its declaration."""
+
+    __slots__ = ()
+
+    TAKES_TEXT: ClassVar[bool] = False
+    """Whether text stands for a number, 0 and 1 for a flag, and numbers may be infinite."""
+
+    def __post_init__(self) -> None:
+        """Check every value and bring it into the declared type."""
+        for declared in settings_of(type(self)):
+            where = self.where(declared.key)
+            value = getattr(self, declared.key)
+            value = checked(where, value, declared, takes_text=self.TAKES_TEXT)
+            object.__setattr__(self, declared.key, value)
+
+    @classmethod
+    def where(cls, key: str) -> str:
+        """Return what errors about a setting begin with."""
+        return key
+
+
+class Stage(Settings):
+    """Base of the stages of the configuration."""
+
+    __slots__ = ()
+
+    STAGE: ClassVar[str] = ''
+    """Name of the stage if it is not that of the class: ``layers.tsdf``."""
+
+    def __post_init__(self) -> None:
+        """Check every value; a whole number becomes a float if a float is declared."""
+        Settings.__post_init__(self)
+        self.check(stage_name(type(self)))
+
+    @classmethod
+    def where(cls, key: str) -> str:
+        """Return the full name of a setting."""
+        return f'{stage_name(cls)}.{key}'
+
+    def check(self, stage: str) -> None:
+        """Check conditions on several settings of the stage; raise ConfigError."""
+
+
+def stage_name(cls: type[Stage]) -> str:
+    """Return the name of a stage: ``STAGE``, or that of the class, so WindowConfig is window."""
+    return cls.STAGE or cls.__name__.removesuffix('Config').lower()
+
+
+def settings_of(cls: type, stage: str = '') -> list[Declaration]:
+    """Return the settings of a dataclass, in order; fields not made by ``setting`` are skipped."""
+    return [
+        Declaration(stage, each.name, each.default, **each.metadata)
+        for each in dataclasses.fields(cls)
+        if 'meaning' in each.metadata
+    ]
 
 
 def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
@@ -107,60 +191,101 @@ def flatten(mapping: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str,
 
 
 def near(name: str, known: Mapping[str, Any] | list[str]) -> str:
-    """Return '; did you mean ...?' for the known name most like this one, or nothing."""
+    """Return '; did you mean ...?' for the most similar known name, or an empty string."""
     found = difflib.get_close_matches(name, list(known), n=1)
     return f'; did you mean {found[0]}?' if found else ''
 
 
-def stage_name(cls: type[Stage]) -> str:
-    """Return the name of a stage: WindowConfig is window, unless it says otherwise."""
-    return cls.STAGE or cls.__name__.removesuffix('Config').lower()
+def checked(name: str, value: Any, declared: Declaration, *, takes_text: bool = False) -> Any:
+    """
+    Return a value in the type of its declaration.
+
+    Parameters
+    ----------
+    name : str
+        Name of the setting in errors.
+    value : object
+        The value given.
+    declared : Declaration
+        Type, bounds and choices.
+    takes_text : bool
+        Whether text stands for a number, 0 and 1 for a flag, and numbers may be infinite.
+
+    Raises
+    ------
+    ConfigError
+        If the value is of another type, out of bounds, none of the choices or nan.
+
+    """
+    if not isinstance(declared.default, tuple):
+        return checked_item(name, value, type(declared.default), declared, takes_text)
+    if takes_text and isinstance(value, str):
+        value = value.strip().removeprefix('[').removesuffix(']').replace(',', ' ').split()
+    if isinstance(value, (str, Mapping)) or not hasattr(value, '__iter__'):
+        words = {float: 'numbers', int: 'whole numbers', str: 'strings'}
+        raise ConfigError(f'{name}: {value!r}, expected a list of {words[declared.items]}')
+    return tuple(checked_item(name, item, declared.items, declared, takes_text) for item in value)
 
 
-def checked(name: str, value: Any, declared: dataclasses.Field[Any]) -> Any:
-    """Return the value in the type of its declaration, or raise ConfigError."""
-    expected, meta = declared.default, declared.metadata
-    if isinstance(expected, tuple):
-        return checked_items(name, value, meta['items'])
-    if isinstance(expected, (bool, str)):
-        if not isinstance(value, type(expected)):
-            raise ConfigError(f'{name}: {value!r}, expected a {type(expected).__name__}')
-    else:
-        value = checked_number(name, value, type(expected))
-        low = -math.inf if meta['low'] is None else meta['low']
-        high = math.inf if meta['high'] is None else meta['high']
-        if not low <= value <= high:
-            raise ConfigError(f'{name}: {value}, expected a value in [{low:g}, {high:g}]')
-    if meta['choices'] and value not in meta['choices']:
-        expected_names = ', '.join(meta['choices'])
+def checked_item(
+    name: str, value: Any, kind: type, declared: Declaration, takes_text: bool
+) -> bool | int | float | str:
+    """Return one value of a type; see checked."""
+    if kind is str:
+        return checked_text(name, value, declared)
+    number = read_number(value, kind) if takes_text and isinstance(value, str) else value
+    if kind is bool:
+        if takes_text and type(number) is int and number in (0, 1):
+            number = bool(number)
+        if not isinstance(number, bool):
+            raise ConfigError(
+                f'{name}: {value!r}, expected {"0 or 1" if takes_text else "a bool"}'
+            )
+        return number
+    if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
+        wanted = 'a number' if kind is float else 'a whole number'
+        raise ConfigError(f'{name}: {value!r}, expected {wanted}')
+    if not takes_text and not math.isfinite(number):
+        raise ConfigError(f'{name}: {number}, expected a finite number')
+    number = kind(number)
+    if not declared.low <= number <= declared.high:  # false for nan
+        bounds = f'[{plain(declared.low)}, {plain(declared.high)}]'
+        raise ConfigError(f'{name}: {plain(number)}, expected a value in {bounds}')
+    return number  # type: ignore[no-any-return]
+
+
+def checked_text(name: str, value: Any, declared: Declaration) -> str:
+    """Return a text that is one of the choices, if there are any; see checked."""
+    if not isinstance(value, str):
+        raise ConfigError(f'{name}: {value!r}, expected a str')
+    if declared.choices and value not in declared.choices:
         raise ConfigError(
-            f'{name}: {value!r}, expected one of {expected_names}'
-            f'{near(str(value), list(meta["choices"]))}'
+            f'{name}: {value!r}, expected one of {declared.allowed}'
+            f'{near(value, list(declared.choices))}'
         )
     return value
 
 
-def checked_items(name: str, value: Any, kind: type) -> tuple[Any, ...]:
-    """Return a list as a tuple of numbers or of strings."""
-    wanted = 'numbers' if kind is float else 'strings'
-    if isinstance(value, str) or not hasattr(value, '__iter__'):
-        raise ConfigError(f'{name}: {value!r}, expected a list of {wanted}')
-    if kind is float:
-        return tuple(checked_number(name, item, float) for item in value)
-    for item in value:
-        if not isinstance(item, str):
-            raise ConfigError(f'{name}: {item!r} in the list, expected a list of {wanted}')
-    return tuple(value)
+def read_number(text: str, kind: type) -> bool | int | float | None:
+    """Return the number in a text as libpointmatcher and YAML write it, None if there is none."""
+    text = text.strip().lower()
+    if kind is bool and text in BOOLEANS:
+        return BOOLEANS[text]
+    if '_' in text:  # Python reads 1_000, libpointmatcher and YAML do not
+        return None
+    sign = text[:1] if text[:1] in '+-' else ''
+    try:
+        if kind is float:
+            return float(sign + text[len(sign) :].removeprefix('.') if 'inf' in text else text)
+        return int(text)
+    except ValueError:
+        return None
 
 
-def checked_number(name: str, value: Any, kind: type) -> Any:
-    """Return a finite number of a type; a whole number may stand for a float."""
-    whole = isinstance(value, int) and not isinstance(value, bool)
-    if kind is float and (whole or isinstance(value, float)):
-        if not math.isfinite(value):
-            raise ConfigError(f'{name}: {value}, expected a finite number')
-        return float(value)
-    if kind is int and whole:
-        return value
-    wanted = 'a number' if kind is float else 'a whole number'
-    raise ConfigError(f'{name}: {value!r}, expected {wanted}')
+def plain(value: Any) -> str:
+    """Return a value as a chain has it: floats to 12 digits, booleans as 0 and 1."""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, tuple):
+        return f'[{", ".join(plain(item) for item in value)}]'
+    return f'{value:.12g}' if isinstance(value, float) else str(value)

@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The stages of the pipeline that every map has, and their settings."""
+"""
+Settings of the pipeline's stages: input, deskewing, frames, poses, map, window and output.
+
+Every map has these stages; settings of optional layers are in layers.py, those of registration
+and alignment in registration.py.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +32,7 @@ class MapConfig(Stage):
     )
     max_voxels: int = setting(
         0,
-        'The oldest scans leave while the map holds more voxels; 0: no such limit.',
+        'The oldest scans are evicted while the map holds more voxels; 0: no such limit.',
         low=0,
         high=2**31 - 1,
         live=True,
@@ -35,15 +40,15 @@ class MapConfig(Stage):
     mode: str = setting(
         'live',
         'live: scans are added to the map; frozen: they are only aligned to the map of map.load, '
-        'which stays as it is.',
+        'which does not change.',
         choices=('live', 'frozen'),
     )
     load: str = setting(
         '',
-        'Map to begin with, a .npz file of ~/save_map; its surfels never leave. Empty: none.',
+        'Map to start from, a .npz file of ~/save_map; its surfels stay. Empty: none.',
     )
     threads: int = setting(
-        1, 'How many threads share the work of a scan; the map is the same.', low=1, high=64
+        1, 'Threads that share the work of a scan; the map does not depend on it.', low=1, high=64
     )
     intensity: bool = setting(
         False, 'Sum the intensity of the points too; clouds without one are dropped.'
@@ -53,7 +58,7 @@ class MapConfig(Stage):
     )
 
     def check(self, stage: str) -> None:
-        """Refuse a frozen map of nothing."""
+        """Refuse a frozen map without a map to load."""
         if self.mode == 'frozen' and not self.load:
             raise ConfigError(f'{stage}.load: empty, expected a map to freeze (map.mode frozen)')
 
@@ -73,14 +78,14 @@ class WindowConfig(Stage):
     )
     max_age_s: float = setting(
         0.0,
-        'A scan older than the newest by more than this leaves, s; 0: no such limit.',
+        'A scan older than the newest by more than this is evicted, s; 0: no such limit.',
         low=0.0,
         high=1e9,
         live=True,
     )
     max_distance_m: float = setting(
         0.0,
-        'A scan leaves once the sensor has travelled farther than this since, m; '
+        'A scan is evicted once the sensor has travelled farther than this since it, m; '
         '0: no such limit.',
         low=0.0,
         high=1e9,
@@ -88,7 +93,7 @@ class WindowConfig(Stage):
     )
     max_bytes: int = setting(
         0,
-        'The oldest scans leave while those held need more bytes; 0: no such limit.',
+        'The oldest scans are evicted while the window needs more bytes; 0: no such limit.',
         low=0,
         high=2**62,
         live=True,
@@ -114,7 +119,7 @@ class WindowConfig(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PoseConfig(Stage):
-    """Where the pose of a scan comes from."""
+    """Source of the poses of scans."""
 
     source: str = setting(
         'tf',
@@ -124,7 +129,7 @@ class PoseConfig(Stage):
     )
     max_wait_s: float = setting(
         0.5,
-        'A scan whose pose is not there when newer data is this much newer is dropped, s.',
+        'A scan is dropped if its pose is missing when data newer by this arrives, s.',
         low=0.0,
         high=3600.0,
         live=True,
@@ -145,17 +150,17 @@ class FramesConfig(Stage):
     base: str = setting('base_link', 'The frame whose pose odometry or pose messages give.')
     sensors: tuple[str, ...] = setting(
         (),
-        'Frames that base_to_sensor gives poses of, in its order; empty: it is that of all.',
+        'Frames whose poses base_to_sensor lists, in its order; empty: one pose for all sensors.',
         items=str,
     )
     base_to_sensor: tuple[float, ...] = setting(
         (),
-        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw, and of further sensors '
-        'behind it; empty: from /tf_static.',
+        'Pose of the sensor in the base frame, x y z in m, qx qy qz qw, followed by those of '
+        'further sensors; empty: from /tf_static.',
     )
 
     def check(self, stage: str) -> None:
-        """Refuse empty frames and extrinsics that are no rigid transform."""
+        """Refuse empty frames and extrinsics that are not rigid transforms."""
         for name in ('fixed', 'base'):
             if not getattr(self, name):
                 raise ConfigError(f'{stage}.{name}: empty, expected the name of a frame')
@@ -177,7 +182,7 @@ class FramesConfig(Stage):
                 )
 
     def mount_of(self, frame_id: str) -> tuple[float, ...]:
-        """Return the pose of a sensor in the base frame, 7 numbers; empty where none is set."""
+        """Return the pose of a sensor in the base frame, 7 numbers; empty if none is set."""
         if not self.sensors:
             return self.base_to_sensor
         if frame_id not in self.sensors:
@@ -188,7 +193,7 @@ class FramesConfig(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputConfig(Stage):
-    """What comes in, and what is taken of it."""
+    """Topics of the input, its ranges and its queue."""
 
     kind: str = setting(
         'cloud',
@@ -201,10 +206,10 @@ class InputConfig(Stage):
         items=str,
     )
     min_range_m: float = setting(
-        0.1, 'Points nearer to the origin of their frame are left out, m.', low=0.0, high=1e6
+        0.1, 'Points nearer to the origin of their frame are ignored, m.', low=0.0, high=1e6
     )
     max_range_m: float = setting(
-        0.0, 'Points farther from it are left out, m; 0: no such limit.', low=0.0, high=1e6
+        0.0, 'Points farther from it are ignored, m; 0: no such limit.', low=0.0, high=1e6
     )
     reset_after_s: float = setting(
         1.0,
@@ -221,7 +226,7 @@ class InputConfig(Stage):
     )
 
     def check(self, stage: str) -> None:
-        """Refuse an empty range, and topics that are none."""
+        """Refuse an empty range and topics that are empty or repeated."""
         if '' in self.topics or len(set(self.topics)) < len(self.topics):
             raise ConfigError(f'{stage}.topics: {self.topics}, expected names that differ')
         if 0.0 < self.max_range_m <= self.min_range_m:
@@ -233,7 +238,7 @@ class InputConfig(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishConfig(Stage):
-    """What the node publishes, and how often."""
+    """Topics that the node publishes, and their rates."""
 
     changed: bool = setting(True, 'Publish ~/changed after every scan.', live=True)
     normals_rate_hz: float = setting(
@@ -244,8 +249,8 @@ class PublishConfig(Stage):
     )
     levels: int = setting(
         0,
-        'Publish so many coarser maps too, each with voxels twice as large as the one before, '
-        'on ~/level_1/normals and so on, at the rate of ~/normals.',
+        'Number of coarser maps to publish too, each with voxels twice as large as the one '
+        'before, on ~/level_1/normals and so on, at the rate of ~/normals.',
         low=0,
         high=8,
     )
@@ -271,9 +276,9 @@ class PublishConfig(Stage):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OutputConfig(Stage):
-    """Where files are written; the node writes nowhere else."""
+    """Directory and name of the files that the node writes; it writes nowhere else."""
 
-    directory: str = setting('surfel_maps', 'Directory of ~/save_map; made when first needed.')
+    directory: str = setting('surfel_maps', 'Directory of ~/save_map; created when first needed.')
     map_name: str = setting('map', 'Name of the files of ~/save_map inside it, no extension.')
     save_on_shutdown: bool = setting(
         False, 'Save the map when the node ends, as ~/save_map does.', live=True
@@ -289,3 +294,96 @@ class OutputConfig(Stage):
                 f'{stage}.map_name: {name!r}, expected a plain file name: '
                 'not empty, no leading dot, no slash'
             )
+
+
+TIME_UNITS = ('auto', 's', 'ms', 'us', 'ns')
+
+TIME_REFERENCES = ('auto', 'stamp', 'epoch')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DeskewConfig(Stage):
+    """Correction of the motion during a scan: each point gets the pose at its own time."""
+
+    enabled: bool = setting(
+        False,
+        'Give each point the pose at its own time; a scan waits for the pose of its last point.',
+    )
+    field: str = setting(
+        '',
+        'Field with the times of the points; empty: the first of t, time, timestamp, offset_time.',
+    )
+    unit: str = setting(
+        'auto',
+        'Unit of these times; auto: s for floating point values of plausible size, else ns.',
+        choices=TIME_UNITS,
+    )
+    reference: str = setting(
+        'auto',
+        'Times count from the stamp of the scan (stamp) or from 1970 (epoch).',
+        choices=TIME_REFERENCES,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClearConfig(Stage):
+    """Regions that ~/clear_box and ~/clear_radius empty."""
+
+    box: tuple[float, ...] = setting(
+        (0.0,) * 6,
+        'The box of ~/clear_box in the fixed frame, m: least x y z, then greatest.',
+        live=True,
+    )
+    radius_m: float = setting(
+        2.0,
+        'The radius of ~/clear_radius about the latest position of the sensor, m.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+
+    def check(self, stage: str) -> None:
+        """Refuse a box whose least corner is above its greatest."""
+        if len(self.box) != 6:
+            raise ConfigError(
+                f'{stage}.box: {len(self.box)} values, expected 6 (least x y z, greatest x y z)'
+            )
+        for axis, least, greatest in zip('xyz', self.box[:3], self.box[3:], strict=True):
+            if least > greatest:
+                raise ConfigError(
+                    f'{stage}.box: least {axis} {least} is above the greatest, {greatest}'
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DiagnosticsConfig(Stage):
+    """Limits beyond which /diagnostics reports a warning or an error."""
+
+    silence_s: float = setting(
+        2.0,
+        'Report an error if no cloud arrives for longer than this, s; 0: never.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    warn_latency_s: float = setting(
+        0.3,
+        'Warn if the 99th percentile of the time from stamp to publication exceeds this, s; '
+        '0: never.',
+        low=0.0,
+        high=1e6,
+        live=True,
+    )
+    error_latency_s: float = setting(
+        1.0, 'Report an error if it exceeds this, s; 0: never.', low=0.0, high=1e6, live=True
+    )
+    warn_dropped_ratio: float = setting(
+        0.0,
+        'Warn if a larger share of the clouds since the last report was dropped.',
+        low=0.0,
+        high=1.0,
+        live=True,
+    )
+    error_dropped_ratio: float = setting(
+        0.5, 'Report an error if a larger share was dropped.', low=0.0, high=1.0, live=True
+    )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.tsdf.block_content import block_keys, Blocks

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filter: what every filter is, and what filters share.
+Filter, the base class of all filters, and the functions that make one scan of another.
 
 A filter is a frozen dataclass whose fields are its parameters. It takes a scan and returns a
-scan; the one that comes in is never changed. Most say only which points stay (``keep``); those
-that make or move points or add columns implement ``apply``.
+scan; the given scan is never changed. Most filters only select points (``keep``); those that make
+or move points or add columns implement ``apply``.
 
-A comparison with nan is false, and a point stays only where a comparison says so: a filter that
-looks at a coordinate drops the points for which it cannot decide.
+A comparison with nan is false, and a point stays only if a comparison holds: a filter that
+compares a coordinate drops the points for which it cannot decide.
 
-Chance depends on the seed and the stamp of the scan alone, not on what came before, so that node
-and replay keep the same points and any part of a bag is filtered as the whole is.
+Random numbers depend on the seed and the stamp of the scan alone, not on earlier scans, so that
+node and replay keep the same points and any part of a bag is filtered as the whole is.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.lazy_columns import LazyColumns
-from surfel_mapper.filters.parameters import cast, parameters_of
+from surfel_mapper.filters.columns import LazyColumns
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.scan import Scan
 
@@ -34,35 +34,43 @@ Mask = npt.NDArray[np.bool_]
 Array = npt.NDArray[Any]
 
 
+parameter = setting
+"""The name of ``setting`` in filters: libpointmatcher and the docs call these parameters."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Filter:
+class Filter(Settings):
     """
     Base of all filters: checks every parameter against its declaration.
 
     A filter implements ``keep`` or ``apply``: ``register`` refuses one that does neither, and
-    gives the others ``name`` and ``theirs``.
+    sets ``name`` and ``libpointmatcher``.
     """
+
+    TAKES_TEXT: ClassVar[bool] = True
 
     name: ClassVar[str] = ''
     """Name in a chain."""
 
-    theirs: ClassVar[str] = ''
-    """Name in libpointmatcher, empty where it has no such filter."""
+    libpointmatcher: ClassVar[str] = ''
+    """Name in libpointmatcher; empty if it has no such filter."""
 
     def __post_init__(self) -> None:
-        """Check every value, and bring it into the declared type."""
-        for declared in parameters_of(type(self)):
-            where = f'{self.name or type(self).__name__}: {declared.name}'
-            value = cast(where, getattr(self, declared.name), declared)
-            object.__setattr__(self, declared.name, value)
+        """Check every parameter, then conditions on several."""
+        Settings.__post_init__(self)
         self.check()
 
+    @classmethod
+    def where(cls, key: str) -> str:
+        """Return the name of a parameter with that of the filter."""
+        return f'{cls.name or cls.__name__}: {key}'
+
     def check(self) -> None:
-        """Check what concerns several parameters; raise ConfigError."""
+        """Check conditions on several parameters; raise ConfigError."""
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay, (N,) bool; nobody asks filters that implement ``apply``."""
-        # not abstract, because those have none; register refuses a filter that has neither
+        """Return which points stay, (N,) bool; not called for filters that implement ``apply``."""
+        # not abstract, because filters with apply have no keep; register refuses one with neither
         raise NotImplementedError(f'{type(self).__name__}: implement keep or apply')
 
     def apply(self, scan: Scan) -> Scan:
@@ -72,7 +80,7 @@ class Filter:
         Raises
         ------
         FilterError
-            If the scan lacks a column that is needed, or holds what the filter cannot take.
+            If the scan lacks a column that the filter needs, or its values are refused.
 
         """
         return select(scan, self.keep(scan))
@@ -84,7 +92,7 @@ class Filter:
         Raises
         ------
         FilterError
-            If the scan has none of this name.
+            If the scan has no column of this name.
 
         """
         if name in scan.columns:
@@ -100,9 +108,9 @@ def select(scan: Scan, rows: Array) -> Scan:
     Parameters
     ----------
     scan : Scan
-        Returned itself where all points stay.
+        Returned itself if all points stay.
     rows : (N,) bool or (K,) int
-        A mask over the points, or the indices of those wanted in the order wanted.
+        A mask over the points, or indices of points in the order wanted.
 
     """
     if rows.dtype == np.bool_:
@@ -124,19 +132,19 @@ def select(scan: Scan, rows: Array) -> Scan:
 
 
 def with_points(scan: Scan, points: Array, columns: Mapping[str, Array]) -> Scan:
-    """Return the scan with other points, made of its own, and their columns."""
+    """Return the scan with its points replaced by others made from them, and their columns."""
     points = points.astype(scan.points.dtype, order='F', copy=False)
     return replace(scan, points=points, columns=columns, times=None, msg=None)
 
 
 def with_columns(scan: Scan, **columns: Array) -> Scan:
     """
-    Return the scan with columns added, or put in place of those of the same name.
+    Return the scan with columns added or replaced.
 
     Raises
     ------
     FilterError
-        If a column has not a row for every point.
+        If a column does not have one row for each point.
 
     """
     for name, column in columns.items():

@@ -1,14 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Boxes: cut the space of a scan until every box holds few points, and see what these are like.
+Filters that cut the space of a scan into boxes of few points and sample from each.
 
-A box is cut at the middle one of its points across its longest edge, so that halves hold the same
-number of points but for one, and boxes stay as even as they can.
+A box is cut at the median of its points across its longest edge, so that both halves hold the same
+number of points within one, and boxes stay as close to cubes as they can.
 
-From each box either points are drawn by chance, which keep their columns and take the shape of
-their box, or one point is made, the mean. libpointmatcher drops boxes whose points are all on one
-line or too few for a normal; here they stay, with a normal as shapes.py says.
+From each box either points are drawn at random, which keep their columns and take the shape of
+their box, or one point is made, the mean.
+
+Ellipsoids (libpointmatcher: Elipsoids) adds the full shape of a box. Of ``shapes``, planarity
+comes first, then cylindricality, then sphericality, and the limit of planarity applies to the same
+number; in libpointmatcher their values depend on the order of unsorted eigenvalues.
 """
 
 from __future__ import annotations
@@ -20,14 +23,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import generator, Mask, select, with_columns, with_points
-from surfel_mapper.filters.columns import DENSITIES
-from surfel_mapper.filters.kernels.cutting import cut
-from surfel_mapper.filters.merging import Groups, MergedColumns
+from surfel_mapper.filters.base import (
+    generator,
+    Mask,
+    parameter,
+    select,
+    with_columns,
+    with_points,
+)
+from surfel_mapper.filters.columns import DENSITIES, MergedColumns, PointGroups
+from surfel_mapper.filters.descriptors import TIME_COLUMNS, times_of
+from surfel_mapper.filters.kernels.boxes import cut
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
-from surfel_mapper.filters.shapes import eigen, Moments, ShapeFilter
+from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, ShapeFilter, shares
 from surfel_mapper.scan import Scan
 
 INT32_MAX = 2**31 - 1
@@ -105,32 +114,36 @@ class BoxFilter(ShapeFilter):
     """Base of the filters that sample from boxes."""
 
     ratio: float = parameter(
-        0.5, 'Share of the points that stay, drawn by chance.', low=1e-7, high=1.0, theirs='ratio'
+        0.5,
+        'Share of the points that stay, drawn by chance.',
+        low=1e-7,
+        high=1.0,
+        libpointmatcher='ratio',
     )
     max_points: int = parameter(
-        7, 'A box with more points is cut in two.', low=3, high=INT32_MAX, theirs='knn'
+        7, 'A box with more points is cut in two.', low=3, high=INT32_MAX, libpointmatcher='knn'
     )
     sampling_method: int = parameter(
         0,
         '0: draw points by chance; 1: one point for a box, the mean.',
         low=0,
         high=1,
-        theirs='samplingMethod',
+        libpointmatcher='samplingMethod',
     )
     max_box_m: float = parameter(
         math.inf,
         'Boxes whose points extend farther along an axis are dropped, m.',
-        theirs='maxBoxDim',
+        libpointmatcher='maxBoxDim',
     )
     average_columns: bool = parameter(
         True,
         'Where one point is made, 1: average the columns; 0: keep those of the first point.',
-        theirs='averageExistingDescriptors',
+        libpointmatcher='averageExistingDescriptors',
     )
     keep_densities: bool = parameter(
         False,
         'Add densities, points per m^3 of the ball about the mean of the box.',
-        theirs='keepDensities',
+        libpointmatcher='keepDensities',
     )
     seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
 
@@ -153,13 +166,13 @@ class BoxFilter(ShapeFilter):
 
     def means(self, scan: Scan, boxes: Boxes, fit: Mask) -> tuple[Scan, Ids]:
         """Return the scan of the means of the boxes that fit, and which boxes these are."""
-        first = Groups.of(boxes.rows, len(boxes)).first
+        first = PointGroups.of(boxes.rows, len(boxes)).first
         chosen = np.flatnonzero(fit)
         chosen = chosen[np.argsort(first[chosen])]
         place = np.full(len(boxes), -1)
         place[chosen] = np.arange(len(chosen))
         inside = select(scan, fit[boxes.rows])
-        groups = Groups.of(place[boxes.rows[fit[boxes.rows]]], len(chosen))
+        groups = PointGroups.of(place[boxes.rows[fit[boxes.rows]]], len(chosen))
         columns = MergedColumns(inside.columns, groups, average=self.average_columns)
         means = with_points(inside, boxes.moments.mean[chosen], columns)
         return means, chosen
@@ -179,7 +192,86 @@ class BoxFilter(ShapeFilter):
         return columns
 
 
-@register(theirs='SamplingSurfaceNormalDataPointsFilter')
+@register(libpointmatcher='SamplingSurfaceNormalDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SamplingSurfaceNormal(BoxFilter):
     """Cut the space into boxes of few points, sample from each, add the normal of the box."""
+
+
+@register(libpointmatcher='ElipsoidsDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ellipsoids(BoxFilter):
+    """Cut the space into boxes of few points, sample from each, add the ellipsoid of the box."""
+
+    ratio: float = parameter(
+        0.5,
+        'Share of the points that stay, drawn by chance.',
+        low=1e-7,
+        high=0.9999999,
+        libpointmatcher='ratio',
+    )
+    max_time_window: float = parameter(
+        math.inf,
+        'Boxes whose points are farther apart in time are dropped; in the unit of their column '
+        f'({", ".join(TIME_COLUMNS)}).',
+        libpointmatcher='maxTimeWindow',
+    )
+    min_planarity: float = parameter(
+        0.0,
+        'Boxes less planar are dropped; 1 is a plane, 0 a line or a ball.',
+        libpointmatcher='minPlanarity',
+    )
+    keep_means: bool = parameter(False, 'Add means, of the box, m.', libpointmatcher='keepMeans')
+    keep_covariances: bool = parameter(
+        False, 'Add covariance, of the box, 9 numbers, m^2.', libpointmatcher='keepCovariances'
+    )
+    keep_weights: bool = parameter(
+        False, 'Add weights, the number of points in the box.', libpointmatcher='keepWeights'
+    )
+    keep_shapes: bool = parameter(
+        False, 'Add shapes: planarity, cylindricality, sphericality.', libpointmatcher='keepShapes'
+    )
+    keep_indices: bool = parameter(
+        False,
+        'Add pointIds, rows of the points of the box in the scan given, -1 past the last, their '
+        'pointX, pointY, pointZ, m, and numOfNN, how many they are.',
+        libpointmatcher='keepIndices',
+    )
+
+    def fit(self, scan: Scan, boxes: Boxes) -> Mask:
+        """Return which boxes are sampled: small, planar and short enough, (M,) bool."""
+        fit = BoxFilter.fit(self, scan, boxes)
+        if self.min_planarity > 0.0:
+            fit = fit & (shares(boxes.values)[:, 0] >= self.min_planarity)
+        if self.max_time_window < math.inf:
+            fit = fit & (boxes.spread(times_of(scan)) <= self.max_time_window)
+        return fit
+
+    def columns_of(self, boxes: Boxes) -> Columns:
+        """Return the columns asked for, a row for each box."""
+        columns = BoxFilter.columns_of(self, boxes)
+        if self.keep_means:
+            columns['means'] = boxes.moments.mean
+        if self.keep_covariances:
+            columns['covariance'] = as_matrices(boxes.moments.covariance).reshape(-1, 9)
+        if self.keep_weights:
+            columns['weights'] = boxes.moments.count.astype(np.float64)
+        if self.keep_shapes:
+            columns['shapes'] = shares(boxes.values)
+        if self.keep_indices:
+            columns |= members(boxes, min(self.max_points, len(boxes.rows)))
+        return columns
+
+
+def members(boxes: Boxes, most: int) -> Columns:
+    """Return the points of each box: pointIds, pointX, pointY, pointZ (M, most), numOfNN (M,)."""
+    count = boxes.moments.count
+    order = np.argsort(boxes.rows, kind='stable')
+    row = boxes.rows[order]
+    place = np.arange(len(order)) - (np.cumsum(count) - count)[row]
+    ids = np.full((len(boxes), most), -1, np.int32)
+    ids[row, place] = order
+    columns: Columns = {'pointIds': ids, 'numOfNN': count.astype(np.float64)}
+    for name, axis in zip(('pointX', 'pointY', 'pointZ'), boxes.points.T, strict=True):
+        columns[name] = np.where(ids >= 0, axis[ids] if len(axis) else 0.0, np.nan)
+    return columns

@@ -30,7 +30,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.yaml_files import read_yaml
+from surfel_mapper.config import near, read_yaml, settings_of
+from surfel_mapper.config.settings import checked
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.base import Filter
 from surfel_mapper.filters.columns import (
@@ -41,7 +42,6 @@ from surfel_mapper.filters.columns import (
     NORMALS,
     OBSERVATION_DIRECTIONS,
 )
-from surfel_mapper.filters.parameters import parameters_of, values_of
 from surfel_mapper.filters.registry import find
 from surfel_mapper.scan import Scan
 
@@ -141,7 +141,7 @@ class Chain:
             {
                 each.name: {
                     declared.name: jsonable(getattr(each, declared.name))
-                    for declared in parameters_of(type(each))
+                    for declared in settings_of(type(each))
                 }
             }
             for each in self.filters
@@ -245,8 +245,52 @@ def made(item: Any, where: str) -> Filter:
         cls = find(name)
     except ConfigError as error:
         raise ConfigError(f'{where}: {error}') from error
-    values = values_of(cls, given, f'{where}, {name}', theirs=name == cls.theirs)
+    values = values_of(cls, given, f'{where}, {name}', libpointmatcher=name == cls.libpointmatcher)
     try:
         return cls(**values)
     except ConfigError as error:  # what concerns several parameters
         raise ConfigError(f'{where}: {error}') from error
+
+
+def values_of(
+    cls: type[Filter], given: Mapping[str, Any], where: str, *, libpointmatcher: bool
+) -> dict[str, Any]:
+    """
+    Return the values of a filter's parameters from an item of a chain.
+
+    Parameters
+    ----------
+    cls : type of Filter
+        The filter.
+    given : mapping of str
+        Our names or libpointmatcher's to values of the right type, or to their text.
+    where : str
+        What the errors begin with.
+    libpointmatcher : bool
+        Whether libpointmatcher's defaults hold for parameters not given.
+
+    Raises
+    ------
+    ConfigError
+        If a name is unknown (with the nearest known one) or given twice, or a value is refused.
+
+    """
+    declared = settings_of(cls)
+    known = {each.key: each for each in declared}
+    known |= {each.libpointmatcher: each for each in declared if each.libpointmatcher}
+    values = (
+        {each.key: each.libpointmatcher_default for each in declared} if libpointmatcher else {}
+    )
+    named: dict[str, str] = {}
+    for name, value in given.items():
+        if name not in known:
+            expected = ', '.join(known) or 'it has none'
+            raise ConfigError(
+                f'{where}: {name}: no such parameter{near(str(name), known)} ({expected})'
+            )
+        key = known[name].key
+        other = named.setdefault(key, name)
+        if other != name:
+            raise ConfigError(f'{where}: {other} and {name} are one parameter, expected one')
+        values[key] = checked(f'{where}: {name}', value, known[name], takes_text=True)
+    return values

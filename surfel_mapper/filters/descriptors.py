@@ -1,17 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Filters that add columns or go by them, one point at a time."""
+"""Filters that add columns or select by them, one point at a time: no neighbours, no groups."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
-from surfel_mapper.filters.base import Filter, Mask, with_columns
+from surfel_mapper.filters.base import Filter, Mask, parameter, with_columns
 from surfel_mapper.filters.columns import (
     EIGEN_VALUES,
     INCIDENCE_ANGLES,
@@ -19,26 +20,30 @@ from surfel_mapper.filters.columns import (
     OBSERVATION_DIRECTIONS,
     with_normals,
 )
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
+
+TIME_COLUMNS = ('t', 'time', 'times', 'timestamp', 'time_stamp', 'timeStamp', 'offset_time')
+"""Names under which drivers give the time of a point."""
 
 Array = npt.NDArray[Any]
 
 MAX_COMPONENTS = 2**32 - 1
 
 
-@register(theirs='AddDescriptorDataPointsFilter')
+@register(libpointmatcher='AddDescriptorDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AddDescriptor(Filter):
     """Give every point the same value, in a new column or in place of one of the same name."""
 
-    column_name: str = parameter('testDescriptor', 'Name of the column.', theirs='descriptorName')
+    column_name: str = parameter(
+        'testDescriptor', 'Name of the column.', libpointmatcher='descriptorName'
+    )
     num_components: int = parameter(
-        1, 'Numbers a point.', low=1, high=MAX_COMPONENTS, theirs='descriptorDimension'
+        1, 'Numbers a point.', low=1, high=MAX_COMPONENTS, libpointmatcher='descriptorDimension'
     )
     values: tuple[float, ...] = parameter(
-        (), 'The value, so many numbers.', items=float, theirs='descriptorValues'
+        (), 'The value, so many numbers.', items=float, libpointmatcher='descriptorValues'
     )
 
     def check(self) -> None:
@@ -60,18 +65,20 @@ class AddDescriptor(Filter):
         )
 
 
-@register(theirs='CutAtDescriptorThresholdDataPointsFilter')
+@register(libpointmatcher='CutAtDescriptorThresholdDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CutAtDescriptorThreshold(Filter):
     """Drop the points whose column is above, or below, a limit; those at it stay."""
 
     column_name: str = parameter(
-        'none', 'Name of the column; of several components the first counts.', theirs='descName'
+        'none',
+        'Name of the column; of several components the first counts.',
+        libpointmatcher='descName',
     )
     use_larger_than: bool = parameter(
-        True, '1: drop what is above; 0: drop what is below.', theirs='useLargerThan'
+        True, '1: drop what is above; 0: drop what is below.', libpointmatcher='useLargerThan'
     )
-    threshold: float = parameter(0.0, 'The limit.', theirs='threshold')
+    threshold: float = parameter(0.0, 'The limit.', libpointmatcher='threshold')
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay; nan does not."""
@@ -82,14 +89,16 @@ class CutAtDescriptorThreshold(Filter):
         return np.asarray(first >= self.threshold, np.bool_)
 
 
-@register(theirs='ObservationDirectionDataPointsFilter')
+@register(libpointmatcher='ObservationDirectionDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservationDirection(Filter):
     """Add observationDirections, from each point to where the sensor is, m."""
 
-    x_m: float = parameter(0.0, 'x of the sensor in the frame of the points, m.', theirs='x')
-    y_m: float = parameter(0.0, 'y of it, m.', theirs='y')
-    z_m: float = parameter(0.0, 'z of it, m.', theirs='z')
+    x_m: float = parameter(
+        0.0, 'x of the sensor in the frame of the points, m.', libpointmatcher='x'
+    )
+    y_m: float = parameter(0.0, 'y of it, m.', libpointmatcher='y')
+    z_m: float = parameter(0.0, 'z of it, m.', libpointmatcher='z')
 
     def apply(self, scan: Scan) -> Scan:
         """Return the scan with the column."""
@@ -97,13 +106,13 @@ class ObservationDirection(Filter):
         return with_columns(scan, **{OBSERVATION_DIRECTIONS: sensor - scan.points})
 
 
-@register(theirs='OrientNormalsDataPointsFilter')
+@register(libpointmatcher='OrientNormalsDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrientNormals(Filter):
     """Turn the normals to the side of the sensor, or all away; needs observationDirections."""
 
     toward_sensor: bool = parameter(
-        True, '1: towards the sensor; 0: away from it.', theirs='towardCenter'
+        True, '1: towards the sensor; 0: away from it.', libpointmatcher='towardCenter'
     )
 
     def apply(self, scan: Scan) -> Scan:
@@ -115,7 +124,7 @@ class OrientNormals(Filter):
         return with_columns(scan, normals=np.where(wrong[:, None], -normals, normals))
 
 
-@register(theirs='IncidenceAngleDataPointsFilter')
+@register(libpointmatcher='IncidenceAngleDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class IncidenceAngle(Filter):
     """Add incidenceAngles, between normal and observation direction, 0 to pi rad."""
@@ -143,16 +152,20 @@ def unit(vectors: Array) -> Array:
     return np.divide(vectors, length, out=np.full_like(vectors, np.nan), where=has_length)
 
 
-@register(theirs='SphericalityDataPointsFilter')
+@register(libpointmatcher='SphericalityDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sphericality(Filter):
     """Add sphericality, -1 on a plane to 1 in a ball; needs three eigValues."""
 
     keep_unstructureness: bool = parameter(
-        False, 'Add unstructureness, the part of it that a ball has.', theirs='keepUnstructureness'
+        False,
+        'Add unstructureness, the part of it that a ball has.',
+        libpointmatcher='keepUnstructureness',
     )
     keep_structureness: bool = parameter(
-        False, 'Add structureness, the part of it that a plane has.', theirs='keepStructureness'
+        False,
+        'Add structureness, the part of it that a plane has.',
+        libpointmatcher='keepStructureness',
     )
 
     def apply(self, scan: Scan) -> Scan:
@@ -184,3 +197,79 @@ class Sphericality(Filter):
             columns['structureness'] = structured
         dtype = scan.points.dtype
         return with_columns(scan, **{name: part.astype(dtype) for name, part in columns.items()})
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeSlice(Filter):
+    """Keep the points measured from one time on until another within their scan."""
+
+    start_s: float = parameter(0.0, 'First time that stays, s.')
+    end_s: float = parameter(math.inf, 'First time that does not, s.')
+    since: str = parameter(
+        'first',
+        'Times count from the first point of the scan, from the stamp of the scan, or as they '
+        'are (zero).',
+        choices=('first', 'stamp', 'zero'),
+    )
+    column_name: str = parameter('', 'Column of the times; empty: the first usual name found.')
+    unit_s: float = parameter(
+        0.0, 'Unit of the times, s; 0: whole numbers are ns, others s.', low=0.0
+    )
+
+    def check(self) -> None:
+        """Refuse an empty slice."""
+        if not self.start_s < self.end_s:
+            raise ConfigError(
+                f'{self.name}: end_s: {self.end_s:g}, expected more than start_s '
+                f'({self.start_s:g})'
+            )
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; those without a time do not."""
+        seconds = self.seconds(scan)
+        return np.asarray((seconds >= self.start_s) & (seconds < self.end_s))
+
+    def seconds(self, scan: Scan) -> npt.NDArray[np.float64]:
+        """Return the times of the points in seconds, counted from where they should."""
+        names = [name for name in TIME_COLUMNS if name in scan.columns]
+        times = self.column(scan, self.column_name or (names[0] if names else 'time'))
+        whole = times.dtype.kind in 'iu'
+        unit_s = self.unit_s or (1e-9 if whole else 1.0)
+        times = times.astype(np.int64 if whole else np.float64)
+        if self.since == 'first' and len(times):
+            times = times - (times.min() if whole else np.nanmin(times))
+        elif self.since == 'stamp':  # subtracted as integers: no float holds ns since 1970
+            stamp = scan.stamp_ns if unit_s == 1e-9 else scan.stamp_ns / 1e9 / unit_s
+            times = times - (round(stamp) if whole else stamp)
+        return np.asarray(times * unit_s)
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelMask(Filter):
+    """Drop, or keep, the points with certain labels."""
+
+    labels: tuple[int, ...] = parameter((), 'The labels.', items=int)
+    remove: bool = parameter(True, '1: drop the points that have one; 0: keep only those.')
+    column_name: str = parameter('label', 'Column of the labels.')
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay."""
+        found = self.column(scan, self.column_name)
+        listed = np.zeros(len(scan), np.bool_)
+        for label in self.labels:  # of few labels, a third of the time of np.isin
+            listed |= found == label
+        return ~listed if self.remove else listed
+
+
+def times_of(scan: Scan) -> npt.NDArray[Any]:
+    """Return the times of the points as their column has them."""
+    for name in TIME_COLUMNS:
+        if name in scan.columns:
+            times = scan.columns[name]
+            return times if times.dtype.kind == 'f' else times.astype(np.int64)
+    have = ', '.join(scan.columns) or 'none'
+    raise FilterError(
+        f'needs the times of the points ({", ".join(TIME_COLUMNS)}); the points have {have}'
+    )

@@ -24,15 +24,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import generator, select, with_columns
+from surfel_mapper.filters.base import generator, parameter, select, with_columns
 from surfel_mapper.filters.columns import NORMALS
-from surfel_mapper.filters.ellipsoids import times_of
+from surfel_mapper.filters.descriptors import times_of
+from surfel_mapper.filters.grids import least_of_each, ScanVoxels
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points, search_tree
-from surfel_mapper.filters.octree_grid import least_of_each
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, ShapeFilter, shares
-from surfel_mapper.filters.voxel_grid import Grid
 from surfel_mapper.scan import Scan
 
 RINGS, SECTORS = 4, 8
@@ -53,7 +51,7 @@ SIZES = {
 """Numbers in the columns that are only found here, a row."""
 
 
-@register(theirs='GestaltDataPointsFilter')
+@register(libpointmatcher='GestaltDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gestalt(ShapeFilter):
     """Keep some keypoints, add gestaltMeans and gestaltVariances of the relief about them."""
@@ -63,44 +61,59 @@ class Gestalt(ShapeFilter):
         'Share of the occupied voxels that get a keypoint.',
         low=1e-7,
         high=0.9999999,
-        theirs='ratio',
+        libpointmatcher='ratio',
     )
     radius_m: float = parameter(
-        5.0, 'How far the description reaches, m.', low=0.1, high=2.0**31 - 1, theirs='radius'
+        5.0,
+        'How far the description reaches, m.',
+        low=0.1,
+        high=2.0**31 - 1,
+        libpointmatcher='radius',
     )
     num_neighbours: int = parameter(
-        7, 'Keypoints with fewer neighbours are dropped.', low=3, high=2**31 - 1, theirs='knn'
+        7,
+        'Keypoints with fewer neighbours are dropped.',
+        low=3,
+        high=2**31 - 1,
+        libpointmatcher='knn',
     )
     size_x_m: float = parameter(
-        1.0, 'Edge along x of the voxels with one candidate each, m.', low=0.001, theirs='vSizeX'
+        1.0,
+        'Edge along x of the voxels with one candidate each, m.',
+        low=0.001,
+        libpointmatcher='vSizeX',
     )
-    size_y_m: float = parameter(1.0, 'Edge along y, m.', low=0.001, theirs='vSizeY')
-    size_z_m: float = parameter(1.0, 'Edge along z, m.', low=0.001, theirs='vSizeZ')
-    keep_means: bool = parameter(False, 'Add means, of the neighbours, m.', theirs='keepMeans')
+    size_y_m: float = parameter(1.0, 'Edge along y, m.', low=0.001, libpointmatcher='vSizeY')
+    size_z_m: float = parameter(1.0, 'Edge along z, m.', low=0.001, libpointmatcher='vSizeZ')
+    keep_means: bool = parameter(
+        False, 'Add means, of the neighbours, m.', libpointmatcher='keepMeans'
+    )
     max_box_m: float = parameter(
         math.inf,
         'Keypoints whose neighbours extend farther along an axis are dropped, m.',
-        theirs='maxBoxDim',
+        libpointmatcher='maxBoxDim',
     )
     average_columns: bool = parameter(
         True,
         'Makes no difference here: keypoints keep their columns.',
-        theirs='averageExistingDescriptors',
+        libpointmatcher='averageExistingDescriptors',
     )
     max_time_window: float = parameter(
         math.inf,
         'Keypoints whose neighbours are farther apart in time are dropped; in the unit of the '
         'column of times.',
-        theirs='maxTimeWindow',
+        libpointmatcher='maxTimeWindow',
     )
     keep_covariances: bool = parameter(
-        False, 'Add covariance, of the neighbours, 9 numbers, m^2.', theirs='keepCovariances'
+        False,
+        'Add covariance, of the neighbours, 9 numbers, m^2.',
+        libpointmatcher='keepCovariances',
     )
     keep_features: bool = parameter(
         True,
         'Add gestaltMeans, m, gestaltVariances, m^2, of 4 rings of 8 sectors, warpedXYZ, the mean '
         'in the frame of the keypoint, m, and gestaltShapes: planarity, cylindricality.',
-        theirs='keepGestaltFeatures',
+        libpointmatcher='keepGestaltFeatures',
     )
     seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
 
@@ -135,7 +148,7 @@ class Gestalt(ShapeFilter):
         if not len(points):
             return np.empty(0, np.int64)
         size = np.array([self.size_x_m, self.size_y_m, self.size_z_m])
-        _, _, groups = Grid.over(points, size, 'minimum').group(points, True)
+        _, _, groups = ScanVoxels.over(points, size, 'minimum').group(points, True)
         random, number = generator(scan, self.seed), len(groups.first)
         rows = least_of_each(random.random(len(points)), groups.rows.astype(np.int64), number)
         return np.sort(rows[random.random(number) < self.ratio])

@@ -17,13 +17,12 @@ import math
 import numpy as np
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.angles import cosine
-from surfel_mapper.filters.base import Filter, Mask, select, with_columns
+from surfel_mapper.filters.base import Filter, Mask, parameter, select, with_columns
+from surfel_mapper.filters.grids import ScanVoxels
+from surfel_mapper.filters.limits import cosine
 from surfel_mapper.filters.neighbours import coordinates, Points
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, Moments, shares
-from surfel_mapper.filters.voxel_grid import Grid
 from surfel_mapper.scan import Scan
 
 
@@ -76,7 +75,7 @@ class Ground(Filter):
             return np.zeros(0, np.bool_)
         x, y, z = points.T.copy()
         points = np.stack([(a * x + b * y) + c * z for a, b, c in R_up_sensor]).T
-        grid = Grid.over(points, np.full(3, self.voxel_size_m), 'origin')
+        grid = ScanVoxels.over(points, np.full(3, self.voxel_size_m), 'origin')
         _, _, groups = grid.group(points, True)
         moments = Moments.of_groups(points, groups.rows, len(groups.first))
         values, vectors = eigen(moments.covariance)

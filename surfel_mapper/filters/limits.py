@@ -1,11 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filters by where a point is: box, distance, angle.
+Filters by the position of a point: box, distance, range, angle, field of view.
 
-They work on the coordinates one at a time and in the type that these have: for 131,072 points in
-float32 a box takes 0.1 ms. A bound is rounded to that type, so that a point which float32 puts on
-a bound is on it.
+They work on one coordinate at a time and in its type: for 131,072 points in float32 a box takes
+0.1 ms. A bound is rounded to that type, so that a point which float32 puts on a bound is on it.
+Angles are not computed: their cosines, or the side of an edge on which a point is, decide. A point
+on the axis about which an angle is measured has no such angle: neither test keeps it.
+
+If several sensors feed one map, a filter with a ``sensor`` applies only to scans of that frame.
+
+One module of more than 350 lines, because the tests of a coordinate are shared.
 """
 
 from __future__ import annotations
@@ -17,13 +22,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import Filter, Mask
-from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.errors import ConfigError, FilterError
+from surfel_mapper.filters.base import Filter, Mask, parameter
+from surfel_mapper.filters.kernels.limits import (
+    ALWAYS,
+    BOTH,
+    EITHER,
+    in_field_of_view,
+    in_wedge,
+    NEVER,
+    outside_box,
+)
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
 
-@register(theirs='IdentityDataPointsFilter')
+@register(libpointmatcher='IdentityDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity(Filter):
     """Leave the scan as it is."""
@@ -33,7 +47,7 @@ class Identity(Filter):
         return scan
 
 
-@register(name='remove_nan', theirs='RemoveNaNDataPointsFilter')
+@register(name='remove_nan', libpointmatcher='RemoveNaNDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoveNaN(Filter):
     """Drop the points with a coordinate that is not a number; infinite ones stay."""
@@ -44,19 +58,19 @@ class RemoveNaN(Filter):
         return np.asarray((x == x) & (y == y) & (z == z), np.bool_)  # nan equals nothing
 
 
-@register(theirs='BoundingBoxDataPointsFilter')
+@register(libpointmatcher='BoundingBoxDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoundingBox(Filter):
     """Drop, or keep, the points in a box along the axes; its faces are outside."""
 
-    x_min_m: float = parameter(-1.0, 'Lowest x, m.', theirs='xMin')
-    x_max_m: float = parameter(1.0, 'Highest x, m.', theirs='xMax')
-    y_min_m: float = parameter(-1.0, 'Lowest y, m.', theirs='yMin')
-    y_max_m: float = parameter(1.0, 'Highest y, m.', theirs='yMax')
-    z_min_m: float = parameter(-1.0, 'Lowest z, m.', theirs='zMin')
-    z_max_m: float = parameter(1.0, 'Highest z, m.', theirs='zMax')
+    x_min_m: float = parameter(-1.0, 'Lowest x, m.', libpointmatcher='xMin')
+    x_max_m: float = parameter(1.0, 'Highest x, m.', libpointmatcher='xMax')
+    y_min_m: float = parameter(-1.0, 'Lowest y, m.', libpointmatcher='yMin')
+    y_max_m: float = parameter(1.0, 'Highest y, m.', libpointmatcher='yMax')
+    z_min_m: float = parameter(-1.0, 'Lowest z, m.', libpointmatcher='zMin')
+    z_max_m: float = parameter(1.0, 'Highest z, m.', libpointmatcher='zMax')
     remove_inside: bool = parameter(
-        True, '1: drop what is inside; 0: keep only that.', theirs='removeInside'
+        True, '1: drop what is inside; 0: keep only that.', libpointmatcher='removeInside'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -98,11 +112,15 @@ class AxisFilter(Filter):
     """Base of those that compare a distance from the origin, or one coordinate."""
 
     axis: int = parameter(
-        -1, '-1: distance from the origin; 0, 1, 2: x, y, z.', low=-1, high=2, theirs='dim'
+        -1,
+        '-1: distance from the origin; 0, 1, 2: x, y, z.',
+        low=-1,
+        high=2,
+        libpointmatcher='dim',
     )
 
 
-@register(theirs='DistanceLimitDataPointsFilter')
+@register(libpointmatcher='DistanceLimitDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DistanceLimit(AxisFilter):
     """Keep the points beyond, or before, a distance from the origin or along one axis."""
@@ -110,10 +128,10 @@ class DistanceLimit(AxisFilter):
     distance_m: float = parameter(
         1.0,
         'The limit, m; points at it do not stay; of a distance its size counts.',
-        theirs='dist',
+        libpointmatcher='dist',
     )
     remove_inside: bool = parameter(
-        True, '1: keep what is beyond; 0: keep what is before.', theirs='removeInside'
+        True, '1: keep what is beyond; 0: keep what is before.', libpointmatcher='removeInside'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -122,24 +140,28 @@ class DistanceLimit(AxisFilter):
         return test(scan, self.axis, self.distance_m)
 
 
-@register(theirs='MaxDistDataPointsFilter')
+@register(libpointmatcher='MaxDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxDist(AxisFilter):
     """Keep the points nearer than a distance; distance_limit can do the same and more."""
 
-    max_m: float = parameter(1.0, 'Points here or farther are dropped, m.', theirs='maxDist')
+    max_m: float = parameter(
+        1.0, 'Points here or farther are dropped, m.', libpointmatcher='maxDist'
+    )
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
         return before(scan, self.axis, self.max_m)
 
 
-@register(theirs='MinDistDataPointsFilter')
+@register(libpointmatcher='MinDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MinDist(AxisFilter):
     """Keep the points farther than a distance; distance_limit can do the same and more."""
 
-    min_m: float = parameter(1.0, 'Points here or nearer are dropped, m.', theirs='minDist')
+    min_m: float = parameter(
+        1.0, 'Points here or nearer are dropped, m.', libpointmatcher='minDist'
+    )
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
@@ -176,3 +198,186 @@ def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
         np.multiply(z, z, out=square)
         total += square
     return np.asarray(total)
+
+
+@register(libpointmatcher='AngleLimitDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AngleLimit(Filter):
+    """Drop, or keep, the points in a wedge of directions; points on its edge never stay."""
+
+    phi_min_deg: float = parameter(
+        -math.inf,
+        'Lowest angle about z, from x towards y, -180 to 180 deg.',
+        libpointmatcher='phiMin',
+    )
+    phi_max_deg: float = parameter(
+        math.inf,
+        'Highest angle about z, deg.',
+        libpointmatcher='phiMax',
+        libpointmatcher_default=-math.inf,
+    )
+    theta_min_deg: float = parameter(
+        -math.inf, 'Lowest angle from z, 0 to 180 deg.', libpointmatcher='thetaMin'
+    )
+    theta_max_deg: float = parameter(
+        math.inf,
+        'Highest angle from z, deg.',
+        libpointmatcher='thetaMax',
+        libpointmatcher_default=-math.inf,
+    )
+    remove_inside: bool = parameter(
+        True, '1: drop what is inside; 0: keep only that.', libpointmatcher='removeInside'
+    )
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay."""
+        phi, theta = [self.phi_min_deg, self.phi_max_deg], [self.theta_min_deg, self.theta_max_deg]
+        if self.remove_inside:  # above the highest or below the lowest
+            phi, theta = phi[::-1], theta[::-1]
+        kinds = [
+            phi_kind(phi[0], below=False),
+            phi_kind(phi[1], below=True),
+            theta_kind(theta[0], below=False),
+            theta_kind(theta[1], below=True),
+        ]
+        cosines = [cosine(limit) if math.isfinite(limit) else 0.0 for limit in (*phi, *theta)]
+        found = np.empty(len(scan), np.bool_)
+        of_type = np.array(cosines, scan.points.dtype)
+        in_wedge(scan.points.T, of_type, np.array(kinds), not self.remove_inside, found)
+        return found
+
+
+def phi_kind(limit_deg: float, *, below: bool) -> int:
+    """Return how phi, in (-180, 180] deg, is found to be above or below a limit."""
+    if not -180.0 <= limit_deg <= 180.0:
+        return ALWAYS if (limit_deg > 180.0) == below else NEVER
+    return BOTH if (limit_deg >= 0.0) != below else EITHER
+
+
+def theta_kind(limit_deg: float, *, below: bool) -> int:
+    """Return how theta, in [0, 180] deg, is found to be above or below a limit."""
+    if not 0.0 <= limit_deg <= 180.0:
+        return ALWAYS if (limit_deg > 180.0) == below else NEVER
+    return BOTH
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldOfView(Filter):
+    """Keep the points that a sensor with this field of view would see; its edges are in it."""
+
+    azimuth_min_deg: float = parameter(
+        -180.0, 'Where it begins about z, from x towards y, deg.', low=-360.0, high=360.0
+    )
+    azimuth_max_deg: float = parameter(
+        180.0, 'Where it ends, up to 360 deg further, deg.', low=-360.0, high=360.0
+    )
+    elevation_min_deg: float = parameter(
+        -90.0, 'Lowest angle above the plane of x and y, deg.', low=-90.0, high=90.0
+    )
+    elevation_max_deg: float = parameter(
+        90.0, 'Highest angle above it, deg.', low=-90.0, high=90.0
+    )
+    sensor: str = parameter('', 'Only scans in this frame are filtered; empty: all.')
+
+    def check(self) -> None:
+        """Refuse fields of view that hold nothing or come round."""
+        if not 0.0 < self.azimuth_max_deg - self.azimuth_min_deg <= 360.0:
+            raise ConfigError(
+                f'{self.name}: azimuth_max_deg: {self.azimuth_max_deg:g}, expected '
+                f'more than azimuth_min_deg ({self.azimuth_min_deg:g}) by up to 360'
+            )
+        if not self.elevation_min_deg <= self.elevation_max_deg:
+            raise ConfigError(
+                f'{self.name}: elevation_max_deg: {self.elevation_max_deg:g}, expected at least '
+                f'elevation_min_deg ({self.elevation_min_deg:g})'
+            )
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; one at the origin or not finite does not."""
+        if self.sensor and self.sensor != scan.frame_id:
+            return np.ones(len(scan), np.bool_)
+        azimuth = (self.azimuth_min_deg, self.azimuth_max_deg)
+        elevation = (self.elevation_min_deg, self.elevation_max_deg)
+        has_low, has_high = (abs(limit) < 90.0 for limit in elevation)
+        edges = [f(limit) for limit in azimuth for f in (cosine, sine)]
+        edges += [sine(limit) / cosine(limit) if abs(limit) < 90.0 else 0.0 for limit in elevation]
+        extent = azimuth[1] - azimuth[0]
+        seen = np.empty(len(scan), np.bool_)
+        in_field_of_view(
+            scan.points.T,
+            np.array(edges, scan.points.dtype),
+            extent < 360.0,
+            extent > 180.0,
+            has_low,
+            has_high,
+            seen,
+        )
+        return seen
+
+
+def sine(angle_deg: float) -> float:
+    """Return a sine that is exactly 0 or 1 where it should be."""
+    turned = math.remainder(angle_deg, 360.0)
+    if abs(turned) > 90.0:
+        turned = math.copysign(180.0, turned) - turned
+    return math.sin(math.radians(turned))
+
+
+def cosine(angle_deg: float) -> float:
+    """Return a cosine as exact as the sine, and equal to it at 45 deg."""
+    return sine(90.0 - abs(math.remainder(angle_deg, 360.0)))
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BodyBox(Filter):
+    """Drop, or keep, the points in a box along the axes of the robot (frames.base)."""
+
+    x_min_m: float = parameter(-1.0, 'Lowest x in the frame of the robot, m.')
+    x_max_m: float = parameter(1.0, 'Highest x, m.')
+    y_min_m: float = parameter(-1.0, 'Lowest y, m.')
+    y_max_m: float = parameter(1.0, 'Highest y, m.')
+    z_min_m: float = parameter(-1.0, 'Lowest z, m.')
+    z_max_m: float = parameter(1.0, 'Highest z, m.')
+    remove_inside: bool = parameter(True, '1: drop what is inside; 0: keep only that.')
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; the faces are outside, a nan is nowhere."""
+        if scan.T_base_sensor is None:
+            raise FilterError(
+                f'the place of {scan.frame_id!r} on the robot is not known; set '
+                'frames.base_to_sensor, or let /tf_static have it'
+            )
+        pose = np.ascontiguousarray(scan.T_base_sensor[:3], np.float64)
+        low = np.array([self.x_min_m, self.y_min_m, self.z_min_m])
+        high = np.array([self.x_max_m, self.y_max_m, self.z_max_m])
+        is_outside = np.empty(len(scan), np.int8)
+        outside_box(scan.points.T, pose, low, high, is_outside)
+        return np.asarray(is_outside == int(self.remove_inside))
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RangeLimit(Filter):
+    """Keep the points between two distances from the sensor; both limits stay."""
+
+    min_m: float = parameter(0.5, 'Nearest, m.', low=0.0)
+    max_m: float = parameter(100.0, 'Farthest, m.', low=0.0)
+    sensor: str = parameter('', 'Only scans in this frame are filtered; empty: all.')
+
+    def check(self) -> None:
+        """Refuse an empty range."""
+        if not self.min_m <= self.max_m:
+            raise ConfigError(
+                f'{self.name}: max_m: {self.max_m:g}, expected at least min_m ({self.min_m:g})'
+            )
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; nan never does."""
+        if self.sensor and self.sensor != scan.frame_id:
+            return np.ones(len(scan), np.bool_)
+        distance_sq = range_sq(scan.points)
+        limits_sq = [limit * limit for limit in (self.min_m, self.max_m)]
+        near_sq, far_sq = rounded(limits_sq, scan.points.dtype)
+        return np.asarray((distance_sq >= near_sq) & (distance_sq <= far_sq))

@@ -1,20 +1,24 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Nearest neighbours within a scan, for the filters that look around a point.
+Nearest neighbours within a scan, and the filters that drop points with few of them.
 
-The search is scipy's k-d tree. Its answer comes in pieces of at most a million neighbours, so
-that memory follows the points and not their number times the number of neighbours: the default
-of the tensor votes on 131,072 points would take 160 MB for the coordinates of all neighbours.
+The search is scipy's k-d tree. It yields pieces of at most a million neighbours, so that memory
+follows the number of points and not its product with the number of neighbours: tensor voting at
+its default on 131,072 points would take 160 MB for the coordinates of all neighbours.
 
-Many lidars put every beam without return at (0, 0, 0). No tree can part points at one place, and
-a search from each through all of them takes minutes; so of those at one place only as many as
-anyone asks for go into the tree.
+Many lidars put every beam without return at (0, 0, 0). No tree can split points at one place, and
+a search from each through all of them takes minutes. So of the points at one place only as many
+enter the tree as a search returns.
+
+The outlier filters are those of PCL and Open3D. A lidar measures near surfaces more densely than
+far ones, so a limit for the whole scan drops far points first; a radius states its limit in m.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 import math
 from typing import Any
 
@@ -22,6 +26,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.base import Filter, Mask, parameter
+from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
 AT_ONCE = 2**20
@@ -107,3 +113,56 @@ def worth_searching(points: Points, number: int) -> Ids:
     starts = np.flatnonzero(begins)
     before = np.arange(len(points)) - np.repeat(starts, np.diff(starts, append=len(points)))
     return np.sort(order[before < number])
+
+
+INT32_MAX = 2**31 - 1
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatisticalOutliers(Filter):
+    """Drop the points whose mean distance to their neighbours is unusual for the scan."""
+
+    num_neighbours: int = parameter(
+        20, 'Neighbours of each point, itself not counted.', low=1, high=INT32_MAX
+    )
+    std_ratio: float = parameter(
+        2.0,
+        'Distances above mean + this times standard deviation, over all points, are unusual.',
+        low=0.0,
+    )
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; nan and infinite ones are refused."""
+        points = coordinates(scan)
+        number = min(self.num_neighbours + 1, len(points))  # the nearest is the point itself
+        if number < 2 or self.std_ratio == math.inf:
+            return np.ones(len(points), np.bool_)
+        distances = np.empty(len(points))
+        for rows, _, around in neighbourhoods(points, number):
+            distances[rows] = around[:, 1:].mean(axis=1)
+        limit = distances.mean() + self.std_ratio * distances.std(ddof=1)
+        return np.asarray(distances <= limit, np.bool_)
+
+
+@register
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RadiusOutliers(Filter):
+    """Drop the points that have too few others around them."""
+
+    radius_m: float = parameter(0.5, 'How far around a point, m; the limit is in.', low=0.0)
+    min_neighbours: int = parameter(2, 'Others that have to be there.', low=0, high=INT32_MAX)
+
+    def keep(self, scan: Scan) -> Mask:
+        """Return which points stay; nan and infinite ones are refused."""
+        points = coordinates(scan)
+        number = self.min_neighbours + 1  # the point itself among them
+        if number > len(points):
+            return np.zeros(len(points), np.bool_)
+        if number == 1:
+            return np.ones(len(points), np.bool_)
+        stays = np.empty(len(points), np.bool_)
+        # whether there are so many is settled by the last of the nearest so many
+        for rows, _, distances in neighbourhoods(points, number, self.radius_m):
+            stays[rows] = np.isfinite(distances[:, -1])
+        return stays

@@ -40,10 +40,12 @@ def register(cls: F) -> F: ...
 
 
 @overload
-def register(*, name: str = '', theirs: str = '') -> Callable[[F], F]: ...
+def register(*, name: str = '', libpointmatcher: str = '') -> Callable[[F], F]: ...
 
 
-def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | Callable[[F], F]:
+def register(
+    cls: F | None = None, *, name: str = '', libpointmatcher: str = ''
+) -> F | Callable[[F], F]:
     """
     Register a filter; a decorator, above ``@dataclass``, with or without arguments.
 
@@ -53,7 +55,7 @@ def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | C
         A dataclass.
     name : str
         Name in a chain; by default that of the class, RangeLimit is range_limit.
-    theirs : str
+    libpointmatcher : str
         Name in libpointmatcher, if it has this filter.
 
     Raises
@@ -63,18 +65,18 @@ def register(cls: F | None = None, *, name: str = '', theirs: str = '') -> F | C
 
     """
     if cls is None:
-        return functools.partial(_register, name=name, theirs=theirs)
-    return _register(cls, name=name, theirs=theirs)
+        return functools.partial(_register, name=name, libpointmatcher=libpointmatcher)
+    return _register(cls, name=name, libpointmatcher=libpointmatcher)
 
 
-def _register(cls: F, *, name: str, theirs: str) -> F:
+def _register(cls: F, *, name: str, libpointmatcher: str) -> F:
     if not (isinstance(cls, type) and issubclass(cls, Filter)):
         raise ConfigError(f'{cls!r}: expected a class derived from surfel_mapper.filters.Filter')
     if cls.keep is Filter.keep and cls.apply is Filter.apply:
         raise ConfigError(f'{cls.__name__}: a filter has to implement keep or apply')
     cls.name = name or re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', cls.__name__).lower()
-    cls.theirs = theirs
-    for each in filter(None, (cls.name, theirs)):
+    cls.libpointmatcher = libpointmatcher
+    for each in filter(None, (cls.name, libpointmatcher)):
         other = _FILTERS.setdefault(each, cls)
         if (other.__module__, other.__qualname__) != (cls.__module__, cls.__qualname__):
             raise ConfigError(
@@ -133,6 +135,6 @@ def _load_entry_point(name: str) -> bool:
                 f'filter {name!r}: entry point {point.value} does not load: {error!r}'
             ) from error
         if name not in _FILTERS:
-            _register(cls, name=name, theirs='')
+            _register(cls, name=name, libpointmatcher='')
         return True
     return False

@@ -1,12 +1,19 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filters that thin a scan: by chance, by count, by rank.
+Filters that thin a scan: at random, by count, by rank, or spread over the directions of normals.
 
-All keep the order of the points. Chance depends on the seed and on the stamp of the scan (see
-base.py), so a filter with a seed of -1, which libpointmatcher seeds from the machine, gives the
-same points every time here too. Its random sampling stops as soon as it has the number expected,
-and so prefers points at the beginning; here every point has the same chance.
+All keep the order of the points and their columns. Random numbers depend on the seed and on the
+stamp of the scan (see base.py), so a seed of -1, which libpointmatcher replaces by one from the
+machine, gives the same points every time here too. libpointmatcher's random sampling stops when
+it has the expected number, and so prefers points at the beginning; here every point has the same
+chance.
+
+Sampling by normals constrains a registration well. Points without a normal (nan) are never
+chosen unless the scan has no more points than wanted, so that all stay.
+
+Sources: Rusinkiewicz and Levoy 2001, Efficient variants of the ICP algorithm, for NormalSpace;
+Gelfand et al. 2003, Geometrically stable sampling for the ICP algorithm, for CovarianceSampling.
 """
 
 from __future__ import annotations
@@ -18,27 +25,31 @@ import math
 
 import numpy as np
 
-from surfel_mapper.filters.base import Filter, generator, Mask, select
-from surfel_mapper.filters.columns import DENSITIES
-from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.errors import FilterError
+from surfel_mapper.filters.base import Filter, generator, Mask, parameter, select
+from surfel_mapper.filters.columns import DENSITIES, NORMALS, with_normals
+from surfel_mapper.filters.kernels.sampling import choose
+from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
 INT32_MAX = 2**31 - 1
 
 
-@register(theirs='RandomSamplingDataPointsFilter')
+@register(libpointmatcher='RandomSamplingDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RandomSampling(Filter):
     """Keep each point with a probability."""
 
     probability: float = parameter(
-        0.75, 'Chance of a point to stay.', low=0.0, high=1.0, theirs='prob'
+        0.75, 'Chance of a point to stay.', low=0.0, high=1.0, libpointmatcher='prob'
     )
     method: int = parameter(
-        0, 'Makes no difference here.', low=0, high=1, theirs='randomSamplingMethod'
+        0, 'Makes no difference here.', low=0, high=1, libpointmatcher='randomSamplingMethod'
     )
-    seed: int = parameter(-1, 'Of the random numbers.', low=-1, high=INT32_MAX, theirs='seed')
+    seed: int = parameter(
+        -1, 'Of the random numbers.', low=-1, high=INT32_MAX, libpointmatcher='seed'
+    )
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
@@ -46,14 +57,16 @@ class RandomSampling(Filter):
         return np.asarray(draws < self.probability, np.bool_)
 
 
-@register(theirs='MaxPointCountDataPointsFilter')
+@register(libpointmatcher='MaxPointCountDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxPointCount(Filter):
     """Keep so many points, drawn by chance, where there are more."""
 
-    seed: int = parameter(1, 'Of the random numbers.', low=0, high=INT32_MAX, theirs='seed')
+    seed: int = parameter(
+        1, 'Of the random numbers.', low=0, high=INT32_MAX, libpointmatcher='seed'
+    )
     max_points: int = parameter(
-        1000, 'At most this many points stay.', low=0, high=INT32_MAX, theirs='maxCount'
+        1000, 'At most this many points stay.', low=0, high=INT32_MAX, libpointmatcher='maxCount'
     )
 
     def apply(self, scan: Scan) -> Scan:
@@ -65,19 +78,22 @@ class MaxPointCount(Filter):
         return select(scan, np.sort(rows))
 
 
-@register(theirs='FixStepSamplingDataPointsFilter')
+@register(libpointmatcher='FixStepSamplingDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixStepSampling(Filter):
     """Keep every n-th point, from a random one on; the step n may change from scan to scan."""
 
     start_step: int = parameter(
-        10, 'Step at the first scan.', low=1, high=INT32_MAX, theirs='startStep'
+        10, 'Step at the first scan.', low=1, high=INT32_MAX, libpointmatcher='startStep'
     )
     end_step: int = parameter(
-        10, 'Step at which it stops changing.', low=1, high=INT32_MAX, theirs='endStep'
+        10, 'Step at which it stops changing.', low=1, high=INT32_MAX, libpointmatcher='endStep'
     )
     step_factor: float = parameter(
-        1.0, 'The step is multiplied by this after every scan.', low=1e-7, theirs='stepMult'
+        1.0,
+        'The step is multiplied by this after every scan.',
+        low=1e-7,
+        libpointmatcher='stepMult',
     )
     seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
     _calls: Iterator[int] = field(
@@ -100,13 +116,13 @@ class FixStepSampling(Filter):
         return select(scan, np.arange(phase, len(scan), step))
 
 
-@register(theirs='MaxDensityDataPointsFilter')
+@register(libpointmatcher='MaxDensityDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxDensity(Filter):
     """Thin points by chance where they are denser than a limit; needs densities."""
 
     max_density: float = parameter(
-        10.0, 'Density that remains, points per m^3.', low=1e-7, theirs='maxDensity'
+        10.0, 'Density that remains, points per m^3.', low=1e-7, libpointmatcher='maxDensity'
     )
     seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
 
@@ -117,17 +133,21 @@ class MaxDensity(Filter):
         return np.asarray(draws * densities < self.max_density, np.bool_)
 
 
-@register(theirs='MaxQuantileOnAxisDataPointsFilter')
+@register(libpointmatcher='MaxQuantileOnAxisDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxQuantileOnAxis(Filter):
     """Keep the points below, or above, a quantile of one coordinate."""
 
-    axis: int = parameter(0, '0, 1, 2: x, y, z.', low=0, high=2, theirs='dim')
+    axis: int = parameter(0, '0, 1, 2: x, y, z.', low=0, high=2, libpointmatcher='dim')
     ratio: float = parameter(
-        0.5, 'The share of points below the quantile.', low=1e-7, high=0.9999999, theirs='ratio'
+        0.5,
+        'The share of points below the quantile.',
+        low=1e-7,
+        high=0.9999999,
+        libpointmatcher='ratio',
     )
     remove_beyond: bool = parameter(
-        True, '1: keep what is below; 0: keep what is above.', theirs='removeBeyond'
+        True, '1: keep what is below; 0: keep what is above.', libpointmatcher='removeBeyond'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -139,3 +159,137 @@ class MaxQuantileOnAxis(Filter):
         rank = math.floor(len(known) * self.ratio)
         quantile = np.partition(known, rank)[rank]
         return np.asarray(values < quantile if self.remove_beyond else values > quantile)
+
+
+UINT32_MAX = 2**32 - 1
+
+UNHELD = 1e-9
+"""Motions held by less than this share of what holds the strongest are held by rounding."""
+
+
+@register(libpointmatcher='NormalSpaceDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalSpace(Filter):
+    """Keep so many points that their normals are spread over all directions; needs normals."""
+
+    num_points: int = parameter(
+        5000,
+        'How many stay where there are more.',
+        low=1,
+        high=UINT32_MAX,
+        libpointmatcher='nbSample',
+    )
+    seed: int = parameter(
+        1, 'Of the random numbers.', low=0, high=UINT32_MAX, libpointmatcher='seed'
+    )
+    step_rad: float = parameter(
+        0.09817477042,
+        'Width of the buckets of directions, rad.',
+        low=0.04908738521,
+        high=3.14159265359,
+        libpointmatcher='epsilon',
+    )
+
+    def apply(self, scan: Scan) -> Scan:
+        """
+        Return the scan with the points chosen.
+
+        One point is drawn from every bucket that has any left, again and again; in the last
+        round from buckets drawn by chance.
+        """
+        normals = normals_of(self, scan)
+        if len(scan) <= self.num_points:
+            return scan
+        usable = np.flatnonzero(np.isfinite(normals).all(axis=1))
+        random = generator(scan, self.seed)
+        usable = random.permutation(usable)
+        bucket = buckets(normals[usable], self.step_rad)
+        order = np.argsort(bucket, kind='stable')
+        starts = np.searchsorted(bucket[order], bucket[order])
+        draw = np.arange(len(order)) - starts  # how many of its bucket were drawn before
+        turn = np.argsort(draw + random.random(len(order)))
+        return select(scan, np.sort(usable[order[turn[: self.num_points]]]))
+
+
+def buckets(normals: Points, step_rad: float) -> Ids:
+    """
+    Return the bucket of every direction, (N,) int64.
+
+    Buckets are bands about z, each cut into as many parts as make all about equally large on the
+    sphere; libpointmatcher cuts every band into as many, and draws those about z more rarely.
+    """
+    lengths = np.sqrt((normals * normals).sum(axis=1))
+    cosine = np.divide(normals[:, 2], lengths, out=np.ones_like(lengths), where=lengths > 0.0)
+    num_bands = math.ceil(math.pi / step_rad)
+    band = np.arccos(np.clip(cosine, -1.0, 1.0)) / step_rad
+    band = np.minimum(band.astype(np.int64), num_bands - 1)
+    middles = np.minimum((np.arange(num_bands) + 0.5) * step_rad, math.pi)
+    num_parts = np.maximum(np.rint(2.0 * np.pi / step_rad * np.sin(middles)), 1.0)
+    turn = np.arctan2(normals[:, 1], normals[:, 0]) / (2.0 * np.pi) % 1.0
+    part = np.minimum(turn * num_parts[band], num_parts[band] - 1.0).astype(np.int64)
+    first = np.cumsum(num_parts) - num_parts
+    return np.asarray(first[band] + part, np.int64)
+
+
+@register(libpointmatcher='CovarianceSamplingDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CovarianceSampling(Filter):
+    """Keep so many points that hold all six directions of a rigid motion; needs normals."""
+
+    num_points: int = parameter(
+        5000,
+        'How many stay where there are more.',
+        low=1,
+        high=UINT32_MAX,
+        libpointmatcher='nbSample',
+    )
+    torque_norm: int = parameter(
+        1,
+        'Length that rotations are measured by, 0: 1 m; 1: the mean distance of the points from '
+        'their mean; 2: the largest.',
+        low=0,
+        high=2,
+        libpointmatcher='torqueNorm',
+    )
+
+    def apply(self, scan: Scan) -> Scan:
+        """
+        Return the scan with the points chosen; nan and infinite points are refused.
+
+        Point to plane distances change with translation along n and rotation along p x n. The
+        eigenvectors of the sum of their products are motions that the scan resists, strongly or
+        weakly. Again and again the one resisted least by the points chosen so far gets the point
+        that resists it most. Motions that nothing resists, as along a tunnel, are left out; in
+        libpointmatcher they get all the points.
+        """
+        normals, points = normals_of(self, scan), coordinates(scan)
+        if len(scan) <= self.num_points:
+            return scan
+        usable = np.flatnonzero(np.isfinite(normals).all(axis=1))
+        normals, points = normals[usable], points[usable]
+        resists = resistance(points, normals, self.torque_norm)
+        by_motion = np.ascontiguousarray(np.argsort(-np.abs(resists), axis=0, kind='stable').T)
+        chosen = np.zeros(len(usable), np.bool_)
+        choose(np.ascontiguousarray(resists), by_motion, min(self.num_points, len(usable)), chosen)
+        return select(scan, usable[chosen])
+
+
+def resistance(points: Points, normals: Points, torque_norm: int) -> Points:
+    """Return how every point resists each motion that the scan resists at all, (N, up to 6)."""
+    if not len(points):
+        return np.empty((0, 6))
+    arms = points - points.mean(axis=0)
+    distances = np.sqrt((arms * arms).sum(axis=1))
+    length = (1.0, distances.mean(), distances.max())[torque_norm]
+    turns = np.cross(arms, normals) / (length if length > 0.0 else 1.0)
+    forces = np.hstack([turns, normals])
+    strengths, motions = np.linalg.eigh(forces.T @ forces)
+    return np.asarray(forces @ motions[:, strengths >= UNHELD * strengths[-1]])
+
+
+def normals_of(each: Filter, scan: Scan) -> Points:
+    """Return the normals, (N, 3) float64."""
+    normals = each.column(with_normals(scan), NORMALS)
+    if normals.shape != (len(scan), 3):
+        raise FilterError(f'{NORMALS}: shape {normals.shape}, expected (N, 3)')
+    return normals.astype(np.float64)

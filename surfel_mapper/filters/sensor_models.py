@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import erf
 
-from surfel_mapper.filters.base import Filter, Mask, select, with_columns, with_points
+from surfel_mapper.filters.base import Filter, Mask, parameter, select, with_columns, with_points
 from surfel_mapper.filters.columns import (
     INCIDENCE_ANGLES,
     NORMALS,
@@ -28,7 +28,6 @@ from surfel_mapper.filters.columns import (
 )
 from surfel_mapper.filters.descriptors import dot, unit
 from surfel_mapper.filters.limits import range_sq
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
@@ -47,7 +46,7 @@ KINECT_PER_M = 0.5 * 0.00285
 """Noise of a depth camera over the squared distance, 1/m."""
 
 
-@register(theirs='SimpleSensorNoiseDataPointsFilter')
+@register(libpointmatcher='SimpleSensorNoiseDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimpleSensorNoise(Filter):
     """Add simpleSensorNoise, the radius within which a point may be, m."""
@@ -58,9 +57,9 @@ class SimpleSensorNoise(Filter):
         '4: Sick TiM3xx.',
         low=0,
         high=4,
-        theirs='sensorType',
+        libpointmatcher='sensorType',
     )
-    gain: float = parameter(1.0, 'Factor on the noise.', low=1.0, theirs='gain')
+    gain: float = parameter(1.0, 'Factor on the noise.', low=1.0, libpointmatcher='gain')
 
     def apply(self, scan: Scan) -> Scan:
         """Return the scan with the column."""
@@ -74,13 +73,17 @@ class SimpleSensorNoise(Filter):
         return with_columns(scan, **{SENSOR_NOISE: noise})
 
 
-@register(theirs='ShadowDataPointsFilter')
+@register(libpointmatcher='ShadowDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shadow(Filter):
     """Drop the points on surfaces seen edge-on, often between two objects; needs normals."""
 
     max_angle_rad: float = parameter(
-        0.1, 'Up to this angle to the line of sight, rad.', low=0.0, high=3.1416, theirs='eps'
+        0.1,
+        'Up to this angle to the line of sight, rad.',
+        low=0.0,
+        high=3.1416,
+        libpointmatcher='eps',
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -102,7 +105,7 @@ BIASED = {
 """Aperture (rad), gain on the shift of the peak, gain on the change of its curvature (m)."""
 
 
-@register(theirs='RemoveSensorBiasDataPointsFilter')
+@register(libpointmatcher='RemoveSensorBiasDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoveSensorBias(Filter):
     """
@@ -113,14 +116,14 @@ class RemoveSensorBias(Filter):
     """
 
     sensor_type: int = parameter(
-        0, '0: Sick LMS-1xx; 1: Velodyne HDL-32E.', low=0, high=1, theirs='sensorType'
+        0, '0: Sick LMS-1xx; 1: Velodyne HDL-32E.', low=0, high=1, libpointmatcher='sensorType'
     )
     max_angle_deg: float = parameter(
         88.0,
         'Points hit at this angle or more are dropped, deg.',
         low=0.0,
         high=90.0,
-        theirs='angleThreshold',
+        libpointmatcher='angleThreshold',
     )
 
     def apply(self, scan: Scan) -> Scan:

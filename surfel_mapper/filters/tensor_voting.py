@@ -1,29 +1,39 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tensor voting: whether a point is on a surface, on a curve or at a corner, by its neighbours.
+Filters by tensor voting: whether a point is on a surface, on a curve or at a junction.
 
 Every neighbour casts a vote, a symmetric matrix that is large in the directions in which it sees
-no continuation of the point. Of the eigenvalues l1 >= l2 >= l3 of the sum, l1 - l2 says how much
-of a surface there is (a stick, along the normal), l2 - l3 how much of a curve (a plate, across
-the tangent) and l3 how much of neither (a ball). Saliencies are these over the number of
-neighbours. libpointmatcher confuses saliencies and eigenvalues where Saliency labels points; here
-the label is the largest saliency.
+no continuation of the point. Of the eigenvalues l1 >= l2 >= l3 of the sum, l1 - l2 is the saliency
+of a surface (stick, along the normal), l2 - l3 that of a curve (plate, across the tangent) and l3
+that of a junction (ball), each over the number of neighbours. libpointmatcher confuses saliencies
+and eigenvalues when Saliency labels points; here the label is the largest saliency.
+
+SpectralDecomposition thins surfaces, curves and junctions to an even density each. If nothing is
+known of the neighbours, the eigenvalues of their votes have known ratios for points spread evenly
+on a curve, on a surface and in space; the nearest ratio classifies a point. If the largest
+eigenvalue exceeds that of neighbours which fill the radius, the place is too dense, and every
+other point of it, drawn at random, is dropped. Then all vote again, until hardly any is dropped.
+libpointmatcher tests every point for all three, drops four of five at once, and ends well below
+the density asked for. Points with no neighbour near enough to vote are outliers and are dropped.
+
+Source: Labussiere et al. 2020, Geometry preserving sampling method based on spectral
+decomposition for large-scale environments.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import Filter, with_columns
+from surfel_mapper.filters.base import Filter, generator, Mask, parameter, select, with_columns
 from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, Points
-from surfel_mapper.filters.parameters import parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, PAIRS
 from surfel_mapper.scan import Scan
@@ -130,22 +140,24 @@ class VotingFilter(Filter):
     """Base of the filters by tensor voting."""
 
     num_neighbours: int = parameter(
-        50, 'Neighbours that vote for each point.', low=6, high=2**32 - 1, theirs='k'
+        50, 'Neighbours that vote for each point.', low=6, high=2**32 - 1, libpointmatcher='k'
     )
     sigma: float = parameter(
         0.2,
         'Scale of the votes: at d m they count exp(-d^2 / sigma), beyond 3 sigma m nothing.',
         low=0.0,
-        theirs='sigma',
+        libpointmatcher='sigma',
     )
     keep_normals: bool = parameter(
-        True, 'Add normals, and tangents of curves.', theirs='keepNormals'
+        True, 'Add normals, and tangents of curves.', libpointmatcher='keepNormals'
     )
     keep_labels: bool = parameter(
-        True, 'Add labels: 3 surface, 2 curve, 1 junction.', theirs='keepLabels'
+        True, 'Add labels: 3 surface, 2 curve, 1 junction.', libpointmatcher='keepLabels'
     )
     keep_tensors: bool = parameter(
-        True, 'Add sticks, plates and balls: their size and directions.', theirs='keepTensors'
+        True,
+        'Add sticks, plates and balls: their size and directions.',
+        libpointmatcher='keepTensors',
     )
 
     def with_votes(self, scan: Scan, votes: Votes, **more: npt.NDArray[Any]) -> Scan:
@@ -159,7 +171,7 @@ class VotingFilter(Filter):
         )
 
 
-@register(theirs='SaliencyDataPointsFilter')
+@register(libpointmatcher='SaliencyDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Saliency(VotingFilter):
     """Add surfaceness, curveness and pointness, by tensor voting, and what follows from them."""
@@ -168,3 +180,99 @@ class Saliency(VotingFilter):
         """Return the scan with the columns added; nan and infinite points are refused."""
         voting = Voting.among(coordinates(scan), self.num_neighbours, self.sigma)
         return self.with_votes(scan, voting.again(voting.first().tensors))
+
+
+EVEN = 5
+"""Fewer points to go in a round mean that the density is even."""
+
+
+RATIOS = np.array([[0.5, 1.0], [0.75, 0.75], [1.0, 1.0]])
+"""Of the smallest and the middle eigenvalue to the largest on a curve, a surface, in space."""
+
+
+@register(libpointmatcher='SpectralDecompositionDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpectralDecomposition(VotingFilter):
+    """Thin surfaces, curves and corners to an even density, drop outliers, add saliencies."""
+
+    radius_m: float = parameter(
+        0.4,
+        'Within this of a point, half of it on curves, its neighbours are to be spread, m.',
+        low=0.0,
+        libpointmatcher='radius',
+    )
+    max_iterations: int = parameter(
+        10, 'Rounds of thinning at most.', low=1, high=2**32 - 1, libpointmatcher='itMax'
+    )
+    keep_lambdas: bool = parameter(
+        True,
+        'Add lambda1, lambda2, lambda3, the eigenvalues, descending.',
+        libpointmatcher='keepLambdas',
+    )
+    seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the points that stay, with the columns; nan and infinite points are refused."""
+        points, random = coordinates(scan), generator(scan, self.seed)
+        rows = np.arange(len(points))
+        voting, votes = self.vote(points)
+        for _ in range(self.max_iterations):
+            if len(rows) <= self.num_neighbours:
+                break
+            stays = self.stays(votes, random)
+            rows = rows[stays]
+            if not stays.all():
+                voting, votes = self.vote(points[rows])
+            if np.count_nonzero(~stays) < EVEN:
+                break
+        votes = voting.again(votes.tensors)
+        voted_for = votes.values[:, 2] > 0.0
+        votes = Votes(votes.values[voted_for], votes.vectors[voted_for], votes.num_neighbours)
+        names = ('lambda3', 'lambda2', 'lambda1') if self.keep_lambdas else ()
+        lambdas = dict(zip(names, votes.values.T, strict=False))
+        return self.with_votes(select(scan, rows[voted_for]), votes, **lambdas)
+
+    def vote(self, points: Points) -> tuple[Voting, Votes]:
+        """Return the votes where nothing is known of the points."""
+        voting = Voting.among(points, self.num_neighbours, self.sigma)
+        return voting, voting.balls()
+
+    def stays(self, votes: Votes, random: np.random.Generator) -> Mask:
+        """Return which points stay for the next round."""
+        lowest, middle, highest = votes.values.T / votes.num_neighbours
+        with np.errstate(invalid='ignore'):  # nan where there are no votes: then not dense either
+            ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
+        nearest = ((ratios[:, None] - RATIOS) ** 2).sum(axis=2).argmin(axis=1)
+        expected = np.array(
+            [
+                mean_decay(1, self.sigma, 0.5 * self.radius_m),
+                mean_decay(2, self.sigma, self.radius_m),
+                mean_decay(3, self.sigma, self.radius_m) * 5.0 / 6.0,
+            ]
+        )
+        is_dense = highest > expected[nearest]
+        return np.asarray(~is_dense | (random.random(len(is_dense)) < 0.5))
+
+
+def mean_decay(dimension: int, sigma: float, radius_m: float) -> float:
+    """
+    Return the mean of exp(-d^2 / sigma) over a ball about a point.
+
+    Parameters
+    ----------
+    dimension : int
+        1 for a ball on a curve, 2 on a surface, 3 in space.
+    sigma : float
+        Scale, m^2.
+    radius_m : float
+        Of the ball.
+
+    """
+    t = math.inf if sigma == 0.0 else radius_m / math.sqrt(sigma)
+    if not 1e-3 < t < math.inf:  # so near the limits that the formulas lose more than they add
+        return 0.0 if t == math.inf else 1.0
+    if dimension == 1:
+        return math.sqrt(math.pi) * math.erf(t) / (2.0 * t)
+    if dimension == 2:
+        return -math.expm1(-t * t) / (t * t)
+    return 3.0 * (math.sqrt(math.pi) * math.erf(t) - 2.0 * t * math.exp(-t * t)) / (4.0 * t**3)

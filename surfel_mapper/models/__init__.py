@@ -6,7 +6,7 @@ Planes, B-spline surfaces and Gaussians that stand for a cloud.
 ``fit`` makes them from the points of one; see docs/models.md.
 """
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import HeightField
 from surfel_mapper.models.evaluation import evaluate, Evaluation
 from surfel_mapper.models.fitting import fit

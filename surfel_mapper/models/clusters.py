@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import folds
 from surfel_mapper.models.kernels.clustering import bisect, NOISE_SPREAD
 from surfel_mapper.models.kernels.joining import components

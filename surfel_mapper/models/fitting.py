@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
-from surfel_mapper.filters.voxel_grid import Grid as VoxelGrid
+from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.models.clusters import (
     Clusters,
@@ -135,7 +135,7 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     points, ends = np.ascontiguousarray(points), np.empty((2, 3))
     if not finite_ends(points, ends):
         return Thinned(np.empty((0, 3)), np.empty(0, np.int64), len(points))
-    grid = VoxelGrid.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
+    grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
     keys, to_key = np.empty(len(points), np.int64), row_bits(len(points))
     voxel_keys(points, grid.size, grid.shift, grid.base, grid.bits, keys)
     key_bits = int(grid.bits.sum())

@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
 from surfel_mapper.models.clusters import is_paper
 from surfel_mapper.models.grid import Grid

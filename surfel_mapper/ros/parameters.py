@@ -11,6 +11,7 @@ does with overrides that nobody declares. What is then declared is the value tha
 from __future__ import annotations
 
 from collections.abc import Iterable
+import math
 import sys
 from typing import Any
 
@@ -84,15 +85,15 @@ def descriptor(declared: Declaration) -> ParameterDescriptor:
         largest = sys.float_info.max
         found.floating_point_range = [
             FloatingPointRange(
-                from_value=-largest if low is None else float(low),
-                to_value=largest if high is None else float(high),
+                from_value=-largest if math.isinf(low) else low,
+                to_value=largest if math.isinf(high) else high,
             )
         ]
     elif isinstance(declared.default, int) and not isinstance(declared.default, bool):
         found.integer_range = [
             IntegerRange(
-                from_value=-INT64_MAX if low is None else int(low),
-                to_value=INT64_MAX if high is None else int(high),
+                from_value=-INT64_MAX if math.isinf(low) else int(low),
+                to_value=INT64_MAX if math.isinf(high) else int(high),
             )
         ]
     return found

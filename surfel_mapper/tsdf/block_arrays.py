@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.tsdf.block_content import Blocks, some
 from surfel_mapper.tsdf.kernels.blocks import HEAD

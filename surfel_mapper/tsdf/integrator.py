@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.tsdf import INTERPOLATIONS, SEMANTICS, TsdfConfig
+from surfel_mapper.config import INTERPOLATIONS, SEMANTICS, TsdfConfig
 from surfel_mapper.errors import PoseError
 from surfel_mapper.threads import pool, split
 from surfel_mapper.tsdf.blocks import BlockMap, Int64

@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.simulation import Lidar, Simulation, World

@@ -21,7 +21,7 @@ def listed(capsys, *arguments):
 def test_every_filter_is_listed_with_its_line_and_parameters(capsys):
     text = listed(capsys)
     for cls in all_filters():
-        assert f'{cls.name} ({cls.theirs})\n' in text or f'{cls.name}\n' in text
+        assert f'{cls.name} ({cls.libpointmatcher})\n' in text or f'{cls.name}\n' in text
     assert 'VoxelGridDataPointsFilter' in text
     assert '  size_x_m (vSizeX): 1, float in [0.001, inf]. Edge along x, m.\n' in text
     assert max(map(len, text.splitlines())) <= 99

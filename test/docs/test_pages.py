@@ -12,10 +12,11 @@ import yaml
 
 import surfel_mapper
 from surfel_mapper.cli.main import VERBS
-from test.settings import README, ROOT
+from test.settings import ROOT
 
 DOCS = ROOT / 'docs'
 PAGES = sorted(DOCS.rglob('*.md'))
+README = ROOT / 'README.md'
 TEXTS = [README, ROOT / 'CONTRIBUTING.md', ROOT / 'SECURITY.md', *PAGES]
 
 

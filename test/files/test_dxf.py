@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.dxf import LAYERS, write_dxf
 from surfel_mapper.models import fit

@@ -10,7 +10,7 @@ import json
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.model_files import write_json, write_models, write_obj, write_parquet
 from surfel_mapper.models import fit

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf

@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.boxes import cut_into_boxes
-from surfel_mapper.filters.kernels.cutting import cut
+from surfel_mapper.filters.kernels.boxes import cut
 from test.filters.examples import filter_of, random_scan, scan_of
 
 SAMPLING, ELLIPSOIDS = 'SamplingSurfaceNormalDataPointsFilter', 'ElipsoidsDataPointsFilter'

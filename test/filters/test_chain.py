@@ -9,8 +9,8 @@ import pytest
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.grids import VoxelGrid
 from surfel_mapper.filters.limits import BoundingBox
-from surfel_mapper.filters.voxel_grid import VoxelGrid
 from test.filters.examples import scan_of
 
 MIXED = """\

@@ -65,7 +65,7 @@ def test_the_table_has_every_filter_with_its_line():
     assert rows == [
         (
             cls.name,
-            cls.theirs.removesuffix('DataPointsFilter'),
+            cls.libpointmatcher.removesuffix('DataPointsFilter'),
             inspect.getdoc(cls).partition('\n')[0],
         )
         for cls in all_filters()

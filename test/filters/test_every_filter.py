@@ -12,15 +12,15 @@ import re
 import numpy as np
 import pytest
 
+from surfel_mapper.config import settings_of
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.parameters import parameters_of
 from surfel_mapper.filters.registry import all_filters, find
 from test.filters import libpointmatcher
 from test.filters.examples import random_scan, scan_of
 
 FILTERS = all_filters()
-PARAMETERS = [(cls, declared) for cls in FILTERS for declared in parameters_of(cls)]
+PARAMETERS = [(cls, declared) for cls in FILTERS for declared in settings_of(cls)]
 NUMBERS = [
     (cls, declared)
     for cls, declared in PARAMETERS
@@ -86,21 +86,28 @@ def test_it_says_in_one_line_what_it_does(cls):
 def test_a_parameter_says_what_it_means_and_defaults_to_what_it_allows(cls, declared):
     assert declared.meaning.endswith('.')
     assert re.fullmatch(r'[a-z0-9]+(_[a-z0-9]+)*', declared.name)
-    assert bool(cls.theirs) or not declared.theirs
+    assert bool(cls.libpointmatcher) or not declared.libpointmatcher
     if isinstance(declared.default, (int, float)):
         assert declared.low <= declared.default <= declared.high
-        assert declared.low <= declared.their_default <= declared.high
+        assert declared.low <= declared.libpointmatcher_default <= declared.high
 
 
 @pytest.mark.parametrize('name', libpointmatcher.FILTERS)
 def test_every_filter_of_libpointmatcher_is_there_with_its_parameters(name):
     cls = find(f'{name}DataPointsFilter')
-    found = {declared.theirs: declared for declared in parameters_of(cls) if declared.theirs}
+    found = {
+        declared.libpointmatcher: declared
+        for declared in settings_of(cls)
+        if declared.libpointmatcher
+    }
     expected = libpointmatcher.FILTERS[name]
     assert set(found) == set(expected)
     for parameter, (default, low, high) in expected.items():
         declared = found[parameter]
-        assert (type(declared.default), declared.their_default) == (type(default), default)
+        assert (type(declared.default), declared.libpointmatcher_default) == (
+            type(default),
+            default,
+        )
         if isinstance(default, (int, float)) and not isinstance(default, bool):
             low, high = libpointmatcher.NARROWER.get((name, parameter), (low, high))
             if low is not None:
@@ -233,7 +240,7 @@ def test_a_chain_can_be_written_and_read_back(cls):
 @every
 def test_it_cannot_be_changed_in_place(cls):
     found = made(cls)
-    for declared in parameters_of(cls):
+    for declared in settings_of(cls):
         with pytest.raises(AttributeError):
             setattr(found, declared.name, declared.default)
 

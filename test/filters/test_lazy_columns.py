@@ -13,7 +13,7 @@ import pytest
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.lazy_columns import LazyColumns
+from surfel_mapper.filters.columns import LazyColumns
 from surfel_mapper.scan import PointTimes
 from test.filters.examples import random_scan, scan_of
 

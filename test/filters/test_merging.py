@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.filters.base import generator, select, with_columns
-from surfel_mapper.filters.columns import Kind, kind_of
-from surfel_mapper.filters.merging import Groups, MergedColumns
+from surfel_mapper.filters.columns import Kind, kind_of, MergedColumns, PointGroups
 from test.filters.examples import scan_of
 
-GROUPS = Groups.of(np.array([1, 0, 1, 0, 1]), 2)
+GROUPS = PointGroups.of(np.array([1, 0, 1, 0, 1]), 2)
 
 
 def merged(column, **settings):
@@ -59,7 +58,7 @@ def test_stamps_are_averaged_exactly_and_towards_zero():
 
 def test_seven_stamps_do_not_overflow():
     scan = scan_of(np.zeros((7, 3)), times=np.full(7, 2**62, np.int64))
-    found = MergedColumns(scan.columns, Groups.of(np.zeros(7, np.int64), 1))['times']
+    found = MergedColumns(scan.columns, PointGroups.of(np.zeros(7, np.int64), 1))['times']
     assert found.tolist() == [2**62]
 
 
@@ -86,7 +85,7 @@ def test_the_first_are_kept_where_averages_are_not_wanted():
 
 def test_no_points_leave_no_rows():
     scan = scan_of(np.zeros((0, 3)), value=np.zeros((0, 4)), times=np.zeros(0, np.int64))
-    found = MergedColumns(scan.columns, Groups.of(np.zeros(0, np.int64), 0))
+    found = MergedColumns(scan.columns, PointGroups.of(np.zeros(0, np.int64), 0))
     assert (found['value'].shape, found['times'].shape) == ((0, 4), (0,))
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.kernels.stable_sampling import choose
-from surfel_mapper.filters.normal_sampling import buckets, resistance
+from surfel_mapper.filters.kernels.sampling import choose
+from surfel_mapper.filters.sampling import buckets, resistance
 from test.filters.examples import filter_of, random_scan, scan_of
 
 SPACE, COVARIANCE = 'NormalSpaceDataPointsFilter', 'CovarianceSamplingDataPointsFilter'

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.filters.octree_grid import leaves, LEVELS, spread
+from surfel_mapper.filters.grids import leaves, LEVELS, spread
 from test.filters.examples import filter_of, random_scan, scan_of
 
 NAME = 'OctreeGridDataPointsFilter'

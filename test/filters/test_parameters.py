@@ -9,17 +9,19 @@ import math
 
 import pytest
 
+from surfel_mapper.config import plain, settings_of
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.filters import parameter
 from surfel_mapper.filters.base import Filter
-from surfel_mapper.filters.parameters import parameter, parameters_of, plain, values_of
+from surfel_mapper.filters.chain import values_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample(Filter):
     """A filter with a parameter of every type."""
 
-    whole: int = parameter(3, 'A whole number.', low=1, high=10, theirs='wholeNumber')
-    real: float = parameter(0.5, 'A number.', low=0.0, their_default=0.25)
+    whole: int = parameter(3, 'A whole number.', low=1, high=10, libpointmatcher='wholeNumber')
+    real: float = parameter(0.5, 'A number.', low=0.0, libpointmatcher_default=0.25)
     flag: bool = parameter(True, 'A flag.')
     text: str = parameter('a', 'A text.', choices=('a', 'b'))
     free: str = parameter('', 'Any text.')
@@ -27,7 +29,7 @@ class Sample(Filter):
 
 
 def read(**given):
-    return Sample(**values_of(Sample, given, 'here', theirs=False))
+    return Sample(**values_of(Sample, given, 'here', libpointmatcher=False))
 
 
 @pytest.mark.parametrize(
@@ -78,11 +80,11 @@ def test_a_text_is_read_as_the_type_of_its_parameter(name, text, value):
         ('flag', 'yes', "flag: 'yes', expected 0 or 1"),
         ('flag', 0.0, 'flag: 0.0, expected 0 or 1'),
         ('text', 'c', "text: 'c', expected one of a, b"),
-        ('text', 1, 'text: 1, expected a text'),
-        ('numbers', 3.0, 'numbers: 3.0, expected a list of float'),
+        ('text', 1, 'text: 1, expected a str'),
+        ('numbers', 3.0, 'numbers: 3.0, expected a list of numbers'),
         ('numbers', ['a'], "numbers: 'a', expected a number"),
         ('numbers', [9.0], r'numbers: 9, expected a value in \[-5, 5\]'),
-        ('numbers', {'a': 1}, 'numbers: .*, expected a list of float'),
+        ('numbers', {'a': 1}, 'numbers: .*, expected a list of numbers'),
     ],
 )
 def test_another_type_or_a_value_out_of_bounds_is_refused_with_what_was_expected(
@@ -104,7 +106,7 @@ def test_either_name_of_a_parameter_is_taken_but_not_both():
 
 
 def test_the_default_follows_the_name_of_the_filter():
-    assert values_of(Sample, {}, 'here', theirs=True)['real'] == 0.25
+    assert values_of(Sample, {}, 'here', libpointmatcher=True)['real'] == 0.25
     assert read().real == 0.5
 
 
@@ -114,7 +116,7 @@ def test_an_unknown_parameter_is_refused_with_the_nearest_and_all_names():
 
 
 def test_a_parameter_says_its_type_and_what_it_allows():
-    assert [(p.name, p.kind, p.allowed) for p in parameters_of(Sample)] == [
+    assert [(p.name, p.kind, p.allowed) for p in settings_of(Sample)] == [
         ('whole', 'int', '[1, 10]'),
         ('real', 'float', '[0, inf]'),
         ('flag', 'bool', ''),

@@ -11,12 +11,11 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.filters import registry
+from surfel_mapper.filters import parameter, registry
 from surfel_mapper.filters.base import Filter
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.parameters import parameter
+from surfel_mapper.filters.grids import VoxelGrid
 from surfel_mapper.filters.registry import all_filters, find, register
-from surfel_mapper.filters.voxel_grid import VoxelGrid
 from test.filters.examples import scan_of
 
 pytestmark = pytest.mark.usefixtures('own_registry')
@@ -65,9 +64,9 @@ def test_a_decorated_class_is_found_under_its_name_in_snake_case():
 
 
 def test_a_name_can_be_given_and_taken_once():
-    register(name='odd', theirs='OddDataPointsFilter')(OddRows)
+    register(name='odd', libpointmatcher='OddDataPointsFilter')(OddRows)
     assert find('odd') is find('OddDataPointsFilter') is OddRows
-    with pytest.raises(ConfigError, match=r"filter 'voxel_grid' of .*: .*voxel_grid has one of"):
+    with pytest.raises(ConfigError, match=r"filter 'voxel_grid' of .*: .*grids has one of"):
         register(name='voxel_grid')(OddRows)
     with pytest.raises(ConfigError, match='expected a class derived from'):
         register(Broken)
@@ -100,4 +99,4 @@ def test_a_broken_entry_point_spoils_nothing_but_what_names_it(monkeypatch, capl
 def test_filters_are_listed_sorted_and_once_each():
     names = [cls.name for cls in all_filters()]
     assert names == sorted(set(names))
-    assert len([cls for cls in all_filters() if cls.theirs]) == 31
+    assert len([cls for cls in all_filters() if cls.libpointmatcher]) == 31

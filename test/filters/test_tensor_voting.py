@@ -11,8 +11,7 @@ import pytest
 
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.shapes import as_matrices, PAIRS
-from surfel_mapper.filters.spectral_decomposition import mean_decay
-from surfel_mapper.filters.tensor_voting import Voting
+from surfel_mapper.filters.tensor_voting import mean_decay, Voting
 from test.filters.examples import filter_of, scan_of
 
 SALIENCY, SPECTRAL = 'SaliencyDataPointsFilter', 'SpectralDecompositionDataPointsFilter'

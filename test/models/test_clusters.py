@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
 from surfel_mapper.models import fit
 from surfel_mapper.models.clusters import clusters_of, surfaces_of

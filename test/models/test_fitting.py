@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
 from surfel_mapper.models.kernels.cells import fill_cells
 from surfel_mapper.models.kernels.coverage import cover_parts, cover_places

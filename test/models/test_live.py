@@ -13,7 +13,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
 from test.models.live_scenes import (

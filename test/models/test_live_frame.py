@@ -15,8 +15,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
-from surfel_mapper.config.models_layer import ModelsLayerConfig
+from surfel_mapper.config import ModelsConfig, ModelsLayerConfig
 from surfel_mapper.models import fit
 from test.models.live_scenes import groups, of_points
 from test.models.scenes import BALL, CYLINDER, room, VIEW

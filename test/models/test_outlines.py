@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
 from surfel_mapper.models.kernels.rims import follow_sides, lay_sides, mark_corners
 from surfel_mapper.models.outlines import middles, outline, rings, simplified, TOLERANCE, triangles

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
 from surfel_mapper.models.multi_model import Gaussians
 from surfel_mapper.models.shapes import (

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig, WEIGHT_MODES
+from surfel_mapper.config import TsdfConfig, WEIGHT_MODES
 from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
 from surfel_mapper.tsdf.sensors import Lidar
 from test.tsdf.scenes import fused, image_of, integrator, SMALL, voxels, zero_crossings

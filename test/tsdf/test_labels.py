@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels.labels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
 from surfel_mapper.tsdf.labels import labels_at, labels_of, log_odds

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels.marching_cubes import CASES, edge_between, FACES
 from surfel_mapper.tsdf.mesh import Mesher

@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.obstacles import distance_field, slice_at

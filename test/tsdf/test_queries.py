@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.queries import FREE, OCCUPIED, sample, states, UNKNOWN
 from test.tsdf.scenes import fused, image_of, SMALL, voxels

@@ -4,7 +4,7 @@
 
 import numpy as np
 
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.sensors import Lidar
 from test.tsdf.scenes import image_of, integrator

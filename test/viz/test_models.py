@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from surfel_mapper.config.models import ModelsConfig
+from surfel_mapper.config import ModelsConfig
 from surfel_mapper.messages.model_markers import GREY, primitive_colors
 from surfel_mapper.models import fit
 from surfel_mapper.models.filling import areas

@@ -1,37 +1,88 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which points lie in a box that stands askew to their frame.
+Cut the space of points into boxes that hold few each.
 
-One pass without branches over three arrays, several points at once: 0.1 ms for 131,072 points.
-numpy needs a pass and memory for each of 18 products and sums.
+A box is cut at the middle one of its points across its longest edge, found by partial sorting: 14
+levels for 131,072 points and boxes of 10, and every level touches each point two or three times.
+Points of equal coordinate are told apart by their rows, so that every order of work gives the
+same boxes.
+
+Source: Hoare 1961 (Algorithm 65: find) for the partial sorting.
 """
 
 from numba import njit
 import numpy as np
 
+DEPTH = 64
+"""Boxes that wait to be cut; each cut leaves one waiting, and halves what is cut next."""
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def outside_box(xyz, pose, low, high, is_outside):
-    """
-    Find which points lie outside of a box or on its faces, and which nowhere.
 
-    xyz         (3, N) float32 or float64, m
-    pose        (3, 4) float64, takes points to the frame of the box
-    low, high   (3,) float64, corners of the box, m
-    is_outside  (N,) int8, out: 1 outside, 0 inside, -1 where a nan leaves it open
+@njit(cache=True, nogil=True)
+def cut(points, max_points, order, rows):
     """
-    r00, r01, r02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
-    r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
-    r20, r21, r22, t2 = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
-    lx, ly, lz = low[0], low[1], low[2]
-    hx, hy, hz = high[0], high[1], high[2]
-    all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
-    for i in range(len(all_x)):
-        x, y, z = np.float64(all_x[i]), np.float64(all_y[i]), np.float64(all_z[i])
-        bx = ((r00 * x + r01 * y) + r02 * z) + t0
-        by = ((r10 * x + r11 * y) + r12 * z) + t1
-        bz = ((r20 * x + r21 * y) + r22 * z) + t2
-        within = (bx > lx) & (bx < hx) & (by > ly) & (by < hy) & (bz > lz) & (bz < hz)
-        known = (bx == bx) & (by == by) & (bz == bz)
-        is_outside[i] = (0 if within else 1) if known else -1
+    Cut until no box has more than max_points; return how many boxes.
+
+    points  (N, 3) float64, finite
+    order   (N,) int64, in: 0 to N - 1, out: the points box by box
+    rows    (N,) int64, out: box of every point
+    """
+    spans = np.empty((DEPTH, 2), np.int64)
+    lows, highs = np.empty((DEPTH, 3)), np.empty((DEPTH, 3))
+    spans[0, 0], spans[0, 1] = 0, len(points)
+    for axis in range(3):
+        lows[0, axis], highs[0, axis] = points[:, axis].min(), points[:, axis].max()
+    waiting, number = 1, 0
+    while waiting > 0:
+        box = waiting - 1
+        first, last = spans[box, 0], spans[box, 1]
+        if last - first <= max_points:
+            for i in range(first, last):
+                rows[order[i]] = number
+            number += 1
+            waiting -= 1
+            continue
+        axis = (highs[box] - lows[box]).argmax()
+        middle = last - (last - first) // 2
+        split(points, axis, order, first, last, middle)
+        # the upper part waits in the place of the box, the lower comes next
+        lower = waiting
+        lows[lower], highs[lower] = lows[box], highs[box]
+        spans[lower, 0], spans[lower, 1] = first, middle
+        spans[box, 0] = middle
+        highs[lower, axis] = lows[box, axis] = points[order[middle], axis]
+        waiting += 1
+    return number
+
+
+@njit(cache=True, nogil=True)
+def split(points, axis, order, first, last, middle):
+    """Move order[first:last] about until none before middle comes after one from there on."""
+    low, high = first, last - 1
+    chance = np.uint32(last - first)  # for pivots that no order of the points can foresee
+    while low < high:
+        chance = chance * np.uint32(1664525) + np.uint32(1013904223)
+        pivot = order[low + np.int64(chance >> np.uint32(8)) % (high - low + 1)]
+        at = points[pivot, axis]
+        i, j = low, high
+        while i <= j:
+            while comes_before(points[order[i], axis], order[i], at, pivot):
+                i += 1
+            while comes_before(at, pivot, points[order[j], axis], order[j]):
+                j -= 1
+            if i <= j:
+                order[i], order[j] = order[j], order[i]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
+
+
+@njit(cache=True, nogil=True, inline='always')
+def comes_before(value, row, other_value, other_row):
+    """Return whether a point comes before another along an axis."""
+    return value < other_value or (value == other_value and row < other_row)

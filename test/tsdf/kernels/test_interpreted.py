@@ -7,7 +7,7 @@ from test.kernels.modes import saved_alike
 SHORT_FUSING = """
 import sys
 import numpy as np
-from surfel_mapper.config.tsdf import TsdfConfig
+from surfel_mapper.config import TsdfConfig
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator

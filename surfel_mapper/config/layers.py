@@ -1,0 +1,449 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Settings of the optional layers: distance field, models, dynamic objects and the costs for Nav2.
+
+Defaults of the distance field follow Hydra's ProjectiveIntegrator unless it has a fault. Its
+blocks have 16 voxels a side, ours 8: a band of 2 tau through a block of 16 leaves most of its
+voxels unused, and a lidar scan at 0.2 m takes 1.6 times as long.
+
+Defaults of the models are those of Gao and Dong 2025 except where real sensors and axis-aligned
+buildings break its rules; profile paper restores those. Lengths are in voxels, the unit of the
+method, so that one number suits a table and a hall.
+
+One module of more than 350 lines: a list of settings, with no other code than their checks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import ClassVar
+
+from surfel_mapper.config.settings import setting, Stage
+from surfel_mapper.errors import ConfigError
+
+WEIGHT_MODES = ('constant', 'inverse_square', 'ray_density', 'ray_density_inv_sq')
+DISTANCES = ('along_ray', 'to_plane')
+INTERPOLATIONS = ('nearest', 'bilinear', 'adaptive')
+SEMANTICS = ('none', 'majority', 'first_k', 'single', 'binary')
+
+MAX_LABEL = (1 << 24) - 1
+"""Labels are kept as float32, which holds whole numbers up to here."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TsdfConfig(Stage):
+    """The truncated signed distance field."""
+
+    STAGE: ClassVar[str] = 'layers.tsdf'
+
+    enabled: bool = setting(False, 'Fuse the scans into a signed distance field too.')
+    when_final: bool = setting(
+        False,
+        'Fuse a scan when it leaves the window, after alignments have moved it, not at once.',
+    )
+    sensor_rows: int = setting(
+        0,
+        'Beams of the lidar; 0: estimated from the first scan. Cameras use their camera_info.',
+        low=0,
+        high=4096,
+    )
+    sensor_columns: int = setting(
+        0, 'Azimuth steps of the lidar; 0: estimated from the first scan.', low=0, high=65536
+    )
+    min_range_m: float = setting(
+        0.5, 'Measurements nearer than this are ignored, m.', low=0.001, high=1e3
+    )
+    max_range_m: float = setting(
+        50.0, 'Measurements beyond this only free the space up to it, m.', low=0.01, high=1e5
+    )
+    voxel_size_m: float = setting(0.1, 'Edge of a voxel, m.', low=0.001, high=100.0)
+    voxels_per_side: int = setting(
+        8, 'Voxels along the edge of a block, a power of two.', low=2, high=32
+    )
+    truncation_m: float = setting(
+        0.3,
+        'Distances are kept up to this on both sides of a surface, m; at least two voxels and '
+        'less than half of the thinnest wall.',
+        low=0.001,
+        high=1000.0,
+    )
+    max_blocks: int = setting(
+        0, 'At most this many blocks; 0: no such limit.', low=0, high=2**31 - 1
+    )
+    max_radius_m: float = setting(
+        0.0,
+        'Blocks farther than this from the sensor are dropped, m; 0: no such limit. At least the '
+        'range of the sensor and half the diagonal of a block.',
+        low=0.0,
+        high=1e6,
+    )
+    max_age_s: float = setting(
+        0.0, 'Blocks not updated for longer are dropped, s; 0: no such limit.', low=0.0, high=1e9
+    )
+    allocation: str = setting(
+        'band',
+        'Blocks that a scan updates: band, those its rays cross near a surface; frustum, all in '
+        'view.',
+        choices=('band', 'frustum'),
+    )
+    carve: bool = setting(True, 'Also update the blocks between sensor and surface.')
+    distance: str = setting(
+        'along_ray',
+        'Distance of a voxel from a surface: along_ray; or to_plane, that times the cosine of the '
+        'angle of incidence, which closes the ground far from a lidar.',
+        choices=DISTANCES,
+    )
+    interpolation: str = setting(
+        'adaptive', 'Interpolation of the range image.', choices=INTERPOLATIONS
+    )
+    max_difference_m: float = setting(
+        0.2, 'Adaptive: pixels that differ by more are not interpolated, m.', low=0.0, high=1e6
+    )
+    max_difference_ratio: float = setting(
+        0.0,
+        'Adaptive: nor those that differ by more than this share of the range.',
+        low=0.0,
+        high=10.0,
+    )
+    max_ray_offset_voxels: float = setting(
+        0.5,
+        'Lidar: if pixels are not interpolated, voxels farther than this from the ray of their '
+        'nearest pixel are not updated, in voxels; 0: no such limit.',
+        low=0.0,
+        high=1e6,
+    )
+    weight_mode: str = setting(
+        'inverse_square',
+        'Weight of a measurement: constant, 1; inverse_square, 1/depth^2; ray_density, rays per '
+        'voxel face; ray_density_inv_sq, that over depth^2.',
+        choices=WEIGHT_MODES,
+    )
+    weight_dropoff: bool = setting(True, 'Weights fall linearly to zero behind a surface.')
+    dropoff_m: float = setting(
+        0.0,
+        'Distance behind the surface at which weights start to fall, m; less than truncation_m; '
+        '0: one voxel.',
+        low=0.0,
+        high=1e3,
+    )
+    min_measurement_weight: float = setting(
+        1e-4, 'Least weight of a measurement.', low=0.0, high=1e6
+    )
+    max_weight: float = setting(
+        1e5,
+        'Largest weight of a voxel; the smaller, the faster it forgets: a measurement of weight w '
+        'then counts w / (max_weight + w).',
+        low=1e-6,
+        high=1e9,
+    )
+    extra_distance_m: float = setting(
+        0.0, 'Depth behind the band in which voxels take -truncation_m, m.', low=0.0, high=1e3
+    )
+    extra_labels: tuple[float, ...] = setting((), 'Labels whose voxels take it; empty: all.')
+    skip_extra_channels: bool = setting(
+        False, 'Write neither colours nor labels to voxels behind the band.'
+    )
+    color: bool = setting(False, 'Keep a colour for each voxel.')
+    color_topic: str = setting(
+        '',
+        'Topic of images that colour points without a colour; empty: none. Images of a depth '
+        'camera match its depth pixel by pixel; for a lidar their camera_info is read too.',
+    )
+    label_topic: str = setting(
+        '', 'Topic of images of labels, 8 or 16 bits or 32SC1; empty: none.'
+    )
+    image_tolerance_s: float = setting(
+        0.02,
+        'An image belongs to a scan if their stamps differ by no more, s.',
+        low=0.0,
+        high=10.0,
+    )
+    tracking: bool = setting(False, 'Keep the first and last stamp of every voxel.')
+    semantics: str = setting(
+        'none',
+        'How labels are fused: majority of counts; weights of the first_k labels; one label by '
+        'weighted majority vote; binary, label 0 against all others.',
+        choices=SEMANTICS,
+    )
+    num_labels: int = setting(0, 'Majority: labels are 0 to num_labels - 1.', low=0, high=4096)
+    first_k: int = setting(5, 'first_k: labels kept for each voxel.', low=1, high=64)
+    min_label_weight: float = setting(
+        0.0, 'first_k: the heaviest label must exceed this weight.', low=0.0, high=1e9
+    )
+    dynamic_labels: tuple[float, ...] = setting(
+        (), 'Labels of moving objects: they free space and leave no surface.'
+    )
+    invalid_labels: tuple[float, ...] = setting(
+        (), 'Labels treated in the same way: sky, the robot.'
+    )
+    mesh_rate_hz: float = setting(
+        1.0,
+        'Rate of ~/mesh, Hz, while it has subscribers; 0: never.',
+        low=0.0,
+        high=100.0,
+        live=True,
+    )
+    slice_rate_hz: float = setting(
+        0.0, 'Rate of ~/tsdf_slice, Hz; 0: never.', low=0.0, high=100.0, live=True
+    )
+    slice_height_m: float = setting(
+        0.5, 'Height of ~/tsdf_slice in the fixed frame, m.', low=-1e5, high=1e5, live=True
+    )
+    mesh_min_weight: float = setting(
+        1e-4, 'The mesh uses voxels of at least this weight.', low=0.0, high=1e9
+    )
+    mesh_max_step_voxels: float = setting(
+        0.0,
+        'The mesh has no faces where distances of neighbours across the surface differ by more, '
+        'in voxels, as at the edge of a shadow; 0: no such limit. For to_plane: the truncation '
+        'and 1.25 voxels.',
+        low=0.0,
+        high=1e3,
+    )
+    threads: int = setting(0, 'Threads; 0: one for each core.', low=0, high=1024)
+
+    def check(self, stage: str) -> None:
+        """Check conditions on several settings."""
+        side = self.voxels_per_side
+        checks = (
+            ('voxels_per_side', side & (side - 1) == 0, 'a power of two'),
+            (
+                'dropoff_m',
+                not self.weight_dropoff or self.dropoff_start_m < self.truncation_m,
+                f'less than truncation_m = {self.truncation_m}; 0 stands for one voxel, '
+                f'{self.voxel_size_m}',
+            ),
+            (
+                'skip_extra_channels',
+                not (self.skip_extra_channels and self.extra_labels),
+                'false where extra_labels are given',
+            ),
+            (
+                'max_range_m',
+                self.max_range_m > self.min_range_m,
+                f'more than min_range_m = {self.min_range_m}',
+            ),
+            ('color', self.color or not self.color_topic, 'true where color_topic is given'),
+            (
+                'semantics',
+                self.semantics != 'none' or not self.label_topic,
+                'another where label_topic is given',
+            ),
+            ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
+        )
+        for name, holds, expected in checks:
+            if not holds:
+                raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
+        for name in ('extra_labels', 'dynamic_labels', 'invalid_labels'):
+            for label in getattr(self, name):
+                if not (label.is_integer() and 0 <= label <= MAX_LABEL):
+                    raise ConfigError(
+                        f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
+                    )
+
+    @property
+    def image_topics(self) -> dict[str, str]:
+        """Topics of the images joined with the scans, by kind: color, label."""
+        topics = {'color': self.color_topic, 'label': self.label_topic}
+        return {kind: topic for kind, topic in topics.items() if topic and self.enabled}
+
+    @property
+    def block_size_m(self) -> float:
+        """Edge of a block."""
+        return self.voxel_size_m * self.voxels_per_side
+
+    @property
+    def dropoff_start_m(self) -> float:
+        """Distance behind a surface at which weights start to fall, m."""
+        return self.dropoff_m or self.voxel_size_m
+
+    @property
+    def reach_behind_m(self) -> float:
+        """Distance behind a surface up to which voxels change, m."""
+        return self.truncation_m + self.extra_distance_m
+
+    @property
+    def mesh_max_step_m(self) -> float:
+        """Largest difference of the distances of neighbouring voxels in the mesh, m; inf: any."""
+        return self.mesh_max_step_voxels * self.voxel_size_m or math.inf
+
+    @property
+    def votes_per_voxel(self) -> int:
+        """Numbers that a voxel keeps for its label."""
+        widths = {'majority': self.num_labels, 'first_k': 2 * self.first_k}
+        return widths.get(self.semantics, 0 if self.semantics == 'none' else 2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelsConfig(Stage):
+    """Planes, B-spline surfaces and Gaussians."""
+
+    STAGE: ClassVar[str] = 'models'
+
+    voxel_size_m: float = setting(
+        0.04, 'Points are thinned to one per voxel of this edge, m.', low=0.001, high=10.0
+    )
+    profile: str = setting(
+        'robust',
+        'robust: rules that allow for noise, outliers, bends and any direction; paper: the rules '
+        'of the paper unchanged.',
+        choices=('robust', 'paper'),
+    )
+    kinds: str = setting(
+        'all',
+        'all: planes, surfaces and Gaussians; gaussians: every cluster is a Gaussian.',
+        choices=('all', 'gaussians'),
+    )
+    max_mixture_points: int = setting(
+        200,
+        'Clusters of more points are split by 2-means, others by two Gaussians.',
+        low=4,
+        high=100_000,
+    )
+    min_points: int = setting(40, 'Clusters of fewer points are not split.', low=4, high=100_000)
+    min_surface_points: int = setting(
+        20, 'Planes and surfaces of fewer points become Gaussians.', low=1, high=100_000
+    )
+    plane_pitch_voxels: float = setting(
+        4.0, 'Edge of the cells of the outline of a plane, in voxels.', low=2.5, high=100.0
+    )
+    min_density_radius: float = setting(
+        2.0, 'Least density of a flat cluster; a full sheet has 2.', low=0.1, high=2.4
+    )
+    outlier_share: float = setting(
+        0.02, 'Largest share of the points of a flat cluster beyond 3 sigma.', low=0.0, high=1.0
+    )
+    max_angle_deg: float = setting(
+        15.0, 'Angle between normals of clusters on one plane, at most, deg.', low=0.1, high=89.0
+    )
+    max_offset_voxels: float = setting(
+        1.0, 'Offset between clusters on one plane, at most, in voxels.', low=0.01, high=100.0
+    )
+    arc_angle_deg: float = setting(
+        30.0, 'Angle between normals of neighbours on one arc, at most, deg.', low=0.1, high=89.0
+    )
+    arc_offset_voxels: float = setting(
+        0.5,
+        'Distance of their middles from a common arc, at most, in voxels.',
+        low=0.01,
+        high=100.0,
+    )
+    fold_angle_deg: float = setting(
+        60.0, 'A surface that bends farther from its mean normal is cut, deg.', low=1.0, high=89.0
+    )
+    noise_m: float = setting(
+        0.0, 'Noise of the sensor at range 0, sigma, m (lidar: 0.02).', low=0.0, high=1.0
+    )
+    noise_per_range_sq: float = setting(
+        0.0, 'Noise that grows with range^2, 1/m (Kinect: 0.001425).', low=0.0, high=1.0
+    )
+    degree: int = setting(3, 'Degree of the splines.', low=1, high=5)
+    smoothing: float = setting(
+        1e-2, 'Weight of the second differences of the control points.', low=1e-9, high=1e6
+    )
+    solver: str = setting(
+        'pspline',
+        'pspline: smooth across holes; lsqr: least change of the initial control points.',
+        choices=('pspline', 'lsqr'),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelsLayerConfig(Stage):
+    """Planes, B-spline surfaces and Gaussians of the voxels of the map, as it changes."""
+
+    STAGE: ClassVar[str] = 'layers.models'
+
+    enabled: bool = setting(
+        False, 'Keep planes, B-spline surfaces and Gaussians of the map up to date.'
+    )
+    extract_period_s: float = setting(
+        1.0,
+        'Time between updates of the models, by the stamps of the scans, s; 0: after every scan.',
+        low=0.0,
+        high=1e6,
+    )
+    min_points: int = setting(
+        10, 'Voxels of fewer points are not used yet.', low=3, high=1_000_000
+    )
+    flat_thickness_m: float = setting(
+        0.0,
+        'A voxel is flat if 6 sigma along its normal are less, m; 0: a fifth of its edge, 0.02 at '
+        'least.',
+        low=0.0,
+        high=10.0,
+    )
+    noise_m: float = setting(
+        0.0, 'Noise of the sensor, sigma, m, allowed on top of the thickness.', low=0.0, high=1.0
+    )
+    max_angle_deg: float = setting(
+        15.0, 'Angle between normals of neighbours on one plane, at most, deg.', low=0.1, high=89.0
+    )
+    arc_angle_deg: float = setting(
+        30.0, 'Angle between normals of neighbours on one arc, at most, deg.', low=0.1, high=89.0
+    )
+    fold_angle_deg: float = setting(
+        60.0, 'A surface that bends farther from its mean normal is cut, deg.', low=1.0, high=89.0
+    )
+    reach_voxels: int = setting(
+        1, 'Largest distance of neighbours, in voxels; 2 for lidars of few beams.', low=1, high=2
+    )
+    min_voxels: int = setting(
+        4, 'Planes and surfaces of fewer voxels become Gaussians.', low=1, high=100_000
+    )
+    absorb: bool = setting(
+        True, 'Voxels with few points and rough ones join the flat neighbour that they lie on.'
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DynamicConfig(Stage):
+    """Clearing of voxels that later rays pass through."""
+
+    clear: bool = setting(False, 'Remove voxels of the surfel map that later scans see through.')
+    min_scans: int = setting(
+        5,
+        'Remove a voxel after this many scans saw through it without one hitting it.',
+        low=1,
+        high=10**6,
+    )
+    margin_m: float = setting(
+        0.0,
+        'A ray passes through a voxel if it ends farther than this behind its centre, m; 0: the '
+        'diagonal of a voxel.',
+        low=0.0,
+        high=1e3,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GridConfig(Stage):
+    """The nav_msgs/OccupancyGrid on ~/grid."""
+
+    rate_hz: float = setting(0.0, 'Rate of ~/grid, Hz; 0: never.', low=0.0, high=100.0, live=True)
+    size_m: float = setting(
+        100.0,
+        'Edge of the grid, with the sensor in its middle, m.',
+        low=1.0,
+        high=4000.0,
+        live=True,
+    )
+    max_slope_deg: float = setting(
+        30.0, 'Steeper ground is an obstacle, deg.', low=1.0, high=90.0, live=True
+    )
+    max_step_m: float = setting(
+        0.25,
+        'Largest height difference between neighbouring cells that is no obstacle, m.',
+        low=0.01,
+        high=100.0,
+        live=True,
+    )
+    clearance_m: float = setting(
+        2.0,
+        'Obstacles higher above the ground of their cell than this are ignored, m.',
+        low=0.0,
+        high=1000.0,
+        live=True,
+    )
