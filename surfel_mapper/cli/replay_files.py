@@ -100,8 +100,7 @@ def write_files(
     from surfel_mapper.files.atomic import write_json
     from surfel_mapper.files.ply import write_mesh
     from surfel_mapper.models.shapes import Shapes
-    from surfel_mapper.viz.models import page_mesh
-    from surfel_mapper.viz.models_section import models_section
+    from surfel_mapper.viz.models import models_section, page_mesh
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
-from surfel_mapper.tsdf.block_content import block_keys, Blocks
-from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
 
 KIND = 'tsdf'
 SHAPE = (

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.fitting import fitted_lidar
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 
 class SensorModels:
@@ -29,9 +29,9 @@ class SensorModels:
     def __init__(self, config: TsdfConfig) -> None:
         """Know none."""
         self._config = config
-        self._lidars: dict[str, Lidar] = {}
+        self._lidars: dict[str, LidarModel] = {}
 
-    def of(self, scan: Scan) -> Camera | Lidar:
+    def of(self, scan: Scan) -> CameraModel | LidarModel:
         """
         Return the sensor of a scan: its camera, else the lidar that the first of its frame shows.
 
@@ -45,7 +45,7 @@ class SensorModels:
         ranges = {'min_range_m': config.min_range_m, 'max_range_m': config.max_range_m}
         if scan.camera:
             width, height, fx, fy, cx, cy = scan.camera
-            return Camera(
+            return CameraModel(
                 columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **ranges
             )
         if scan.frame_id not in self._lidars:

@@ -3,7 +3,7 @@
 """
 BlockMap: the voxels of a TSDF in cubes of M x M x M, found by hash.
 
-Blocks stand in the rows of arrays, see block_arrays.py, which a hash table knows. A row is reused
+Blocks stand in the rows of arrays, see blocks.py, which a hash table knows. A row is reused
 when its block has left; one that is not in use is zero but for its head.
 
 ``version`` counts the changes of the map; whoever follows them keeps the version that he has seen
@@ -13,6 +13,7 @@ flagged updated, and stays when the window moves on.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,13 +21,13 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.layout import INDEX_OFFSET, KEY
+from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
 from surfel_mapper.mapping.hash_table import HashTable
-from surfel_mapper.tsdf.block_arrays import BlockArrays
-from surfel_mapper.tsdf.block_content import block_index, block_keys, Blocks
+from surfel_mapper.mapping.slab import Slab
 from surfel_mapper.tsdf.kernels.blocks import (
     find_blocks,
     FREE,
+    HEAD,
     NEW,
     place_blocks,
     remove_blocks,
@@ -35,6 +36,158 @@ from surfel_mapper.tsdf.kernels.blocks import (
 )
 
 Int64 = npt.NDArray[np.int64]
+Float32 = npt.NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Blocks:
+    """
+    Content of some blocks, taken out of a map or about to be put into one.
+
+    Attributes
+    ----------
+    index : (K, 3) int64
+        Which blocks.
+    stamp_ns : (K,) int64
+        Stamp of the last change of each.
+    field, color, votes, stamps
+        As in BlockMap, one row a block.
+
+    """
+
+    index: Int64
+    stamp_ns: Int64
+    field: Float32
+    color: Float32
+    votes: Float32
+    stamps: Int64
+
+    def __len__(self) -> int:
+        """Return how many blocks."""
+        return len(self.index)
+
+
+def some(array: npt.NDArray[Any], rows: Int64) -> Any:
+    """Return a copy of some rows, or of none where the channel is not kept."""
+    return array[rows] if len(array) else array.copy()
+
+
+def block_keys(index: npt.NDArray[Any]) -> Int64:
+    """Return the keys of blocks, (...,) int64; -1 for an index beyond 20 bits."""
+    place = index.astype(np.int64) + INDEX_OFFSET
+    within = ((place >= 0) & (place <= INDEX_MASK)).all(axis=-1)
+    x, y, z = (place[..., axis] for axis in range(3))
+    keys: Int64 = np.where(within, x << 2 * INDEX_BITS | y << INDEX_BITS | z, -1)
+    return keys
+
+
+def block_index(keys: Int64) -> Int64:
+    """Return the blocks that keys stand for, (..., 3) int64."""
+    shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
+    index: Int64 = (keys[..., None] >> shifts & INDEX_MASK) - INDEX_OFFSET
+    return index
+
+
+FIRST_ROWS = 128
+"""Rows to begin with; any slab of so many is whole pages."""
+
+
+class BlockArrays:
+    """
+    A row for each block, in as many arrays as the configuration asks for.
+
+    Parameters
+    ----------
+    config : TsdfConfig
+        Voxels per side, and what a voxel keeps.
+
+    """
+
+    def __init__(self, config: TsdfConfig) -> None:
+        """Make rows that are not in use."""
+        self.config = config
+        voxels = self.voxels_per_block
+        widths = {  # in int64
+            'head': HEAD,
+            'field': voxels,
+            'color': 2 * voxels * config.color,
+            'votes': config.votes_per_voxel * voxels // 2,
+            'stamps': 2 * voxels * config.tracking,
+        }
+        self._slabs = {name: Slab(FIRST_ROWS, width) for name, width in widths.items() if width}
+        self._row_bytes = 8 * sum(widths.values())
+
+    @property
+    def voxels_per_block(self) -> int:
+        """N, the number of voxels in a block."""
+        return self.config.voxels_per_side**3
+
+    @property
+    def head(self) -> Int64:
+        """Key, version and stamp of each row, (R, 4); only until the map grows."""
+        return self._slabs['head'].array[:, :HEAD]
+
+    @property
+    def field(self) -> Float32:
+        """Distance and weight, (R, 2, N); only until the map grows."""
+        return self._floats('field', 2)
+
+    @property
+    def distance(self) -> Float32:
+        """Signed distances, (R, N) m, a view of field."""
+        return self.field[:, 0]
+
+    @property
+    def weight(self) -> Float32:
+        """Weights, (R, N), 0 where never observed, a view of field."""
+        return self.field[:, 1]
+
+    @property
+    def color(self) -> Float32:
+        """Colours and their weights, (R, 4, N), or no rows."""
+        return self._floats('color', 4)
+
+    @property
+    def votes(self) -> Float32:
+        """Votes for labels, (R, V, N), or no rows."""
+        return self._floats('votes', self.config.votes_per_voxel)
+
+    @property
+    def stamps(self) -> Int64:
+        """First and last stamps, (R, 2, N) ns, or no rows."""
+        if 'stamps' not in self._slabs:
+            return np.empty((0, 2, self.voxels_per_block), np.int64)
+        return self._slabs['stamps'].array.reshape(-1, 2, self.voxels_per_block)
+
+    def _floats(self, name: str, width: int) -> Float32:
+        if name not in self._slabs:
+            return np.empty((0, width, self.voxels_per_block), np.float32)
+        flat = self._slabs[name].array.view(np.float32)
+        return flat.reshape(-1, width, self.voxels_per_block)
+
+    def _copied(self, rows: Int64) -> dict[str, npt.NDArray[Any]]:
+        """Return a copy of what some rows hold beside their head, by name."""
+        names = ('field', 'color', 'votes', 'stamps')
+        return {name: some(getattr(self, name), rows) for name in names}
+
+    def _write(self, rows: Int64, blocks: Blocks) -> None:
+        """Put the content of blocks into rows, but for their head."""
+        for name in self._slabs.keys() - {'head'}:
+            getattr(self, name)[rows] = getattr(blocks, name)
+
+    def _wipe(self, rows: Int64) -> None:
+        """Make rows zero, but for their head."""
+        for name, slab in self._slabs.items():
+            if name != 'head':
+                slab.array[rows] = 0
+
+    def _grow(self) -> None:
+        """Make room for twice as many rows."""
+        num_rows = len(self.head)
+        for slab in reversed(self._slabs.values()):  # the head, which says how many, last
+            if len(slab.array) < 2 * num_rows:
+                slab.grow(2 * num_rows)
+
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries."""

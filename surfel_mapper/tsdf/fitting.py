@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 
 USUAL_ROWS = 64
 """Beams where nothing tells how many there are."""
@@ -38,7 +38,7 @@ def fitted_lidar(
     columns: int = 0,
     min_range_m: float,
     max_range_m: float,
-) -> Lidar:
+) -> LidarModel:
     """
     Return a lidar that looks all around and has measured these points.
 
@@ -51,7 +51,7 @@ def fitted_lidar(
     rows, columns : int
         Beams and steps of azimuth; 0: as the points show.
     min_range_m, max_range_m : float
-        As in Lidar.
+        As in LidarModel.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def fitted_lidar(
         beams = beam_elevations(elevations, ring[known])
         fullest = int(np.unique(ring, return_counts=True)[1].max())
         if len(beams) > 1:
-            return Lidar(
+            return LidarModel(
                 rows=len(beams),
                 columns=columns or min(max(fullest, 2), MAX_COLUMNS),
                 beam_elevations_deg=tuple(beams.tolist()),
@@ -80,7 +80,7 @@ def fitted_lidar(
                 max_range_m=max_range_m,
             )
     rows = rows or USUAL_ROWS
-    return Lidar(
+    return LidarModel(
         rows=rows,
         columns=columns or min(max(-(-len(points) // rows), 2), MAX_COLUMNS),
         vertical_fov_deg=float(np.ptp(elevations)),

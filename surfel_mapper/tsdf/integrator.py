@@ -27,7 +27,7 @@ from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.kernels.integration import integrate_blocks
 from surfel_mapper.tsdf.range_image import RangeImage
 from surfel_mapper.tsdf.selection import BlockSelection, NO_COSINE, reach_behind_m
-from surfel_mapper.tsdf.sensors import Lidar, Sensor
+from surfel_mapper.tsdf.sensors import LidarModel, Sensor
 
 logger = logging.getLogger(__name__)
 
@@ -238,7 +238,7 @@ POWERS = {'constant': 0, 'inverse_square': 1, 'ray_density': 1, 'ray_density_inv
 
 def settings(config: TsdfConfig, image: RangeImage) -> Float32:
     """Return the numbers that the kernel takes, in its order."""
-    sensor, is_lidar = image.sensor, isinstance(image.sensor, Lidar)
+    sensor, is_lidar = image.sensor, isinstance(image.sensor, LidarModel)
     found = np.zeros(kernels.NUM_SETTINGS, np.float32)
     found[kernels.TAU] = config.truncation_m
     found[kernels.EXTRA] = config.extra_distance_m

@@ -11,6 +11,7 @@ where it is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -133,3 +134,93 @@ def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.f
         raise ValueError(f'points: {places.shape}, expected (P, 3)')
     bits = blocks.config.voxels_per_side.bit_length() - 1
     return places / blocks.config.voxel_size_m, bits
+
+
+Float32 = npt.NDArray[np.float32]
+
+
+def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:
+    """
+    Return the labels of the voxels that points lie in, and their weights.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        A map that keeps labels (``semantics``).
+    points : (P, 3) float
+        In the map frame, m.
+
+    Returns
+    -------
+    (P,) int32 and (P,) float32
+        As ``labels_of`` has them; -1 and 0 where the map has no voxel.
+
+    Raises
+    ------
+    ValueError
+        If points are of another shape, or the map keeps no labels.
+
+    """
+    config = blocks.config
+    if config.semantics == 'none':
+        raise ValueError("semantics: 'none', expected a map that keeps labels")
+    places, bits = in_voxels(blocks, points)
+    near = np.abs(places).max(axis=1) < 1e12  # false for nan; farther there are no blocks
+    voxel = np.floor(np.where(near[:, None], places, 0.0)).astype(np.int64)
+    rows = np.where(near, blocks.find(voxel >> bits), -1)
+    x, y, z = (voxel & ((1 << bits) - 1)).T
+    votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]
+    votes[rows < 0] = 0.0  # as in a voxel that was never labelled
+    return labels_of(config.semantics, votes.T, min_weight=config.min_label_weight)
+
+
+def labels_of(
+    semantics: str, votes: Float32, *, min_weight: float = 0.0
+) -> tuple[npt.NDArray[np.int32], Float32]:
+    """
+    Return the label of each voxel, and its weight.
+
+    Parameters
+    ----------
+    semantics : str
+        As in the configuration.
+    votes : (V, ...) float32
+        Of voxels, see tsdf/kernels/channels.py.
+    min_weight : float
+        first_k: a label counts if it weighs more.
+
+    Returns
+    -------
+    (...) int32
+        -1 where there is none; on a tie the smaller one, of the first k that seen first.
+    (...) float32
+        How often it was seen (majority, binary), its weight (first_k), or its lead (single).
+
+    """
+    if semantics in ('majority', 'binary'):
+        label, weight = votes.argmax(axis=0), votes.max(axis=0)
+        return np.where(weight > 0.0, label, -1).astype(np.int32), weight
+    if semantics == 'single':
+        return votes[0].astype(np.int32) - 1, votes[1]
+    best = votes[1::2].argmax(axis=0)[None]
+    label = np.take_along_axis(votes[::2], best, axis=0)[0]
+    weight = np.take_along_axis(votes[1::2], best, axis=0)[0]
+    return np.where(weight > min_weight, label - 1, -1).astype(np.int32), weight
+
+
+def log_odds(votes: Float32, confidence: float) -> Float32:
+    """
+    Return the log-likelihoods of labels but for a constant, from counts, (V, ...).
+
+    Parameters
+    ----------
+    votes : (V, ...) float32
+        Counts of the majority.
+    confidence : float
+        How likely a label seen is right, in (0, 1); each of the others has the rest.
+
+    """
+    if not 0.0 < confidence < 1.0:
+        raise ValueError(f'confidence: {confidence}, expected more than 0 and less than 1')
+    odds: Float32 = votes * np.float32(math.log(confidence / (1.0 - confidence)))
+    return odds

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.kernels import range_image as kernels
-from surfel_mapper.tsdf.sensors import Camera, Sensor
+from surfel_mapper.tsdf.sensors import CameraModel, Sensor
 
 Float32 = npt.NDArray[np.float32]
 
@@ -39,7 +39,7 @@ class RangeImage:
 
     Attributes
     ----------
-    sensor : Camera or Lidar
+    sensor : CameraModel or LidarModel
         Of which the pixels are.
     range_m : (rows, columns or one more) float32
         Length of each ray; 0: unknown; more than max_range_m: nothing up to there.
@@ -135,7 +135,7 @@ class RangeImage:
 
 
 def from_depth(
-    sensor: Camera,
+    sensor: CameraModel,
     depth: npt.NDArray[Any],
     *,
     scale: float | None = None,
@@ -146,7 +146,7 @@ def from_depth(
 
     Parameters
     ----------
-    sensor : Camera
+    sensor : CameraModel
         Which took it.
     depth : (rows, columns) float32, float64 or uint16
         Along z; in metres if float, 0, negative and nan: unknown, inf: nothing up to max_range_m;
@@ -196,7 +196,7 @@ def from_points(
 
     Parameters
     ----------
-    sensor : Camera or Lidar
+    sensor : CameraModel or LidarModel
         Which measured them.
     points : (N, 3) float32 or float64
         In its frame, m; those not finite or out of view are left out.
@@ -234,7 +234,7 @@ def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
 
     Parameters
     ----------
-    sensor : Camera or Lidar
+    sensor : CameraModel or LidarModel
         Which measured them, rows from the highest beam to the lowest.
     range_m : (rows, columns) float
         Length of each ray; 0, negative and nan: unknown; inf: nothing up to max_range_m.

@@ -1,10 +1,367 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sensors: which ray each pixel of a range image stands for."""
+"""
+Projection models of the sensors: which ray each pixel of a range image stands for.
 
-from surfel_mapper.tsdf.camera import Camera
-from surfel_mapper.tsdf.lidar import Lidar
+Camera: x right, y down, z ahead. An integer pixel (column u, row v) is the ray through (u, v),
+without half-pixel offsets, both when a range image is made and when it is read.
 
-__all__ = ['Camera', 'Lidar', 'Sensor']
+Lidar: x ahead, y left, z up; rows from the highest beam to the lowest, columns clockwise seen from
+above. With a field of view of 360 deg the last column is the neighbour of the first.
 
-Sensor = Camera | Lidar
+One module: both models share their checks, and the kernels take either (kernels/projection.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+import itertools
+import math
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.kernels.projection import CAMERA, LIDAR, LIDAR_TABLE
+
+Check = tuple[str, bool, str]
+"""A property, whether it is as it has to be, and how that is."""
+
+MAX_PIXELS = 1 << 26
+
+
+class Ranging(Protocol):
+    """What every sensor has."""
+
+    @property
+    def rows(self) -> int:
+        """Rows of its images."""
+
+    @property
+    def columns(self) -> int:
+        """Columns of its images."""
+
+    @property
+    def min_range_m(self) -> float:
+        """What is nearer is ignored."""
+
+    @property
+    def max_range_m(self) -> float:
+        """What is farther says that there is nothing up to here."""
+
+
+def refuse_unless(sensor: object, checks: Iterable[Check]) -> None:
+    """Raise ConfigError for the first property that does not hold."""
+    for name, holds, expected in checks:
+        if not holds:
+            kind = type(sensor).__name__
+            raise ConfigError(f'{kind}.{name}: {getattr(sensor, name)}, expected {expected}')
+
+
+def range_checks(sensor: Ranging) -> list[Check]:
+    """Return the checks of what all sensors have."""
+    return [
+        ('rows', sensor.rows >= 1, 'at least 1'),
+        ('columns', sensor.columns >= 1, 'at least 1'),
+        ('columns', sensor.rows * sensor.columns <= MAX_PIXELS, f'at most {MAX_PIXELS} pixels'),
+        ('min_range_m', 0.0 < sensor.min_range_m < math.inf, 'positive, finite'),
+        (
+            'max_range_m',
+            sensor.min_range_m < sensor.max_range_m < math.inf,
+            'more than min_range_m, finite',
+        ),
+    ]
+
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CameraModel:
+    """
+    A pinhole camera that measures depth.
+
+    Attributes
+    ----------
+    columns, rows : int
+        Size of its images.
+    fx, fy, cx, cy : float
+        Intrinsics, pixels.
+    min_range_m, max_range_m : float
+        What is nearer is ignored; what is farther says that there is nothing up to max_range_m.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of bounds.
+
+    """
+
+    columns: int
+    rows: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    min_range_m: float = 0.1
+    max_range_m: float = 8.0
+
+    wraps = False
+    kind = CAMERA
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        checks = [
+            *range_checks(self),
+            ('fx', 0.0 < self.fx < math.inf, 'positive, finite'),
+            ('fy', 0.0 < self.fy < math.inf, 'positive, finite'),
+            ('cx', 0.0 < self.cx <= self.columns, 'positive, at most the number of columns'),
+            ('cy', 0.0 < self.cy <= self.rows, 'positive, at most the number of rows'),
+        ]
+        refuse_unless(self, checks)
+
+    @cached_property
+    def ray_length(self) -> Float32:
+        """Range of each pixel at depth 1, (rows, columns)."""
+        x = (np.arange(self.columns) - self.cx) / self.fx
+        y = (np.arange(self.rows) - self.cy) / self.fy
+        length: Float32 = np.asarray(np.sqrt(x * x + (y * y)[:, None] + 1.0), np.float32)
+        return length
+
+    @cached_property
+    def directions(self) -> Float32:
+        """Unit vector of each pixel, (rows, columns, 3)."""
+        rays = np.empty((self.rows, self.columns, 3))
+        rays[:, :, 0] = (np.arange(self.columns) - self.cx) / self.fx
+        rays[:, :, 1] = ((np.arange(self.rows) - self.cy) / self.fy)[:, None]
+        rays[:, :, 2] = 1.0
+        rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+        return rays.astype(np.float32)
+
+    @cached_property
+    def parameters(self) -> Float32:
+        """What the kernels need to project, see kernels/projection.py."""
+        return np.array(
+            [self.fx, self.fy, self.cx, self.cy, self.columns, self.rows, 0.0, 0.0], np.float32
+        )
+
+    @cached_property
+    def elevations(self) -> Float32:
+        """Nothing: rows of a camera are not at one elevation."""
+        return np.zeros(0, np.float32)
+
+    @property
+    def projection(self) -> tuple[Any, ...]:
+        """What the kernels take: kind, parameters, elevations."""
+        return self.kind, self.parameters, self.elevations
+
+    @property
+    def density(self) -> float:
+        """Rays that a face of 1 m^2 at depth 1 m meets."""
+        return self.fx * self.fy
+
+    @property
+    def pitch_rad(self) -> tuple[float, float]:
+        """Largest angles between neighbouring rows and columns."""
+        return 1.0 / self.fy, 1.0 / self.fx
+
+    def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
+        """Return which balls about (K, 3) centres in its frame reach into its view."""
+        corners = [(0.0, 0.0), (self.columns, 0.0), (self.columns, self.rows), (0.0, self.rows)]
+        rays = np.array(
+            [((u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0) for u, v in corners]
+        )
+        normals = np.cross(rays, np.roll(rays, -1, axis=0))
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        within = centres[:, 2] >= -inflation_m
+        inside: npt.NDArray[np.bool_] = within & (centres @ normals.T >= -inflation_m).all(axis=1)
+        return inside
+
+
+@dataclass(frozen=True, kw_only=True)
+class LidarModel:
+    """
+    A spinning lidar.
+
+    Attributes
+    ----------
+    rows : int
+        Beams; as many as beam_elevations_deg where those are given.
+    columns : int
+        Steps of azimuth.
+    vertical_fov_deg : float
+        Angle between the highest and the lowest beam.
+    vertical_fov_top_deg : float
+        Elevation of the highest beam; nan: half of vertical_fov_deg.
+    horizontal_fov_deg : float
+        360 for all around, otherwise the angle between the first and the last column.
+    first_azimuth_deg : float
+        Azimuth of column 0, counted from x to y; nan: half of horizontal_fov_deg.
+    beam_elevations_deg : tuple of float
+        Elevation of each beam from the highest to the lowest, where they are not evenly spaced.
+    min_range_m, max_range_m : float
+        What is nearer is ignored; what is farther says that there is nothing up to max_range_m.
+
+    Raises
+    ------
+    ConfigError
+        If a value is out of bounds.
+
+    """
+
+    rows: int = 64
+    columns: int = 2048
+    vertical_fov_deg: float = 45.0
+    vertical_fov_top_deg: float = math.nan
+    horizontal_fov_deg: float = 360.0
+    first_azimuth_deg: float = math.nan
+    beam_elevations_deg: tuple[float, ...] = ()
+    min_range_m: float = 0.5
+    max_range_m: float = 100.0
+
+    def __post_init__(self) -> None:
+        """Check every value; missing angles follow from the others."""
+        beams = tuple(float(value) for value in self.beam_elevations_deg)
+        object.__setattr__(self, 'beam_elevations_deg', beams)
+        if beams:
+            object.__setattr__(self, 'vertical_fov_top_deg', beams[0])
+            object.__setattr__(self, 'vertical_fov_deg', beams[0] - beams[-1])
+        if math.isnan(self.vertical_fov_top_deg):
+            object.__setattr__(self, 'vertical_fov_top_deg', self.vertical_fov_deg / 2.0)
+        if math.isnan(self.first_azimuth_deg):
+            object.__setattr__(self, 'first_azimuth_deg', self.horizontal_fov_deg / 2.0)
+        top, bottom = self.vertical_fov_top_deg, self.vertical_fov_top_deg - self.vertical_fov_deg
+        descends = all(high > low for high, low in itertools.pairwise(beams))
+        checks = [
+            *range_checks(self),
+            ('beam_elevations_deg', len(beams) in (0, self.rows), 'one for each row'),
+            ('beam_elevations_deg', descends, 'descending'),
+            ('rows', self.rows >= 2, 'at least 2 beams'),
+            ('columns', self.columns >= 2, 'at least 2'),
+            ('vertical_fov_deg', 0.0 < self.vertical_fov_deg < 180.0, 'between 0 and 180'),
+            ('vertical_fov_top_deg', bottom > -90.0 and top < 90.0, 'beams between -90 and 90'),
+            ('horizontal_fov_deg', 0.0 < self.horizontal_fov_deg <= 360.0, 'in (0, 360]'),
+            ('first_azimuth_deg', -360.0 <= self.first_azimuth_deg <= 360.0, 'in [-360, 360]'),
+        ]
+        refuse_unless(self, checks)
+
+    @classmethod
+    def from_resolution(
+        cls,
+        *,
+        vertical_fov_deg: float,
+        vertical_resolution_deg: float,
+        horizontal_resolution_deg: float,
+        **properties: Any,
+    ) -> LidarModel:
+        """
+        Return a lidar of which the angles between neighbouring rays are known.
+
+        Beams span one gap less than they are: 30 deg in steps of 2 deg are 16 beams.
+
+        Raises
+        ------
+        ConfigError
+            If an angle is not positive and finite, or another property is out of bounds.
+
+        """
+        angles = (vertical_fov_deg, vertical_resolution_deg, horizontal_resolution_deg)
+        if not all(0.0 < angle < math.inf for angle in angles):
+            raise ConfigError(f'LidarModel: angles {angles} deg, expected positive ones')
+        across = properties.get('horizontal_fov_deg', 360.0)
+        gaps = round(across / horizontal_resolution_deg)
+        return cls(
+            rows=round(vertical_fov_deg / vertical_resolution_deg) + 1,
+            columns=gaps if across == 360.0 else gaps + 1,
+            vertical_fov_deg=vertical_fov_deg,
+            **properties,
+        )
+
+    @property
+    def wraps(self) -> bool:
+        """Whether the first column follows the last."""
+        reach = self.horizontal_fov_deg * self.columns / (self.columns - 1)
+        return reach > 360.0 - 1e-6
+
+    @property
+    def kind(self) -> int:
+        """How the kernels project, see kernels/projection.py."""
+        return LIDAR_TABLE if self.beam_elevations_deg else LIDAR
+
+    @cached_property
+    def azimuths_rad(self) -> Float64:
+        """Azimuth of each column."""
+        steps = np.arange(self.columns, dtype=np.float64) * self._column_rad
+        return math.radians(self.first_azimuth_deg) - steps
+
+    @property
+    def _column_rad(self) -> float:
+        if self.wraps:
+            return 2.0 * math.pi / self.columns
+        return math.radians(self.horizontal_fov_deg) / (self.columns - 1)
+
+    @cached_property
+    def elevations_rad(self) -> Float64:
+        """Elevation of each row, from the highest to the lowest."""
+        if self.beam_elevations_deg:
+            return np.deg2rad(self.beam_elevations_deg)
+        top = self.vertical_fov_top_deg
+        return np.deg2rad(np.linspace(top, top - self.vertical_fov_deg, self.rows))
+
+    @cached_property
+    def elevations(self) -> Float32:
+        """Elevation of each row, rad."""
+        return self.elevations_rad.astype(np.float32)
+
+    @cached_property
+    def directions(self) -> Float32:
+        """Unit vector of each pixel, (rows, columns, 3)."""
+        rays = np.empty((self.rows, self.columns, 3))
+        level = np.cos(self.elevations_rad)[:, None]
+        rays[:, :, 0] = level * np.cos(self.azimuths_rad)
+        rays[:, :, 1] = level * np.sin(self.azimuths_rad)
+        rays[:, :, 2] = np.sin(self.elevations_rad)[:, None]
+        return rays.astype(np.float32)
+
+    @cached_property
+    def parameters(self) -> Float32:
+        """What the kernels need to project, see kernels/projection.py."""
+        row_rad = math.radians(self.vertical_fov_deg) / (self.rows - 1)
+        top_rad, first_rad = self.elevations_rad[0], math.radians(self.first_azimuth_deg)
+        turn, lowest = 2.0 * math.pi / self._column_rad, 0.0 if self.wraps else -0.5
+        angles = [first_rad, self._column_rad, top_rad, row_rad]
+        return np.array([*angles, self.columns, self.rows, turn, lowest], np.float32)
+
+    @property
+    def projection(self) -> tuple[Any, ...]:
+        """What the kernels take: kind, parameters, elevations."""
+        return self.kind, self.parameters, self.elevations
+
+    @property
+    def density(self) -> float:
+        """Rays that a face of 1 m^2 at range 1 m meets, as virtual focal lengths have it."""
+        across = self.columns * 90.0 / self.horizontal_fov_deg / 2.0
+        return across * self.rows * 90.0 / self.vertical_fov_deg / 2.0
+
+    @property
+    def pitch_rad(self) -> tuple[float, float]:
+        """Largest angles between neighbouring rows and columns."""
+        return float(-np.diff(self.elevations_rad).min()), self._column_rad
+
+    def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
+        """Return which balls about (K, 3) centres in its frame reach into its view."""
+        distance = np.linalg.norm(centres, axis=1)
+        ball = np.arcsin(np.minimum(inflation_m / np.maximum(distance, inflation_m), 1.0))
+        half_top, half_bottom = -np.diff(self.elevations_rad)[[0, -1]] / 2.0
+        elevation = np.arcsin(np.clip(centres[:, 2] / np.maximum(distance, 1e-12), -1.0, 1.0))
+        above = elevation - ball > self.elevations_rad[0] + half_top
+        below = elevation + ball < self.elevations_rad[-1] - half_bottom
+        seen: npt.NDArray[np.bool_] = ~(above | below) | (distance <= inflation_m)
+        return seen
+
+
+Sensor = CameraModel | LidarModel

@@ -11,11 +11,13 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.tsdf.sensors import Camera
+from surfel_mapper.tsdf.sensors import CameraModel
 
 FloatArray = npt.NDArray[np.float64]
 
-CAMERA = Camera(columns=640, rows=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5, max_range_m=8.0)
+CAMERA = CameraModel(
+    columns=640, rows=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5, max_range_m=8.0
+)
 
 ROOM = np.array([[-2.5, -2.0, 0.0], [2.5, 2.0, 2.8]])
 BLOCK = np.array([[0.6, -0.5, 0.0], [1.6, 0.5, 0.75]])

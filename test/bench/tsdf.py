@@ -27,7 +27,7 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.bench import room
 from test.bench.machine import one_core
 from test.bench.mesh_error import mesh_error
@@ -171,7 +171,7 @@ def street_cases(options: Options, scans: int) -> list[Case]:
     street, numbers = Street(options), range(WARM + scans)
     street.prepare(len(numbers))
     simulated = street.simulation.lidar
-    sensor = Lidar(
+    sensor = LidarModel(
         rows=simulated.beams,
         columns=simulated.columns,
         vertical_fov_deg=simulated.elevation_deg[1] - simulated.elevation_deg[0],

@@ -19,10 +19,10 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.moved_away import MovedAway
 from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 
 S = 10**9
-LIDAR = Lidar(rows=64, columns=512, vertical_fov_deg=60.0)
+LIDAR = LidarModel(rows=64, columns=512, vertical_fov_deg=60.0)
 RING = np.repeat(np.arange(64), 512)
 ROOM_M = np.array([8.0, 6.0, 2.0])
 BOX_M = np.array([0.5, 0.5, 1.0])

@@ -10,7 +10,7 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
-from surfel_mapper.tsdf.labels import labels_of
+from surfel_mapper.tsdf.queries import labels_of
 from test.pipeline.test_tsdf_layer import LIDAR, RING
 
 MS = 10**6

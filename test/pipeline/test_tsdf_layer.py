@@ -15,12 +15,12 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.labels import labels_of
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.queries import labels_of
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 S = 10**9
 RADIUS_M = 5.0
-LIDAR = Lidar(rows=64, columns=360, vertical_fov_deg=60.0)
+LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
 SETTINGS = {
     'pose.source': 'odometry',
     'frames.base': 'lidar',
@@ -128,7 +128,7 @@ def test_a_scan_that_shows_no_lidar_is_counted_and_mapped_all_the_same():
 
 
 def test_a_depth_image_is_fused_as_its_camera_saw_it():
-    camera = Camera(columns=80, rows=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    camera = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     depth_m = 2.0
     points = (camera.directions / camera.directions[..., 2:] * depth_m).reshape(-1, 3)
     mapper = mapper_with(**{'layers.tsdf.voxel_size_m': 0.05, 'layers.tsdf.truncation_m': 0.15})

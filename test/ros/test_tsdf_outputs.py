@@ -17,7 +17,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from visualization_msgs.msg import Marker
 
 from surfel_mapper.sensors.depth import PinholeCamera
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.messages.test_compressed_image import packed, packed_depth
 from test.ros.live import cloud, LATCHED, odometry, reliably, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
@@ -41,7 +41,7 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     start_node(start, peer, **SETTINGS)
     meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
-    directions = Lidar(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
 
@@ -137,7 +137,7 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
 def test_rates_changed_while_running_hold_at_once(start, peer):
     start_node(start, peer, **{**SETTINGS, 'layers.tsdf.slice_rate_hz': 0.0})
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
-    directions = Lidar(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
     peer.diagnosis({'scans.mapped': 1})

@@ -17,9 +17,9 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, free_rays, PinholeCamera
 from surfel_mapper.sensors.free_rays import free_directions
 from surfel_mapper.tsdf.queries import FREE, states, UNKNOWN
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 
-LIDAR = Lidar(rows=32, columns=360, vertical_fov_deg=40.0)
+LIDAR = LidarModel(rows=32, columns=360, vertical_fov_deg=40.0)
 S = 10**9
 
 

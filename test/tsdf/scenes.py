@@ -8,11 +8,11 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.range_image import from_ranges
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
-VGA = Camera(columns=640, rows=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
-SMALL = Camera(columns=80, rows=60, fx=65.0, fy=65.0, cx=40.0, cy=30.0)
-VLP16 = Lidar(rows=16, columns=360, vertical_fov_deg=30.0, max_range_m=30.0)
+VGA = CameraModel(columns=640, rows=480, fx=525.0, fy=525.0, cx=320.0, cy=240.0)
+SMALL = CameraModel(columns=80, rows=60, fx=65.0, fy=65.0, cx=40.0, cy=30.0)
+VLP16 = LidarModel(rows=16, columns=360, vertical_fov_deg=30.0, max_range_m=30.0)
 
 
 def plane(sensor, angle_deg, depth_m=2.0):

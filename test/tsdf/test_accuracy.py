@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf.scenes import fused, image_of, plane, sphere, VGA, voxels, zero_crossings
 
 ANGLES = (0.0, 45.0, 70.0)
@@ -109,8 +109,8 @@ def test_the_zero_level_of_a_ball_lies_on_it_and_not_behind_its_silhouette():
 @pytest.mark.parametrize(
     'sensor',
     [
-        Camera(columns=200, rows=150, fx=160.0, fy=160.0, cx=100.0, cy=75.0),
-        Lidar(rows=32, columns=512, vertical_fov_deg=40.0),
+        CameraModel(columns=200, rows=150, fx=160.0, fy=160.0, cx=100.0, cy=75.0),
+        LidarModel(rows=32, columns=512, vertical_fov_deg=40.0),
     ],
     ids=['camera', 'lidar'],
 )
@@ -158,7 +158,7 @@ def test_far_from_the_origin_distances_are_as_exact():
 
 
 def test_on_the_negative_side_of_the_origin_the_field_is_mirrored():
-    sensor = Camera(columns=101, rows=101, fx=80.0, fy=80.0, cx=50.0, cy=50.0)
+    sensor = CameraModel(columns=101, rows=101, fx=80.0, fy=80.0, cx=50.0, cy=50.0)
     range_m, _ = plane(sensor, 0.0)
     blocks = fused(image_of(sensor, range_m), voxel_size_m=0.05, truncation_m=0.15)
     rows = blocks.rows()

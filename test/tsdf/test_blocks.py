@@ -7,8 +7,7 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.tsdf.block_content import block_index, block_keys
-from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap
 from surfel_mapper.tsdf.kernels.blocks import VERSION
 
 

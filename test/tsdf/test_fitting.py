@@ -7,7 +7,7 @@ import pytest
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.fitting import fitted_lidar
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 
 RANGES = {'min_range_m': 0.5, 'max_range_m': 40.0}
 
@@ -24,7 +24,7 @@ def points_of(lidar, seed=0, keep=0.8):
 
 def test_with_rings_every_beam_gets_its_elevation():
     beams = (12.0, 7.5, 4.0, 1.0, -0.5, -3.0, -9.0, -20.0)
-    points, ring = points_of(Lidar(rows=8, columns=256, beam_elevations_deg=beams))
+    points, ring = points_of(LidarModel(rows=8, columns=256, beam_elevations_deg=beams))
     found = fitted_lidar(points, ring, **RANGES)
     assert (found.rows, found.columns) == (8, 256)
     assert np.abs(np.subtract(found.beam_elevations_deg, beams)).max() <= 1e-4
@@ -32,14 +32,14 @@ def test_with_rings_every_beam_gets_its_elevation():
 
 
 def test_without_rings_the_beams_are_evenly_spaced():
-    points, _ = points_of(Lidar(rows=16, columns=300, vertical_fov_deg=30.0))
+    points, _ = points_of(LidarModel(rows=16, columns=300, vertical_fov_deg=30.0))
     found = fitted_lidar(points, rows=16, **RANGES)
     assert (found.rows, found.columns) == (16, 300)
     assert np.abs(np.degrees(found.elevations_rad) - np.linspace(15.0, -15.0, 16)).max() <= 1e-4
 
 
 def test_what_is_set_is_not_fitted():
-    points, ring = points_of(Lidar(rows=16, columns=300, vertical_fov_deg=30.0))
+    points, ring = points_of(LidarModel(rows=16, columns=300, vertical_fov_deg=30.0))
     found = fitted_lidar(points, ring, rows=32, columns=512, **RANGES)
     assert (found.rows, found.columns, found.beam_elevations_deg) == (32, 512, ())
     assert fitted_lidar(points, ring, columns=512, **RANGES).columns == 512
@@ -47,7 +47,7 @@ def test_what_is_set_is_not_fitted():
 
 
 def test_rings_of_one_elevation_are_one_beam():
-    points, _ = points_of(Lidar(rows=2, columns=64, vertical_fov_deg=10.0))
+    points, _ = points_of(LidarModel(rows=2, columns=64, vertical_fov_deg=10.0))
     found = fitted_lidar(points, np.arange(128) // 32, **RANGES)
     assert found.rows == 2
     assert fitted_lidar(points, np.zeros(128, int), **RANGES).rows == 64  # of one ring: no beams

@@ -7,11 +7,11 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig, WEIGHT_MODES
 from surfel_mapper.errors import ConfigError, MapLimitError, PoseError
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf.scenes import fused, image_of, integrator, SMALL, voxels, zero_crossings
 
 SIZES = dict(voxel_size_m=0.1, truncation_m=0.3)
-LIDAR = Lidar(rows=32, columns=256, vertical_fov_deg=60.0, max_range_m=10.0)
+LIDAR = LidarModel(rows=32, columns=256, vertical_fov_deg=60.0, max_range_m=10.0)
 
 
 def wall(sensor, range_m, **images):

@@ -9,8 +9,8 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.kernels.labels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
-from surfel_mapper.tsdf.labels import labels_at, labels_of, log_odds
+from surfel_mapper.tsdf.kernels.channels import BINARY, FIRST_K, fuse_labels, MAJORITY, SINGLE
+from surfel_mapper.tsdf.queries import labels_at, labels_of, log_odds
 from test.tsdf.scenes import image_of, integrator, SMALL
 
 RNG = np.random.default_rng(2)

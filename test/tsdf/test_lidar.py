@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.tsdf.mesh import Mesher
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf.scenes import fused, image_of, plane, sphere, VGA, voxels, zero_crossings
 
-OS = Lidar(rows=64, columns=1024, vertical_fov_deg=60.0, max_range_m=30.0)
+OS = LidarModel(rows=64, columns=1024, vertical_fov_deg=60.0, max_range_m=30.0)
 SIZES = dict(voxel_size_m=0.2, truncation_m=0.6)
 
 
@@ -28,7 +28,7 @@ def ground(sensor, height_m):
 
 @pytest.mark.parametrize('first_azimuth_deg', [180.0, 37.0])
 def test_a_round_wall_has_no_gap_at_the_seam(first_azimuth_deg):
-    sensor = Lidar(
+    sensor = LidarModel(
         rows=64, columns=1024, vertical_fov_deg=60.0, first_azimuth_deg=first_azimuth_deg
     )
     mesher = Mesher(fused(image_of(sensor, cylinder(sensor, 4.0)), **SIZES))
@@ -96,7 +96,7 @@ def test_along_rays_the_ground_has_holes_that_cosines_close():
 
 
 def test_a_point_does_not_paint_voxels_far_from_its_ray():
-    sensor = Lidar(rows=16, columns=90, vertical_fov_deg=30.0)  # 4 deg from column to column
+    sensor = LidarModel(rows=16, columns=90, vertical_fov_deg=30.0)  # 4 deg from column to column
     ball = image_of(sensor, sphere(sensor, [10.0, 0.0, 0.0], 1.0))
     counts = {}
     for offset in (0.0, 0.5):

@@ -11,15 +11,15 @@ from surfel_mapper.errors import CloudFormatError, ConfigError
 from surfel_mapper.kernels.projection import OUTSIDE, project
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf import twin
 from test.tsdf.scenes import SMALL, VLP16
 
 LIDARS = {
     'around': VLP16,
-    'narrow': Lidar(rows=10, columns=50, vertical_fov_deg=20.0, horizontal_fov_deg=100.0),
-    'turned': Lidar(rows=8, columns=100, vertical_fov_deg=30.0, first_azimuth_deg=10.0),
-    'table': Lidar(rows=4, columns=90, beam_elevations_deg=(15.0, 2.0, 0.0, -25.0)),
+    'narrow': LidarModel(rows=10, columns=50, vertical_fov_deg=20.0, horizontal_fov_deg=100.0),
+    'turned': LidarModel(rows=8, columns=100, vertical_fov_deg=30.0, first_azimuth_deg=10.0),
+    'table': LidarModel(rows=4, columns=90, beam_elevations_deg=(15.0, 2.0, 0.0, -25.0)),
 }
 
 
@@ -59,11 +59,11 @@ def test_points_fall_where_the_equations_say(sensor):
 
 
 def test_sixteen_beams_are_sixteen_rows():
-    made = Lidar.from_resolution(
+    made = LidarModel.from_resolution(
         vertical_fov_deg=30.0, vertical_resolution_deg=2.0, horizontal_resolution_deg=0.2
     )
     assert (made.rows, made.columns, made.wraps) == (16, 1800, True)
-    half = Lidar.from_resolution(
+    half = LidarModel.from_resolution(
         vertical_fov_deg=33.2,
         vertical_resolution_deg=0.527,
         horizontal_resolution_deg=0.5,
@@ -166,20 +166,26 @@ def blank():
 @pytest.mark.parametrize(
     ('make', 'message'),
     [
-        (lambda: Camera(columns=0, rows=2, fx=1, fy=1, cx=1, cy=1), 'columns: 0'),
-        (lambda: Camera(columns=4, rows=2, fx=0, fy=1, cx=1, cy=1), 'fx: 0'),
-        (lambda: Camera(columns=4, rows=2, fx=math.nan, fy=1, cx=1, cy=1), 'fx: nan'),
-        (lambda: Camera(columns=4, rows=2, fx=1, fy=1, cx=5, cy=1), 'cx: 5'),
-        (lambda: Camera(columns=4, rows=2, fx=1, fy=1, cx=1, cy=3), 'cy: 3'),
-        (lambda: Lidar(max_range_m=math.inf), 'max_range_m: inf, expected more .*, finite'),
-        (lambda: Lidar(min_range_m=0.0), 'min_range_m: 0'),
-        (lambda: Lidar(min_range_m=9.0, max_range_m=8.0), 'max_range_m: 8'),
-        (lambda: Lidar(rows=1), 'rows: 1'),
-        (lambda: Lidar(vertical_fov_deg=0.0), 'vertical_fov_deg: 0'),
-        (lambda: Lidar(vertical_fov_top_deg=95.0), 'vertical_fov_top_deg: 95'),
-        (lambda: Lidar(horizontal_fov_deg=361.0), 'horizontal_fov_deg: 361'),
-        (lambda: Lidar(rows=2, beam_elevations_deg=(1.0, 2.0)), 'beam_elevations_deg: .*desc'),
-        (lambda: Lidar(rows=3, beam_elevations_deg=(2.0, 1.0)), 'beam_elevations_deg: .*one for'),
+        (lambda: CameraModel(columns=0, rows=2, fx=1, fy=1, cx=1, cy=1), 'columns: 0'),
+        (lambda: CameraModel(columns=4, rows=2, fx=0, fy=1, cx=1, cy=1), 'fx: 0'),
+        (lambda: CameraModel(columns=4, rows=2, fx=math.nan, fy=1, cx=1, cy=1), 'fx: nan'),
+        (lambda: CameraModel(columns=4, rows=2, fx=1, fy=1, cx=5, cy=1), 'cx: 5'),
+        (lambda: CameraModel(columns=4, rows=2, fx=1, fy=1, cx=1, cy=3), 'cy: 3'),
+        (lambda: LidarModel(max_range_m=math.inf), 'max_range_m: inf, expected more .*, finite'),
+        (lambda: LidarModel(min_range_m=0.0), 'min_range_m: 0'),
+        (lambda: LidarModel(min_range_m=9.0, max_range_m=8.0), 'max_range_m: 8'),
+        (lambda: LidarModel(rows=1), 'rows: 1'),
+        (lambda: LidarModel(vertical_fov_deg=0.0), 'vertical_fov_deg: 0'),
+        (lambda: LidarModel(vertical_fov_top_deg=95.0), 'vertical_fov_top_deg: 95'),
+        (lambda: LidarModel(horizontal_fov_deg=361.0), 'horizontal_fov_deg: 361'),
+        (
+            lambda: LidarModel(rows=2, beam_elevations_deg=(1.0, 2.0)),
+            'beam_elevations_deg: .*desc',
+        ),
+        (
+            lambda: LidarModel(rows=3, beam_elevations_deg=(2.0, 1.0)),
+            'beam_elevations_deg: .*one for',
+        ),
     ],
 )
 def test_sensors_that_cannot_be_are_refused(make, message):

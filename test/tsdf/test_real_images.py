@@ -14,10 +14,10 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.tsdf.queries import FREE, sample, states
 from surfel_mapper.tsdf.range_image import from_depth
-from surfel_mapper.tsdf.sensors import Camera
+from surfel_mapper.tsdf.sensors import CameraModel
 from test.tsdf.scenes import integrator
 
-KINECT = Camera(
+KINECT = CameraModel(
     columns=640, rows=480, fx=585.0, fy=585.0, cx=320.0, cy=240.0, min_range_m=0.4, max_range_m=4.0
 )
 

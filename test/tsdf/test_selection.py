@@ -10,12 +10,14 @@ from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.selection import BlockSelection
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf.scenes import image_of
 
 SENSORS = {
-    'camera': Camera(columns=48, rows=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0, max_range_m=5.0),
-    'lidar': Lidar(rows=16, columns=90, vertical_fov_deg=50.0, max_range_m=5.0),
+    'camera': CameraModel(
+        columns=48, rows=36, fx=40.0, fy=40.0, cx=24.0, cy=18.0, max_range_m=5.0
+    ),
+    'lidar': LidarModel(rows=16, columns=90, vertical_fov_deg=50.0, max_range_m=5.0),
 }
 SIZES = dict(voxel_size_m=0.125, truncation_m=0.3, voxels_per_side=4)
 
@@ -91,7 +93,7 @@ def test_rays_touch_every_block_of_their_band(sensor, extra_m):
 
 
 def test_through_a_dense_image_rays_are_thinned_but_no_voxel_of_the_surface_is_lost():
-    sensor = Camera(columns=320, rows=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)
+    sensor = CameraModel(columns=320, rows=240, fx=260.0, fy=260.0, cx=160.0, cy=120.0)
     row, column = np.indices((240, 320))
     image = image_of(sensor, 2.0 + 0.3 * np.sin(column / 30.0) + 0.2 * np.cos(row / 20.0))
     counts = {}
@@ -111,7 +113,7 @@ def test_through_a_dense_image_rays_are_thinned_but_no_voxel_of_the_surface_is_l
 
 
 def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
-    sensor = Lidar(rows=64, columns=1024, vertical_fov_deg=45.0, max_range_m=20.0)
+    sensor = LidarModel(rows=64, columns=1024, vertical_fov_deg=45.0, max_range_m=20.0)
     rng = np.random.default_rng(8)
     range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
     image, T = image_of(sensor, range_m), random_pose(rng)

@@ -11,13 +11,13 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.range_image import from_ranges
 from surfel_mapper.tsdf.selection import BlockSelection
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf import twin
 from test.tsdf.scenes import SMALL
 
 POSE = pose_matrix([3.2, -7.1, 0.4], [0.1, -0.2, 0.3, 0.927361849549570])
-COARSE = Lidar(rows=8, columns=60, vertical_fov_deg=40.0, max_range_m=9.0)
-NARROW = Lidar(
+COARSE = LidarModel(rows=8, columns=60, vertical_fov_deg=40.0, max_range_m=9.0)
+NARROW = LidarModel(
     rows=6,
     columns=40,
     vertical_fov_deg=20.0,
@@ -25,7 +25,7 @@ NARROW = Lidar(
     horizontal_fov_deg=120.0,
     max_range_m=9.0,
 )
-TABLE = Lidar(
+TABLE = LidarModel(
     rows=5, columns=45, beam_elevations_deg=(15.0, 6.0, 2.0, -1.0, -14.0), max_range_m=9.0
 )
 SENSORS = {'camera': SMALL, 'lidar': COARSE, 'narrow': NARROW, 'table': TABLE}

@@ -6,10 +6,10 @@ import numpy as np
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.sensors import Lidar
+from surfel_mapper.tsdf.sensors import LidarModel
 from test.tsdf.scenes import image_of, integrator
 
-SENSOR = Lidar(rows=8, columns=90, vertical_fov_deg=40.0, max_range_m=3.0)
+SENSOR = LidarModel(rows=8, columns=90, vertical_fov_deg=40.0, max_range_m=3.0)
 HALF_DIAGONAL_M = np.sqrt(3.0) / 2.0
 
 

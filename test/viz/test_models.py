@@ -15,8 +15,7 @@ from surfel_mapper.models import fit
 from surfel_mapper.models.filling import areas
 from surfel_mapper.models.shapes import shape_of
 from surfel_mapper.viz import models as viz_models
-from surfel_mapper.viz.models import draw_models, models_mesh, page_mesh
-from surfel_mapper.viz.models_section import models_section, MOST_ROWS
+from surfel_mapper.viz.models import draw_models, models_mesh, models_section, MOST_ROWS, page_mesh
 from test.models.scenes import A, room, VIEW
 from test.viz.test_report import plane, report
 

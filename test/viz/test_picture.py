@@ -9,8 +9,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.viz.frames import Frame
-from surfel_mapper.viz.picture import draw_map, limits, views, X, Y, Z
+from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
 
 YELLOW, PURPLE = (np.array(colormaps['viridis'](value)[:3]) for value in (1.0, 0.0))
 

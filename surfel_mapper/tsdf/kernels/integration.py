@@ -17,8 +17,16 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.projection import project
-from surfel_mapper.tsdf.kernels.channels import apply_mask, fuse_color, fuse_stamps, SKIP
-from surfel_mapper.tsdf.kernels.labels import fuse_labels, keep_labels, NONE, vote_labels
+from surfel_mapper.tsdf.kernels.channels import (
+    apply_mask,
+    fuse_color,
+    fuse_labels,
+    fuse_stamps,
+    keep_labels,
+    NONE,
+    SKIP,
+    vote_labels,
+)
 from surfel_mapper.tsdf.kernels.lookup import (
     drop_far,
     DROPOFF,

@@ -13,11 +13,11 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.queries import sample, states
 from surfel_mapper.tsdf.range_image import from_depth, from_points
-from surfel_mapper.tsdf.sensors import Camera, Lidar
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 rng = np.random.default_rng(1)
-camera = Camera(columns=24, rows=18, fx=20.0, fy=20.0, cx=12.0, cy=9.0, max_range_m=4.0)
-lidar = Lidar(rows=5, columns=40, beam_elevations_deg=(20.0, 8.0, 0.0, -6.0, -21.0))
+camera = CameraModel(columns=24, rows=18, fx=20.0, fy=20.0, cx=12.0, cy=9.0, max_range_m=4.0)
+lidar = LidarModel(rows=5, columns=40, beam_elevations_deg=(20.0, 8.0, 0.0, -6.0, -21.0))
 found = []
 for semantics in ('majority', 'first_k', 'single', 'binary'):
     config = TsdfConfig(
