@@ -4,7 +4,7 @@
 Start the node: ``ros2 launch surfel_mapper mapper.launch.py points:=/lidar/points rviz:=true``.
 
 Settings come from one file: a preset of this package, or your own with ``config``. An argument
-overrides the file only where it is given, so that a file alone says what runs.
+overrides the file only if it is given.
 """
 
 from pathlib import Path
@@ -56,7 +56,7 @@ ARGUMENTS = [
         'autostart',
         default_value='true',
         choices=BOOLEAN,
-        description='Map at once; false: wait for the transitions configure and activate.',
+        description='Configure and activate at once; false: wait for these transitions.',
     ),
     DeclareLaunchArgument(
         'use_sim_time',
@@ -65,18 +65,18 @@ ARGUMENTS = [
         description='Take the time from /clock, as for a bag played with --clock.',
     ),
     DeclareLaunchArgument(
-        'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with a view of it.'
+        'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with a view of the map.'
     ),
     DeclareLaunchArgument(
         'log_level',
         default_value='info',
         choices=['debug', 'info', 'warn', 'error'],
-        description='What the node logs.',
+        description='Least severity that the node logs.',
     ),
 ]
 
 TOPICS = {'points': 'points', 'depth': 'depth/image', 'odom': 'odom', 'pose': 'pose'}
-"""What the node reads, by the argument that says where it is."""
+"""Relative names of the topics that the node reads, by launch argument."""
 
 
 def nodes(context: LaunchContext) -> list[Node]:
@@ -120,5 +120,5 @@ def nodes(context: LaunchContext) -> list[Node]:
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Return what ``ros2 launch`` runs."""
+    """Return the arguments and the nodes for ``ros2 launch``."""
     return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=nodes)])

@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What has changed in the map since clients were told last.
+The changes of the map since the last message on ~/changed and ~/removed.
 
-After a scan that is what the scan did. But a map changes in other ways too: it is cleared,
-wholly or in part, another one is loaded, its scans are aligned. Then the voxels there are now are
-compared with those that clients know of, so that nothing in the way a map may change has to be
-foreseen here.
+After a scan these are the changes that the update lists. If the map was cleared, loaded or
+aligned, its present voxels are compared with the published ones, which covers any kind of change.
 """
 
 from __future__ import annotations
@@ -23,20 +21,20 @@ from surfel_mapper.pipeline import Mapper, Update
 Keys = npt.NDArray[np.int64]
 
 LIST_EVERY = 30
-"""Scans between two listings of the voxels of the map."""
+"""After this many scans the voxels of the map are listed again, which takes milliseconds."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapChange:
     """
-    What clients do not know yet.
+    Changes of the map that are not published yet.
 
     Attributes
     ----------
     surfels : Surfels
-        Of every voxel that changed and holds enough points.
+        The surfels of changed voxels that have enough points.
     removed : (E, 3) int32
-        Voxels that held enough points and do no longer.
+        Indices of voxels that had enough points and no longer do.
 
     """
 
@@ -46,70 +44,69 @@ class MapChange:
 
 class ChangeTracker:
     """
-    Follows the map for clients.
+    Collects the changes of the map between messages; called in the mapping thread.
 
     Parameters
     ----------
     mapper : Mapper
-        Whose map it is; all is called in the mapping thread.
+        The mapper whose map is published.
 
     """
 
     def __init__(self, mapper: Mapper) -> None:
-        """Begin with clients who know nothing, of whom there are none."""
         self._mapper = mapper
-        self._known: PublishedKeys | None = None
+        self._published: PublishedKeys | None = None
         self._version = mapper.map.version
         self._num_resets = mapper.counters.resets
 
     @property
     def min_points(self) -> int:
-        """From how many points on clients are told of a voxel: where moments are asked for, 1."""
+        """Points that a voxel needs to be published: 1 with ``publish.moments``."""
         config = self._mapper.config
         return 1 if config.publish.moments else config.map.min_points
 
-    def forget(self) -> None:
-        """Have no clients any more."""
-        self._known = None
+    def reset(self) -> None:
+        """Start from the present map; called while there are no subscribers."""
+        self._published = None
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
 
-    def of(self, update: Update) -> MapChange:
-        """Return what a scan changed, and whatever else happened since the last call."""
+    def after_scan(self, update: Update) -> MapChange:
+        """Return the changes of a scan, and all others since the last call."""
         num_resets = self._mapper.counters.resets
-        is_usual = update.alignment is None and num_resets == self._num_resets
+        is_only_scan = update.alignment is None and num_resets == self._num_resets
         self._num_resets = num_resets
-        if not is_usual:
-            return self.since_last()
-        if self._known is None:
-            self._known = PublishedKeys(self._held())
+        if not is_only_scan:
+            return self.collect()
+        if self._published is None:
+            self._published = PublishedKeys(self._keys())
         if not self._mapper.config.publish.moments:
             change = MapChange(update.changed, update.removed_voxel_index)
         else:
             surfels = self._mapper.map.surfels_changed(self._version, 1)
             change = MapChange(surfels, self._emptied(update))
         self._version = self._mapper.map.version
-        self._known.note(change)
-        if len(self._known) >= LIST_EVERY:
-            self._known = PublishedKeys(self._held())
+        self._published.append(change)
+        if len(self._published) >= LIST_EVERY:
+            self._published = PublishedKeys(self._keys())
         return change
 
-    def since_last(self) -> MapChange:
-        """Return what has changed since the last call, in whatever way."""
+    def collect(self) -> MapChange:
+        """Return all changes since the last call."""
         surfel_map = self._mapper.map
         surfels = surfel_map.surfels_changed(self._version, self.min_points)
-        keys = self._held()
-        before = np.empty(0, np.int64) if self._known is None else self._known.keys()
-        self._known = PublishedKeys(keys)
+        keys = self._keys()
+        before = np.empty(0, np.int64) if self._published is None else self._published.keys()
+        self._published = PublishedKeys(keys)
         self._version = surfel_map.version
         return MapChange(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
 
-    def _held(self) -> Keys:
-        """Return the voxels that clients should know of."""
+    def _keys(self) -> Keys:
+        """Return the keys of all voxels to be published."""
         return self._mapper.map.keys(self.min_points)
 
     def _emptied(self, update: Update) -> npt.NDArray[np.int32]:
-        """Return the voxels that hold no point since evictions."""
+        """Return the voxels that evictions have emptied."""
         keys = [eviction.scan.moments.key for eviction in update.evictions]
         if not keys:
             return np.empty((0, 3), np.int32)
@@ -119,35 +116,34 @@ class ChangeTracker:
 
 class PublishedKeys:
     """
-    The voxels that clients know of.
+    The keys of the voxels that were published.
 
-    Right after a scan these are the voxels that the map holds. To list them takes milliseconds,
-    so that is done now and then, and what scans change in between is only remembered.
+    After each scan they equal the voxels of the map. Listing these takes milliseconds, so it is
+    done every ``LIST_EVERY`` scans only; the changes in between are kept and applied on demand.
 
     Parameters
     ----------
     keys : (K,) int64
-        At first, each once.
+        The initial keys, unique.
 
     """
 
     def __init__(self, keys: Keys) -> None:
-        """Know of some voxels."""
         self._keys = keys
         self._changes: list[MapChange] = []
 
     def __len__(self) -> int:
-        """Return how many changes are remembered."""
+        """Return the number of changes since the last listing."""
         return len(self._changes)
 
-    def note(self, change: MapChange) -> None:
-        """Remember a change."""
+    def append(self, change: MapChange) -> None:
+        """Add a change."""
         self._changes.append(change)
 
     def keys(self) -> Keys:
-        """Return all, in ascending order."""
-        known = self._keys
+        """Return all keys, ascending."""
+        keys = self._keys
         for change in self._changes:
-            known = np.setdiff1d(known, pack_keys(change.removed))
-            known = np.union1d(known, pack_keys(change.surfels.voxel_index))
-        return np.asarray(known, np.int64)
+            keys = np.setdiff1d(keys, pack_keys(change.removed))
+            keys = np.union1d(keys, pack_keys(change.surfels.voxel_index))
+        return np.asarray(keys, np.int64)

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Reports on /diagnostics, from the first moment of a node to its last.
+Reports on /diagnostics, published in every state of the node.
 
-A report about a map is made in the mapping thread, where nothing changes meanwhile. The timer
-that asks for it runs in the executor's, and tells if there was no answer: a thread that hangs
-cannot say so itself. The rate is one of a steady clock, so it holds while simulated time stands.
+The mapping thread makes the report, since the map does not change meanwhile. A timer in the
+executor asks for it and reports an error if there is no answer, because a thread that hangs
+cannot say so itself. The timer uses the steady clock, so it also runs while simulated time
+stands still.
 """
 
 from __future__ import annotations
@@ -30,24 +31,23 @@ from surfel_mapper.ros.session import Session
 LEVELS = (DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR)
 
 BUSY_S = 5.0
-"""A mapping thread that has not answered for so long is an error."""
+"""A mapping thread that does not answer for this time is reported as an error."""
 
 
 class Diagnostics:
     """
-    The reports of a node.
+    Publishes the reports of a node.
 
     Parameters
     ----------
     node : Node
-        Has a ``state``, the name of its state.
+        The node; ``node.state`` is the name of its life cycle state.
     rate_hz : float
-        So many reports a second; 0: none.
+        Rate of the reports; 0: none.
 
     """
 
     def __init__(self, node: Any, rate_hz: float) -> None:
-        """Report from now on, at first the state alone."""
         self._session: Session | None = None
         self._node = node
         self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
@@ -57,11 +57,11 @@ class Diagnostics:
             steady_timer(node, rate_hz, self._on_timer)
 
     def watch(self, session: Session | None) -> None:
-        """Report about a session from now on, or about none."""
+        """Report about a session from now on; None: the state alone."""
         self._session, self._asked_s, self._last = session, None, Totals()
 
     def _on_timer(self) -> None:
-        """Ask the mapping thread for a report, or report that it does not answer."""
+        """Request a report from the mapping thread, or report that it does not answer."""
         session, now_s = self._session, time.monotonic()
         if session is None:
             self._publish(OK, self._node.state, {'state': self._node.state})
@@ -81,15 +81,15 @@ class Diagnostics:
             return
         last, now = self._last, Totals.of(self._node, session)
         self._last = now
-        found = []
+        problems = []
         if self._node.state == 'active':
             interval = now.since(last, self._node, session)
-            found = list(findings(interval, session.config.diagnostics))
-        level = max((level for level, _ in found), default=OK)
-        text = '; '.join(text for _, text in found)
-        fine = 'ok' if self._node.state == 'active' else self._node.state
+            problems = list(findings(interval, session.config.diagnostics))
+        level = max((level for level, _ in problems), default=OK)
+        text = '; '.join(text for _, text in problems)
+        healthy = 'ok' if self._node.state == 'active' else self._node.state
         values = {'state': self._node.state, **now.rates(last), **figures(session)}
-        self._publish(level, text or fine, values)
+        self._publish(level, text or healthy, values)
 
     def _publish(self, level: int, text: str, values: Mapping[str, Any]) -> None:
         now_ns = self._node.get_clock().now().nanoseconds
@@ -98,10 +98,10 @@ class Diagnostics:
 
 
 class Totals:
-    """What happened until a moment, of which two make an interval."""
+    """Counts since the start of the session; two of them make an interval."""
 
     def __init__(self) -> None:
-        """Be the totals of the beginning."""
+        """Start at zero."""
         self.time_s = time.monotonic()
         self.received = 0
         self.lost = 0
@@ -110,7 +110,7 @@ class Totals:
 
     @classmethod
     def of(cls, node: Node, session: Session) -> Totals:
-        """Return those of a session now."""
+        """Return the present counts of a session."""
         now = cls()
         counters = session.mapper.counters
         now.received = counters.received
@@ -124,7 +124,7 @@ class Totals:
         return now
 
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
-        """Return what happened since the last; of several topics the most silent one counts."""
+        """Return the interval since an earlier count; of several topics, the most silent one."""
         topic, heard_s = session.inputs.most_silent
         return Interval(
             topic=topic,
@@ -139,7 +139,7 @@ class Totals:
         )
 
     def rates(self, last: Totals) -> dict[str, Any]:
-        """Return messages a second since the last, in and out."""
+        """Return the rates since an earlier count, received and published, in Hz."""
         seconds = self.time_s - last.time_s
 
         def rate_hz(number: int, before: int) -> float:
@@ -155,13 +155,13 @@ class Totals:
 
 
 def figures(session: Session) -> dict[str, Any]:
-    """Return counts, times and sizes of a session."""
+    """Return the counts, times and sizes of a session."""
     mapper, counters = session.mapper, session.mapper.counters
-    done = counters.mapped + counters.gated + counters.localised + counters.dropped.total()
+    finished = counters.mapped + counters.gated + counters.localised + counters.dropped.total()
     return {
         'clouds_lost': session.inputs.clouds_lost,
         'queue': session.thread.num_clouds,
-        'waiting': counters.received - done,
+        'waiting': counters.received - finished,
         'latency_ms': {
             name: None if found is None else round(found * 1e3, 1)
             for name, found in (('median', latency(session, 50)), ('p99', latency(session, 99)))
@@ -176,7 +176,7 @@ def figures(session: Session) -> dict[str, Any]:
 
 
 def latency(session: Session, percentile: float) -> float | None:
-    """Return a percentile of the latest latencies, s; None without any, or by another clock."""
+    """Return a percentile of the latest latencies, s; None without any or if clocks differ."""
     if not session.latencies_s:
         return None
     found = float(np.percentile(session.latencies_s, percentile))
@@ -184,11 +184,11 @@ def latency(session: Session, percentile: float) -> float | None:
 
 
 def process_bytes() -> int:
-    """Return the memory that the process has resident; 0 where nobody tells."""
+    """Return the resident memory of the process; 0 if it is not known."""
     try:
         pages = Path('/proc/self/statm').read_text(encoding='ascii').split()[1]
     except OSError:
-        return 0  # no Linux, or no file descriptor left
+        return 0  # not Linux, or no file descriptor left
     return int(pages) * resource.getpagesize()
 
 
@@ -201,15 +201,15 @@ def diagnostics(
     Parameters
     ----------
     name : str
-        Of the node.
+        Name of the node.
     stamp_ns : int
-        The time now.
+        Present time.
     level : int
         OK, WARN or ERROR.
     text : str
-        What is wrong and what to do about it.
+        The problem and its remedy.
     values : mapping of str
-        Figures; nested mappings become names with dots.
+        Values; nested mappings become dotted names.
 
     """
     status = DiagnosticStatus(
@@ -223,7 +223,7 @@ def diagnostics(
 
 
 def leaves(values: Mapping[str, Any], prefix: str = '') -> Iterator[tuple[str, Any]]:
-    """Yield the values of nested mappings under dotted names."""
+    """Yield the values of nested mappings with dotted names."""
     for key, value in values.items():
         if isinstance(value, Mapping):
             yield from leaves(value, f'{prefix}{key}.')

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What is wrong with a node: findings of two severities, from what happened since the last report.
+The problems of a node since its last report, as warnings and errors with a remedy.
 
-No ROS here: numbers in, sentences out. A sentence names what it is about and the remedy.
+Imports no ROS: counts in, sentences out.
 """
 
 from __future__ import annotations
@@ -19,34 +19,34 @@ OK, WARN, ERROR = 0, 1, 2
 """As in diagnostic_msgs/DiagnosticStatus."""
 
 OFF_S = 1e5
-"""A latency beyond a day means that stamps and clock have nothing to do with each other."""
+"""Latencies above this (a day) mean that stamps and clock are of different times."""
 
 
 @dataclass(kw_only=True)
 class Interval:
     """
-    What happened from one report to the next.
+    Counts between two reports.
 
     Attributes
     ----------
     topic : str
-        Where clouds come in.
+        The topic of the clouds.
     num_publishers : int
-        How many publish there.
+        Number of its publishers.
     ever_received : bool
-        Whether there was any cloud before.
+        Whether a cloud has ever been received.
     received : int
-        Clouds that came in.
+        Clouds received.
     silent_s : float
-        Time since the last.
+        Time since the last cloud.
     dropped : Counter of str
         Scans dropped, by cause.
     latency_s : float or None
-        99th percentile from stamp to publication; None where no scan was mapped.
+        99th percentile from stamp to publication; None if no scan was mapped.
     paused : bool
         Whether clouds are dropped on request.
     loss : str
-        What the middleware says was lost, and the remedy.
+        Messages lost by the middleware, and the remedy; empty if none.
 
     """
 
@@ -62,7 +62,7 @@ class Interval:
 
 
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
-    """Yield what is wrong, each with its level."""
+    """Yield the problems, each with its level."""
     yield from _input(interval, limits)
     if interval.loss:
         yield WARN, interval.loss
@@ -76,16 +76,16 @@ def _input(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
     topic = interval.topic
     if not interval.ever_received:
         remedy = (
-            f'{interval.num_publishers} publish there; see fastdds_shm.xml if clouds are large'
+            f'publishers: {interval.num_publishers}; see fastdds_shm.xml if clouds are large'
             if interval.num_publishers
-            else 'nobody publishes there; remap points to the topic of the lidar'
+            else 'it has no publisher; remap points to the topic of the lidar'
         )
         yield WARN, f'no cloud on {topic} yet: {remedy}'
     elif 0.0 < limits.silence_s < interval.silent_s:
         yield (
             ERROR,
             f'no cloud on {topic} for {interval.silent_s:.1f} s '
-            f'({interval.num_publishers} publish there); is the lidar alive?',
+            f'(publishers: {interval.num_publishers}); is the lidar alive?',
         )
 
 
@@ -106,7 +106,7 @@ def _drops(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int,
 def _latency(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
     latency_s = interval.latency_s
     if latency_s is None or abs(latency_s) > OFF_S:
-        return  # a bag played without use_sim_time is no fault
+        return  # a bag played without use_sim_time is not a problem
     for level, limit_s in ((ERROR, limits.error_latency_s), (WARN, limits.warn_latency_s)):
         if 0.0 < limit_s < latency_s:
             yield (

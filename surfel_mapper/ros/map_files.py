@@ -3,7 +3,7 @@
 """
 Saving and loading the map inside ``output.directory``, and nowhere else.
 
-Whoever can call a service of the node could otherwise write, or probe for, any file of its user.
+Otherwise any client of the node's services could write, or probe for, any file of its user.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from surfel_mapper.pipeline import Mapper
 
 def save_map(mapper: Mapper) -> str:
     """
-    Write the map to ``output.directory``; return what was written.
+    Write the map to ``output.directory``; return a sentence that states path, sizes and digest.
 
-    ``output.map_name``.ply holds the surfels, for other programs; ``output.map_name``.npz the
-    exact map and its window, to go on from.
+    ``output.map_name``.ply has the surfels, for other programs; ``output.map_name``.npz the
+    exact map and its window, from which mapping can continue.
 
     Raises
     ------
@@ -52,12 +52,14 @@ def save_map(mapper: Mapper) -> str:
 
 def load_map(mapper: Mapper, url: str) -> str:
     """
-    Put a map that ``save_map`` wrote in the place of the mapper's; return what was loaded.
+    Replace the map by one that ``save_map`` wrote; return a sentence that states path and digest.
+
+    After an error the map is unchanged.
 
     Parameters
     ----------
     mapper : Mapper
-        Its map and window are replaced; scans that come next are added.
+        Its map and window are replaced; later scans are added.
     url : str
         A file in ``output.directory``, relative to it or in full, as a path or a file: URL, with
         or without the extension; empty: ``output.map_name``.
@@ -69,10 +71,9 @@ def load_map(mapper: Mapper, url: str) -> str:
     FileNotFoundError
         If there is no such file.
     FileFormatError
-        If it cannot be read, is damaged or holds something else.
+        If it cannot be read, is damaged, or is not a map.
     MapError
-        If it has another voxel size or other columns than this mapper. Nothing has changed then,
-        nor after any other of these errors.
+        If it has another voxel size or other columns than this mapper.
 
     """
     output = mapper.config.output
@@ -94,7 +95,7 @@ def directory_of(output: OutputConfig) -> Path:
 
 
 def path_inside(directory: Path, url: str) -> Path:
-    """Return the full path of a map in a directory, or raise ConfigError if it is elsewhere."""
+    """Return the full path of a map in a directory; raise ConfigError if it is outside."""
     parts = urlsplit(url)
     if parts.scheme not in ('', 'file') or parts.netloc or '\0' in url:
         raise ConfigError(f'map_url: {url!r}, expected a file in output.directory, {directory}')
@@ -110,5 +111,5 @@ def path_inside(directory: Path, url: str) -> Path:
 
 
 def is_inside(directory: Path, path: Path) -> bool:
-    """Return whether a path is inside a directory, with links followed, and ``..``."""
+    """Return whether a path is inside a directory, after resolving links and ``..``."""
     return path.resolve().is_relative_to(directory.resolve())

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The one thread that writes the map, and the bounded queue before it.
+The thread that owns the mapper, and its bounded queue.
 
-Callbacks only put things in, so messages are taken from the middleware as they come: what waits
-there too long is overwritten without a word, what is dropped here is counted. Poses overtake
-clouds. They are small, and a backlog of clouds would otherwise be mapped before the poses that
-it needs, although these have arrived.
+Callbacks only append to the queue, so messages are taken from the middleware as they arrive: its
+queues overwrite old messages silently, while drops from this queue are counted. Poses overtake
+clouds. They are small, and a backlog of clouds would otherwise be mapped before the poses that it
+needs, although these have arrived.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
 MAX_POSES = 10_000
-"""Poses that may wait, 10 s of odometry at 1 kHz; the oldest is dropped."""
+"""Most poses in the queue, 10 s of odometry at 1 kHz; then the oldest is dropped."""
 
 TOO_FAST = f'clouds come faster than they can be mapped; {REMEDIES["overload"]}'
 
 Result = TypeVar('Result')
 
 
-class Cloud(NamedTuple):
-    """A message that waits to be mapped, and what makes a scan of it."""
+class QueuedCloud(NamedTuple):
+    """A cloud or image in the queue, and the function that decodes it to a scan."""
 
     msg: Any
     topic: str
@@ -43,7 +43,7 @@ class Cloud(NamedTuple):
 
 
 class LostCloud(NamedTuple):
-    """What a cloud that never gets to the mapper is counted as; see Mapper.refuse_clouds."""
+    """How a dropped cloud is counted; see Mapper.refuse_clouds."""
 
     cause: str
     topic: str
@@ -52,17 +52,17 @@ class LostCloud(NamedTuple):
 
 
 class LostPose(NamedTuple):
-    """The same of a pose or an image beside; see Mapper.ignore_message."""
+    """How a dropped pose, or image of colours or labels, is counted; see Mapper.ignore_message."""
 
     cause: str
     reason: str
 
 
-TOO_MANY_POSES = LostPose('overload', 'poses dropped: too many wait to be taken')
+TOO_MANY_POSES = LostPose('overload', 'poses dropped: too many are waiting')
 
 
 class Call(NamedTuple):
-    """A function that waits to be called, and who waits for its result, if anybody."""
+    """A function in the queue, and the future for its result, if one is wanted."""
 
     function: Callable[[], Any]
     future: Future[Any] | None = None
@@ -70,19 +70,19 @@ class Call(NamedTuple):
 
 class MappingThread:
     """
-    Feeds a mapper from a queue.
+    Feeds the mapper from a queue.
 
     Parameters
     ----------
     mapper : Mapper
-        Used by this thread alone from ``start`` to ``stop``.
+        Accessed by this thread only, from ``start`` to ``stop``.
     on_failure : callable
-        Called in this thread with an error that nobody foresaw; the thread ends with it.
+        Called in this thread with an unexpected error, after which the thread ends.
 
     Attributes
     ----------
     paused : bool
-        While set, clouds are dropped (and counted), poses are not.
+        If true, clouds are dropped and counted; poses are still used.
 
     """
 
@@ -91,7 +91,6 @@ class MappingThread:
         mapper: Mapper,
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """Make the thread; ``start`` starts it."""
         self.paused = False
         self._mapper = mapper
         self._on_failure = on_failure
@@ -99,21 +98,21 @@ class MappingThread:
         self._max_clouds = mapper.config.input.max_waiting_clouds
         self._poses: deque[tuple[StampedPose, bool]] = deque()
         self._images: deque[SceneImage] = deque(maxlen=MAX_IMAGES)
-        self._work: deque[Cloud | Call] = deque()
+        self._work: deque[QueuedCloud | Call] = deque()
         self._num_clouds = 0
         self._lost: Counter[LostCloud | LostPose] = Counter()
         self._stopping = False
         self._thread = threading.Thread()
 
     def start(self, on_update: Callable[[Update], None]) -> None:
-        """Start the thread; it calls a function with what every scan did to the map."""
+        """Start the thread; it calls ``on_update`` with the result of every scan."""
         self._thread = threading.Thread(
             target=self._run, args=(on_update,), name='mapping', daemon=True
         )
         self._thread.start()
 
     def stop(self) -> None:
-        """End the thread when all that waits is done."""
+        """Work off the queue and end the thread."""
         with self._changed:
             self._stopping = True
             self._changed.notify()
@@ -130,15 +129,15 @@ class MappingThread:
             self._changed.notify()
 
     def refuse_pose(self, reason: str) -> None:
-        """Count a message of poses that cannot be read."""
+        """Count a pose message that cannot be decoded."""
         self._lose(LostPose('bad_pose', reason))
 
     def refuse_image(self, reason: str) -> None:
-        """Count an image of colours or labels, or its calibration, that cannot be read."""
+        """Count an image of colours or labels, or its calibration, that cannot be decoded."""
         self._lose(LostPose('bad_image', f'image ignored: {reason}'))
 
     def refuse_cloud(self, topic: str, reason: str) -> None:
-        """Count a cloud that cannot be read."""
+        """Count a cloud that cannot be decoded."""
         self._lose(LostCloud('bad_cloud', topic, reason))
 
     def put_image(self, image: SceneImage) -> None:
@@ -150,12 +149,12 @@ class MappingThread:
     def put_cloud(
         self, msg: Any, topic: str, decode: Callable[[Any, str], Scan] = to_scan
     ) -> None:
-        """Queue a cloud, or an image to be decoded; where too many wait, the oldest is dropped."""
+        """Queue a cloud or depth image; if the queue is full, drop the oldest."""
         with self._changed:
-            self._work.append(Cloud(msg, topic, decode))
+            self._work.append(QueuedCloud(msg, topic, decode))
             self._num_clouds += 1
             if self._num_clouds > self._max_clouds:
-                oldest = next(item for item in self._work if isinstance(item, Cloud))
+                oldest = next(item for item in self._work if isinstance(item, QueuedCloud))
                 self._work.remove(oldest)
                 self._num_clouds -= 1
                 frame_id = oldest.msg.header.frame_id
@@ -165,14 +164,14 @@ class MappingThread:
 
     @property
     def num_clouds(self) -> int:
-        """How many clouds wait."""
+        """Number of clouds in the queue."""
         return self._num_clouds
 
     def call(self, function: Callable[[], Result]) -> Future[Result]:
         """
-        Have a function called in this thread, after all clouds that came before.
+        Call a function in this thread, after all clouds queued before it; return a future.
 
-        The future is cancelled where the thread ends first.
+        The future is cancelled if the thread ends first.
         """
         future: Future[Result] = Future()
         with self._changed:
@@ -184,7 +183,7 @@ class MappingThread:
         return future
 
     def post(self, function: Callable[[], object]) -> None:
-        """Have a function called in this thread, unless it waits to be called already."""
+        """Call a function in this thread, unless it is queued already."""
         call = Call(function)
         with self._changed:
             if call not in self._work:
@@ -192,7 +191,7 @@ class MappingThread:
                 self._changed.notify()
 
     def _run(self, on_update: Callable[[Update], None]) -> None:
-        """Work until stopped; an error that is not ours to handle ends it."""
+        """Work until stopped or until an unexpected error."""
         try:
             while self._step(on_update):
                 pass
@@ -200,13 +199,13 @@ class MappingThread:
             self._on_failure(error)
         with self._changed:
             self._stopping = True
-            left, self._work = self._work, deque()
-        for item in left:
+            remaining, self._work = self._work, deque()
+        for item in remaining:
             if isinstance(item, Call) and item.future:
                 item.future.cancel()
 
     def _step(self, on_update: Callable[[Update], None]) -> bool:
-        """Wait for something to do and do it; false at the end."""
+        """Wait for input and process it; return False at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._stopping or self._has_input())
             if not self._has_input():
@@ -214,23 +213,23 @@ class MappingThread:
             poses, self._poses = self._poses, deque()
             images = [self._images.popleft() for _ in range(len(self._images))]
             item = self._work.popleft() if self._work else None
-            self._num_clouds -= isinstance(item, Cloud)
+            self._num_clouds -= isinstance(item, QueuedCloud)
             lost, self._lost = self._lost, Counter()
         self._count(lost)
         for pose, static in poses:
             self._mapper.add_pose(*pose, static=static)
         for image in images:
             self._mapper.add_image(image)
-        if isinstance(item, Cloud):
+        if isinstance(item, QueuedCloud):
             self._add(item)
         elif item is not None:
-            fulfil(item)
+            run_call(item)
         for update in self._mapper.insert_ready(more_follows=self._num_clouds > 0):
             on_update(update)
         return True
 
     def _has_input(self) -> bool:
-        """Return whether there is something to do; called with the lock."""
+        """Return whether any input waits; called with the lock held."""
         return bool(self._poses or self._images or self._work or self._lost)
 
     def _lose(self, lost: LostCloud | LostPose) -> None:
@@ -239,20 +238,20 @@ class MappingThread:
             self._changed.notify()
 
     def _count(self, lost: Counter[LostCloud | LostPose]) -> None:
-        """Enter in the counts what does not get to the mapper."""
-        for what, number in lost.items():
-            if isinstance(what, LostPose):
-                self._mapper.ignore_message(what.cause, what.reason, number)
+        """Report dropped messages to the mapper, which counts and logs them."""
+        for message, number in lost.items():
+            if isinstance(message, LostPose):
+                self._mapper.ignore_message(message.cause, message.reason, number)
             else:
                 self._mapper.refuse_clouds(
-                    what.cause, what.topic, what.reason, number, what.frame_id
+                    message.cause, message.topic, message.reason, number, message.frame_id
                 )
 
-    def _add(self, cloud: Cloud) -> None:
-        """Decode a cloud and give it to the mapper; a bad one is counted."""
+    def _add(self, cloud: QueuedCloud) -> None:
+        """Decode a cloud and pass it to the mapper; invalid ones are counted."""
         frame_id = cloud.msg.header.frame_id
         if self.paused:
-            reason = 'mapping is paused; call ~/pause with false to go on'
+            reason = 'mapping is paused; call ~/pause with false to continue'
             self._mapper.refuse_clouds('paused', cloud.topic, reason, frame_id=frame_id)
             return
         try:
@@ -265,8 +264,8 @@ class MappingThread:
         self._mapper.add_scan(scan, cloud.topic)
 
 
-def fulfil(call: Call) -> None:
-    """Call a function; its result or its error goes to whoever waits for it."""
+def run_call(call: Call) -> None:
+    """Call a function; its result or error goes to the future, if there is one."""
     if call.future is None:
         call.function()
         return

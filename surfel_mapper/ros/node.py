@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The node: its life cycle and its parameters, around a session that does the work.
+The lifecycle node: states, parameters, and the session that does the work.
 
-Four threads. The main one makes the transitions and hears signals (running.py). That of the intake
-takes clouds and poses and passes them on, the executor's does so with requests and timers. The
-mapping thread alone touches the map, and publishes what comes of it.
+There are four threads. The main thread makes the transitions and handles signals (main_thread.py).
+The subscription executor takes clouds and poses, the rclpy executor requests and timers; both pass
+them on. Only the mapping thread accesses the map, and publishes the results.
 
     unconfigured  parameters and diagnostics
-    inactive      kernels are compiled, topics and services are there, no scan is taken
+    inactive      kernels are compiled, publishers and services exist, no scan is taken
     active        scans are mapped
 """
 
@@ -44,33 +44,33 @@ SUCCESS = TransitionCallbackReturn.SUCCESS
 
 class MapperNode(LifecycleNodeMixin, BaseNode):
     """
-    A managed node that maps clouds.
+    A lifecycle node that maps clouds.
 
     Attributes
     ----------
     tasks : TaskQueue
-        What the main thread has to do: transitions that were requested, errors to raise.
+        Tasks for the main thread: requested transitions, and errors to raise.
     refusal : Exception or None
-        Why the last transition was refused.
+        The reason why the last transition was refused.
 
     Raises
     ------
     ConfigError
-        If the user set a parameter that does not exist, or to a value that it cannot have.
+        If the user set an unknown parameter, or a value out of bounds.
 
     """
 
     def __init__(self) -> None:
-        """Declare the parameters, and offer the services of the life cycle."""
+        """Declare the parameters and create the services of the life cycle."""
         try:
             Node.__init__(self, 'surfel_mapper')
-        except ParameterException as error:  # one of rclpy's own, such as use_sim_time
+        except ParameterException as error:  # a parameter of rclpy, such as use_sim_time
             raise ConfigError(str(error)) from error
         self.tasks = TaskQueue()
         self.refusal: Exception | None = None
         self._session: Session | None = None
         self._config = declare_settings(self)
-        # reentrant, so that a node that compiles still says in which state it is
+        # reentrant, so that get_state is answered while kernels compile
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         self._change_state = self._service_change_state.callback
         self._service_change_state.callback = self._on_change_state
@@ -90,46 +90,46 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return str(self._state_machine.current_state[1])
 
     def start(self) -> None:
-        """Configure and activate; raises why if that is refused."""
+        """Configure and activate; raises the reason if refused."""
         for transition in (self.trigger_configure, self.trigger_activate):
             if transition() != SUCCESS:
                 raise self.refusal or RuntimeError(f'{self.state}: the transition failed')
 
     def end(self) -> None:
-        """Shut down from whatever state, even from within a transition that was interrupted."""
+        """Shut down from any state, even after an interrupted transition."""
         if self.state in ('unconfigured', 'inactive', 'active'):
             self.trigger_shutdown()
         self._release(save=self._config.output.save_on_shutdown)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
-        """Set parameters that someone sends; the reason of a refusal names what is wrong."""
+        """Set parameters from a service request; a refusal names the parameter and the reason."""
         if reason := refusal(self, parameter_list):
             return SetParametersResult(successful=False, reason=reason)
         return super().set_parameters_atomically([as_declared(p) for p in parameter_list])
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Compile the kernels, then offer topics to read, and services."""
+        """Compile the kernels, then create publishers and services."""
         return self._attempt(self._configure)
 
     def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Subscribe and publish."""
+        """Subscribe and start publishing."""
         return self._attempt(self._activate)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Take no more scans, and keep the map."""
+        """Unsubscribe; the map stays."""
         return self._attempt(self._deactivate)
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the map, and withdraw topics and services."""
+        """Discard the map, publishers and services."""
         return self._attempt(partial(self._release, save=False))
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """End for good; the map is saved first if that is asked for."""
+        """Discard everything; saves the map first if ``output.save_on_shutdown`` is set."""
         save = self._config.output.save_on_shutdown
         return self._attempt(partial(self._release, save=save))
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Go back to unconfigured; the main thread ends the node with the error."""
+        """Return to unconfigured; the main thread ends the node with the error."""
         self._release(save=False)
         return SUCCESS
 
@@ -139,7 +139,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         except BaseException:
             self._withdraw()
             raise
-        if self._config != self._session.config:  # changed meanwhile: compiling takes a while
+        if self._config != self._session.config:  # changed while kernels compiled
             self._session.reconfigure(self._config)
         self._diagnostics.watch(self._session)
 
@@ -167,13 +167,13 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             self._withdraw()
 
     def _withdraw(self) -> None:
-        """Destroy all topics, services and timers that came with a session."""
+        """Destroy all publishers, subscriptions, services and timers of a session."""
         for entity, destroy in dict(self._entities()).items():
             if (entity, destroy) not in self._lasting:
                 destroy(entity)
 
     def _entities(self) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
-        """Yield everything that others see of the node, and what destroys it."""
+        """Yield all timers and endpoints of the node, each with the method that destroys it."""
         for entities, destroy in (
             (self.timers, self.destroy_timer),
             (self.subscriptions, self.destroy_subscription),
@@ -183,7 +183,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             yield from ((entity, destroy) for entity in entities)
 
     def _attempt(self, action: Callable[[], object]) -> TransitionCallbackReturn:
-        """Carry out a transition; an error that nobody foresaw goes to the main thread."""
+        """Run a transition; an unexpected error goes to the main thread."""
         self.refusal = None
         try:
             action()
@@ -199,18 +199,18 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     async def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        """Have the main thread make a transition; one that is not possible is refused."""
+        """Pass a transition to the main thread; impossible ones are refused."""
         action = partial(self._transit, request, response)
         response.success = await result_of(self.tasks.submit(action), self.executor)
         return response
 
     def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
-        """Make a transition that was requested, in the main thread; return whether it was made."""
+        """Make a requested transition, in the main thread; return whether it succeeded."""
         name = request.transition.label or str(request.transition.id)
         before, self.refusal = self.state, None
         try:
             done = bool(self._change_state(request, response).success)
-        except rclpy_implementation.RCLError:  # no such transition; rclpy lets it end the executor
+        except rclpy_implementation.RCLError:  # unknown transition, which rclpy does not catch
             done = False
         if not done:
             reason = self.refusal or f'not possible while {before}'
@@ -218,7 +218,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse values that the configuration refuses, and files that hold no filters."""
+        """Refuse values that the configuration refuses, and invalid filter files."""
         try:
             config = changed_config(self._config, parameters)
             if config.filters and config.filters != self._config.filters:
@@ -228,7 +228,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        """Put new settings to work, from the next scan on."""
+        """Apply new settings from the next scan on."""
         config = changed_config(self._config, parameters)
         if config != self._config:
             self._config = config

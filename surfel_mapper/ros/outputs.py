@@ -112,9 +112,9 @@ class Outputs:
         if self._models is not None:
             self._models.note(update)
         if self._has_clients():
-            self._publish_change(self._changes.of(update))
+            self._publish_change(self._changes.after_scan(update))
         else:
-            self._changes.forget()
+            self._changes.reset()
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
 
@@ -133,7 +133,7 @@ class Outputs:
         if self._models is not None:
             self._models.expire()
         if self._has_clients():
-            self._publish_change(self._changes.since_last())
+            self._publish_change(self._changes.collect())
 
     def start_timers(self, config: Config) -> None:
         """Publish at the rates of these settings from now on; called in the executor's thread."""

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-ROS parameters from the configuration, and back.
+ROS parameters declared from the configuration, and the configuration set by ROS parameters.
 
-The configuration checks what a user set before anything is declared: it knows all names and
-bounds, so a typing mistake gets the nearest name instead of being passed over, which is what ROS
-does with overrides that nobody declares. What is then declared is the value that was checked.
+The configuration checks all overrides before any parameter is declared. ROS silently ignores
+overrides of parameters that are not declared; here a misspelt name is an error that suggests the
+nearest one.
 """
 
 from __future__ import annotations
@@ -22,23 +22,22 @@ from rclpy.parameter import Parameter
 from surfel_mapper.config import Config, Declaration, declarations, near
 
 QOS_OVERRIDES = 'qos_overrides.'
-"""Parameters of this prefix are declared by rclpy with the topic that they are for."""
+"""rclpy declares parameters of this prefix when it subscribes to their topics."""
 
 INT64_MAX = 2**63 - 1
 
 LISTS = {float: Parameter.Type.DOUBLE_ARRAY, str: Parameter.Type.STRING_ARRAY}
-"""Types of parameters by what a list holds."""
+"""Parameter types of lists, by the type of their items."""
 
 
 def declare_settings(node: Node) -> Config:
     """
-    Declare every setting as a parameter of a node; return the configuration they make.
+    Declare every setting as a parameter of a node; return the configuration.
 
     Raises
     ------
     ConfigError
-        If the user set a parameter that is no setting, or to a value that it cannot have.
-        Nothing is declared then.
+        If the user set an unknown parameter, or a value out of bounds. Nothing is declared then.
 
     """
     config = Config.from_mapping(overrides(node))
@@ -49,8 +48,8 @@ def declare_settings(node: Node) -> Config:
 
 
 def overrides(node: Node) -> dict[str, Any]:
-    """Return what the user set, without what is meant for rclpy."""
-    found = node._parameter_overrides  # rclpy offers overrides in no other way
+    """Return the parameters set by the user, without those of rclpy."""
+    found = node._parameter_overrides  # rclpy has no public access to overrides
     return {
         name: [] if parameter.value is None else parameter.value  # an empty list has no type
         for name, parameter in found.items()
@@ -59,12 +58,12 @@ def overrides(node: Node) -> dict[str, Any]:
 
 
 def declare(node: Node, declared: Declaration, value: Any) -> None:
-    """Declare one setting with a value that was checked."""
+    """Declare one setting with its checked value."""
     if not isinstance(value, tuple):
         node.declare_parameter(declared.name, value, descriptor(declared), ignore_override=True)
         return
-    # rclpy takes an empty list for one of bytes, so the type is declared first, then the value,
-    # and in the end whether it can be changed.
+    # rclpy takes an empty list for one of bytes, so first the type is declared, then the value
+    # set, and then the parameter made read-only.
     kind = LISTS[declared.items]
     node.declare_parameter(declared.name, kind, ParameterDescriptor(), ignore_override=True)
     node.set_parameters([Parameter(declared.name, kind, list(value))])
@@ -74,7 +73,7 @@ def declare(node: Node, declared: Declaration, value: Any) -> None:
 
 
 def descriptor(declared: Declaration) -> ParameterDescriptor:
-    """Return what ``ros2 param describe`` shows of a setting."""
+    """Return the descriptor of a setting, which ``ros2 param describe`` prints."""
     low, high = declared.low, declared.high
     found = ParameterDescriptor(
         description=declared.meaning,
@@ -101,7 +100,7 @@ def descriptor(declared: Declaration) -> ParameterDescriptor:
 
 def changed_config(config: Config, parameters: Iterable[Parameter]) -> Config:
     """
-    Return a configuration with some parameters changed; others than settings are passed over.
+    Return a configuration with some parameters changed; parameters of rclpy are ignored.
 
     Raises
     ------
@@ -114,7 +113,7 @@ def changed_config(config: Config, parameters: Iterable[Parameter]) -> Config:
 
 
 def refusal(node: Node, parameters: Iterable[Parameter]) -> str:
-    """Return why parameters cannot be set on a running node, whatever their values; or nothing."""
+    """Return why parameters cannot be set on a running node: unknown or read-only; else empty."""
     for parameter in parameters:
         name = parameter.name
         if not node.has_parameter(name):
@@ -126,7 +125,7 @@ def refusal(node: Node, parameters: Iterable[Parameter]) -> str:
 
 
 def as_declared(parameter: Parameter) -> Parameter:
-    """Return a parameter with a float for a whole number where a float is declared."""
+    """Return the parameter as a float if it is declared as one and given as an integer."""
     floats = {declared.name for declared in declarations() if isinstance(declared.default, float)}
     if parameter.name in floats and parameter.type_ == Parameter.Type.INTEGER:
         return Parameter(parameter.name, value=float(parameter.value))

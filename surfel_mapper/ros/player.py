@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Publishing a bag over DDS at the pace of its record times.
+Publish a bag over DDS at the pace of its record times.
 
-Messages go out as the bytes that lie in the bag. A subscriber loses nothing that was published
-once it was found, if it is reliable; so playing can wait for subscribers before the first
-message, and waits for the last to be taken in the end.
+Messages are published as the serialized bytes in the bag. A reliable subscriber receives all
+messages published after its discovery, so the player can wait for subscribers before the first
+message, and waits until the last is acknowledged.
 """
 
 from __future__ import annotations
@@ -31,14 +31,13 @@ from surfel_mapper.ros.messages import time_message
 log = logging.getLogger(__name__)
 
 DEPTH = 20
-"""Messages of a topic kept until everybody has them."""
+"""Queue of a publisher: messages kept until all subscribers have them."""
 
 MAX_LATCHED = 100
-"""Messages kept for late subscribers of a latched topic; each may be of another publisher."""
+"""Queue of a latched topic, which may hold the messages of several recorded publishers."""
 
 SETTLE_S = 0.5
-"""A publisher knows a subscriber before the subscriber knows it; a best-effort one misses what
-comes between."""
+"""Time for the subscriber to discover the publisher, after the publisher has discovered it."""
 
 CLOCK_PERIOD_S = 0.01
 
@@ -62,19 +61,19 @@ def play(
     reader : BagReader
         The bag.
     topics : collection of str, optional
-        The topics to play; all whose types are installed without.
+        The topics to play; by default all whose types are installed.
     rate : float
-        Times the pace of the recording.
+        Speed relative to the recording.
     loop : bool
-        Begin anew at the end, until interrupted.
+        Repeat the bag until interrupted.
     clock : bool
         Publish the record time on /clock.
     wait_for : collection of str
-        Begin when somebody subscribes to each of these.
+        Start when each of these topics has a subscriber.
     timeout_s : float
-        How long to wait for that, s.
+        Longest wait for these subscribers, s.
     ros_args : sequence of str
-        What follows --ros-args on the command line, that included.
+        The command line from --ros-args on, that included.
 
     Returns
     -------
@@ -84,9 +83,9 @@ def play(
     Raises
     ------
     BagError
-        If the bag has no such topic, nothing to play, or is one of ROS 1.
+        If a topic is not in the bag, none can be played, or it is a ROS 1 bag.
     SubscriberError
-        If nobody subscribes in time.
+        If a topic has no subscriber in time.
 
     """
     keep_freed_memory()
@@ -109,14 +108,14 @@ def play(
 
 class Player:
     """
-    Publishers of the topics of a bag.
+    Publishes the topics of a bag.
 
     Attributes
     ----------
     published : dict of str to int
-        Messages published, by topic.
+        Number of messages published, by topic.
     skipped : dict of str to str
-        Why a topic is not published.
+        Reason why a topic is not published.
 
     """
 
@@ -129,10 +128,10 @@ class Player:
         rate: float,
         clock: bool,
     ) -> None:
-        """Make the publishers."""
+        """Create the publishers."""
         if reader.is_ros1:
             raise BagError(
-                f'{reader.path}: a bag of ROS 1, whose bytes ROS 2 cannot read; convert it: '
+                f'{reader.path}: a ROS 1 bag, whose messages ROS 2 cannot read; convert it: '
                 f'`rosbags-convert --src {reader.path} --dst {reader.path.stem}`'
             )
         self._reader = reader
@@ -144,7 +143,7 @@ class Player:
         self._make_publishers(node, topics)
 
     def _make_publishers(self, node: Node, names: Collection[str] | None) -> None:
-        """Make a publisher for every topic whose type is installed."""
+        """Create a publisher for every topic whose type is installed."""
         known = {topic.name: topic for topic in self._reader.topics}
         for name in known if names is None else names:
             if name not in known:
@@ -162,24 +161,24 @@ class Player:
             raise BagError(f'{self._reader.path}: no topic to play; skipped: {self.skipped}')
 
     def _qos(self, name: str) -> QoSProfile:
-        """Return the quality of service to publish with: reliable, latched as recorded."""
+        """Return the QoS of a publisher: reliable, and latched if it was recorded so."""
         if self._reader.is_latched(name):
             return QoSProfile(depth=MAX_LATCHED, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         return QoSProfile(depth=DEPTH)
 
     def wait_for_subscribers(self, names: Collection[str], timeout_s: float) -> None:
-        """Return when somebody subscribes to each of these topics."""
+        """Return when each of these topics has a subscriber."""
         unknown = [name for name in names if name not in self._publishers]
         if unknown:
             raise BagError(
-                f'{self._reader.path}: nobody can subscribe to {", ".join(unknown)}; '
-                f'played are {", ".join(self._publishers)}'
+                f'{self._reader.path}: no topic {", ".join(unknown)} to wait for; '
+                f'topics played: {", ".join(self._publishers)}'
             )
         end_s = time.monotonic() + timeout_s
-        while alone := [n for n in names if not self._publishers[n].get_subscription_count()]:
+        while unread := [n for n in names if not self._publishers[n].get_subscription_count()]:
             if time.monotonic() > end_s:
                 raise SubscriberError(
-                    f'nobody subscribed to {", ".join(alone)} within {timeout_s:g} s; is the '
+                    f'no subscriber of {", ".join(unread)} within {timeout_s:g} s; is the '
                     'subscriber running, with the same ROS_DOMAIN_ID and topic names?'
                 )
             time.sleep(0.02)
@@ -187,7 +186,7 @@ class Player:
             time.sleep(SETTLE_S)
 
     def play(self) -> None:
-        """Publish all messages once, each when its time has come."""
+        """Publish all messages once, each at its time."""
         start_s, first_ns = time.monotonic(), None
         for message in self._reader.messages(set(self._publishers)):
             first_ns = message.record_ns if first_ns is None else first_ns
@@ -197,7 +196,7 @@ class Player:
             self.published[message.topic] += 1
 
     def _sleep_until(self, due_s: float, record_ns: int) -> None:
-        """Sleep until a message is due; meanwhile publish the time that it is in the bag."""
+        """Sleep until a message is due; meanwhile publish the bag time on /clock."""
         while True:
             left_s = due_s - time.monotonic()
             if self._clock is not None:
@@ -210,7 +209,7 @@ class Player:
                 return
 
     def flush(self) -> None:
-        """Wait until those who subscribe reliably have everything."""
+        """Wait until all reliable subscribers have all messages."""
         clock = {'/clock': self._clock} if self._clock is not None else {}
         for name, publisher in {**self._publishers, **clock}.items():
             if not publisher.wait_for_all_acked(Duration(seconds=5)):

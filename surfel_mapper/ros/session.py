@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node has from configure to cleanup: a mapper, its thread, what goes in and out."""
+"""The parts of a node that exist from configure to cleanup: mapper, thread, inputs, outputs."""
 
 from __future__ import annotations
 
@@ -25,45 +25,47 @@ from surfel_mapper.ros.pose_outputs import registration_outputs
 from surfel_mapper.ros.services import Services
 
 LATEST = 200
-"""Latencies of so many scans are kept for the percentiles, 10 s at 20 Hz."""
+"""Scans whose latencies are kept for the percentiles: 10 s at 20 Hz."""
 
 
 class Session:
     """
-    The working parts of a node, from empty map to report.
+    Mapper, mapping thread, inputs, outputs and services of a configured node.
 
     Parameters
     ----------
     node : Node
-        Whose topics and services they are.
+        The node that owns the topics and services.
     config : Config
         All settings.
     tasks : TaskQueue
-        Gets the error if the mapping thread fails.
+        Takes the error if the mapping thread fails.
 
     Attributes
     ----------
     latencies_s : deque of float
-        Of the latest scans, from their stamps until what they changed was published, by the
-        clock of the node.
+        Times from the stamps of the latest scans until ~/changed was published, by the clock of
+        the node.
 
     Raises
     ------
     ConfigError
-        If this version cannot do what the settings ask for.
+        If the settings ask for a feature that is not available.
     FileFormatError, MapError
         If the map of ``map.load`` cannot be read, or is not as configured.
 
     """
 
     def __init__(self, node: Node, config: Config, tasks: TaskQueue) -> None:
-        """Compile the kernels, then offer topics to read, and services."""
+        """Compile the kernels, then create publishers and services."""
         self._node = node
         self.config = config
         self.mapper = Mapper(config)
         if config.map.load:
             surfel_map, _ = load_map(config.map.load, voxel_size_m=config.map.voxel_size_m)
-            self.mapper.restore(surfel_map, [])  # without its window: it stays
+            self.mapper.restore(
+                surfel_map, []
+            )  # without its window, so these scans are never evicted
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, or half a minute the first time')
         self.mapper.warm_up()
@@ -79,7 +81,7 @@ class Session:
         self.thread.start(self._on_update)
 
     def activate(self) -> None:
-        """Subscribe and publish; raises what ``Inputs.subscribe`` does."""
+        """Subscribe and start publishing; raises the errors of ``Inputs.subscribe``."""
         try:
             self.inputs.subscribe()
         except SurfelMapperError:
@@ -90,16 +92,16 @@ class Session:
             self.outputs.start_timers(self.config)
 
     def deactivate(self) -> None:
-        """Take no more messages and, when those that came are mapped, publish no more."""
+        """Unsubscribe, map the messages received so far, and stop publishing."""
         self.inputs.unsubscribe()
         with self._changing:
             self._is_active = False
             self.outputs.stop_timers()
-        with suppress(CancelledError):  # the thread may have failed, which the tasks tells
+        with suppress(CancelledError):  # the thread has failed; its error is in the task queue
             self.thread.call(lambda: None).result()
 
     def reconfigure(self, config: Config) -> None:
-        """Put new settings to work, from the next scan on."""
+        """Apply new settings from the next scan on."""
         with self._changing:
             self.config = config
             if self._is_active:
@@ -107,7 +109,7 @@ class Session:
         self.thread.post(self._reconfigure)
 
     def close(self, *, save: bool) -> None:
-        """End the thread when all that came is mapped; save the map if asked, and report."""
+        """Map the messages received so far, end the thread, save the map if asked, and log."""
         self.thread.stop()
         self.mapper.finish()
         log = self._node.get_logger()
@@ -119,7 +121,7 @@ class Session:
         log.info(report(self.mapper))
 
     def _on_update(self, update: Update) -> None:
-        """Publish what a scan changed; called in the mapping thread."""
+        """Publish the changes of a scan; called in the mapping thread."""
         if not self.latencies_s:
             self._node.get_logger().info(
                 f'first scan mapped: {update.num_points} points of frame {update.scan.frame_id}, '
@@ -132,16 +134,16 @@ class Session:
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
 
     def _reconfigure(self) -> None:
-        """Give the mapper the newest settings; called in the mapping thread."""
+        """Pass the newest settings to the mapper; called in the mapping thread."""
         try:
             self.mapper.reconfigure(self.config)
-        except SurfelMapperError as error:  # the file of filters is not what it was when checked
-            self._node.get_logger().error(f'settings not taken: {error}')
+        except SurfelMapperError as error:  # the filter file has changed since it was checked
+            self._node.get_logger().error(f'settings not applied: {error}')
         self.outputs.expire()
 
 
 def report(mapper: Mapper) -> str:
-    """Return in one line what was mapped."""
+    """Return the counts and the digest of a map in one line."""
     summary = mapper.summary()
     scans = summary['scans']
     dropped = ', '.join(f'{cause} {number}' for cause, number in scans['dropped'].items())

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A ROS domain of this test run's own, nodes in it as processes, and a peer to talk to them."""
+"""Fixtures: a ROS domain for this test run, nodes as processes in it, and a peer node."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import socket
 import pytest
 
 COMPILING_S = 3600.0
-"""A minute where nothing else runs; where this is not enough, all tests of nodes fail."""
+"""Longest wait for all kernels to compile; a minute on an idle machine."""
 
 LAYERS = {
     'pose.source': 'odometry',
@@ -28,12 +28,12 @@ WITHOUT_POSES = {'pose.source': 'registration'}
 
 @contextmanager
 def domain_of_our_own():
-    """Give the number of a ROS domain that no other run of these tests has, in a with-block."""
+    """Reserve a ROS domain that no other run of these tests uses, in a with-block."""
     for number in itertools.chain(range(os.getpid() % 100, 100), range(100)):
         with socket.socket(socket.AF_UNIX) as claim:
             try:
                 claim.bind(f'\0surfel_mapper-tests-in-domain-{number + 1}')
-            except OSError:  # claimed; a claim goes with its process
+            except OSError:  # taken; released when its process ends
                 continue
             yield number + 1
             return
@@ -41,7 +41,7 @@ def domain_of_our_own():
 
 @pytest.fixture(scope='session')
 def domain(tmp_path_factory):
-    """Keep all ROS traffic of this test run on this machine and apart from others'."""
+    """Keep the ROS traffic of this test run on this machine and in its own domain."""
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
     with domain_of_our_own() as number, pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_DOMAIN_ID', str(number))
@@ -52,7 +52,7 @@ def domain(tmp_path_factory):
 
 @pytest.fixture(scope='session')
 def compiled(domain, tmp_path_factory):
-    """Run nodes until all kernels are compiled, which takes longer than any test waits."""
+    """Run nodes until all kernels are compiled, which takes longer than the tests wait."""
     from test.ros.live import Process
 
     folder = tmp_path_factory.mktemp('compiling')
@@ -68,7 +68,7 @@ def compiled(domain, tmp_path_factory):
 
 @pytest.fixture
 def start(compiled, tmp_path):
-    """Give a function that runs a verb as a process; all are ended after the test."""
+    """Return a function that runs a verb as a process; all are killed after the test."""
     from test.ros.live import Process
 
     processes = []
@@ -80,12 +80,12 @@ def start(compiled, tmp_path):
     yield run
     for process in processes:
         process.kill()
-        print(process.output)  # shown where a test failed
+        print(process.output)  # pytest shows it if the test fails
 
 
 @pytest.fixture
 def peer(domain):
-    """Give a node of the test itself."""
+    """Return a node in the process of the test."""
     from test.ros.live import Peer
 
     peer = Peer()

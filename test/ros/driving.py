@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A drive through a room: settings of the node that maps it, what is sent, and a twin of it."""
+"""A drive through a room: settings of the node, messages to send, and a mapper without ROS."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SETTINGS = {
 
 
 def arguments(**changes):
-    """Return the arguments of a node with these settings, changed."""
+    """Return the arguments of a node with ``SETTINGS`` and some changes."""
     pairs = [('-p', f'{name}:={value}') for name, value in {**SETTINGS, **changes}.items()]
     return ['--ros-args', *(item for pair in pairs for item in pair), *RELIABLE]
 
@@ -31,7 +31,7 @@ ARGUMENTS = arguments()
 
 
 def drive(num_scans):
-    """Return clouds with their poses: a sensor that moves through a room."""
+    """Return clouds with their poses of a sensor that moves through a room."""
     stamps = [START_NS + i * PERIOD_NS for i in range(num_scans)]
     return [
         (cloud(stamp_ns, room(seed=i)), odometry(stamp_ns, (0.2 * i, 0.0, 0.0)))
@@ -42,13 +42,13 @@ def drive(num_scans):
 def send(peer, messages):
     """Send clouds with their poses."""
     for points, pose in messages:
-        peer.spin_for(0.02)  # the queue of a topic holds 20
+        peer.spin_for(0.02)  # the subscription has a queue of 20
         peer.publish('/odom', pose)
         peer.publish('/points', points)
 
 
 def mapped(messages, **changes):
-    """Return the updates of a Mapper fed with the same messages, and the Mapper."""
+    """Return the updates of a Mapper without ROS for the same messages, and the Mapper."""
     mapper = Mapper(Config.from_mapping({**SETTINGS, **changes}))
     updates = []
     for points, pose in messages:

@@ -1,12 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The table of faults in docs/faults.md and what is counted there, made from the tests.
+The table of faults in docs/faults.md and its figures, generated from the tests.
 
-``python -m test.ros.fault_table`` writes both.
-
-Each test of a fault states, where it stands, what happens, what is counted and what is lost; it
-then holds the node to it.
+``python -m test.ros.fault_table`` writes both. Each test of a fault states the effect, the counter
+and the loss in its decorator, and then checks them.
 """
 
 from __future__ import annotations
@@ -25,11 +23,11 @@ MODULES = (
     'test.ros.test_faults_files',
     'test.ros.test_faults_input',
 )
-BEGIN, END = '<!-- from here on made from test/ros -->', '<!-- to here -->'
+BEGIN, END = '<!-- begin: generated from test/ros -->', '<!-- end -->'
 
 
 class Fault(NamedTuple):
-    """A fault, and what comes of it."""
+    """A fault and its consequences."""
 
     name: str
     happens: str
@@ -41,7 +39,7 @@ FAULTS: list[Fault] = []
 
 
 def fault(name: str, *, happens: str, counted: str, lost: str) -> Callable:
-    """Mark a test as that of a fault."""
+    """Register a test as that of a fault."""
     FAULTS.append(Fault(name, happens, counted, lost))
     return lambda test: test
 
@@ -56,7 +54,7 @@ def table() -> str:
 
 
 def figures() -> dict[str, int]:
-    """Return what is counted, by the beginnings of the rows that state it."""
+    """Return the figures of the page, by the beginning of their row."""
     tried = sum(len(harness.corpus()) + harness.number for harness in HARNESSES.values())
     return {
         '| inputs of the tests, the same in every run |': tried,
@@ -65,7 +63,7 @@ def figures() -> dict[str, int]:
 
 
 def page_with(rows: str) -> str:
-    """Return the page with other rows, and with the figures of today."""
+    """Return the page with new rows and present figures."""
     text = PAGE.read_text(encoding='utf-8')
     before, _, rest = text.partition(BEGIN)
     text = before + rows + rest.partition(END)[2]
@@ -75,6 +73,6 @@ def page_with(rows: str) -> str:
 
 
 if __name__ == '__main__':
-    from test.ros import fault_table  # where the tests have entered theirs
+    from test.ros import fault_table  # the module that the tests have registered with
 
     PAGE.write_text(fault_table.page_with(fault_table.table()), encoding='utf-8')

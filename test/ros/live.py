@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Processes of the command line, a peer that talks to them over DDS, and messages to send."""
+"""Verbs as processes, a peer node that communicates with them over DDS, and messages to send."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from std_srvs.srv import Trigger
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120.0
-"""Of what takes a second on an idle machine."""
+"""Longest wait for an event that takes a second on an idle machine."""
 
 RETRY_S = 1.0
 START_NS = 1_700_000_000_000_000_000
@@ -35,7 +35,7 @@ NODE = '/surfel_mapper'
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 RVIZ = QoSProfile(depth=10)
 ALL = QoSProfile(depth=1000)
-"""Reliable, with room for whatever a test is sent: nothing is lost."""
+"""Reliable, with a queue longer than any test needs: no message is lost."""
 
 
 def reliably(*topics):
@@ -48,7 +48,7 @@ RELIABLE = reliably('/points', '/odom')
 
 
 class Process:
-    """A verb of the command line, running in a folder that also takes its output."""
+    """A verb running as a process in a folder, which also gets its output."""
 
     def __init__(self, arguments, folder):
         self._output = Path(folder) / f'{arguments[0]}_{time.monotonic_ns()}.txt'
@@ -72,7 +72,7 @@ class Process:
         return self._process.poll() is None
 
     def check(self):
-        """Check that it goes on, and that nothing was raised in it."""
+        """Check that the process runs and has printed no traceback."""
         assert self.is_running(), self.output
         assert 'Traceback' not in self.output, self.output
 
@@ -94,7 +94,7 @@ class Process:
 
 
 class Peer:
-    """A node of the test, which sends and collects."""
+    """A node of the test that publishes and collects messages."""
 
     def __init__(self):
         self._context = rclpy.Context()
@@ -121,12 +121,12 @@ class Peer:
 
     def meet(self, name=NODE):
         """
-        Return when a node knows all publishers and subscribers that there are here by now.
+        Return when a node has discovered all publishers and subscribers of this peer.
 
-        A publisher or client that knows a node is not known to it yet: a server answers nobody
-        whom it has not discovered, a best-effort subscriber misses what comes before. What is
-        made here is announced in that order, the two ends of a client last; so a node that
-        answers a new client has heard of everything before it.
+        Discovery has two directions: a publisher or client may know a node that does not know it
+        yet. A server does not answer unknown clients, and a best-effort subscriber misses messages
+        of unknown publishers. Endpoints are announced in the order of their creation, so a node
+        that answers a new client has discovered everything created before it.
         """
         client = self.node.create_client(GetState, f'{name}/get_state')
         answers, asked_s = [], [-RETRY_S]
@@ -141,7 +141,7 @@ class Peer:
         self.node.destroy_client(client)
 
     def advertise(self, *topics, depth=50, kinds=None):
-        """Publish clouds on topics of points and odometry on others, once they are read."""
+        """Create publishers, of odometry on topics ending in odom, else clouds; wait for readers."""
         for topic in topics:
             kind = Odometry if topic.endswith('odom') else PointCloud2
             kind = (kinds or {}).get(topic, kind)
@@ -149,7 +149,7 @@ class Peer:
         self.wait_until_read(*topics)
 
     def wait_until_read(self, *topics):
-        """Return when the node reads what is published on topics that are advertised."""
+        """Return when the node has subscribed to advertised topics."""
         self.spin_until(lambda: all(self._publishers[t].get_subscription_count() for t in topics))
         self.meet()
 
@@ -163,7 +163,7 @@ class Peer:
         return messages
 
     def collect(self, kind, topic, qos=ALL):
-        """Return the same once the node publishes them, and to us too."""
+        """Do the same; return when the node publishes the topic and has discovered the peer."""
         messages = self.subscribe(kind, topic, qos)
         self.spin_until(lambda: self.node.count_publishers(topic) > 0)
         self.meet()
@@ -176,7 +176,7 @@ class Peer:
         return answer
 
     def client(self, kind, service):
-        """Return a client of a service of the node, which answers it."""
+        """Return a client of a service of the node that is ready to use."""
         client = self.node.create_client(kind, f'{NODE}/{service}')
         self.meet()
         self.spin_until(client.service_is_ready)
@@ -193,7 +193,7 @@ class Peer:
         return future.result()
 
     def diagnosis(self, expected=None):
-        """Return the first report that holds some values, as (status, values)."""
+        """Return the first report with the expected values, as (status, values)."""
         reports, values = [], {}
         listening = self.node.create_subscription(
             DiagnosticArray, '/diagnostics', reports.append, ALL
@@ -213,7 +213,7 @@ class Peer:
 
 @contextmanager
 def node_and_peer(folder, *arguments):
-    """Give a node that saves into a folder and a peer of it, in a with-block."""
+    """Run a node that saves maps to a folder, and a peer, in a with-block."""
     node = Process(['node', *arguments, '-p', f'output.directory:={folder}'], folder.parent)
     peer = Peer()
     try:
@@ -224,7 +224,7 @@ def node_and_peer(folder, *arguments):
 
 
 def odometry(stamp_ns, xyz, parent='odom', child='base_link'):
-    """Return the pose of a vehicle that does not turn."""
+    """Return an Odometry message without rotation."""
     message = Odometry(child_frame_id=child)
     message.header.frame_id = parent
     stamp(message, stamp_ns)
@@ -234,7 +234,7 @@ def odometry(stamp_ns, xyz, parent='odom', child='base_link'):
 
 
 def cloud(stamp_ns, points, frame_id='lidar'):
-    """Return points as a cloud of x y z."""
+    """Return points as a PointCloud2 with the fields x y z."""
     content = np.ascontiguousarray(points, '<f4')
     message = PointCloud2(
         height=1,
@@ -253,7 +253,7 @@ def cloud(stamp_ns, points, frame_id='lidar'):
 
 
 def stamp(message, stamp_ns):
-    """Set the time of a message."""
+    """Set the stamp of a message."""
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""~/align over DDS: what it says, the path it publishes, and the map it leaves."""
+"""~/align over DDS: its answer, the path, and the map."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ARGUMENTS = [
 
 
 def messages():
-    """Return clouds of the street with the poses of an odometry that drifts."""
+    """Return clouds of a street with the poses of a drifting odometry."""
     scans, true = street_scans(30)
     found = []
     for scan, pose in zip(scans, drifted(true[:NUM_SCANS], 0.02, 0.2), strict=False):
@@ -51,7 +51,7 @@ def messages():
 
 
 def driven(peer):
-    """Publish what ``messages`` gives, and return it."""
+    """Publish the messages, and return them."""
     peer.advertise('/odom', '/points')
     sent = messages()
     for points, pose in sent:
@@ -73,7 +73,7 @@ def aligned_twin(sent):
     return mapper, mapper.align()
 
 
-def test_the_window_is_aligned_and_the_path_published(start, peer, tmp_path):
+def test_align_moves_the_window_and_publishes_the_path(start, peer, tmp_path):
     node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
     refused = peer.call('align')
     paths = peer.collect(Path, '/surfel_mapper/path', LATCHED)
@@ -107,7 +107,7 @@ def pose_of(pose):
 
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is None, reason='tf2_msgs is not installed')
-def test_the_transform_from_map_to_odom_goes_out_with_every_scan(start, peer):
+def test_map_to_odom_is_published_with_every_scan(start, peer):
     from tf2_msgs.msg import TFMessage
 
     start('node', *ARGUMENTS)

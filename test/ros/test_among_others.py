@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node among others: found by name, told new settings, outliving them, in their time."""
+"""The node in a ROS graph: names and types, QoS changes, simulated time, parameters."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ SERVICES = {
 }
 
 
-def test_topics_and_services_are_found_under_the_name_of_the_node_with_their_types(start, peer):
+def test_topics_and_services_have_the_documented_names_and_types(start, peer):
     start('node', *ARGUMENTS, '-r', '__ns:=/robot', '-r', '__node:=map', '-r', 'odom:=/odom')
     found = {}
 
@@ -60,7 +60,7 @@ def test_topics_and_services_are_found_under_the_name_of_the_node_with_their_typ
     peer.spin_until(lambda: ('map', '/robot') in peer.node.get_node_names_and_namespaces())
 
 
-def test_a_lidar_that_comes_back_with_another_quality_of_service_is_mapped_on(start, peer):
+def test_a_lidar_that_returns_with_another_qos_is_mapped(start, peer):
     start('node', *ARGUMENTS)
     peer.advertise('/odom')
     messages = drive(6)
@@ -84,7 +84,7 @@ def test_a_lidar_that_comes_back_with_another_quality_of_service_is_mapped_on(st
     assert values['resets'] == '0'
 
 
-def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
+def test_reports_and_latencies_use_simulated_time(start, peer):
     start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
     clock = peer.node.create_publisher(Clock, '/clock', 10)
     peer.spin_until(clock.get_subscription_count)
@@ -96,7 +96,7 @@ def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
         message.clock.sec, message.clock.nanosec = divmod(now_ns, 10**9)
 
         def is_heard():
-            clock.publish(message)  # again and again: the node takes it as best effort
+            clock.publish(message)  # repeatedly: the node reads it as best effort
             return reports and reports[-1].header.stamp == message.clock
 
         peer.spin_until(is_heard, what=lambda: f'{reports[-1].header.stamp}, not {message.clock}')
@@ -111,7 +111,7 @@ def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
     _, values = peer.diagnosis({'scans.mapped': 2})
     assert values['latency_ms.median'] == '50.0'
 
-    long_ago = START_NS - 10**11  # the simulation starts anew
+    long_ago = START_NS - 10**11  # the simulation restarts
     set_time(long_ago)
     send(peer, [(cloud(long_ago, room(seed=5)), odometry(long_ago, (0, 0, 0)))])
     _, values = peer.diagnosis({'scans.mapped': 3})
@@ -120,11 +120,11 @@ def test_simulated_time_is_the_time_of_reports_and_latencies(start, peer):
 
 @fault(
     'a negative time on `/clock`',
-    happens='it is passed over, with a warning; time stays as it was',
+    happens='it is ignored, with a warning; time stays as it was',
     counted='the log',
     lost='nothing',
 )
-def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
+def test_a_negative_clock_is_ignored(start, peer):
     node = start('node', *ARGUMENTS, '-p', 'use_sim_time:=true')
     peer.advertise('/clock', kinds={'/clock': Clock})
     peer.advertise('/odom', '/points')
@@ -142,8 +142,8 @@ def test_a_clock_that_shows_no_time_is_passed_over(start, peer):
 
 
 @fault(
-    'a parameter set to a value of a type that there is not',
-    happens='refused with the reason, and all others of the request',
+    'a parameter set to a value of an unknown type',
+    happens='the whole request is refused with the reason',
     counted='the answer of the service',
     lost='nothing',
 )
@@ -162,7 +162,7 @@ def test_a_parameter_of_no_known_type_is_refused(start, peer, kind):
     node.check()
 
 
-def test_filters_change_while_scans_come_and_bad_files_are_refused(start, peer, tmp_path):
+def test_filters_change_while_running_and_bad_files_are_refused(start, peer, tmp_path):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     client = peer.parameters()
@@ -196,7 +196,7 @@ def test_filters_change_while_scans_come_and_bad_files_are_refused(start, peer, 
     assert 'Traceback' not in node.output
 
 
-def test_limits_and_rates_change_while_running_and_what_is_wrong_is_refused(start, peer):
+def test_limits_and_rates_change_while_running_and_bad_values_are_refused(start, peer):
     start('node', *ARGUMENTS, '-p', 'publish.normals_rate_hz:=0.0')
     peer.advertise('/odom', '/points')
     normals = peer.collect(PointCloud2, f'{NODE}/normals')
@@ -227,7 +227,7 @@ def test_limits_and_rates_change_while_running_and_what_is_wrong_is_refused(star
     assert normals[-1].width == len(mapper.map.surfels(50)) < normals[0].width
 
 
-def test_no_pose_in_time_is_counted_by_cause_and_frame_and_the_log_says_what_to_do(start, peer):
+def test_a_missing_pose_is_counted_by_frame_and_logged_with_a_remedy(start, peer):
     node = start('node', *ARGUMENTS, '-p', 'pose.max_wait_s:=0.05')
     peer.advertise('/odom', '/points')
     (first, pose), (second, _) = drive(2)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What clients are told, and a MapMirror that is told it: it equals the map whatever happens to it.
+The published changes of a map, and a MapMirror that applies them: it always equals the map.
 
-No ROS here: messages are the bytes that the node publishes, in order or late.
+Imports no ROS: messages are built from the bytes that the node publishes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def config_with(**changes):
 
 
 class Node:
-    """A mapper, and what a node says of it."""
+    """A mapper, and the messages that a node would publish about it."""
 
     def __init__(self, **changes):
         self.mapper = Mapper(config_with(**changes))
@@ -61,7 +61,7 @@ class Node:
         return self.message(self.mapper.map.surfels(1))
 
     def map_scan(self, stamp_ns, num=300):
-        """Map a random scan somewhere; return what changed, as (MapChange, message)."""
+        """Map a random scan; return its changes as (MapChange, message)."""
         center = self._rng.integers(-3, 3, 3)
         points = self._rng.normal(scale=0.8, size=(num, 3)) + center
         colors = self._rng.integers(0, 2**24, num).astype(np.uint32)
@@ -71,11 +71,11 @@ class Node:
         )
         (update,) = self.mapper.insert_ready()
         self.stamp_ns = stamp_ns
-        change = self.changes.of(update)
+        change = self.changes.after_scan(update)
         return change, self.message(change.surfels, change.removed)
 
-    def tell(self):
-        change = self.changes.since_last()
+    def collect(self):
+        change = self.changes.collect()
         return change, self.message(change.surfels, change.removed)
 
 
@@ -95,7 +95,7 @@ def test_a_mirror_follows_scans_that_come_and_go(channels):
     assert node.mapper.counters.evicted['max_scans'] == 8
 
 
-def test_a_client_that_comes_late_is_complete_with_the_next_full_map():
+def test_a_late_client_is_complete_after_the_next_full_map():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(3):
         node.map_scan(number * SECOND)
@@ -107,7 +107,7 @@ def test_a_client_that_comes_late_is_complete_with_the_next_full_map():
     assert_equal(mirror, node)
 
 
-def test_a_full_map_that_arrives_after_later_changes_takes_none_of_them_back():
+def test_an_old_full_map_does_not_undo_later_changes():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(8):
         _, message = node.map_scan(number * SECOND)
@@ -119,7 +119,7 @@ def test_a_full_map_that_arrives_after_later_changes_takes_none_of_them_back():
     assert mirror.stamp_ns == 7 * SECOND
 
 
-def test_a_change_that_was_lost_is_mended_by_the_next_full_map():
+def test_the_next_full_map_repairs_a_lost_change():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(6):
         _, message = node.map_scan(number * SECOND)
@@ -130,18 +130,18 @@ def test_a_change_that_was_lost_is_mended_by_the_next_full_map():
     assert_equal(mirror, node)
 
 
-def test_a_map_that_is_cleared_or_changed_otherwise_is_followed():
+def test_a_mirror_follows_clearing_and_loading():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(3):
         mirror.change(node.map_scan(number * SECOND)[1])
     node.mapper.clear_region(Ball((0.0, 0.0, 0.0), 1.5))
-    mirror.change(node.tell()[1])
+    mirror.change(node.collect()[1])
     assert_equal(mirror, node)
     mirror.change(node.map_scan(3 * SECOND)[1])
     assert_equal(mirror, node)
 
     node.mapper.clear()
-    change, message = node.tell()
+    change, message = node.collect()
     mirror.change(message)
     assert len(mirror.map) == 0
     assert len(change.removed) > 100
@@ -149,11 +149,11 @@ def test_a_map_that_is_cleared_or_changed_otherwise_is_followed():
     other = SurfelMap(0.5)
     other.add(np.random.default_rng(5).normal(size=(500, 3)))
     node.mapper.restore(other, [])
-    mirror.change(node.tell()[1])
+    mirror.change(node.collect()[1])
     assert_equal(mirror, node)
 
 
-def test_time_that_is_set_back_is_followed():
+def test_a_mirror_follows_a_reset_of_time():
     node, mirror = Node(), MapMirror(0.5)
     for stamp_s in (100, 101, 102, 5, 6):
         mirror.change(node.map_scan(stamp_s * SECOND)[1])
@@ -163,11 +163,11 @@ def test_time_that_is_set_back_is_followed():
     assert_equal(mirror, node)
 
 
-def test_stamps_of_several_sensors_need_no_order():
+def test_stamps_of_several_sensors_may_be_out_of_order():
     node, mirror = Node(), MapMirror(0.5)
     stamps = [5.0, 5.3, 5.2, 5.5, 5.4]
     for number, stamp_s in enumerate(stamps):
-        node.mapper._queue.forget_stamps()  # as if each were another sensor's
+        node.mapper._queue.forget_stamps()  # as if each were from another sensor
         _, message = node.map_scan(round(stamp_s * SECOND))
         mirror.change(message)
         if number == 1:
@@ -176,7 +176,7 @@ def test_stamps_of_several_sensors_need_no_order():
     assert_equal(mirror, node)
 
 
-def test_without_moments_clients_are_told_of_surfels_alone():
+def test_without_moments_only_surfels_are_published():
     node = Node(**{'publish.moments': False})
     known = set()
     for number in range(10):
@@ -189,28 +189,28 @@ def test_without_moments_clients_are_told_of_surfels_alone():
         now = node.mapper.map.surfels(4)
         assert known == set(pack_keys(now.voxel_index).tolist())
     node.mapper.clear()
-    change, _ = node.tell()
+    change, _ = node.collect()
     assert set(pack_keys(change.removed).tolist()) == known
 
 
-def test_whoever_comes_first_gets_what_the_next_scan_changed_only():
+def test_the_first_subscriber_gets_only_the_changes_of_the_next_scan():
     node = Node()
     for number in range(3):
         node.map_scan(number * SECOND)
-        node.changes.forget()
+        node.changes.reset()
     before = node.mapper.map.version
     change, _ = node.map_scan(3 * SECOND, num=50)
     changed = node.mapper.map.surfels_changed(before, 1)
     assert len(change.surfels) == len(changed) < len(node.mapper.map)
 
 
-def test_what_clients_know_is_listed_anew_now_and_then(monkeypatch):
+def test_the_published_keys_are_listed_again_at_intervals(monkeypatch):
     monkeypatch.setattr('surfel_mapper.ros.changes.LIST_EVERY', 3)
     for moments in (True, False):
         node = Node(**{'publish.moments': moments})
         for number in range(8):
             node.map_scan(number * SECOND)
-            known = node.changes._known
+            known = node.changes._published
             assert len(known) < 3
             expected = np.sort(node.mapper.map.keys(1 if moments else 4))
             np.testing.assert_array_equal(np.sort(known.keys()), expected)
@@ -224,7 +224,7 @@ def test_integers_keep_all_their_bits():
     np.testing.assert_array_equal(whole(pairs), values)
 
 
-def test_a_voxel_that_is_gone_has_no_points_and_no_place():
+def test_a_removed_voxel_has_no_points_and_no_position():
     node = Node()
     node.map_scan(0)
     message = node.message(node.mapper.map.surfels(1), np.array([[7, -8, 9]], np.int32))
@@ -234,7 +234,7 @@ def test_a_voxel_that_is_gone_has_no_points_and_no_place():
     assert [scan.columns[f'voxel_{axis}'][-1] for axis in 'xyz'] == [7, -8, 9]
 
 
-def test_removed_voxels_are_told_by_place_and_index():
+def test_removed_voxels_have_position_and_index():
     columns = voxel_columns(np.array([[0, -1, 3]], np.int32), 0.5)
     assert {name: values.tolist() for name, values in columns.items()} == {
         'x': [0.25],
@@ -246,7 +246,7 @@ def test_removed_voxels_are_told_by_place_and_index():
     }
 
 
-def test_clouds_that_cannot_be_mirrored_are_refused_and_change_nothing():
+def test_clouds_without_moments_are_refused_and_change_nothing():
     node, mirror = Node(), MapMirror(0.5)
     mirror.change(node.map_scan(0)[1])
     digest = mirror.map.digest()
@@ -273,7 +273,7 @@ def test_an_empty_map_is_mirrored():
     assert len(mirror.map) == 0
 
 
-def test_memory_of_changes_is_bounded():
+def test_the_memory_for_recent_changes_is_bounded():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(MAX_RECENT + 5):
         mirror.change(node.map_scan(number * SECOND, num=5)[1])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Disks, directories, descriptors, and ends of the process: files are whole, or as before."""
+"""Full disks, read-only directories, descriptors, killed processes: files stay complete."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from test.ros.live import node_and_peer, ROOT
 
 
 def mapper_of(num_scans, folder):
-    """Return a mapper that has mapped scans and would save into a folder."""
+    """Return a mapper with some scans that saves to a folder."""
     mapper = Mapper(
         Config.from_mapping({'pose.source': 'identity', 'output.directory': str(folder)})
     )
@@ -47,7 +47,7 @@ def mapper_of(num_scans, folder):
 
 
 def ends_at(number, how, function):
-    """Call a function in a process that a signal ends at a step of writing; tell if it did."""
+    """Call a function in a process killed at a step of writing; return whether it was killed."""
     child = os.fork()
     if child:
         return os.WIFSIGNALED(os.waitpid(child, 0)[1])
@@ -80,12 +80,12 @@ def leftovers(folder):
 
 @fault(
     'SIGKILL or SIGTERM at any step of `~/save_map`',
-    happens='each file is the old one or the new one, whole',
+    happens='each file is complete, either the old or the new one',
     counted='nothing',
-    lost='at most the map that was being saved; a `.part` file may stay',
+    lost='at most the map being saved; a `.part` file may remain',
 )
 @pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM])
-def test_a_process_that_ends_while_saving_leaves_whole_maps(tmp_path, how):
+def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
     old, new = mapper_of(2, tmp_path), mapper_of(3, tmp_path)
     digests = {old.map.digest(), new.map.digest()}
     sizes = {len(m.map.surfels(5)) for m in (old, new)}
@@ -104,16 +104,16 @@ def test_a_process_that_ends_while_saving_leaves_whole_maps(tmp_path, how):
 
 
 @fault(
-    'SIGKILL or SIGTERM at any step of what `replay` writes',
-    happens='each file is whole or not there; `summary.json` comes last',
+    'SIGKILL or SIGTERM at any step of writing in `replay`',
+    happens='each file is complete or absent; `summary.json` is written last',
     counted='nothing',
-    lost='that replay; a `.part` file may stay',
+    lost='that replay; a `.part` file may remain',
 )
-def test_a_replay_that_ends_while_writing_leaves_whole_files(tmp_path, monkeypatch):
+def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypatch):
     from surfel_mapper.viz import picture
 
     mapper = mapper_of(2, tmp_path)
-    # a picture takes a second, of which the steps of writing are no part
+    # drawing takes a second and has no steps of writing
     monkeypatch.setattr(picture, 'draw_map', lambda _, path, *rest, **more: path.write_bytes(b''))
     summary = {'bag': 'a', 'replay_s': 1.0, 'recorded_s': 1.0, **mapper.summary()}
     monkeypatch.setattr('surfel_mapper.viz.report.write_report', lambda path, *rest: None)
@@ -136,7 +136,7 @@ def test_a_replay_that_ends_while_writing_leaves_whole_files(tmp_path, monkeypat
 
 
 class Disk:
-    """A small file system of its own."""
+    """A small file system mounted for a test."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -175,21 +175,21 @@ def running(compiled, tmp_path_factory):
         yield node, peer, maps
 
 
-def saves(peer):
-    """Return whether the map is saved, and what is said."""
+def save(peer):
+    """Call ~/save_map; return (success, message)."""
     answer = peer.call('save_map')
     return answer.success, answer.message
 
 
-def goes_on(node, peer):
-    """Check that a node works as before."""
+def check_unaffected(node, peer):
+    """Check that a node runs and has lost no scan."""
     node.check()
     _, values = peer.diagnosis()
     assert values['scans.mapped'] == values['scans.received'] == '3'
 
 
-def pointed(maps, target):
-    """Have the directory of maps lead elsewhere."""
+def link(maps, target):
+    """Replace the directory of maps by a link."""
     if maps.is_symlink():
         maps.unlink()
     elif maps.exists():
@@ -199,52 +199,52 @@ def pointed(maps, target):
 
 @fault(
     'disk full while saving',
-    happens='refused with the reason; what was saved before stays; works again when there is room',
+    happens='refused with the reason; earlier files stay; works again once there is space',
     counted='the answer of the service, and the log',
     lost='nothing: the map is in memory',
 )
-def test_a_full_disk_is_answered_and_the_node_goes_on(running, disk):
+def test_a_full_disk_is_reported_and_the_node_continues(running, disk):
     node, peer, maps = running
-    pointed(maps, disk.folder)
+    link(maps, disk.folder)
     filler = disk.folder / 'filler'
     filler.write_bytes(bytes(250 << 10))
-    success, said = saves(peer)
+    success, said = save(peer)
     assert not success
     assert 'No space left on device' in said
     assert not leftovers(disk.folder)
     filler.unlink()
     disk.unmount()
     disk.mount('size=64m')
-    assert saves(peer)[0]
-    goes_on(node, peer)
+    assert save(peer)[0]
+    check_unaffected(node, peer)
 
 
 @fault(
     'read-only directory',
-    happens='refused with the reason; the node goes on',
+    happens='refused with the reason; the node continues',
     counted='the answer of the service, and the log',
     lost='nothing: the map is in memory',
 )
-def test_a_read_only_directory_is_answered_and_the_node_goes_on(running, disk):
+def test_a_read_only_directory_is_reported_and_the_node_continues(running, disk):
     node, peer, maps = running
     disk.unmount()
     disk.mount('ro')
-    pointed(maps, disk.folder)
-    success, said = saves(peer)
+    link(maps, disk.folder)
+    success, said = save(peer)
     assert not success
     assert 'Read-only file system' in said
-    goes_on(node, peer)
+    check_unaffected(node, peer)
 
 
 @fault(
     'no file descriptors left',
-    happens='saving is refused with the reason, whoever is connected stays so; works again later',
+    happens='saving is refused with the reason; connections stay; works again later',
     counted='the answer of the service, and the log',
-    lost='who comes anew is not connected until there are some',
+    lost='new peers cannot connect until file descriptors are free',
 )
-def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
+def test_the_node_survives_without_file_descriptors(running, tmp_path):
     node, peer, maps = running
-    pointed(maps, tmp_path)
+    link(maps, tmp_path)
     pid = node._process.pid
     client = peer.client(Trigger, 'save_map')
     assert peer.result(client.call_async(Trigger.Request())).success
@@ -263,16 +263,16 @@ def test_without_file_descriptors_the_node_goes_on(running, tmp_path):
     assert not answer.success
     assert 'Too many open files' in answer.message
     assert peer.result(client.call_async(Trigger.Request())).success
-    goes_on(node, peer)
+    check_unaffected(node, peer)
 
 
 @fault(
     'cache directory of compiled kernels unwritable',
-    happens='they are kept in a temporary one and compiled at every start; a warning says so',
+    happens='a temporary one is used, so kernels are compiled at every start; a warning',
     counted='the log',
     lost='half a minute at the start',
 )
-def test_without_a_cache_the_kernels_load(disk, tmp_path):
+def test_kernels_load_without_a_cache_directory(disk, tmp_path):
     disk.unmount()
     disk.mount('size=32m')
     package = disk.folder / 'surfel_mapper'

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-One node that is fed all that goes wrong with sensors, poses and clocks, fault after fault.
+Faults of sensors, poses and clocks, one after the other, sent to one node.
 
-Whatever comes, the node goes on, every cloud is accounted for, and in the end its map is to the
-bit what a map made anew is.
+The node survives each fault, every cloud is mapped or counted as dropped, and in the end the map
+has the digest of a new map of the same scans.
 
-(Longer than other files: one node lives through all of them, in this order.)
+(Longer than other files: the tests share one node and run in this order.)
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SECOND_NS = 10**9
 
 
 class Stream:
-    """A node with a peer, stamps that go on from test to test, and what its counts grew by."""
+    """A node and its peer; stamps that increase from test to test; the growth of counters."""
 
     def __init__(self, node, peer):
         self.node, self.peer = node, peer
@@ -44,7 +44,7 @@ class Stream:
         self.begin()
 
     def begin(self):
-        """Take the counts as they are for nothing."""
+        """Count from the present values on."""
         self.peer.spin_for(0.3)
         self._before = self.values()
 
@@ -61,7 +61,7 @@ class Stream:
         self.peer.publish('/points', cloud(stamp_ns or self.now_ns, points, frame_id))
 
     def pair(self, **options):
-        """Send a pose and a cloud of the next stamp; soon, so that no history overflows."""
+        """Send a pose and a cloud with the next stamp, slowly enough for the queues."""
         self.step()
         self.pose()
         self.scan(**options)
@@ -77,7 +77,7 @@ class Stream:
         return {key: value - self._before.get(key, 0) for key, value in now.items()}
 
     def wait(self, **expected):
-        """Wait until counts have grown by so much; nothing may be dropped beyond it."""
+        """Wait until counters have grown by these numbers; no other scan may be dropped."""
         wanted = {key.replace('__', '.'): value for key, value in expected.items()}
         self.peer.spin_until(
             lambda: all(self.grown().get(key, 0) == value for key, value in wanted.items()),
@@ -93,7 +93,7 @@ class Stream:
         self.node.check()
 
     def settle(self):
-        """Wait until every cloud that came is accounted for, and none comes any more."""
+        """Wait until no cloud has arrived for 1 s and all are mapped or counted as dropped."""
         last = [None, time.monotonic()]
 
         def is_settled():
@@ -138,11 +138,11 @@ for number in range(10_000):
 
 @fault(
     'publisher killed (SIGKILL) and started again',
-    happens='mapping stops and goes on with the first cloud of the new one',
+    happens='mapping stops, and continues with the first cloud of the new publisher',
     counted='silence in the diagnostics',
-    lost='nothing that was sent',
+    lost='no cloud that was sent',
 )
-def test_a_publisher_that_was_killed_is_heard_again(stream):
+def test_a_restarted_publisher_is_mapped(stream):
     for _ in range(2):
         before = stream.grown().get('scans.mapped', 0)
         command = [sys.executable, '-c', SENDER, str(stream.step(200 * SECOND_NS))]
@@ -160,7 +160,7 @@ def test_a_publisher_that_was_killed_is_heard_again(stream):
     counted='`stamp_repeated`, each of the others',
     lost='nothing',
 )
-def test_clouds_that_come_again_are_mapped_once(stream):
+def test_repeated_clouds_are_mapped_once(stream):
     for _ in range(5):
         stream.pair()
         stream.scan()
@@ -171,7 +171,7 @@ def test_clouds_that_come_again_are_mapped_once(stream):
 
 @fault(
     'clouds out of order',
-    happens='those older than the newest are dropped, the map stays',
+    happens='clouds older than the newest are dropped, the map stays',
     counted='`stamp_back`',
     lost='the clouds that came too late',
 )
@@ -185,12 +185,12 @@ def test_clouds_out_of_order_are_dropped(stream):
 
 
 @fault(
-    'clock set back by an hour, and forth again',
-    happens='set back, the map is cleared and mapping goes on; set forth, it goes on',
+    'clock set back by an hour, and forward again',
+    happens='set back: the map is cleared, mapping continues; set forward: mapping continues',
     counted='`resets`, one for each time back',
-    lost='the map before it, on purpose: it is of another time',
+    lost='the earlier map, on purpose: it is of another time',
 )
-def test_a_clock_set_back_and_forth_is_followed(stream):
+def test_a_clock_set_back_and_forward_is_followed(stream):
     stream.pair()
     stream.wait(scans__mapped=1)
     for hours, resets in ((-1, 1), (1, 1), (-1, 2)):
@@ -205,7 +205,7 @@ def test_a_clock_set_back_and_forth_is_followed(stream):
     'no transform at all for a cloud',
     happens='it waits `pose.max_wait_s` of data time, then it is dropped',
     counted='`no_pose`, by frame',
-    lost='clouds that nobody says the place of',
+    lost='clouds without a pose',
 )
 def test_a_cloud_without_a_transform_is_dropped(stream):
     stream.step()
@@ -224,7 +224,7 @@ def test_a_cloud_without_a_transform_is_dropped(stream):
     counted='nothing',
     lost='nothing',
 )
-def test_clouds_wait_for_transforms_that_are_late(stream):
+def test_clouds_wait_for_late_transforms(stream):
     stamps = [stream.step() for _ in range(3)]
     for stamp_ns in stamps:
         stream.scan(stamp_ns)
@@ -236,12 +236,12 @@ def test_clouds_wait_for_transforms_that_are_late(stream):
 
 
 @fault(
-    'transforms in a loop, or with two parents, or no numbers',
-    happens='they are left out, with a warning; the tree stays',
+    'transforms in a loop, with two parents, or not finite',
+    happens='they are ignored, with a warning; the tree stays',
     counted='`messages_ignored`',
     lost='nothing',
 )
-def test_transforms_that_contradict_are_left_out(stream):
+def test_contradictory_transforms_are_ignored(stream):
     stream.pair()
     broken = odometry(stream.now_ns, (np.nan, 0.0, 0.0))
     unturned = odometry(stream.now_ns, (0.0, 0.0, 0.0))
@@ -258,11 +258,11 @@ def test_transforms_that_contradict_are_left_out(stream):
 
 @fault(
     'bursts at ten times the rate',
-    happens='clouds are mapped as fast as it goes, the oldest that wait give way',
-    counted='`overload`; what the middleware has no room for, `clouds_lost`, as far as it tells',
+    happens='clouds are mapped as fast as possible; the oldest in the queue are dropped',
+    counted='`overload`; losses of the middleware, as far as it reports them, `clouds_lost`',
     lost='clouds beyond `input.max_waiting_clouds`',
 )
-def test_a_burst_is_mapped_as_far_as_it_goes(stream):
+def test_a_burst_is_mapped_as_fast_as_possible(stream):
     for _ in range(100):
         stream.step(PERIOD_NS // 10)
         stream.pose()
@@ -275,18 +275,18 @@ def test_a_burst_is_mapped_as_far_as_it_goes(stream):
 
 
 @fault(
-    'a subscriber that takes nothing',
+    'a subscriber that reads nothing',
     happens='the node does not wait for it',
     counted='nothing',
     lost='nothing in the map; that subscriber misses messages',
 )
-def test_a_subscriber_that_is_slow_holds_nobody_up(stream):
-    asleep = Peer()  # nobody spins it later
+def test_a_slow_subscriber_does_not_delay_the_node(stream):
+    asleep = Peer()  # it is never spun
     try:
         for topic in ('normals', 'changed'):
             asleep.subscribe(PointCloud2, f'{NODE}/{topic}', QoSProfile(depth=1))
         asleep.meet()
-        for number in range(10, 40, 10):  # fewer than the node lets wait
+        for number in range(10, 40, 10):  # fewer than the queue of the node holds
             for _ in range(10):
                 stream.pair(num=4000)
             stream.wait(scans__mapped=number)
@@ -296,7 +296,7 @@ def test_a_subscriber_that_is_slow_holds_nobody_up(stream):
 
 @fault(
     'thousands of tiny clouds',
-    happens='each is mapped, or dropped where they come too fast',
+    happens='each is mapped, or dropped if they arrive too fast',
     counted='`overload`',
     lost='clouds beyond `input.max_waiting_clouds`',
 )
@@ -315,8 +315,8 @@ def test_thousands_of_tiny_clouds_are_accounted_for(stream):
 
 @fault(
     'a few huge clouds (12 MB)',
-    happens='they are mapped, those behind them wait',
-    counted='nothing; lost on the way without shared memory: `clouds_lost`',
+    happens='they are mapped, later ones wait',
+    counted='nothing; losses without shared memory: `clouds_lost`',
     lost='nothing, with a reliable publisher',
 )
 def test_a_few_huge_clouds_are_mapped(stream):
@@ -328,12 +328,12 @@ def test_a_few_huge_clouds_are_mapped(stream):
 
 
 @fault(
-    'clouds of ever new frames',
-    happens='they are treated as those of any sensor, up to 64 frames',
+    'clouds of ever new frame ids',
+    happens='each frame is treated as a sensor, up to 64 frames',
     counted='`too_many_frames`; by frame for the first 128, then as `(others)`',
-    lost='clouds beyond those',
+    lost='clouds of further frames',
 )
-def test_frames_without_end_cost_no_memory_without_end(stream):
+def test_the_memory_for_frames_is_bounded(stream):
     stream.pair()
     for number in range(150):
         stream.step(PERIOD_NS // 10)
@@ -347,15 +347,15 @@ def test_frames_without_end_cost_no_memory_without_end(stream):
     assert len(by_frame) <= 129
 
 
-def test_after_all_that_the_map_is_exact(stream):
+def test_the_map_is_exact_after_all_faults(stream):
     assert stream.peer.call('clear').success
     messages = drive(5)
-    send(stream.peer, [(c, p) for c, p in messages])  # long ago: the map starts anew
+    send(stream.peer, [(c, p) for c, p in messages])  # older than the map, which is reset
     _, mapper = mapped(messages)
     stream.peer.spin_until(lambda: stream.grown()['scans.mapped'] == 5)
     assert mapper.map.digest() in stream.peer.call('save_map').message
     assert stream.node.stop(signal.SIGTERM) == 0
 
 
-def test_the_table_of_faults_is_that_of_the_tests():
+def test_the_table_of_faults_is_generated_from_the_tests():
     assert PAGE.read_text(encoding='utf-8') == page_with(table()), 'python -m test.ros.fault_table'

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is said to be wrong with a node, and how badly, at the thresholds of the settings."""
+"""The warnings and errors of a node at the thresholds of the settings."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ LIMITS = DiagnosticsConfig(
 
 
 def found(limits=LIMITS, **happened):
-    """Return (level, text) of everything that is wrong."""
+    """Return all findings as (level, text)."""
     return list(findings(Interval(topic='/points', **happened), limits))
 
 
-def test_nothing_is_wrong_where_scans_come_and_are_mapped():
+def test_a_healthy_node_has_no_findings():
     assert found(received=20, silent_s=0.04, latency_s=0.03) == []
     assert found() == []
 
 
 @pytest.mark.parametrize(
-    ('num_publishers', 'remedy'), [(0, 'remap points'), (1, '1 publish there; see fastdds_shm')]
+    ('num_publishers', 'remedy'), [(0, 'remap points'), (1, 'publishers: 1; see fastdds_shm')]
 )
-def test_no_cloud_so_far_is_a_warning_with_what_to_look_for(num_publishers, remedy):
+def test_no_cloud_yet_is_a_warning_with_a_remedy(num_publishers, remedy):
     ((level, text),) = found(ever_received=False, num_publishers=num_publishers, silent_s=99.0)
     assert level == WARN
     assert text.startswith('no cloud on /points yet')
@@ -51,7 +51,7 @@ def test_silence_is_an_error_beyond_its_limit_only():
 @pytest.mark.parametrize(
     ('num', 'level'), [(2, None), (3, WARN), (10, WARN), (11, ERROR), (20, ERROR)]
 )
-def test_drops_are_a_warning_or_an_error_by_their_share(num, level):
+def test_the_share_of_drops_decides_between_warning_and_error(num, level):
     said = found(received=20, dropped=Counter(overload=num - 1, bad_cloud=1))
     assert [severity for severity, _ in said] == ([] if level is None else [level])
     if said:
@@ -64,7 +64,7 @@ def test_any_drop_is_a_warning_by_default():
     assert (level, text) == (WARN, '1 scans dropped just now (no_points 1)')
 
 
-def test_a_pause_is_a_warning_and_its_drops_are_no_fault():
+def test_a_pause_is_a_warning_and_its_drops_are_ignored():
     ((level, text),) = found(received=20, dropped=Counter(paused=20), paused=True)
     assert level == WARN
     assert text.startswith('paused')
@@ -76,11 +76,11 @@ def test_latency_is_a_warning_or_an_error_beyond_its_limits(latency_s, level):
     assert [severity for severity, _ in said] == ([] if level is None else [level])
 
 
-def test_stamps_of_another_time_and_limits_of_zero_are_no_latency():
+def test_latency_is_ignored_with_other_clocks_and_zero_limits():
     assert found(latency_s=3e8) == []
     assert found(latency_s=-3e8) == []
     assert found(DiagnosticsConfig(warn_latency_s=0.0, error_latency_s=0.0), latency_s=9.0) == []
 
 
-def test_what_the_middleware_lost_is_handed_on():
+def test_losses_of_the_middleware_are_reported():
     assert found(loss='3 lost, do this') == [(WARN, '3 lost, do this')]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node takes in, over DDS: several lidars, any QoS, depth images, rolling sweeps."""
+"""The inputs of a node over DDS: several lidars, any QoS, depth images, rolling shutter."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def node_digest(node):
     return node.output.rpartition('digest ')[2].split()[0]
 
 
-def test_several_lidars_are_mapped_each_where_it_is_mounted(start, peer):
+def test_several_lidars_are_mapped_with_their_mounting_poses(start, peer):
     settings = {
         'input.topics': ['/front/points', '/rear/points'],
         'frames.sensors': ['front', 'rear'],
@@ -91,7 +91,7 @@ def test_several_lidars_are_mapped_each_where_it_is_mounted(start, peer):
     assert 'reads /odom, /front/points, /rear/points' in node.output
 
 
-def test_reliable_and_best_effort_publishers_are_heard_alike_and_after_a_restart(start, peer):
+def test_reliable_and_best_effort_publishers_are_mapped_after_a_restart(start, peer):
     node = start('node', *arguments(reliably('/odom')))
     peer.advertise('/odom')
     number = 0
@@ -146,7 +146,7 @@ def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
         poses.append(odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
         peer.publish('/odom', poses[-1])
         peer.publish(image, images[-1])
-        if number == 1:  # the first images wait for it
+        if number == 1:  # the first images wait for the camera info
             peer.spin_for(0.2)
             peer.publish(info, camera_info(camera))
             peer.spin_for(0.2)
@@ -161,7 +161,7 @@ def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
 
 
 def rolling_cloud(scan):
-    """Return a simulated sweep as a cloud with the times of its points, as Ouster writes them."""
+    """Return a simulated scan as a cloud with a time per point, in the layout of Ouster."""
     dtype = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('t', '<u4')])
     points = np.zeros(len(scan), dtype)
     for axis, name in enumerate('xyz'):
@@ -174,7 +174,7 @@ def rolling_cloud(scan):
     return message
 
 
-def test_sweeps_are_deskewed_live_as_they_are_offline(start, peer):
+def test_live_deskewing_equals_offline_deskewing(start, peer):
     world = World.street(seed=0, length_m=40.0)
     simulation = Simulation(world, Lidar(beams=8, columns=256), num_scans=3, rolling=True)
     settings = {
@@ -187,7 +187,7 @@ def test_sweeps_are_deskewed_live_as_they_are_offline(start, peer):
     for number in range(simulation.num_scans):
         clouds.append(rolling_cloud(simulation.scan(number)))
         first = simulation.stamp_ns(number)
-        peer.publish('/points', clouds[-1])  # its poses come after it
+        peer.publish('/points', clouds[-1])  # its poses follow
         for stamp_ns in range(first, first + PERIOD_NS, PERIOD_NS // 5):
             poses.append(moving(simulation, stamp_ns))
             peer.publish('/odom', poses[-1])
@@ -220,7 +220,7 @@ def inputs_of(config):
     return Inputs(node, config, thread, on_failure=None)
 
 
-def test_of_several_lidars_the_one_that_is_silent_is_known():
+def test_the_most_silent_of_several_lidars_is_found():
     inputs = inputs_of(Config.from_mapping({'input.topics': ['front', 'rear']}))
     before = time.monotonic()
     inputs._on_cloud('/front', b'')
@@ -239,7 +239,7 @@ def inputs_that_lost(size):
 
 
 @pytest.mark.skipif(any(map(os.environ.get, FASTDDS_VARIABLES)), reason='Fast DDS is configured')
-def test_large_clouds_that_get_lost_are_noticed_and_the_remedy_named(start, peer):
+def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
     node = start('node', *arguments([], **{'pose.source': 'identity'}))
     publisher = peer.node.create_publisher(PointCloud2, '/points', BEST_EFFORT)
     peer.spin_until(publisher.get_subscription_count)
@@ -262,7 +262,7 @@ def test_large_clouds_that_get_lost_are_noticed_and_the_remedy_named(start, peer
     assert 'fastdds_shm.xml' in node.output
 
 
-def test_large_clouds_that_are_lost_point_to_shared_memory_and_small_ones_do_not():
+def test_the_remedy_for_lost_clouds_depends_on_their_size():
     large, small = inputs_that_lost(4 << 20), inputs_that_lost(10_000)
     assert inputs_that_lost(0).loss() == large.loss()  # none came at all
     assert large.clouds_lost == small.clouds_lost == 5

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The life cycle of a node that is a process of its own, driven over DDS as ``ros2 lifecycle``."""
+"""The life cycle of a node, driven over DDS as by ``ros2 lifecycle``."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WAITING = [*ARGUMENTS, '-p', 'autostart:=false']
 
 
 def transit(peer, label='', number=0):
-    """Ask for a transition by its name or number; return whether it was made."""
+    """Request a transition by name or number; return whether it succeeded."""
     request = ChangeState.Request(transition=Transition(label=label, id=number))
     return peer.call('change_state', ChangeState, request).success
 
@@ -38,7 +38,7 @@ def state(peer):
     return peer.call('get_state', GetState).current_state.label
 
 
-def test_a_node_is_configured_activated_and_back_as_it_is_told(start, peer):
+def test_the_lifecycle_runs_through_all_states(start, peer):
     node = start('node', *WAITING)
     events = peer.collect(TransitionEvent, f'{NODE}/transition_event', RVIZ)
     assert state(peer) == 'unconfigured'
@@ -91,7 +91,7 @@ def test_a_node_is_configured_activated_and_back_as_it_is_told(start, peer):
     assert 'Traceback' not in node.output
 
 
-def test_a_transition_that_is_not_possible_is_refused_and_the_node_goes_on(start, peer):
+def test_an_impossible_transition_is_refused(start, peer):
     node = start('node', *WAITING)
     assert not transit(peer, 'activate')
     assert not transit(peer, 'nonsense')
@@ -105,7 +105,7 @@ def test_a_transition_that_is_not_possible_is_refused_and_the_node_goes_on(start
 
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
-def test_a_transition_that_fails_says_why_and_leaves_the_state_before(start, peer):
+def test_a_failed_transition_states_the_reason_and_keeps_the_state(start, peer):
     node = start('node', *WAITING, '-p', 'pose.source:=tf')
     assert transit(peer, 'configure')
     assert not transit(peer, 'activate')
@@ -115,7 +115,7 @@ def test_a_transition_that_fails_says_why_and_leaves_the_state_before(start, pee
     assert node.stop() == 0
 
 
-def test_settings_that_are_changed_before_configure_hold_after_it(start, peer):
+def test_settings_changed_before_configure_are_used(start, peer):
     start('node', *WAITING)
     client = peer.parameters()
     changed = client.set_parameters([Parameter('window.max_scans', value=2)])
@@ -128,9 +128,7 @@ def test_settings_that_are_changed_before_configure_hold_after_it(start, peer):
     assert values['window_scans'] == '2'
 
 
-def test_settings_that_are_changed_while_kernels_compile_hold_after_it(
-    compiled, peer, monkeypatch
-):
+def test_settings_changed_while_kernels_compile_are_used(compiled, peer, monkeypatch):
     answers = []
 
     def compile_until_set(mapper):
@@ -152,7 +150,7 @@ def test_settings_that_are_changed_while_kernels_compile_hold_after_it(
 
 
 @pytest.mark.parametrize('how', ['signal', 'shutdown'])
-def test_the_map_is_saved_at_the_end_where_that_is_asked_for(start, peer, tmp_path, how):
+def test_the_map_is_saved_on_shutdown_if_configured(start, peer, tmp_path, how):
     folder = tmp_path / 'maps'
     node = start(
         *('node', *ARGUMENTS, '-p', 'output.save_on_shutdown:=true'),
@@ -171,7 +169,7 @@ def test_the_map_is_saved_at_the_end_where_that_is_asked_for(start, peer, tmp_pa
     assert load_map(folder / 'map.npz')[0].digest() == mapper.map.digest()
 
 
-def test_a_late_joiner_gets_the_map_of_a_node_that_is_inactive_by_now(start, peer):
+def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     early = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The node, fed by play over DDS, ends with the digest that replay of the same bag states."""
+"""The node fed by ``play``, and the examples, reach the digest that ``replay`` reports."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import load_config
-from test.ros.live import RELIABLE, ROOT, TIMEOUT_S
+from surfel_mapper.files.map_state import load_map
+from test.ros.live import Peer, RELIABLE, ROOT, TIMEOUT_S
 
 
 def offered_settings(bag, capsys):
-    """Return the settings that info offers for the bag's odometry."""
+    """Return the settings that ``info`` suggests for the odometry of a bag."""
     assert main(['info', str(bag), '--json']) == 0
     poses = json.loads(capsys.readouterr().out)['poses']
     return next(o['settings'] for o in poses if o['settings']['pose.source'] == 'odometry')
 
 
 def live_digest(start, bag, config, num_scans, rate):
-    """Return what the node says at its end, having mapped the bag."""
+    """Return the digest that the node logs at its end, after mapping the bag."""
     node = start('node', '--ros-args', '--params-file', config, *RELIABLE)
     waiting = ['--wait-for', '/points', '/odom', '--timeout', TIMEOUT_S]
     playing = start('play', bag, '--rate', rate, *waiting, '--json')
@@ -47,7 +48,7 @@ def offline_summary(bag, config, output, capsys):
 def compare(start, bag, tmp_path, capsys, num_scans, rate, **settings):
     offered = offered_settings(bag, capsys)
     config = tmp_path / 'settings.yaml'
-    # more than there are: none is dropped by a machine that is slower than the bag is played
+    # more clouds than the bag has: a slow machine drops none
     settings['input.max_waiting_clouds'] = 100
     content = {'/**': {'ros__parameters': {**offered, **settings}}}
     config.write_text(yaml.safe_dump(content), encoding='utf-8')
@@ -74,7 +75,7 @@ def test_live_equals_offline_on_a_real_bag(start, tmp_path, capsys, data_folder)
     compare(start, bag, tmp_path, capsys, 22, 5, **{'window.max_scans': 9})
 
 
-def test_the_demo_finds_live_equal_to_offline(domain, tmp_path):
+def test_the_demo_reports_live_equal_to_offline(domain, tmp_path):
     lidar = ['--scans', '8', '--beams', '16', '--columns', '256']
     done = subprocess.run(
         [sys.executable, str(ROOT / 'examples' / 'demo.py'), '--output', 'out', *lidar],
@@ -92,7 +93,7 @@ def test_the_demo_finds_live_equal_to_offline(domain, tmp_path):
     assert (tmp_path / 'out' / 'live' / 'map.ply').is_file()
 
 
-def test_the_settings_of_the_demo_are_those_that_info_offers(tmp_path, capsys):
+def test_the_demo_uses_the_settings_that_info_suggests(tmp_path, capsys):
     bag = tmp_path / 'street'
     lidar = ['--scans', '2', '--beams', '8', '--columns', '64']
     assert main(['simulate', 'street', '--output', str(bag), *lidar]) == 0
@@ -102,3 +103,35 @@ def test_the_settings_of_the_demo_are_those_that_info_offers(tmp_path, capsys):
     assert {name: settings[name] for name in offered} == {
         name: tuple(value) if isinstance(value, list) else value for name, value in offered.items()
     }
+
+
+def test_the_mirror_example_has_the_digest_of_the_saved_map(start, tmp_path):
+    bag = tmp_path / 'bag'
+    lidar = ['--scans', '20', '--beams', '16', '--columns', '360']
+    assert main(['simulate', 'street', '--output', str(bag), *lidar]) == 0
+    settings = ['--params-file', ROOT / 'examples' / 'street.yaml', '-p', 'publish.moments:=true']
+    node = start('node', '--ros-args', *settings, '-p', f'output.directory:={tmp_path}')
+    node.wait_for_output('ready:')
+    mirror = subprocess.Popen(
+        [sys.executable, ROOT / 'examples' / 'mirror_map.py'],
+        env={**os.environ, 'PYTHONPATH': str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    peer = Peer()
+    try:
+        playing = start('play', bag, '--wait-for', '/points', '/odom')
+        assert playing.wait() == 0, playing.output
+        answer = peer.call('save_map')
+        assert answer.success, answer.message
+        saved, _ = load_map(tmp_path / 'map.npz')
+        said = ''
+        while saved.digest() not in said:  # it prints once a second
+            said = mirror.stdout.readline()
+            assert said, 'the example has ended'
+    finally:
+        peer.close()
+        mirror.terminate()
+        mirror.wait(TIMEOUT_S)
+    assert saved.num_points > 0
+    assert 'flat and level' in said

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Signals end a node wherever they find it; what it is asked for meanwhile is answered."""
+"""Signals interrupt the main thread at any point; its tasks are answered in every case."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def send(number):
 
 
 @pytest.mark.parametrize('number', NUMBERS)
-def test_a_signal_interrupts_and_those_that_follow_do_not(number):
+def test_only_the_first_signal_interrupts(number):
     signals = Signals()
     with pytest.raises(KeyboardInterrupt), signals:
         send(number)
@@ -63,12 +63,12 @@ def test_a_signal_within_a_destructor_is_found_by_check():
         assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0), 'another would come'
 
 
-def test_a_signal_within_a_destructor_interrupts_what_comes_after():
+def test_a_signal_in_a_destructor_interrupts_after_it():
     with Signals(), pytest.raises(KeyboardInterrupt):
         act_and_wait(Freed)
 
 
-def test_a_signal_while_llvm_calls_back_interrupts_what_comes_after(capfd):
+def test_a_signal_in_a_callback_of_llvm_interrupts_after_it(capfd):
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     module = llvm.parse_assembly('define i32 @one() { ret i32 1 }')
@@ -80,7 +80,7 @@ def test_a_signal_while_llvm_calls_back_interrupts_what_comes_after(capfd):
     assert 'KeyboardInterrupt' not in capfd.readouterr().err
 
 
-def test_without_a_signal_all_is_as_before():
+def test_handlers_are_restored_without_a_signal():
     before = {number: signal.getsignal(number) for number in HANDLED}
     with Signals() as signals:
         signals.check()
@@ -91,7 +91,7 @@ def nothing():
     return None
 
 
-def test_a_request_is_answered_by_the_thread_that_serves_and_an_error_ends_it():
+def test_tasks_run_in_the_main_thread_until_an_error():
     tasks = TaskQueue()
     names = []
 
@@ -107,7 +107,7 @@ def test_a_request_is_answered_by_the_thread_that_serves_and_an_error_ends_it():
     assert names == [threading.current_thread().name]
 
 
-def test_a_request_that_raises_is_answered_and_raises_where_it_is_served():
+def test_an_error_in_a_task_is_raised_in_the_main_thread():
     tasks = TaskQueue()
     answer = tasks.submit(lambda: 1 // 0)
     with pytest.raises(ZeroDivisionError):
@@ -115,7 +115,7 @@ def test_a_request_that_raises_is_answered_and_raises_where_it_is_served():
     assert answer.result(TIMEOUT_S) is False
 
 
-def test_what_is_asked_for_at_the_end_or_after_it_is_answered_with_no():
+def test_tasks_after_closing_return_false():
     tasks = TaskQueue()
     before = tasks.submit(lambda: True)
     tasks.fail(RuntimeError('unheard'))
@@ -124,7 +124,7 @@ def test_what_is_asked_for_at_the_end_or_after_it_is_answered_with_no():
     assert tasks.submit(lambda: True).result(TIMEOUT_S) is False
 
 
-def test_a_signal_that_does_not_wake_whoever_waits_ends_the_service():
+def test_a_signal_taken_by_another_thread_ends_the_wait():
     asleep = threading.Thread(target=threading.Event().wait, daemon=True)
     asleep.start()  # takes the signal, as the main thread just before it waits
 
@@ -142,7 +142,7 @@ def test_a_signal_that_does_not_wake_whoever_waits_ends_the_service():
     alarm.cancel()
 
 
-def test_an_interruption_is_noticed_before_the_next_wait():
+def test_interrupts_are_checked_before_every_wait():
     def check():
         raise KeyboardInterrupt
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The queue before the mapper: its order, its bounds, and its end."""
+"""The queue of the mapping thread: order, bounds, and shutdown."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TIMEOUT_S = 120
 
 
 class Bench:
-    """A thread at work, or held until released, and what came of it."""
+    """A running mapping thread, which can be blocked, and its results."""
 
     def __init__(self, on_update=None):
         self.mapper = Mapper(CONFIG)
@@ -38,7 +38,7 @@ class Bench:
         self._released = threading.Event()
 
     def hold(self):
-        """Keep the thread busy, so that what is put in waits."""
+        """Block the thread, so that all input waits in the queue."""
         busy = threading.Event()
 
         def wait():
@@ -82,7 +82,7 @@ def test_poses_overtake_clouds_so_that_a_backlog_is_mapped_completely(bench):
     assert not bench.mapper.counters.dropped
 
 
-def test_of_too_many_clouds_the_oldest_are_dropped_and_counted(bench):
+def test_a_full_queue_drops_and_counts_the_oldest_clouds(bench):
     stamps = [START_NS + i * PERIOD_NS for i in range(MAX_CLOUDS + 3)]
     bench.hold()
     for stamp_ns in stamps:
@@ -97,7 +97,7 @@ def test_of_too_many_clouds_the_oldest_are_dropped_and_counted(bench):
     assert bench.mapper.counters.dropped_by_frame == {'lidar': {'overload': 3}}
 
 
-def test_of_too_many_poses_the_oldest_are_dropped_and_counted(bench):
+def test_a_full_queue_drops_and_counts_the_oldest_poses(bench):
     bench.hold()
     pose = StampedPose('odom', 'base_link', START_NS, (0.0, 0.0, 0.0), UNTURNED)
     later = [pose._replace(stamp_ns=START_NS + i) for i in range(1, MAX_POSES)]
@@ -108,7 +108,7 @@ def test_of_too_many_poses_the_oldest_are_dropped_and_counted(bench):
     assert bench.mapper.counters.messages_ignored == {'overload': 1}
 
 
-def test_a_call_comes_after_the_clouds_before_it_and_hands_back_result_or_error(bench):
+def test_a_call_follows_the_queued_clouds_and_returns_result_or_error(bench):
     bench.hold()
     bench.put_pose(START_NS)
     bench.put_cloud(START_NS)
@@ -121,7 +121,7 @@ def test_a_call_comes_after_the_clouds_before_it_and_hands_back_result_or_error(
         failed.result(TIMEOUT_S)
 
 
-def test_what_is_posted_twice_is_done_once(bench):
+def test_a_function_posted_twice_is_called_once(bench):
     done = []
 
     def note():
@@ -136,7 +136,7 @@ def test_what_is_posted_twice_is_done_once(bench):
     assert done == [1]
 
 
-def test_bad_clouds_and_those_of_a_pause_are_counted_and_the_next_is_mapped(bench):
+def test_bad_and_paused_clouds_are_counted_and_the_next_is_mapped(bench):
     bad = cloud(START_NS, room(seed=1))
     bad.point_step = 11
     stamps = [START_NS + i * PERIOD_NS for i in range(3)]
@@ -154,7 +154,7 @@ def test_bad_clouds_and_those_of_a_pause_are_counted_and_the_next_is_mapped(benc
     assert bench.mapper.counters.dropped == {'bad_cloud': 1, 'paused': 1}
 
 
-def test_an_error_that_nobody_foresaw_ends_the_thread_and_cancels_what_waits():
+def test_an_unexpected_error_ends_the_thread_and_cancels_calls():
     def fail(update):
         raise RuntimeError('broken')
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds as messages."""
+"""Clouds and times as rclpy messages; a file of its own because it runs without a node."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from surfel_mapper.ros.messages import cloud_message, time_message
 from test.ros.live import room
 
 
-def test_surfels_arrive_as_they_were_sent():
+def test_surfels_survive_serialization():
     surfel_map = SurfelMap(voxel_size_m=0.5)
     surfel_map.add(room(seed=1))
     surfels = surfel_map.surfels(min_points=3)
@@ -43,11 +43,11 @@ def test_surfels_arrive_as_they_were_sent():
         np.testing.assert_array_equal(scan.columns[name], values.astype(scan.columns[name].dtype))
 
 
-def test_an_empty_map_is_a_cloud_without_points():
+def test_an_empty_map_gives_an_empty_cloud():
     empty = surfel_columns(SurfelMap(0.5).surfels())
     scan = to_scan(cloud_message(from_columns(empty), 0, 'odom'))
     assert len(scan) == 0
 
 
-def test_times_before_the_epoch_have_positive_nanoseconds():
+def test_negative_times_have_positive_nanoseconds():
     assert (time_message(-1).sec, time_message(-1).nanosec) == (-1, 999_999_999)

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What a node publishes of the models of its map, seen over DDS.
+The model topics of a node, received over DDS.
 
-Expected values come from a mapper that is fed the same messages here, and from the scene.
+Expected values come from a mapper without ROS for the same messages, and from the scene.
 
 (Longer than other files: all topics show the models of one drive.)
 """
@@ -59,7 +59,7 @@ def scene(seed, *, wall=True):
 
 
 def drive(*walls):
-    """Return clouds with the pose of a sensor that stays; each says whether the wall is there."""
+    """Return clouds of a sensor at rest, with poses; ``walls``: whether each has the wall."""
     stamps = [START_NS + k * PERIOD_NS for k in range(len(walls))]
     return [
         (cloud(stamp_ns, scene(k, wall=wall)), odometry(stamp_ns, (0.0, 0.0, 0.0)))
@@ -80,7 +80,7 @@ def send(peer, messages):
 
 
 def models_of(messages):
-    """Return the models of a mapper without ROS after some messages."""
+    """Return the models of a mapper without ROS after the same messages."""
     mapper = Mapper(Config.from_mapping(SETTINGS))
     for points, pose in messages:
         for found in poses_in('odometry', pose, 'base_link'):
@@ -95,7 +95,7 @@ def stamp_of(message):
 
 
 class Picture:
-    """What a viewer shows after some messages."""
+    """The markers that a viewer shows after some messages."""
 
     def __init__(self, messages):
         self.shown = {}
@@ -121,7 +121,7 @@ def points_of(points):
 
 
 def ring_area(ring, normal):
-    """Return the area within a ring (M, 3) seen against a normal, holes taken off."""
+    """Return the area of a ring (M, 3) about a normal, without its holes."""
     after = np.roll(ring, -1, axis=0)
     return 0.5 * float(np.cross(ring, after).sum(axis=0) @ normal)
 
@@ -150,17 +150,17 @@ def wait_for(peer, found, stamp_ns, names=TOPICS):
 
 
 def wait_for_outlines(peer, found, ids):
-    """Spin until the outlines are those of some models: each comes as a message of its own."""
+    """Spin until the outlines have these ids; each comes in a message of its own."""
     peer.spin_until(
         lambda: sorted(outlines_in(found['outlines'])) == ids,
         what=lambda: f'{sorted(outlines_in(found["outlines"]))}, expected {ids}',
     )
-    peer.call('publish_normals')  # answered behind all that is published of the last scan
+    peer.call('publish_normals')  # answered after everything of the last scan is published
     peer.spin_for(0.3)
 
 
 def outlines_in(messages):
-    """Return the rings that a client knows after some messages, by id."""
+    """Return the outlines that a client has after some messages, by id."""
     known = {}
     for message in messages:
         ring = points_of(message.polygon.polygon.points)
@@ -170,7 +170,7 @@ def outlines_in(messages):
     return known
 
 
-def test_what_is_published_is_what_a_mapper_without_ros_finds(start, peer):
+def test_published_models_equal_those_of_a_mapper_without_ros(start, peer):
     start_node(start, peer)
     found = collect(peer)
     messages = drive(True, True, True)
@@ -261,7 +261,7 @@ def check_surfels(rows, models):
     assert np.array_equal(rows.columns['kind'] == 255, labels == -1)
 
 
-def test_what_is_no_more_is_deleted(start, peer):
+def test_removed_models_are_deleted(start, peer):
     start_node(start, peer)
     found = collect(peer)
     messages = drive(True, True, False, False)
@@ -270,7 +270,7 @@ def test_what_is_no_more_is_deleted(start, peer):
     (wall,) = [p.id for p in models_of(messages[:2]).model.planes if abs(p.normal[1]) > 0.9]
     assert wall in Picture(found['planes']).ids('planes')
     peer.spin_until(lambda: wall in outlines_in(found['outlines']))
-    send(peer, messages[2:])  # and the two with the wall leave the window
+    send(peer, messages[2:])  # the scans with the wall leave the window
     wait_for(peer, found, START_NS + 3 * PERIOD_NS, ('planes', 'primitives'))
     left = sorted(patch.id for patch in models_of(messages).model.patches)
     assert wall not in left
@@ -286,7 +286,7 @@ def test_what_is_no_more_is_deleted(start, peer):
 
 
 @pytest.mark.parametrize('qos', [None, RVIZ], ids=['latched', 'volatile'])
-def test_who_comes_late_gets_everything_without_another_scan(start, peer, qos):
+def test_a_late_subscriber_gets_everything_without_another_scan(start, peer, qos):
     start_node(start, peer)
     messages = drive(True, True)
     send(peer, messages)
@@ -301,7 +301,7 @@ def test_who_comes_late_gets_everything_without_another_scan(start, peer, qos):
         assert expected == to_scan(found['primitives'][-1]).columns['id'][: len(expected)].tolist()
 
 
-def test_a_late_reader_does_not_learn_of_outlines_that_went_while_nobody_read(start, peer):
+def test_a_late_subscriber_gets_no_outlines_removed_before(start, peer):
     start_node(start, peer)
     first = peer.collect(PolygonInstanceStamped, f'{NODE}/outlines', ALL_OUTLINES)
     messages = drive(True, True, False, False)
@@ -317,7 +317,7 @@ def test_a_late_reader_does_not_learn_of_outlines_that_went_while_nobody_read(st
     peer.spin_until(lambda: sorted(outlines_in(late)) == expected, what=lambda: str(expected))
 
 
-def test_nothing_is_made_while_nobody_reads(start, peer):
+def test_no_models_are_published_without_subscribers(start, peer):
     start_node(start, peer)
     send(peer, drive(True, True, True))
     _, values = peer.diagnosis({'scans.mapped': 3})

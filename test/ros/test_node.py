@@ -1,10 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-The node as a process of its own, talked to over DDS.
-
-(Longer than other files: all tests share one way to start a node and to talk to it.)
-"""
+"""The node as a process: inputs, outputs, faulty clouds, parameters, and signals, over DDS."""
 
 from __future__ import annotations
 
@@ -40,7 +36,7 @@ from test.ros.live import (
 
 
 def assert_equal_columns(message, surfels):
-    """Check that a cloud holds surfels, in any order."""
+    """Check that a cloud holds these surfels, in any order."""
     scan, expected = to_scan(message), surfel_columns(surfels)
     found = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
     assert list(found) == list(expected)
@@ -50,7 +46,7 @@ def assert_equal_columns(message, surfels):
         np.testing.assert_array_equal(found[name][order], values[expected_order], name)
 
 
-def test_what_comes_out_is_what_a_mapper_makes_of_what_went_in(start, peer, tmp_path):
+def test_the_outputs_equal_those_of_a_mapper_without_ros(start, peer, tmp_path):
     node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
     changed = peer.collect(PointCloud2, '/surfel_mapper/changed')
     normals = peer.collect(PointCloud2, '/surfel_mapper/normals', LATCHED)
@@ -90,7 +86,7 @@ def test_what_comes_out_is_what_a_mapper_makes_of_what_went_in(start, peer, tmp_
 
 
 def bad_clouds(stamp_ns):
-    """Return clouds that no sensor should send, one for each way to be wrong, with the cause."""
+    """Return invalid clouds, one of each kind, with the cause of their drop."""
     points = room(seed=1)
 
     def made(points=points, **changes):
@@ -118,7 +114,7 @@ def bad_clouds(stamp_ns):
     ]
 
 
-def test_bad_clouds_are_counted_and_the_good_ones_between_them_mapped(start, peer):
+def test_bad_clouds_are_counted_and_valid_ones_mapped(start, peer):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     causes = [cause for cause, _ in bad_clouds(START_NS)]
@@ -137,7 +133,7 @@ def test_bad_clouds_are_counted_and_the_good_ones_between_them_mapped(start, pee
     assert node.stop() == 0
 
 
-def test_stamps_that_go_back_are_dropped_or_start_anew(start, peer):
+def test_a_stamp_that_goes_back_is_dropped_or_resets_the_map(start, peer):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     (first, pose), (second, second_pose) = drive(2)
@@ -153,7 +149,7 @@ def test_stamps_that_go_back_are_dropped_or_start_anew(start, peer):
     assert values['window_scans'] == '1'
 
 
-def test_stamped_poses_of_the_base_and_remapped_clouds_are_taken(start, peer):
+def test_pose_stamped_and_remapped_clouds_are_mapped(start, peer):
     start(
         *('node', *ARGUMENTS, '-p', 'pose.source:=pose', '-p', 'frames.base_to_sensor:=[]'),
         *('-p', 'frames.base:=lidar', '-r', 'points:=/lidar/points', '-r', 'pose:=/where'),
@@ -168,7 +164,7 @@ def test_stamped_poses_of_the_base_and_remapped_clouds_are_taken(start, peer):
     peer.diagnosis({'scans.mapped': 2})
 
 
-def test_clear_and_pause_do_what_they_say(start, peer):
+def test_clear_empties_the_map_and_pause_drops_clouds(start, peer):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     messages = drive(4)
@@ -190,7 +186,7 @@ def test_clear_and_pause_do_what_they_say(start, peer):
     assert node.is_running()
 
 
-def test_a_map_that_cannot_be_saved_is_answered_with_the_reason(start, peer, tmp_path):
+def test_a_failed_save_states_the_reason(start, peer, tmp_path):
     (tmp_path / 'file').write_text('in the way')
     node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "file"}')
 
@@ -202,7 +198,7 @@ def test_a_map_that_cannot_be_saved_is_answered_with_the_reason(start, peer, tmp
     assert node.is_running()
 
 
-def test_parameters_are_described_and_only_live_ones_change(start, peer):
+def test_parameters_have_descriptions_and_only_live_ones_change(start, peer):
     node = start('node', *ARGUMENTS)
     client = peer.parameters()
 
@@ -226,7 +222,7 @@ def test_parameters_are_described_and_only_live_ones_change(start, peer):
     assert values['window_scans'] == '2', node.output
 
 
-def test_markers_come_while_somebody_subscribes(start, peer):
+def test_markers_are_published_to_a_subscriber(start, peer):
     start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     messages = drive(3)
@@ -248,11 +244,11 @@ def test_markers_come_while_somebody_subscribes(start, peer):
     assert discs.header.frame_id == 'odom'
 
 
-def test_without_clouds_the_diagnostics_say_so(start, peer):
+def test_the_diagnostics_report_missing_clouds(start, peer):
     start('node', *ARGUMENTS)
     status, values = peer.diagnosis({'state': 'active'})
     assert status.level == b'\1'
-    assert status.message.startswith('no cloud on /points yet: nobody publishes there')
+    assert status.message.startswith('no cloud on /points yet: it has no publisher')
     assert values['scans.received'] == '0'
 
 
@@ -271,7 +267,7 @@ def test_without_clouds_the_diagnostics_say_so(start, peer):
         ),
     ],
 )
-def test_what_cannot_work_ends_the_node_with_a_message(domain, capfd, arguments, messages):
+def test_invalid_arguments_end_the_node_with_a_message(domain, capfd, arguments, messages):
     assert main(['node', '--ros-args', *arguments]) == 1
     said = capfd.readouterr().err
     for message in messages:
@@ -279,7 +275,7 @@ def test_what_cannot_work_ends_the_node_with_a_message(domain, capfd, arguments,
     assert 'surfel-mapper node: ' in said
 
 
-def test_a_file_of_settings_alone_is_refused_with_what_to_put_around_them(domain, capfd, tmp_path):
+def test_a_parameter_file_without_node_name_is_refused_with_a_remedy(domain, capfd, tmp_path):
     (tmp_path / 'my.yaml').write_text('map: {voxel_size_m: 1.0}\n', encoding='utf-8')
     assert main(['node', '--ros-args', '--params-file', str(tmp_path / 'my.yaml')]) == 1
     said = capfd.readouterr().err
@@ -297,14 +293,14 @@ def test_an_unknown_parameter_gives_no_traceback(start):
 
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
-def test_transforms_without_their_package_end_the_node_with_what_to_install(domain, capfd):
+def test_a_missing_tf2_msgs_ends_the_node_with_the_install_command(domain, capfd):
     assert main(['node']) == 1
     assert 'sudo apt install ros-jazzy-tf2-msgs' in capfd.readouterr().err
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize('when', ['compiling', 'ready:'])
-def test_a_signal_ends_the_node_at_any_time_without_complaint(start, number, when):
+def test_a_signal_ends_the_node_cleanly_at_any_time(start, number, when):
     node = start('node', *ARGUMENTS)
     node.wait_for_output(when)
     assert node.stop(number) == 0
@@ -314,7 +310,7 @@ def test_a_signal_ends_the_node_at_any_time_without_complaint(start, number, whe
         assert node.output.count('digest') == 1
 
 
-def test_a_burst_of_signals_is_one(start):
+def test_several_signals_act_as_one(start):
     node = start('node', *ARGUMENTS)
     node.wait_for_output('ready:')
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGINT):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a node publishes, seen over DDS: changes, mirrors, scans with normals, markers, grids."""
+"""The outputs of a node over DDS: changes, mirrors, scan normals, markers, grids."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ def start_node(start, peer, **changes):
 
 
 def digest_of(peer):
-    """Return the digest that the node states of its map, behind all that was sent before."""
+    """Return the digest of the node's map after everything sent before."""
     return peer.call('save_map').message.rpartition('digest ')[2]
 
 
 @pytest.mark.parametrize('columns', [(), ('intensity',)])
-def test_a_mirror_follows_the_node_to_the_bit(start, peer, tmp_path, columns):
+def test_a_mirror_equals_the_map_of_the_node(start, peer, tmp_path, columns):
     sums = {'map.intensity': 'true'} if columns else {}
     node = start_node(
         start, peer, **sums, **{'publish.moments': 'true', 'output.directory': tmp_path / 'maps'}
@@ -82,13 +82,13 @@ def test_a_mirror_follows_the_node_to_the_bit(start, peer, tmp_path, columns):
 
 
 def with_intensity(points):
-    """Return a cloud whose y serves as its intensity too."""
+    """Return a cloud whose intensity is its y."""
     field = type(points.fields[1])(name='intensity', offset=4, datatype=7, count=1)
     points.fields = [*points.fields, field]
     return points
 
 
-def test_what_changed_less_what_was_removed_is_the_map(start, peer):
+def test_changed_minus_removed_equals_the_map(start, peer):
     start_node(start, peer)
     changed = peer.collect(PointCloud2, f'{BASE}/changed', MANY)
     removed = peer.collect(PointCloud2, f'{BASE}/removed', MANY)
@@ -115,14 +115,14 @@ def test_what_changed_less_what_was_removed_is_the_map(start, peer):
     assert voxels(removed[-1]) == expected
 
 
-def test_the_full_map_comes_on_request(start, peer):
+def test_the_full_map_is_published_on_request(start, peer):
     start_node(start, peer, **{'publish.normals_rate_hz': 0.0})
     late = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     messages = drive(2)
     send(peer, messages)
     peer.diagnosis({'scans.mapped': 2})
     normals = peer.collect(PointCloud2, f'{BASE}/normals', late)
-    peer.spin_for(0.5)  # in which it would come at the usual rate
+    peer.spin_for(0.5)  # within which it would come at the usual rate
     assert normals == []
 
     answer = peer.call('publish_normals')
@@ -136,7 +136,7 @@ def test_the_full_map_comes_on_request(start, peer):
     assert again[0].width == number
 
 
-def test_coarser_maps_come_where_they_are_asked_for(start, peer):
+def test_coarser_levels_are_published(start, peer):
     start_node(start, peer, **{'publish.levels': 2, 'map.min_points': 3})
     clouds = [peer.collect(PointCloud2, f'{BASE}/level_{n}/normals', LATCHED) for n in (1, 2)]
     messages = drive(4)
@@ -149,7 +149,7 @@ def test_coarser_maps_come_where_they_are_asked_for(start, peer):
 
 
 def holds_all(received, surfels):
-    """Return whether the last message holds surfels, in whatever order."""
+    """Return whether the last message holds these surfels, in any order."""
     if not received or received[-1].width != len(surfels):
         return False
     found = to_scan(received[-1])
@@ -162,7 +162,7 @@ def holds_all(received, surfels):
     )
 
 
-def test_mean_intensity_comes_with_every_surfel_where_it_is_asked_for(start, peer):
+def test_surfels_have_mean_intensity_if_configured(start, peer):
     start_node(start, peer, **{'map.intensity': 'true'})
     normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
     send(peer, [(with_intensity(points), pose) for points, pose in drive(1)])
@@ -173,7 +173,7 @@ def test_mean_intensity_comes_with_every_surfel_where_it_is_asked_for(start, pee
     np.testing.assert_allclose(scan.columns['intensity'], scan.points[:, 1], atol=0.01)
 
 
-def test_the_scan_comes_back_with_normals_and_every_field(start, peer):
+def test_scan_normals_keep_every_field_of_the_cloud(start, peer):
     node = start_node(start, peer)
     messages = drive(4)
     send(peer, messages[:3])
@@ -208,7 +208,7 @@ def test_the_scan_comes_back_with_normals_and_every_field(start, peer):
 
 
 def odd_message(stamp_ns):
-    """Return a real message of a cloud with odd offsets and padded rows."""
+    """Return a PointCloud2 with odd offsets and padded rows."""
     odd = odd_cloud(padding=5)
     message = cloud(stamp_ns, np.zeros((1, 3)))
     kind = type(message.fields[0])
@@ -226,7 +226,7 @@ def colors_of(marker):
     return colors[:: 3 * (SEGMENTS - 2)]
 
 
-def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(start, peer):
+def test_markers_follow_colour_limit_and_clearing(start, peer):
     start_node(start, peer, **{'publish.marker_color': 'normal'})
     messages = drive(3)
     send(peer, messages)
@@ -257,7 +257,7 @@ def test_markers_are_coloured_as_asked_and_bounded_and_leave_with_their_surfels(
     peer.spin_until(lambda: {m.action for m in markers[-1].markers} == {Marker.DELETE})
 
 
-def test_a_grid_comes_to_those_who_ask_for_it_and_to_late_ones(start, peer):
+def test_the_grid_is_published_and_latched(start, peer):
     start_node(start, peer, **{'grid.size_m': 20.0})
     send(peer, drive(3))
     peer.diagnosis({'scans.mapped': 3})
@@ -278,7 +278,7 @@ def test_a_grid_comes_to_those_who_ask_for_it_and_to_late_ones(start, peer):
     assert cost[0, 0] == -1
 
 
-def test_keys_of_a_message_are_those_of_the_map(start, peer):
+def test_voxel_indices_equal_those_of_the_map(start, peer):
     start_node(start, peer, **{'publish.moments': 'true'})
     normals = peer.collect(PointCloud2, f'{BASE}/normals', LATCHED)
     messages = drive(2)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Settings as ROS parameters: declared as they are, set wrongly never in silence."""
+"""Settings as ROS parameters: declarations, overrides, and refused values."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def type_name(declared):
 
 @pytest.fixture
 def make(domain):
-    """Give a function that makes a node with parameters set by the user."""
+    """Return a function that creates a node with overrides."""
     nodes = []
     context = rclpy.Context()
     rclpy.init(context=context)
@@ -72,9 +72,9 @@ def test_every_setting_is_a_parameter_of_its_type_default_bounds_and_meaning(mak
         )
 
 
-def test_what_the_user_sets_is_what_the_configuration_holds(make):
+def test_overrides_reach_the_configuration(make):
     node = make(
-        'map.voxel_size_m:=2',  # a whole number where a float is meant
+        'map.voxel_size_m:=2',  # an integer for a float
         'pose.source:=odometry',
         'frames.base_to_sensor:=[1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]',
         'use_sim_time:=false',
@@ -95,7 +95,7 @@ def test_what_the_user_sets_is_what_the_configuration_holds(make):
         assert node.get_parameter(name).value == shown
 
 
-def test_an_empty_list_is_that_default(make):
+def test_an_empty_list_is_the_default(make):
     assert declare_settings(make('frames.base_to_sensor:=[]')) == Config()
 
 
@@ -132,7 +132,7 @@ def test_a_wrong_name_or_value_is_refused_before_anything_is_declared(make, over
     assert not node.has_parameter('map.min_points')
 
 
-def test_changes_are_checked_and_foreign_parameters_passed_over():
+def test_changes_are_checked_and_other_parameters_ignored():
     changes = [Parameter('window.max_scans', value=7), Parameter('use_sim_time', value=True)]
     assert changed_config(Config(), changes).window.max_scans == 7
     with pytest.raises(ConfigError, match=r'window\.max_scans: -1'):

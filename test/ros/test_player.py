@@ -62,7 +62,7 @@ def report(process):
     return json.loads(process.output.splitlines()[-1])
 
 
-def test_every_message_arrives_in_order_as_it_was_recorded(start, peer, bag):
+def test_every_message_arrives_in_order_and_unchanged(start, peer, bag):
     clouds = peer.subscribe(PointCloud2, '/points')
     poses = peer.subscribe(Odometry, '/odom')
 
@@ -78,7 +78,7 @@ def test_every_message_arrives_in_order_as_it_was_recorded(start, peer, bag):
     assert found['seconds'] >= (2 * NUM_SCANS - 1) * PERIOD_NS / 1e9 / 2
 
 
-def test_topics_are_chosen_and_remapped_and_the_clock_runs(start, peer, bag):
+def test_topics_are_selected_and_remapped_and_the_clock_runs(start, peer, bag):
     poses = peer.subscribe(PoseStamped, '/other')
     clock = peer.subscribe(Clock, '/clock')
 
@@ -99,7 +99,7 @@ def test_topics_are_chosen_and_remapped_and_the_clock_runs(start, peer, bag):
     assert len(clock) > 2 * 12  # between the messages too
 
 
-def test_a_latched_topic_is_latched_again(start, peer, tmp_path):
+def test_a_latched_topic_is_published_latched(start, peer, tmp_path):
     qos = Qos(
         history=QosHistory.KEEP_LAST,
         depth=1,
@@ -129,10 +129,10 @@ def test_a_latched_topic_is_latched_again(start, peer, tmp_path):
     assert playing.is_running()
 
 
-def test_nobody_to_wait_for_is_said_with_what_to_check(domain, capsys, bag):
+def test_a_missing_subscriber_is_reported_with_a_remedy(domain, capsys, bag):
     assert main(['play', str(bag), '--wait-for', '/points', '--timeout', '0.2']) == 1
     said = capsys.readouterr().err
-    assert 'nobody subscribed to /points within 0.2 s' in said
+    assert 'no subscriber of /points within 0.2 s' in said
     assert 'ROS_DOMAIN_ID' in said
 
 
@@ -140,12 +140,12 @@ def test_nobody_to_wait_for_is_said_with_what_to_check(domain, capsys, bag):
     ('arguments', 'message'),
     [
         (['--topics', '/nothing'], 'no topic /nothing; its topics: /odom, /points'),
-        (['--topics', '/points', '--wait-for', '/odom'], 'nobody can subscribe to /odom'),
+        (['--topics', '/points', '--wait-for', '/odom'], 'no topic /odom to wait for'),
         (['--rate', '0'], 'rate: 0.0, expected more than 0'),
         (['--ros-args', '--nonsense'], '--nonsense'),
     ],
 )
-def test_what_cannot_be_played_is_refused(domain, capsys, bag, arguments, message):
+def test_invalid_arguments_are_refused(domain, capsys, bag, arguments, message):
     assert main(['play', str(bag), *arguments]) == 1
     assert message in capsys.readouterr().err
 
@@ -162,7 +162,7 @@ def test_a_type_that_is_not_installed_is_named(domain, name):
         message_type(name)
 
 
-def test_shared_memory_is_left_as_the_user_configured_it(monkeypatch):
+def test_a_user_configuration_of_fast_dds_is_kept(monkeypatch):
     for name in context.FASTDDS_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')

@@ -79,7 +79,7 @@ def test_odometry_and_track_are_those_that_a_mapper_finds(start, peer):
     assert mapper.map.digest() in node.output
 
 
-def test_on_a_frozen_map_an_initial_pose_tells_where_to_begin(start, peer, tmp_path):
+def test_registration_on_a_frozen_map_starts_from_an_initial_pose(start, peer, tmp_path):
     save_map(tmp_path / 'room.npz', map_of(ROOM))
     far_off = '[40.0, -30.0, 0.0, 0.0, 0.0, 0.0, 1.0]'
     node = start(
@@ -109,7 +109,7 @@ def test_on_a_frozen_map_an_initial_pose_tells_where_to_begin(start, peer, tmp_p
     assert map_of(ROOM).digest() in node.output
 
 
-def test_a_map_that_is_not_there_ends_the_node_with_a_message(start):
+def test_a_missing_map_ends_the_node_with_a_message(start):
     node = start('node', *arguments(map__load='nowhere.npz'))
 
     assert node.wait() == 1
@@ -117,7 +117,7 @@ def test_a_map_that_is_not_there_ends_the_node_with_a_message(start):
     assert 'Traceback' not in node.output
 
 
-def test_where_nothing_is_known_the_covariance_is_huge():
+def test_covariance_is_huge_without_information():
     information = np.diag([1e4, 0.0, 1e4, 1e6, 1e6, 1e6])
 
     found = np.diag(covariance(information))

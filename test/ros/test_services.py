@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The services of a node over DDS: what they say they did is what a Mapper does when told."""
+"""The services of a node over DDS, compared with the same calls of a Mapper without ROS."""
 
 from __future__ import annotations
 
@@ -27,27 +27,27 @@ from test.ros.live import NODE, odometry, stamp, START_NS, TIMEOUT_S
 
 ANSWERS = LoadMap.Response
 SQUARE = ((-1.0, -1.0), (2.0, -1.0), (2.0, 1.5), (-1.0, 1.5))
-"""In the frame base_link, which drive() moves by 0.2 m a scan."""
+"""Corners in base_link, which drive() moves by 0.2 m per scan."""
 
 
 @pytest.fixture
 def node(start, peer, tmp_path):
-    """Give a node that has mapped four scans, and a twin of its Mapper."""
+    """Return a node that saves to a folder of the test; clouds and odometry are advertised."""
     node = start('node', *ARGUMENTS, '-p', f'output.directory:={tmp_path / "maps"}')
     peer.advertise('/odom', '/points')
     return node
 
 
 def feed(peer, num_scans):
-    """Have some scans mapped; return a Mapper that has mapped the same."""
+    """Send scans to the node; return a Mapper that has mapped the same."""
     messages = drive(num_scans)
     send(peer, messages)
     peer.diagnosis({'scans.mapped': num_scans})
     return mapped(messages)[1]
 
 
-def go_on(peer, twin, first, num_scans):
-    """Have more scans mapped, by the twin too, until all that were there before have left."""
+def send_more(peer, twin, first, num_scans):
+    """Send further scans to the node and to the twin."""
     from surfel_mapper.messages.pointcloud2 import to_scan
     from surfel_mapper.messages.pose_messages import poses_in
 
@@ -62,13 +62,13 @@ def go_on(peer, twin, first, num_scans):
 
 
 def digest(peer):
-    """Return the digest of the map of the node, as it says itself."""
+    """Return the digest that the node states for its map."""
     saved = peer.call('save_map')
     assert saved.success, saved.message
     return saved.message.rpartition('digest ')[2]
 
 
-def test_a_box_of_the_parameters_is_cleared_and_what_leaves_later_leaves_exactly(peer, node):
+def test_clear_box_removes_voxels_and_later_evictions_stay_exact(peer, node):
     twin = feed(peer, 3)
     refused = peer.call('clear_box')
     assert not refused.success
@@ -89,13 +89,13 @@ def test_a_box_of_the_parameters_is_cleared_and_what_leaves_later_leaves_exactly
         f'cleared {gone} voxels in clear.box from (-1.0, -1.0, -2.0) to (2.0, 1.5, 0.0)'
     )
     assert digest(peer) == twin.map.digest()
-    _, values = go_on(peer, twin, 3, 2)  # evicts two scans that have lost voxels
+    _, values = send_more(peer, twin, 3, 2)  # evicts two scans that have lost voxels
     assert values['window_scans'] == '3'
     assert digest(peer) == twin.map.digest()
     assert 'Traceback' not in node.output
 
 
-def test_all_about_the_sensor_is_cleared(peer, node):
+def test_clear_radius_removes_voxels_about_the_sensor(peer, node):
     nowhere = peer.call('clear_radius')
     assert not nowhere.success
     assert 'no scan in the map yet' in nowhere.message
@@ -120,7 +120,7 @@ def polygon(corners, frame_id, stamp_ns=0):
     return message
 
 
-def test_a_polygon_is_cleared_in_whatever_frame_it_comes(peer, node):
+def test_clear_polygon_accepts_any_known_frame(peer, node):
     polygons = peer.node.create_publisher(PolygonStamped, f'{NODE}/clear_polygon', 10)
     twin = feed(peer, 3)
     peer.spin_until(polygons.get_subscription_count)
@@ -150,14 +150,12 @@ def test_a_polygon_is_cleared_in_whatever_frame_it_comes(peer, node):
         ((float('nan'), 0.0), 'odom', ValueError, 'finite corners'),
     ],
 )
-def test_a_polygon_of_nowhere_is_refused(corner, frame_id, error, reason):
+def test_an_invalid_polygon_is_refused(corner, frame_id, error, reason):
     with pytest.raises(error, match=reason):
         prism(polygon([corner, (1.0, 0.0), (1.0, 1.0)], frame_id), Mapper(Config()))
 
 
-def test_a_map_that_was_saved_is_loaded_and_goes_on_as_if_it_had_never_stopped(
-    peer, node, tmp_path
-):
+def test_a_loaded_map_continues_where_it_was_saved(peer, node, tmp_path):
     twin = feed(peer, 3)
     saved = digest(peer)
     assert saved == twin.map.digest()
@@ -173,13 +171,11 @@ def test_a_map_that_was_saved_is_loaded_and_goes_on_as_if_it_had_never_stopped(
 
     assert f'surfels of 3 scans, digest {saved}' in node.output
     assert digest(peer) == saved
-    go_on(peer, twin, 3, 2)
+    send_more(peer, twin, 3, 2)
     assert digest(peer) == twin.map.digest()
 
 
-def test_a_map_that_cannot_be_loaded_is_answered_with_why_and_nothing_changes(
-    peer, node, start, tmp_path
-):
+def test_a_failed_load_states_the_reason_and_changes_nothing(peer, node, start, tmp_path):
     twin = feed(peer, 2)
     (tmp_path / 'secret.npz').write_bytes(b'not for everybody')
     assert peer.call('save_map').success
@@ -205,7 +201,7 @@ def test_a_map_that_cannot_be_loaded_is_answered_with_why_and_nothing_changes(
     assert 'voxel_size_m 0.5, expected 0.25 as configured' in other.output
 
 
-def test_several_requests_at_a_time_are_answered_and_clouds_taken_meanwhile(peer, node):
+def test_concurrent_requests_are_answered_while_clouds_are_mapped(peer, node):
     feed(peer, 1)
     client = peer.client(Trigger, 'save_map')
     answers = [client.call_async(Trigger.Request()) for _ in range(8)]
@@ -217,7 +213,7 @@ def test_several_requests_at_a_time_are_answered_and_clouds_taken_meanwhile(peer
     peer.diagnosis({'scans.mapped': 4})
 
 
-def test_a_pause_drops_clouds_takes_poses_and_says_so(peer, node):
+def test_a_pause_drops_clouds_and_uses_poses(peer, node):
     feed(peer, 1)
     assert peer.call('pause', SetBool, SetBool.Request(data=True)).success
     send(peer, drive(2)[1:])
@@ -232,7 +228,7 @@ def test_a_pause_drops_clouds_takes_poses_and_says_so(peer, node):
     peer.diagnosis({'scans.mapped': 2})
 
 
-def test_of_too_many_requests_that_wait_the_last_are_refused_at_once(peer):
+def test_requests_beyond_the_queue_are_refused_at_once(peer):
     mapper = Mapper(Config())
     thread, busy, released = MappingThread(mapper, pytest.fail), Event(), Event()
     thread.start(lambda update: None)

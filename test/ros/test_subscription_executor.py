@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The thread that takes messages: poses before clouds, bytes that are none, events, its end."""
+"""The subscription executor: poses before clouds, malformed messages, events, shutdown."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ ARGUMENTS = (
 )
 PERIOD_NS = 100_000_000
 NUM_CLOUDS = 18
-"""Fewer than the node lets wait, so that none is dropped as too many."""
+"""Fewer than the queue of the node holds, so that none is dropped."""
 
 ALL = QoSProfile(depth=1000)
 
 
 @pytest.mark.parametrize('rate_hz', [100, 200])
-def test_of_a_burst_of_clouds_none_lacks_its_pose(start, peer, rate_hz):
+def test_every_cloud_of_a_burst_has_its_pose(start, peer, rate_hz):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points', depth=1000)
     step_ns = 10**9 // rate_hz
@@ -50,7 +50,7 @@ def test_of_a_burst_of_clouds_none_lacks_its_pose(start, peer, rate_hz):
     assert values['scans.mapped'] == str(NUM_CLOUDS - 1)
 
 
-def test_bytes_that_are_no_message_are_counted_and_the_good_ones_between_them_mapped(start, peer):
+def test_malformed_messages_are_counted_and_valid_ones_mapped(start, peer):
     node = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
     for number in range(3):
@@ -72,12 +72,12 @@ def test_bytes_that_are_no_message_are_counted_and_the_good_ones_between_them_ma
 
 
 class Bench:
-    """An intake in the node of a peer, what it took, and its failures."""
+    """A subscription executor in the node of a peer, the messages taken, and its failures."""
 
     def __init__(self, peer):
         self.taken = []
         self.failures = []
-        self.intake = SubscriptionExecutor(peer.node, self.failures.append)
+        self.executor = SubscriptionExecutor(peer.node, self.failures.append)
 
     def take(self, message):
         self.taken.append(message.data)
@@ -87,11 +87,11 @@ class Bench:
 def bench(peer):
     bench = Bench(peer)
     yield bench
-    bench.intake.stop()
+    bench.executor.stop()
 
 
 def published(peer, topic, kind, values, qos=ALL):
-    """Publish messages to somebody who has subscribed."""
+    """Publish messages once there is a subscriber; return when they are acknowledged."""
     publisher = peer.node.create_publisher(kind, topic, qos)
     peer.spin_until(publisher.get_subscription_count)
     for value in values:
@@ -100,23 +100,23 @@ def published(peer, topic, kind, values, qos=ALL):
 
 
 def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
-    bench.intake.subscribe(String, 'others', bench.take, ALL)
-    bench.intake.subscribe(Int32, 'eager', bench.take, ALL, eager=True)
+    bench.executor.subscribe(String, 'others', bench.take, ALL)
+    bench.executor.subscribe(Int32, 'eager', bench.take, ALL, eager=True)
     published(peer, 'others', String, ['a', 'b', 'c'])
     published(peer, 'eager', Int32, range(100))
 
-    bench.intake.start()
+    bench.executor.start()
 
     peer.spin_until(lambda: len(bench.taken) == 103)
     assert bench.taken == [*range(100), 'a', 'b', 'c']
-    assert bench.intake.topics() == ['/eager', '/others']
+    assert bench.executor.topics() == ['/eager', '/others']
 
 
-def test_what_the_middleware_reports_is_heard(peer, bench):
+def test_events_of_the_middleware_are_delivered(peer, bench):
     reports = []
     events = SubscriptionEventCallbacks(incompatible_qos=reports.append)
-    bench.intake.subscribe(String, 'others', bench.take, ALL, events=events)
-    bench.intake.start()
+    bench.executor.subscribe(String, 'others', bench.take, ALL, events=events)
+    bench.executor.start()
 
     best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
     peer.node.create_publisher(String, 'others', best_effort)
@@ -125,21 +125,21 @@ def test_what_the_middleware_reports_is_heard(peer, bench):
     assert reports[0].total_count == 1
 
 
-def test_an_error_of_a_callback_ends_the_thread_and_is_handed_on(peer, bench):
-    error = RuntimeError('nobody foresaw it')
+def test_an_error_in_a_callback_ends_the_thread_and_is_reported(peer, bench):
+    error = RuntimeError('unexpected')
 
     def fail(message):
         raise error
 
-    bench.intake.subscribe(String, 'others', fail, ALL)
-    bench.intake.start()
+    bench.executor.subscribe(String, 'others', fail, ALL)
+    bench.executor.start()
     published(peer, 'others', String, ['a'])
 
     peer.spin_until(lambda: bench.failures)
     assert bench.failures == [error]
 
 
-def test_what_has_arrived_is_taken_before_the_end(peer, bench):
+def test_received_messages_are_taken_before_the_end(peer, bench):
     busy, released = threading.Event(), threading.Event()
 
     def take(message):
@@ -147,19 +147,19 @@ def test_what_has_arrived_is_taken_before_the_end(peer, bench):
         released.wait(TIMEOUT_S)
         bench.take(message)
 
-    bench.intake.subscribe(String, 'others', take, ALL)
-    bench.intake.start()
+    bench.executor.subscribe(String, 'others', take, ALL)
+    bench.executor.start()
     published(peer, 'others', String, ['a', 'b', 'c'])
     assert busy.wait(TIMEOUT_S)
-    stopping = threading.Thread(target=bench.intake.stop)
+    stopping = threading.Thread(target=bench.executor.stop)
     stopping.start()
-    stopping.join(0.2)  # it waits for the callback by now
+    stopping.join(0.2)  # it now waits for the callback
     released.set()
     stopping.join(TIMEOUT_S)
     assert bench.taken == ['a', 'b', 'c']
 
 
-def test_it_can_be_stopped_while_messages_keep_coming(peer, bench, monkeypatch):
+def test_stopping_works_while_messages_keep_arriving(peer, bench, monkeypatch):
     monkeypatch.setattr('surfel_mapper.ros.subscription_executor.LAST_S', 0.1)
     publisher = peer.node.create_publisher(String, 'others', ALL)
 
@@ -167,22 +167,22 @@ def test_it_can_be_stopped_while_messages_keep_coming(peer, bench, monkeypatch):
         bench.take(message)
         publisher.publish(message)
 
-    bench.intake.subscribe(String, 'others', answer_with_another, ALL)
-    bench.intake.start()
+    bench.executor.subscribe(String, 'others', answer_with_another, ALL)
+    bench.executor.start()
     published(peer, 'others', String, ['a'])
     peer.spin_until(lambda: len(bench.taken) > 10)
-    stopping = threading.Thread(target=bench.intake.stop, daemon=True)
+    stopping = threading.Thread(target=bench.executor.stop, daemon=True)
     stopping.start()
     stopping.join(TIMEOUT_S)
     assert not stopping.is_alive()
 
 
-def test_it_can_be_stopped_at_any_time_and_started_again(peer, bench):
-    bench.intake.stop()
+def test_stopping_and_restarting_works_at_any_time(peer, bench):
+    bench.executor.stop()
     for _ in range(3):
-        bench.intake.subscribe(String, 'others', bench.take, ALL)
-        bench.intake.start()
-        bench.intake.stop()
-        assert bench.intake.topics() == []
+        bench.executor.subscribe(String, 'others', bench.take, ALL)
+        bench.executor.start()
+        bench.executor.stop()
+        assert bench.executor.topics() == []
         assert 'intake' not in [thread.name for thread in threading.enumerate()]
     assert not peer.node.count_subscribers('others')

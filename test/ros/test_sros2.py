@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The SROS 2 policy of the node allows what the node does, and nothing that it never does."""
+"""The SROS 2 policy of the node, and a node that is told to enforce security."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ EVERYTHING = [
 ]
 
 SOURCES = {'pose', 'depth', 'camera_info', 'tf', 'tf_static', 'clock', 'initialpose'}
-"""Read in other configurations than that of the test."""
+"""Subscriptions of other configurations than that of the test."""
 
 OUTPUTS = {'tf', '~/odometry', '~/track', *(f'~/level_{n}/normals' for n in (1, 2, 3))}
-"""Written in other configurations."""
+"""Publishers of other configurations."""
 
 NOT_SERVED = {'~/get_type_description'}
-"""By every version of rclpy."""
+"""Services that not every version of rclpy has."""
 
 
 def allowed(kind, how):
@@ -44,14 +44,14 @@ def full(name):
 
 
 def shown(find):
-    """Return the names that the graph shows of the node by now."""
+    """Return the names that the graph has for the node."""
     try:
         return {name for name, _ in find('surfel_mapper', '/')}
     except NodeNameNonExistentError:
         return set()
 
 
-def test_the_policy_allows_what_the_node_does_and_no_more(start, peer):
+def test_the_policy_allows_exactly_the_topics_and_services_of_the_node(start, peer):
     node = start('node', *ARGUMENTS, *EVERYTHING)
     node.wait_for_output('ready:')
     graph = peer.node
@@ -63,3 +63,49 @@ def test_the_policy_allows_what_the_node_does_and_no_more(start, peer):
         needed = allowed(*policy) - {full(name) for name in missing}
         peer.spin_until(lambda f=find, n=needed: n <= shown(f))
         assert shown(find) <= allowed(*policy)
+
+
+ENCLAVE = (
+    'identity_ca.cert.pem',
+    'cert.pem',
+    'key.pem',
+    'permissions_ca.cert.pem',
+    'governance.p7s',
+    'permissions.p7s',
+)
+
+
+@pytest.fixture
+def keystore(tmp_path, monkeypatch):
+    keystore = tmp_path / 'keys'
+    monkeypatch.setenv('ROS_SECURITY_ENABLE', 'true')
+    monkeypatch.setenv('ROS_SECURITY_STRATEGY', 'Enforce')
+    monkeypatch.setenv('ROS_SECURITY_KEYSTORE', str(keystore))
+    return keystore
+
+
+def refused(start):
+    """Start a node that has to refuse; return its output."""
+    node = start('node', '--ros-args', '--enclave', '/surfel_mapper')
+    assert node.wait() == 1, node.output
+    assert 'Traceback' not in node.output
+    assert 'ready:' not in node.output
+    assert 'ROS_SECURITY_ENABLE is true' in node.output
+    return node.output
+
+
+def test_the_node_refuses_to_start_without_a_keystore(start, keystore, monkeypatch):
+    monkeypatch.delenv('ROS_SECURITY_KEYSTORE')
+    assert 'ROS_SECURITY_KEYSTORE (None)' in refused(start)
+
+
+def test_the_node_refuses_to_start_without_its_enclave(start, keystore):
+    assert 'enclaves/surfel_mapper' in refused(start)
+
+
+def test_the_node_refuses_to_start_with_an_invalid_enclave(start, keystore):
+    enclave = keystore / 'enclaves' / 'surfel_mapper'
+    enclave.mkdir(parents=True)
+    for name in ENCLAVE:
+        (enclave / name).write_text('rubbish', encoding='ascii')
+    assert 'ROS cannot make the node' in refused(start)
