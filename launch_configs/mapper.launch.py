@@ -65,7 +65,7 @@ ARGUMENTS = [
         description='Take the time from /clock, as for a bag played with --clock.',
     ),
     DeclareLaunchArgument(
-        'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with a view of the map.'
+        'rviz', default_value='false', choices=BOOLEAN, description='Start RViz with its view.'
     ),
     DeclareLaunchArgument(
         'log_level',

@@ -141,7 +141,7 @@ class Peer:
         self.node.destroy_client(client)
 
     def advertise(self, *topics, depth=50, kinds=None):
-        """Create publishers, of odometry on topics ending in odom, else clouds; wait for readers."""
+        """Create publishers, of odometry if named so, else clouds; wait for readers."""
         for topic in topics:
             kind = Odometry if topic.endswith('odom') else PointCloud2
             kind = (kinds or {}).get(topic, kind)
