@@ -20,7 +20,7 @@ from surfel_mapper import load_config
 from surfel_mapper.cluster.engines import engine
 from surfel_mapper.cluster.running import map_bags
 from surfel_mapper.cluster.shards import cut
-from surfel_mapper.offline.recording import Request
+from surfel_mapper.offline.request import Request
 
 
 def main() -> None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
     from surfel_mapper.mapping.window import SlidingWindow
     from surfel_mapper.messages.mirror import MapMirror
+    from surfel_mapper.offline.replay import replay
     from surfel_mapper.pipeline import Mapper
     from surfel_mapper.scan import Scan
 
@@ -39,6 +40,7 @@ __all__ = [
     'Surfels',
     '__version__',
     'load_config',
+    'replay',
 ]
 
 _HOMES = {
@@ -52,6 +54,7 @@ _HOMES = {
     'SurfelMap': 'mapping.surfel_map',
     'Surfels': 'mapping.surfels',
     'load_config': 'config',
+    'replay': 'offline.replay',
 }
 """The module that each public name comes from."""
 

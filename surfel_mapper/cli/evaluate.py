@@ -10,18 +10,14 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
+from surfel_mapper.cli._arguments import positive_float
 from surfel_mapper.errors import FileFormatError
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from surfel_mapper.evaluation.map_files import Discs
-    from surfel_mapper.files.trajectory import Trajectory
 
 SUMMARY = 'Compare a map with the truth or another map, or a trajectory with another.'
 
@@ -53,19 +49,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--max-distance',
-        type=positive,
+        type=positive_float,
         metavar='M',
         help='surfels farther from the truth are not compared (the voxel size)',
     )
     add(
         '--radius',
-        type=positive,
+        type=positive_float,
         metavar='M',
         help='a place of the truth is found by a surfel this near (the voxel size)',
     )
     add(
         '--max-difference',
-        type=positive,
+        type=positive_float,
         default=0.01,
         metavar='S',
         help='poses at most so far apart in time are compared (%(default)s)',
@@ -78,17 +74,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='from how many points on a voxel counts as a surfel (%(default)s)',
     )
     add('--json', action='store_true', help='print as JSON')
-
-
-def positive(text: str) -> float:
-    """Return a finite positive number."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f'{text!r}, expected a positive number')
-    return value
 
 
 def run(args: argparse.Namespace) -> int:
@@ -106,7 +91,7 @@ def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of a map, and lines that state them."""
     from surfel_mapper.evaluation.comparison import CloudTruth, evaluate, Truth
     from surfel_mapper.evaluation.map_files import load_discs
-    from surfel_mapper.evaluation.world_truth import is_world, load_truth
+    from surfel_mapper.evaluation.truth import is_world, load_truth
 
     surfels = load_discs(args.map, args.min_points)
     truth: Truth
@@ -163,9 +148,9 @@ def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) ->
 def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of a trajectory, and lines that state them."""
     from surfel_mapper.alignment.trajectory_errors import compare
-    from surfel_mapper.files.trajectory import read_trajectory
+    from surfel_mapper.evaluation.truth import read_poses, true_poses
 
-    estimated_ns, estimated = poses_of(args.map, read_trajectory(args.map))
+    estimated_ns, estimated = read_poses(args.map)
     true_ns, true = true_poses(args.truth, estimated_ns)
     try:
         result = compare(
@@ -185,42 +170,3 @@ def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     drift_m, drift_deg = result['drift_m_per_100m'], result['drift_deg_per_100m']
     lines.append(f'drift {drift_m:.3f} m, {drift_deg:.3f} deg in 100 m')
     return result, lines
-
-
-def true_poses(
-    path: Path, stamps_ns: npt.NDArray[np.int64]
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Return the true poses: of a file, or of the lidar of a simulated bag at given stamps."""
-    import numpy as np
-
-    from surfel_mapper.files.trajectory import read_trajectory
-    from surfel_mapper.simulation import load_simulation
-    from surfel_mapper.simulation.recording import SIMULATION_FILE
-
-    if not path.is_dir():
-        return poses_of(path, read_trajectory(path))
-    if not (path / SIMULATION_FILE).exists():
-        raise FileFormatError(
-            f'{path}: not a simulated bag, which has a {SIMULATION_FILE}; '
-            'expected one, or a trajectory (TUM, KITTI or CSV)'
-        )
-    drive = load_simulation(path).drive
-    poses = [drive.T_odom_sensor(int(stamp_ns)) for stamp_ns in stamps_ns]
-    return stamps_ns, np.array(poses).reshape(-1, 4, 4)
-
-
-def poses_of(
-    path: Path, trajectory: Trajectory
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
-    """Return stamps (S,) and poses (S, 4, 4) of a trajectory; without stamps, by number."""
-    import numpy as np
-
-    from surfel_mapper.geometry import pose_matrix
-
-    poses = [
-        pose_matrix(xyz, q_xyzw)
-        for xyz, q_xyzw in zip(trajectory.xyz, trajectory.q_xyzw, strict=True)
-    ]
-    if trajectory.stamp_ns is None:
-        raise FileFormatError(f'{path}: poses without times, expected a times.txt beside it')
-    return trajectory.stamp_ns, np.array(poses).reshape(-1, 4, 4)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper info``: what a bag holds, and how to configure a replay of it."""
+"""``surfel-mapper info``: topics, rates and poses of a bag, and settings for a replay of it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli.progress import progress
+from surfel_mapper.cli._arguments import CUT
+from surfel_mapper.cli._progress import progress
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
 SUMMARY = 'Show the topics, rates and poses of a bag, or the settings of node and replay.'
 
 EXAMPLE = 'surfel-mapper info street.mcap'
-
-CUT = 3
-"""Exit code: the bag ends too early and --strict was given."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read a bag and report, or tell the settings."""
+    """Survey a bag and report, or print the settings."""
     if args.parameters:
         from surfel_mapper.config import settings_table
 
@@ -58,8 +56,8 @@ def run(args: argparse.Namespace) -> int:
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
         read = itertools.count(1)
-        with progress('info', total, 'message') as show:
-            found = survey(reader, lambda: show(next(read)))
+        with progress('info', 'message') as show:
+            found = survey(reader, lambda: show(next(read), total))
         made = offers(found)
         content = as_mapping(reader, found, made)
     print(json.dumps(content) if args.json else report(content, made))
@@ -90,7 +88,7 @@ def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str,
 
 
 def report(content: dict[str, Any], made: list[Offer]) -> str:
-    """Return what was found for people."""
+    """Return the survey for people."""
     start = datetime.fromtimestamp(content['start_ns'] / 1e9, timezone.utc)
     messages = sum(topic['messages'] for topic in content['topics'])
     lines = [

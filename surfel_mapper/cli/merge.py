@@ -3,7 +3,7 @@
 """
 ``surfel-mapper merge``: finished maps into one, tile by tile, exactly.
 
-What comes out has the digest of a map of all their scans. No process holds a whole map.
+The result has the digest of a map of all their scans. No process holds a whole map.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import json
 from pathlib import Path
 import time
 
-from surfel_mapper.cli import replay_many
-from surfel_mapper.cli.replay_report import rounded
+from surfel_mapper.cli._arguments import add_workers, positive_int
+from surfel_mapper.offline.summary import rounded
 
 SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
 
@@ -34,13 +34,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--output', type=Path, required=True, metavar='DIR', help='directory to write to')
     add(
         '--min-points',
-        type=replay_many.positive,
+        type=positive_int,
         default=5,
         metavar='N',
-        help='from how many points on a voxel counts as a surfel, for the figures (%(default)s)',
+        help='points that a voxel needs to count as a surfel, for the figures (%(default)s)',
     )
     add('--json', action='store_true', help='print the summary as JSON')
-    replay_many.add_arguments(parser)
+    add_workers(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     summary = {
         'maps': [str(path) for path in args.maps],
         'points': tiled.points,
-        **replay_many.described(tiled),
+        **tiled.summary(),
         'seconds': time.perf_counter() - began,
         'peak_memory_mb': {'merging': tiled.peak_bytes // 10**6},
     }

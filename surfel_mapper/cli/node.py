@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import argparse
 
-from surfel_mapper.cli.ros import loading_ros
+from surfel_mapper.cli._ros import loading_ros
 from surfel_mapper.ros.main_thread import Signals
 
 SUMMARY = 'Map clouds live from ROS 2 topics.'

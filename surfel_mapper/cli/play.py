@@ -49,7 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Play a bag and report what was published."""
     from surfel_mapper.bags.reader import BagReader
-    from surfel_mapper.cli.ros import loading_ros
+    from surfel_mapper.cli._ros import loading_ros
 
     if not args.rate > 0.0:
         raise ConfigError(f'rate: {args.rate}, expected more than 0')

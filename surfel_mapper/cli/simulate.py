@@ -11,8 +11,8 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli.replay_report import rounded
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.offline.summary import rounded
 
 if TYPE_CHECKING:
     from surfel_mapper.simulation import Simulation

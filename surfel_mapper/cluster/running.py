@@ -75,6 +75,17 @@ class TiledMap:
     sample: Surfels
     peak_bytes: int
 
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of the map for summary.json."""
+        return {
+            'voxels': self.voxels,
+            'surfels': self.surfels,
+            'tiles': self.tiles,
+            'bytes': self.nbytes,
+            'voxel_size_m': self.voxel_size_m,
+            'digest': self.digest,
+        }
+
 
 @dataclass(slots=True, kw_only=True)
 class Mapped:

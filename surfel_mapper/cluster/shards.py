@@ -26,8 +26,10 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.files.parquet_tiles import Part, Tile, write_shard
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.offline.recording import BagRecording, open_recording, Request
-from surfel_mapper.offline.replay import add_cloud, add_poses, ALL_SCANS
+from surfel_mapper.offline.bag_recording import add_cloud, add_poses, BagRecording
+from surfel_mapper.offline.recording import open_recording
+from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
 SHORTEST_S, LONGEST_S = 5.0, 60.0

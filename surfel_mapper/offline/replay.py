@@ -1,35 +1,36 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A bag through the pipeline: its clouds and poses into a Mapper, in the order of record time.
+Replay: a recording into a map, its picture, a report and figures, in this process.
 
-That order is the one in which the node receives them, so that both map the same; nothing is
-looked up ahead, although a bag would allow it.
+The files are written when the whole recording is mapped; see outputs.py. A replay that maps
+nothing is an error, because an empty map looks like a result. Heavy modules are imported inside
+functions, so that ``surfel_mapper.replay`` can be named without loading rosbags or matplotlib.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, ExitStack
+from dataclasses import dataclass
+from functools import partial
+import logging
+from pathlib import Path
+import time
+from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.bags.reader import BagMessage, BagReader
-from surfel_mapper.errors import BagError, CloudFormatError, PoseError
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_pose import raw_poses
-from surfel_mapper.offline.pose_topics import PoseTopics
-from surfel_mapper.offline.span import Span, WHOLE
+from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.offline.summary import causes_text
 
-if TYPE_CHECKING:  # it brings the compiler, which a look into a bag does not need
-    import numpy as np
-    import numpy.typing as npt
-
-    from surfel_mapper.offline.depth_feed import Decode, DepthFeed
-    from surfel_mapper.offline.scene_feed import SceneFeed
+if TYPE_CHECKING:
+    from surfel_mapper.config import Config
+    from surfel_mapper.offline.normals_bag import NormalsBag
+    from surfel_mapper.offline.outputs import ScanTrajectory
+    from surfel_mapper.offline.recording import Recording
+    from surfel_mapper.offline.request import Request
     from surfel_mapper.pipeline import Mapper, Update
 
-ALL_SCANS = {
+ALL_SCANS: Mapping[str, Any] = {
     'window.max_scans': 0,
     'window.max_age_s': 0.0,
     'window.max_distance_m': 0.0,
@@ -38,198 +39,297 @@ ALL_SCANS = {
 }
 """Settings with which no scan leaves the map."""
 
+SAME_TIME_NS = 10_000_000
+"""A pose is compared with a true pose at most 10 ms apart."""
 
-def load_start(mapper: Mapper) -> None:
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayOptions:
     """
-    Give a mapper the map that ``map.load`` names, if any; its surfels never leave.
+    Options of a replay beside its configuration.
 
-    Raises
-    ------
-    FileFormatError
-        If it cannot be read, or is of another voxel size.
-    MapError
-        If it has other columns than are configured.
+    Attributes
+    ----------
+    window : bool
+        Let scans leave the map by the window of the configuration, as the node does; else all
+        scans stay.
+    align : bool
+        Align all scans with each other at the end; keeps all points in memory until then.
+    formats : tuple of str
+        Formats of the map: ply, pcd, parquet, npz, dxf, bag.
+    poses_out : Path, optional
+        File for the poses of the scans, as TUM text.
+    truth : Path, optional
+        True poses of the sensor, a file or a simulated bag; the summary states the errors.
+    view : bool
+        Show the map in rerun while it grows.
+    rrd : Path, optional
+        File for the same, for rerun to open.
 
     """
-    from surfel_mapper.files.map_state import load_map  # it brings the compiler
 
-    path = mapper.config.map.load
-    if path:
-        surfel_map, _ = load_map(path, voxel_size_m=mapper.map.voxel_size_m)
-        mapper.restore(surfel_map, [])
+    window: bool = False
+    align: bool = False
+    formats: tuple[str, ...] = ('ply',)
+    poses_out: Path | None = None
+    truth: Path | None = None
+    view: bool = False
+    rrd: Path | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ReplayResult:
+    """
+    Map and figures of a replay.
+
+    Attributes
+    ----------
+    mapper : Mapper
+        Holds the map, ``mapper.map``, and the window.
+    trajectory : ScanTrajectory
+        Stamps and poses of the mapped scans.
+    summary : dict of str
+        The content of summary.json.
+    written : list of Path
+        The files of the map, picture, report and summary.
+
+    """
+
+    mapper: Mapper
+    trajectory: ScanTrajectory
+    summary: dict[str, Any]
+    written: list[Path]
 
 
 def replay(
-    reader: BagReader,
-    mapper: Mapper,
-    cloud_topics: str | Collection[str],
-    poses: PoseTopics,
+    path: str | Path | Request,
     *,
-    span: Span = WHOLE,
+    output: str | Path | None = None,
+    config: Config | str | Path | None = None,
+    options: ReplayOptions | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
     stopped: Callable[[], bool] = lambda: False,
-) -> Iterator[Update]:
+) -> ReplayResult:
     """
-    Feed a bag to a mapper; yield what each scan did.
+    Map a bag or a folder of scans and write the map, a picture, a report and a summary.
 
-    Clouds and poses that cannot be decoded are counted, the first of each is warned about.
+    The same as ``surfel-mapper replay`` with one recording. Six parameters, because the first
+    three suffice for most calls.
 
     Parameters
     ----------
-    reader : BagReader
-        The bag.
-    mapper : Mapper
-        Maps it.
-    cloud_topics : str or collection of str
-        One topic of clouds, or several; their sensors are told apart by their frames.
-    poses : PoseTopics
-        Where poses come from.
-    span : Span
-        Which clouds.
+    path : str, Path or Request
+        The recording; a Request also chooses topics, poses and a part of it.
+    output : str or Path, optional
+        Directory to write to; without, the name of the recording followed by _surfels, in the
+        working directory.
+    config : Config, str or Path, optional
+        The configuration, or its YAML file; without, the defaults.
+    options : ReplayOptions, optional
+        Window, alignment, formats, truth, viewer.
+    progress : callable
+        Called with the numbers of scans received and expected after every mapped scan.
     stopped : callable
-        Asked before every message; once it is true no more are read.
+        Asked before every message; once it returns True, the map of the scans so far is written
+        and the summary says ``interrupted``.
+
+    Returns
+    -------
+    ReplayResult
 
     Raises
     ------
     BagError
-        If the bag is damaged.
+        If the recording cannot be read, lacks topics or poses, or none of its scans was mapped.
+    ConfigError
+        If a setting or an option is wrong.
+    FileFormatError
+        If a file cannot be read or written.
+    MapError
+        If it was stopped before any scan was mapped.
 
     """
-    clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
-    for topic, mount in poses.mounts.items():
-        base = mapper.config.frames.base
-        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
-    first = numbers_before(reader, clouds, poses, span)
-    seen: Counter[str] = Counter()
+    from surfel_mapper.memory import keep_freed_memory
+    from surfel_mapper.offline.outputs import output_directory, write_files
+    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.request import Request
+    from surfel_mapper.viz.history import History
 
-    def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
-        add_cloud(reader, mapper, message, poses, number, decode)
-
-    images = depth_feed(clouds, add) if mapper.config.input.kind == 'depth' else None
-    infos = images.info_topics if images else {}
-    beside = scene_feed(mapper)
-    scenes = beside.topics if beside else set()
-    for message in messages(reader, {*clouds, *infos, *scenes}, poses, span):
-        if stopped():
-            break
-        if beside and message.topic in scenes:
-            beside.take(reader, message)
-        elif images and message.topic in infos:
-            add_camera_info(reader, mapper, message, images)
-        elif message.topic not in clouds:
-            add_poses(reader, mapper, message, poses)
-        elif span.holds(message.record_ns):
-            if seen[message.topic] % span.every == 0:
-                number = first[message.topic] + seen[message.topic]
-                (images.take_image if images else add)(message, number)
-            seen[message.topic] += 1
-        yield from mapper.insert_ready(more_follows=True)
-    if beside:
-        mapper.end_images()
-    yield from mapper.insert_ready()
-    mapper.finish()
-
-
-def depth_feed(
-    clouds: Collection[str], add: Callable[[BagMessage, int, Decode], None]
-) -> DepthFeed:
-    """Return what pairs images with calibrations; loaded here, for it brings the compiler."""
-    from surfel_mapper.offline.depth_feed import DepthFeed
-
-    return DepthFeed(clouds, add)
-
-
-def scene_feed(mapper: Mapper) -> SceneFeed | None:
-    """Return what takes images of colours and labels, where the mapper wants any."""
-    if not mapper.config.tsdf.image_topics:
-        return None
-    from surfel_mapper.offline.scene_feed import SceneFeed
-
-    return SceneFeed(mapper)
+    options = options or ReplayOptions()
+    request = path if isinstance(path, Request) else Request(path=Path(path))
+    settings = configured(config, options)
+    directory = output_directory(request.path, None if output is None else Path(output))
+    keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
+    with open_recording(request, settings) as recording:
+        mapper = started_mapper(recording.config)
+        if options.truth is not None:
+            check_truth(options.truth)
+        history = History()
+        with listeners(directory, options, mapper) as listening:
+            listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
+            start_s = time.perf_counter()
+            trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
+            replay_s = time.perf_counter() - start_s
+            refuse_empty(recording, mapper, was_stopped)
+            aligned = {'alignment': mapper.align().summary()} if options.align else {}
+            if mapper.models is not None:
+                mapper.models.update()  # they follow at their own period, not after alignment
+            trajectory.follow_alignment(mapper)
+        summary = {
+            **recording.describe(),
+            'recorded_s': recording.recorded_s,
+            'replay_s': replay_s,
+            'window': options.window,
+            'interrupted': was_stopped,
+            'cut': list(recording.cuts),
+            **aligned,
+            **pose_errors(options.truth, trajectory),
+            **mapper.summary(),
+            'settings': mapper.config.to_mapping(),
+        }
+    if options.poses_out is not None:
+        trajectory.write(options.poses_out)
+    written = write_files(directory, options.formats, mapper, trajectory, summary, history)
+    return ReplayResult(mapper, trajectory, summary, written)
 
 
-def messages(
-    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
-) -> Iterator[BagMessage]:
-    """Yield what a part needs: static transforms from before it, its clouds and their poses."""
-    if poses.static and span.poses_start_ns is not None:
-        yield from reader.messages(poses.static, None, span.poses_start_ns)
-    names = {*clouds, *poses.kinds, *poses.static}
-    yield from reader.messages(names, span.poses_start_ns, span.poses_stop_ns)
+def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:
+    """Return the configuration for a replay with some options, after checking their formats."""
+    from surfel_mapper.config import Config, load_config
+    from surfel_mapper.offline.outputs import DXF, FORMATS
+
+    settings = config if isinstance(config, Config) else load_config(config)
+    unknown = [name for name in options.formats if name not in FORMATS]
+    if unknown:
+        raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(FORMATS)}')
+    if DXF in options.formats and not settings.models.enabled:
+        raise ConfigError(
+            'formats: dxf holds planes and surfaces, expected layers.models.enabled: true in the '
+            'configuration'
+        )
+    if options.align:
+        settings = settings.replace({'window.keep_points': True})
+    return settings if options.window else settings.replace(ALL_SCANS)
 
 
-def numbers_before(
-    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
-) -> Counter[str]:
-    """Return how many clouds come before a part, where poses are known by their number."""
-    if poses.path is None or poses.path.has_stamps or span.start_ns is None:
-        return Counter()
-    return Counter(message.topic for message in reader.messages(clouds, None, span.start_ns))
+def started_mapper(config: Config) -> Mapper:
+    """Return a mapper with compiled kernels and the map that ``map.load`` names, if any."""
+    from surfel_mapper.files.map_state import load_map
+    from surfel_mapper.pipeline import Mapper
+
+    mapper = Mapper(config)
+    if config.map.load:
+        surfel_map, _ = load_map(config.map.load, voxel_size_m=mapper.map.voxel_size_m)
+        mapper.restore(surfel_map, [])
+    mapper.warm_up()
+    return mapper
 
 
-def poses_now(
-    mapper: Mapper, stamps_ns: Sequence[int], poses: Sequence[npt.NDArray[np.float64]]
-) -> list[npt.NDArray[np.float64]]:
-    """
-    Return the poses of scans as alignment left them, as far as they are in the window.
+@contextmanager
+def listeners(
+    directory: Path, options: ReplayOptions, mapper: Mapper
+) -> Iterator[list[Callable[[Update], None]]]:
+    """Open the bag of normals and the viewers that were asked for; give their callbacks."""
+    from surfel_mapper.offline.outputs import BAG
 
-    Parameters
-    ----------
-    mapper : Mapper
-        Which mapped the scans.
-    stamps_ns : sequence of int
-        Of the scans, in the order in which they were mapped.
-    poses : sequence of (4, 4) float64
-        Where each was when it was mapped.
-
-    """
-    result = list(poses)
-    for place, scan in enumerate(reversed(list(mapper.window)), start=1):
-        if place > len(stamps_ns) or stamps_ns[-place] != scan.stamp_ns:
-            break
-        result[-place] = scan.T_map_sensor
-    return result
+    with ExitStack() as files:
+        found = viewers(options, mapper, files)
+        bag = None
+        if BAG in options.formats:
+            bag = normals_bag(directory, mapper, files)
+            found.append(bag.add)
+        yield found
+        if bag is not None:
+            bag.finish()
 
 
-def add_cloud(
-    reader: BagReader,
+def viewers(
+    options: ReplayOptions, mapper: Mapper, files: ExitStack
+) -> list[Callable[[Update], None]]:
+    """Return the callbacks of the rerun viewers that were asked for; closed with the files."""
+    paths: list[Path | None] = [None] if options.view else []
+    paths += [options.rrd] if options.rrd is not None else []
+    if not paths:
+        return []
+    from surfel_mapper.viz.viewer import Viewer
+
+    return [files.enter_context(Viewer(mapper, path)).add for path in paths]
+
+
+def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:
+    """Begin the bag of normals; it is complete when the files are closed, or does not exist."""
+    from surfel_mapper.bags.writer import BagWriter
+    from surfel_mapper.offline.normals_bag import NormalsBag
+    from surfel_mapper.offline.outputs import BAG, FORMATS
+
+    writer = BagWriter(directory / FORMATS[BAG], overwrite=True)
+    return NormalsBag(files.enter_context(writer), mapper)
+
+
+def mapped(
+    recording: Recording,
     mapper: Mapper,
-    message: BagMessage,
-    poses: PoseTopics,
-    number: int,
-    decode: Decode = to_scan,
-) -> None:
-    """Decode a cloud or an image and queue it as a scan, with its pose where a file has it."""
-    try:
-        with mapper.counters.timed('decode'):
-            scan = decode(reader.decode(message), message.topic)
-    except (CloudFormatError, BagError) as error:
-        mapper.refuse_clouds('bad_cloud', message.topic, str(error))
+    listen: Sequence[Callable[[Update], object]],
+    progress: Callable[[int, int], object],
+    stopped: Callable[[], bool],
+) -> tuple[ScanTrajectory, bool]:
+    """Map all scans; return their poses, and whether mapping was stopped."""
+    from surfel_mapper.offline.outputs import ScanTrajectory
+
+    trajectory, total = ScanTrajectory(), recording.num_scans
+    for update in recording.replay(mapper, stopped):
+        trajectory.add(update)
+        for each in listen:
+            each(update)
+        progress(mapper.counters.received, total)
+    return trajectory, stopped()
+
+
+def refuse_empty(recording: Recording, mapper: Mapper, was_stopped: bool) -> None:
+    """Raise if no scan was mapped, with the causes."""
+    counters = mapper.counters
+    if counters.mapped or counters.localised:
         return
-    if message.topic in poses.mounts:
-        scan = replace(scan, frame_id=message.topic)
-    if poses.path is not None:
-        poses.path.add_for(mapper, scan.stamp_ns, number)
-    mapper.add_scan(scan)
+    found = recording.describe()
+    if was_stopped:
+        raise MapError(f'{found["bag"]}: stopped before a scan was mapped')
+    of = f' of {", ".join(found["topics"])}' if 'topics' in found else ''
+    look = f'; `surfel-mapper info {found["bag"]}` shows what poses it has'
+    raise BagError(
+        f'{found["bag"]}: none of {counters.received} clouds{of} was mapped '
+        f'({causes_text(counters.dropped)}){look if "no_pose" in counters.dropped else ""}'
+    )
 
 
-def add_camera_info(
-    reader: BagReader, mapper: Mapper, message: BagMessage, images: DepthFeed
-) -> None:
-    """Decode a calibration, and map the images that waited for it; a bad one is counted."""
+def check_truth(truth: Path) -> None:
+    """Raise if there are no true poses at a path, before hours of work."""
+    import numpy as np
+
+    from surfel_mapper.evaluation.truth import true_poses
+
+    true_poses(truth, np.zeros(1, np.int64))
+
+
+def pose_errors(truth: Path | None, trajectory: ScanTrajectory) -> dict[str, Any]:
+    """Return the errors of the poses for the summary; empty without truth."""
+    import numpy as np
+
+    from surfel_mapper.alignment.trajectory_errors import compare
+    from surfel_mapper.evaluation.truth import true_poses
+
+    if truth is None:
+        return {}
+    stamps_ns = np.array(trajectory.stamps_ns, np.int64)
     try:
-        images.take_info(message.topic, reader.decode(message))
-    except (CloudFormatError, BagError) as error:
-        mapper.ignore_message('bad_message', f'calibration ignored: {error}')
-
-
-def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
-    """Enter the poses of a message; one that cannot be read is counted."""
-    kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
-    try:
-        poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
-    except PoseError as error:
-        mapper.ignore_message('bad_message', f'pose ignored: {error}')
-        return
-    for pose in poses:
-        if topics.path is None or pose.child != base:  # whose pose is in the file
-            mapper.add_pose(*pose, static=message.topic in topics.static)
+        errors = compare(
+            stamps_ns,
+            trajectory.matrices,
+            *true_poses(truth, stamps_ns),
+            max_difference_ns=SAME_TIME_NS,
+        )
+    except ValueError as error:
+        _log.warning('--truth %s: %s', truth, error)
+        return {}
+    return {'pose_errors': errors}

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A folder of scans, a file each, through the pipeline.
+A folder of scans, one file each, through the pipeline.
 
-The scans are in the frame frames.base, whose poses the file of poses has; where
-frames.base_to_sensor is set, in a frame called sensor on it. The time of scan i is that of pose
-i, if there are as many; else it is the name of the file, as a time.
+The scans are in the frame frames.base, whose poses are read from a file; if
+frames.base_to_sensor is set, they are in a frame called sensor on it. The time of scan i is that
+of pose i, if there are as many poses as scans; else it is parsed from the name of its file.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files
 from surfel_mapper.files.trajectory import nanoseconds
-from surfel_mapper.offline.pose_path import PosePath
-from surfel_mapper.offline.span import part, Span
+from surfel_mapper.offline.pose_sources import PosePath
+from surfel_mapper.offline.request import part, Span
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
 SENSOR = 'sensor'
-"""The frame of the scans, where it is not the base."""
+"""The frame of the scans, if frames.base_to_sensor is set."""
 
 PERIOD_NS = 100_000_000
-"""Between scans that have no time at all: 10 Hz."""
+"""Period of scans that have no time: 10 Hz."""
 
 UNITS = {19: 'ns', 16: 'us', 13: 'ms'}
-"""What a whole number of so many digits counts, in the name of a file."""
+"""Unit of a whole number in the name of a file, by its number of digits."""
 
 
 class ScanFolder:
     """
-    The scans of a folder, with their poses.
+    Scans of a folder, with their poses.
 
     Parameters
     ----------
@@ -47,21 +47,20 @@ class ScanFolder:
     config : Config
         Without poses its ``pose.source`` has to be identity.
     poses : PosePath, optional
-        Where the base is.
+        Poses of frames.base.
     part_of : mapping
         start_s, duration_s, every; see ``part``.
 
     Raises
     ------
     BagError
-        If there are no poses, or it is not known which scan they belong to.
+        If there are no poses, or they cannot be assigned to the scans.
 
     """
 
     cuts: tuple[str, ...] = ()
 
     def __init__(self, path: Path, config: Config, poses: PosePath | None, **part_of: Any) -> None:
-        """List the files and find the time of each."""
         self.path = path
         self.files = scan_files(path)
         self.poses = poses
@@ -76,23 +75,23 @@ class ScanFolder:
 
     @property
     def num_scans(self) -> int:
-        """How many scans are mapped."""
+        """Number of scans in the part that is mapped."""
         return -(-sum(map(self.span.holds, self.stamps)) // self.span.every)
 
     @property
     def recorded_s(self) -> float:
-        """How long the part that is mapped took to record."""
+        """Duration of the part that is mapped, s."""
         start_ns, stop_ns = self.span.clipped(self.stamps[0], self.stamps[-1])
         return (stop_ns - start_ns) / 1e9
 
     def describe(self) -> dict[str, Any]:
-        """Return where scans and poses come from, for the summary."""
+        """Return the sources of scans and poses, for the summary."""
         return {'bag': str(self.path), 'poses': str(self.poses.path) if self.poses else None}
 
     def replay(
         self, mapper: Mapper, stopped: Callable[[], bool] = lambda: False
     ) -> Iterator[Update]:
-        """Feed the scans to a mapper; yield what each did."""
+        """Feed the scans to a mapper; yield the update of each."""
         frames = mapper.config.frames
         frame = SENSOR if frames.base_to_sensor else frames.base
         held = [n for n, stamp_ns in enumerate(self.stamps) if self.span.holds(stamp_ns)]

@@ -22,7 +22,7 @@ from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.pose_messages import frame_name, stamp_ns, StampedPose
 from surfel_mapper.messages.raw_pose import raw_poses
-from surfel_mapper.offline.pose_topics import static_topics, TYPES
+from surfel_mapper.offline.pose_sources import static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 
 SOURCES = {type_: source for source, type_ in TYPES.items()}

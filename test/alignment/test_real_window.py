@@ -10,8 +10,8 @@ import pytest
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import q_xyzw
-from surfel_mapper.offline.pose_topics import pose_topics
-from surfel_mapper.offline.replay import replay
+from surfel_mapper.offline.bag_recording import feed
+from surfel_mapper.offline.pose_sources import pose_topics
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, relative_errors
@@ -25,7 +25,7 @@ def recorded(data_folder):
     config = Config.from_mapping(SETTINGS)
     mapper = Mapper(config)
     with BagReader(data_folder / 'data' / 'bags' / 'hall_os0_full') as reader:
-        for _ in replay(reader, mapper, '/points', pose_topics(reader.topics, config)):
+        for _ in feed(reader, mapper, '/points', pose_topics(reader.topics, config)):
             pass
     return list(mapper.window)
 

@@ -5,7 +5,7 @@
 import pytest
 
 from surfel_mapper.cluster.engines import InProcess
-from surfel_mapper.offline.recording import Request
+from surfel_mapper.offline.request import Request
 from test.bench.offline import recorded
 from test.bench.options import Options
 from test.bench.street import Street

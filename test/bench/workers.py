@@ -30,8 +30,9 @@ from surfel_mapper.cluster.shards import cut, peak_bytes, shard_length_s
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.offline.recording import open_recording, Request
+from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline import Mapper
 from test.bench.offline import recorded
 from test.bench.options import Options

@@ -18,9 +18,9 @@ import time
 import numpy as np
 import pytest
 
-from surfel_mapper.cli import progress as progress_module
+from surfel_mapper.cli import _progress as progress_module
+from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.cli.main import main
-from surfel_mapper.cli.progress import finished_first, progress, stopped_by_interrupt
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.viz import picture
 from test.bags.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
@@ -29,8 +29,8 @@ MANY = 5000
 WAIT_S = 300.0
 WITH_MANY_LINES = """
 import sys
-from surfel_mapper.cli import main, progress
-progress.EVERY_S = 0.02
+from surfel_mapper.cli import _progress, main
+_progress.EVERY_S = 0.02
 sys.exit(main.main())
 """
 
@@ -38,10 +38,10 @@ sys.exit(main.main())
 def test_lines_say_how_far_it_is_how_fast_and_how_long_it_takes(monkeypatch, capsys):
     monkeypatch.setattr(progress_module, 'EVERY_S', 0.0)
 
-    with progress('replay', 200, 'scan') as show:
-        show(0)
+    with progress('replay', 'scan') as show:
+        show(0, 200)
         time.sleep(0.01)
-        show(50)
+        show(50, 200)
 
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith('surfel-mapper replay: 50 of 200 scans, ')
@@ -49,8 +49,8 @@ def test_lines_say_how_far_it_is_how_fast_and_how_long_it_takes(monkeypatch, cap
 
 
 def test_no_line_comes_in_the_first_seconds(capsys):
-    with progress('replay', 200, 'scan') as show:
-        show(50)
+    with progress('replay', 'scan') as show:
+        show(50, 200)
 
     assert capsys.readouterr().err == ''
 
@@ -65,21 +65,6 @@ def test_the_first_interrupt_is_told_and_the_second_interrupts():
             signal.raise_signal(signal.SIGINT)
 
     assert signal.getsignal(signal.SIGINT) is before
-
-
-def test_an_interrupt_in_what_is_finished_first_comes_after_it_and_a_second_one_at_once():
-    done = []
-
-    def press(times):
-        with finished_first():
-            for _ in range(times):
-                signal.raise_signal(signal.SIGINT)
-            done.append(times)
-
-    for times in (1, 2):
-        with pytest.raises(KeyboardInterrupt):
-            press(times)
-    assert done == [1]
 
 
 def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch, capsys):

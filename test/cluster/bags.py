@@ -6,8 +6,9 @@ from __future__ import annotations
 
 from surfel_mapper.cluster.shards import cut
 from surfel_mapper.config import Config
-from surfel_mapper.offline.recording import open_recording, Request
+from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline import Mapper
 from test.bags.recorded import drive, START_NS, write_rosbag2
 

@@ -7,7 +7,7 @@ import pytest
 
 from surfel_mapper.evaluation.comparison import CloudTruth, completeness, evaluate, spread
 from surfel_mapper.evaluation.map_files import Discs
-from surfel_mapper.evaluation.world_truth import WorldTruth
+from surfel_mapper.evaluation.truth import WorldTruth
 from surfel_mapper.simulation import Lidar, Primitive, Simulation, World
 
 SIDE = 40

@@ -16,8 +16,9 @@ from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.trajectory import write_tum
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.offline.recording import open_recording, Request
+from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.offline.request import Request
 from test.bags.recorded import (
     CLOUD,
     cut,

@@ -10,8 +10,9 @@ import pytest
 from surfel_mapper import Config, Mapper, SurfelMap
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.errors import BagError
-from surfel_mapper.offline.pose_topics import pose_topics
-from surfel_mapper.offline.replay import ALL_SCANS, replay
+from surfel_mapper.offline.bag_recording import feed
+from surfel_mapper.offline.pose_sources import pose_topics
+from surfel_mapper.offline.replay import ALL_SCANS
 from test.bags.recorded import (
     CLOUD,
     drive,
@@ -35,7 +36,7 @@ def mapped(path, settings, pose_topic=None, cloud_topic='/points'):
     mapper = Mapper(Config.from_mapping({**ALL_SCANS, **settings}))
     with BagReader(path) as reader:
         poses = pose_topics(reader.topics, mapper.config, pose_topic)
-        for _ in replay(reader, mapper, cloud_topic, poses):
+        for _ in feed(reader, mapper, cloud_topic, poses):
             pass
     return mapper
 

@@ -9,8 +9,9 @@ import pytest
 
 from surfel_mapper import Config, Mapper
 from surfel_mapper.bags.reader import BagReader
-from surfel_mapper.offline.pose_topics import pose_topics
-from surfel_mapper.offline.replay import ALL_SCANS, replay
+from surfel_mapper.offline.bag_recording import feed
+from surfel_mapper.offline.pose_sources import pose_topics
+from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.survey import offers, survey
 from test.bags.recorded import (
     CLOUD,
@@ -56,7 +57,7 @@ def test_every_source_is_offered_and_its_settings_map_every_scan(tmp_path):
         mapper = Mapper(Config.from_mapping({**ALL_SCANS, **offer.settings}))
         with BagReader(path) as reader:
             poses = pose_topics(reader.topics, mapper.config, offer.poses)
-            assert sum(1 for _ in replay(reader, mapper, offer.clouds, poses)) == NUM_SCANS
+            assert sum(1 for _ in feed(reader, mapper, offer.clouds, poses)) == NUM_SCANS
 
 
 def test_the_mounting_is_taken_from_the_static_transforms(tmp_path):

@@ -21,10 +21,10 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from diagnostic_msgs.msg import DiagnosticArray
 from std_srvs.srv import Trigger
 
-from surfel_mapper.cli.replay_files import Mapped, write_files
 from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.ply import read_points
+from surfel_mapper.offline.outputs import ScanTrajectory, write_files
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.scan import Scan
@@ -120,7 +120,7 @@ def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypa
     output = tmp_path / 'out'
 
     def write():
-        write_files(output, ['npz', 'ply', 'pcd'], mapper, Mapped(), summary, History())
+        write_files(output, ['npz', 'ply', 'pcd'], mapper, ScanTrajectory(), summary, History())
 
     number = 0
     while ends_at(number, (signal.SIGKILL, signal.SIGTERM)[number % 2], write):

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What to tell who runs a verb that needs ROS 2 without having it."""
+"""
+Message for users who run a verb that needs ROS 2 without having it.
+
+On its own because ``node`` and ``play`` share it, and no verb imports another.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ INSTALL = (
 
 @contextmanager
 def loading_ros() -> Iterator[None]:
-    """Turn an import that fails in a with-block into an error that says what to install."""
+    """Turn a failed import in a with-block into an error that says what to install."""
     try:
         yield
     except DependencyError:

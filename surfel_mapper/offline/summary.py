@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The summary of a replay in a few lines for people."""
+"""Text for people from the summary of a replay: a few lines for the terminal, parts of titles."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 
-def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
+def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     """Return the summary in a few lines for people."""
-    from surfel_mapper.counters import STAGES  # brings numpy, which --help does without
+    from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
 
     scans, times = summary['scans'], summary['milliseconds']
-    out = f' ({sum(scans["dropped"].values())} dropped: {causes(scans["dropped"])})'
+    out = f' ({sum(scans["dropped"].values())} dropped: {causes_text(scans["dropped"])})'
     gated = f' ({scans["gated"]} left out by the motion gate)'
     localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
     stages = '   '.join(
@@ -26,7 +26,7 @@ def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         for name, done in summary['filters'].items()
     )
     aligned = f'{summary["alignment"]["text"]}\n' if 'alignment' in summary else ''
-    errors = f'{in_a_line(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
+    errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     speed = summary['recorded_s'] / summary['replay_s']
     return (
         f'scans {scans["received"]}{out if scans["dropped"] else ""}'
@@ -39,8 +39,8 @@ def report(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     )
 
 
-def in_a_line(errors: Mapping[str, Any]) -> str:
-    """Return how far poses are from the true ones for people."""
+def errors_text(errors: Mapping[str, Any]) -> str:
+    """Return the errors of poses against the truth in one line."""
     absolute, relative = (
         f'{1e3 * errors[kind]["translation_m"]["rmse"]:.3f} mm, '
         f'{errors[kind]["rotation_deg"]["rmse"]:.3f} deg'
@@ -53,13 +53,13 @@ def in_a_line(errors: Mapping[str, Any]) -> str:
     )
 
 
-def causes(counts: Mapping[str, int]) -> str:
-    """Return counts by cause for people: no pose 4, no points 1."""
+def causes_text(counts: Mapping[str, int]) -> str:
+    """Return counts of drops by cause in one line: no pose 4, no points 1."""
     return ', '.join(f'{cause.replace("_", " ")} {count}' for cause, count in counts.items())
 
 
 def rounded(number: int) -> str:
-    """Return a number with three digits and k or M."""
+    """Return a count with three digits and k, M or G."""
     for factor, letter in ((10**9, 'G'), (10**6, 'M'), (10**3, 'k')):
         if number >= factor:
             return f'{number / factor:.3g} {letter}'

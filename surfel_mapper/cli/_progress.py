@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How far a long piece of work is, on stderr, and stopping it with Ctrl-C.
+Progress of long work on stderr, and stopping it with Ctrl-C.
 
-On a terminal a bar with rate and time left; elsewhere, as in a log, a plain line now and then.
+A bar with rate and time left on a terminal; elsewhere, as in a log, a plain line every 10 s.
 """
 
 from __future__ import annotations
@@ -17,33 +17,31 @@ import time
 from types import FrameType
 
 EVERY_S = 10.0
-"""Between plain lines."""
+"""Time between plain lines, s."""
 
 
 @contextmanager
-def progress(verb: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+def progress(verb: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """
-    Give a function that is told how much is done.
+    Give a function that shows how much is done of a total.
 
     Parameters
     ----------
     verb : str
-        What lines begin with.
-    total : int
-        About how much there is.
+        Start of the lines.
     unit : str
-        What is counted.
+        Name of one piece of the work.
 
     """
     if not sys.stderr.isatty():
-        yield Lines(verb, total, unit).show
+        yield Lines(verb, unit).show
         return
     from tqdm import tqdm
     from tqdm.contrib.logging import logging_redirect_tqdm
 
-    with logging_redirect_tqdm(), tqdm(total=total, unit=unit, leave=False) as bar:
+    with logging_redirect_tqdm(), tqdm(unit=unit, leave=False) as bar:
 
-        def show(done: int) -> None:
+        def show(done: int, total: int) -> None:
             bar.total = max(total, done)
             bar.update(done - bar.n)
 
@@ -53,21 +51,20 @@ def progress(verb: str, total: int, unit: str) -> Iterator[Callable[[int], None]
 class Lines:
     """Progress as plain lines, none within the first seconds."""
 
-    def __init__(self, verb: str, total: int, unit: str) -> None:
-        """Begin to count the time."""
-        self._verb, self._total, self._unit = verb, total, unit
+    def __init__(self, verb: str, unit: str) -> None:
+        self._verb, self._unit = verb, unit
         self._start = self._last = time.monotonic()
 
-    def show(self, done: int) -> None:
-        """Say how far it is, if the last line is long ago."""
+    def show(self, done: int, total: int) -> None:
+        """Print the progress, if the last line is old enough."""
         now = time.monotonic()
         if now - self._last < EVERY_S or not done:
             return
         self._last = now
         rate = done / (now - self._start)
-        left_s = max(self._total - done, 0) / rate
+        left_s = max(total - done, 0) / rate
         print(
-            f'surfel-mapper {self._verb}: {done} of {max(self._total, done)} {self._unit}s, '
+            f'surfel-mapper {self._verb}: {done} of {max(total, done)} {self._unit}s, '
             f'{rate:.1f} {self._unit}s/s, {left_s:.0f} s left',
             file=sys.stderr,
             flush=True,
@@ -77,10 +74,10 @@ class Lines:
 @contextmanager
 def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
     """
-    Give a function that tells whether Ctrl-C was pressed; pressed again, it interrupts.
+    Give a function that returns whether Ctrl-C was pressed; pressed again, it interrupts.
 
-    What is being mapped can so be ended between two scans and written. Outside of the main
-    thread signals cannot be caught, and nothing changes.
+    Mapping can thus end between two scans and its result be written. Outside of the main thread
+    signals cannot be caught, and nothing changes.
     """
     pressed: list[int] = []
 
@@ -97,12 +94,3 @@ def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
         yield lambda: bool(pressed)
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-@contextmanager
-def finished_first() -> Iterator[None]:
-    """Finish what takes a second before Ctrl-C interrupts; pressed again, it does at once."""
-    with stopped_by_interrupt() as stopped:
-        yield
-    if stopped():
-        raise KeyboardInterrupt

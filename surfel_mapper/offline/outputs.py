@@ -1,16 +1,20 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The files that a replay writes, each whole or not at all; summary.json last."""
+"""
+The files that a replay writes, each whole or not at all; summary.json last.
+
+So if summary.json is new, the others are.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-import logging
 import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli.replay_report import rounded
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.offline.summary import rounded
 
 if TYPE_CHECKING:
     import numpy as np
@@ -21,10 +25,10 @@ if TYPE_CHECKING:
     from surfel_mapper.viz.history import History
 
 BAG = 'bag'
-"""Written while mapping, and so not here: a bag of normals in the directory ``normals``."""
+"""Format that is written while mapping: a bag of normals in the directory ``normals``."""
 
 DXF = 'dxf'
-"""Of planes and surfaces, where ``layers.models.enabled``."""
+"""Format of planes and surfaces; needs ``layers.models.enabled``."""
 
 FORMATS = {
     'ply': 'map.ply',
@@ -34,22 +38,30 @@ FORMATS = {
     DXF: 'models.dxf',
     BAG: 'normals',
 }
-"""What the map is written as, and where: npz and parquet are exact, to be loaded again."""
+"""File of each format in the output directory; npz and parquet are exact, to be loaded again."""
 
 MODELS_PICTURE = 'models.png'
 
-SAME_TIME_NS = 10_000_000
-"""Poses of a scan and of the truth at most so far apart are of one time."""
 
-_log = logging.getLogger(__name__)
+def output_directory(recording: Path, wanted: Path | None) -> Path:
+    """
+    Return the directory to write to, after checking that it can be made.
 
+    Parameters
+    ----------
+    recording : Path
+        Gives the default: its name followed by _surfels, in the working directory.
+    wanted : Path, optional
+        The directory asked for.
 
-def output_directory(bag: Path, wanted: Path | None) -> Path:
-    """Return where to write; refuse what cannot be a directory before the work begins."""
-    from surfel_mapper.errors import FileFormatError
+    Raises
+    ------
+    FileFormatError
+        If it cannot be a directory, or must not be written to.
 
-    name = bag.resolve().stem if bag.is_file() else bag.resolve().name
-    directory = wanted or Path(f'{name}_surfels')
+    """
+    full = recording.resolve()
+    directory = wanted or Path(f'{full.stem if recording.is_file() else full.name}_surfels')
     absolute = directory.absolute()
     nearest = next(path for path in (absolute, *absolute.parents) if path.exists())
     if not nearest.is_dir():
@@ -59,44 +71,70 @@ def output_directory(bag: Path, wanted: Path | None) -> Path:
     return directory
 
 
-class Mapped:
-    """Stamp and pose of every scan that was mapped."""
+class ScanTrajectory:
+    """
+    Stamp and pose of every mapped scan.
+
+    Attributes
+    ----------
+    stamps_ns : list of int
+    poses : list of (4, 4) float64
+        T_map_sensor of each scan.
+
+    """
 
     def __init__(self) -> None:
-        """Begin without any."""
         self.stamps_ns: list[int] = []
         self.poses: list[npt.NDArray[np.float64]] = []
 
     def add(self, update: Update) -> None:
-        """Take note of a scan."""
+        """Append the pose of a mapped scan."""
         self.stamps_ns.append(update.stamp_ns)
         self.poses.append(update.T_map_sensor)
 
+    def follow_alignment(self, mapper: Mapper) -> None:
+        """Replace the poses of scans that are still in the window by their aligned poses."""
+        for place, scan in enumerate(reversed(list(mapper.window)), start=1):
+            if place > len(self.stamps_ns) or self.stamps_ns[-place] != scan.stamp_ns:
+                break
+            self.poses[-place] = scan.T_map_sensor
+
     def write(self, path: Path) -> None:
         """Write the poses as TUM text."""
-        import numpy as np
-
         from surfel_mapper.files.trajectory import write_tum
 
-        write_tum(path, self.stamps_ns, np.array(self.poses).reshape(-1, 4, 4))
+        write_tum(path, self.stamps_ns, self.matrices)
+
+    @property
+    def matrices(self) -> npt.NDArray[np.float64]:
+        """The poses as one array, (S, 4, 4)."""
+        import numpy as np
+
+        return np.array(self.poses).reshape(-1, 4, 4)
 
     @property
     def positions(self) -> npt.NDArray[np.float64]:
-        """Where the sensor was, (S, 3) m."""
-        import numpy as np
-
-        return np.array([pose[:3, 3] for pose in self.poses]).reshape(-1, 3)
+        """Positions of the sensor in the map frame, (S, 3) m."""
+        return self.matrices[:, :3, 3]
 
 
 def write_files(
     output: Path,
     formats: Sequence[str],
     mapper: Mapper,
-    mapped: Mapped,
+    trajectory: ScanTrajectory,
     summary: dict[str, Any],
     history: History,
 ) -> list[Path]:
-    """Write the map in some formats, picture, report and summary; return what is there."""
+    """
+    Write the map in some formats, layers, picture, report and summary.
+
+    Returns
+    -------
+    list of Path
+        The files of the formats, then picture, report and summary.
+
+    """
     from surfel_mapper.files.atomic import write_json
     from surfel_mapper.files.ply import write_mesh
     from surfel_mapper.models.shapes import Shapes
@@ -125,7 +163,7 @@ def write_files(
         f'{rounded(summary["points"])} points, '
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
-    draw_map(surfels, picture, title, trajectory=mapped.positions)
+    draw_map(surfels, picture, title, trajectory=trajectory.positions)
     write_report(page, title, summary, surfels, history, picture, layers, sections)
     write_json(figures, summary)
     return [*(output / FORMATS[name] for name in formats), picture, page, figures]
@@ -147,7 +185,7 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
 
 
 def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) -> None:
-    """Write models as JSON and OBJ, in what other formats are asked for, and their picture."""
+    """Write models as JSON, OBJ and further formats that were asked for, and their picture."""
     from surfel_mapper.files.model_files import write_models
     from surfel_mapper.models.surfel_points import above, surfel_points
     from surfel_mapper.viz.models import draw_models
@@ -158,35 +196,3 @@ def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) 
     points = surfel_points(surfels, models.model.voxel_size_m)
     title = f'{len(surfels)} voxels'
     draw_models(output / MODELS_PICTURE, points, models.model, above(surfels), title)
-
-
-def check_truth(truth: Path) -> None:
-    """Refuse a file or bag without true poses, before hours of work."""
-    import numpy as np
-
-    from surfel_mapper.cli.evaluate import true_poses
-
-    true_poses(truth, np.zeros(1, np.int64))
-
-
-def pose_errors(truth: Path | None, mapped: Mapped) -> dict[str, Any]:
-    """Return how far the poses are from the true ones, for the summary; nothing without truth."""
-    import numpy as np
-
-    from surfel_mapper.alignment.trajectory_errors import compare
-    from surfel_mapper.cli.evaluate import true_poses
-
-    if truth is None:
-        return {}
-    stamps_ns = np.array(mapped.stamps_ns, np.int64)
-    try:
-        errors = compare(
-            stamps_ns,
-            np.array(mapped.poses).reshape(-1, 4, 4),
-            *true_poses(truth, stamps_ns),
-            max_difference_ns=SAME_TIME_NS,
-        )
-    except ValueError as error:
-        _log.warning('--truth %s: %s', truth, error)
-        return {}
-    return {'pose_errors': errors}

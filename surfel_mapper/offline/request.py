@@ -1,34 +1,73 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which part of a recording is mapped, by record time.
+The recording to map, and the part of it.
 
-A part needs poses from a little before its first cloud, to interpolate, and from after its last,
-which come late. Static transforms hold for all time, wherever they were recorded.
+A ``Request`` names both in plain values, so that it can be sent to another process; ``part``
+turns its times into a ``Span`` of record times. A part needs poses from a little before its first
+cloud, to interpolate, and from after its last, because poses come late. Static transforms hold
+for all time, wherever they were recorded.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 import math
+from pathlib import Path
 
 from surfel_mapper.errors import BagError
 
 MARGIN_NS = 5_000_000_000
-"""Poses this much before the part and after it are read."""
+"""Poses are read from 5 s before the part to 5 s after it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """
+    Recording to map, and options for reading it.
+
+    Attributes
+    ----------
+    path : Path
+        A bag or a folder of scans.
+    topics : tuple of str
+        Topics of clouds; empty: the only one of the bag.
+    pose_topic : str, optional
+        Topic of poses, if there are several.
+    poses : Path, optional
+        A file of poses of frames.base instead.
+    poses_format : str, optional
+        tum, kitti or csv.
+    mounts : mapping of str to 7 floats
+        Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
+    start_s, duration_s, every : float, float, int
+        The part to map; see ``part``.
+
+    """
+
+    path: Path
+    topics: tuple[str, ...] = ()
+    pose_topic: str | None = None
+    poses: Path | None = None
+    poses_format: str | None = None
+    mounts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    start_s: float = 0.0
+    duration_s: float = math.inf
+    every: int = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Span:
     """
-    Which clouds are mapped.
+    Part of a recording, by record time.
 
     Attributes
     ----------
     start_ns, stop_ns : int, optional
-        Record time of the first one wanted, and of the first not wanted any more.
+        Record time of the first cloud in the part, and of the first one after it.
     every : int
-        1: all of them; n: the first of every n of a topic.
+        1: all clouds are mapped; n: the first of every n of a topic.
 
     """
 
@@ -37,18 +76,18 @@ class Span:
     every: int = 1
 
     def holds(self, record_ns: int) -> bool:
-        """Return whether a cloud recorded then is in the part."""
+        """Return whether a cloud recorded at this time is in the part."""
         begun = self.start_ns is None or record_ns >= self.start_ns
         return begun and (self.stop_ns is None or record_ns < self.stop_ns)
 
     @property
     def poses_start_ns(self) -> int | None:
-        """From where on poses are read."""
+        """Record time from which poses are read; None: from the start."""
         return None if self.start_ns is None else self.start_ns - MARGIN_NS
 
     @property
     def poses_stop_ns(self) -> int | None:
-        """Up to where poses are read."""
+        """Record time up to which poses are read; None: to the end."""
         return None if self.stop_ns is None else self.stop_ns + MARGIN_NS
 
     def clipped(self, first_ns: int, last_ns: int) -> tuple[int, int]:
@@ -59,6 +98,7 @@ class Span:
 
 
 WHOLE = Span()
+"""All of a recording."""
 
 
 def part(
@@ -76,20 +116,20 @@ def part(
     Parameters
     ----------
     name : str
-        What errors call the recording.
+        Name of the recording in errors.
     first_ns, last_ns : int
         Record time of its first and last message.
     start_s : float
-        Where the part begins, s after the first message.
+        Start of the part, s after the first message.
     duration_s : float
-        How long it is, s.
+        Length of the part, s.
     every : int
-        One cloud of so many is mapped.
+        Map the first of every this many clouds.
 
     Raises
     ------
     BagError
-        If it is empty, or begins outside of the recording.
+        If the part is empty, or begins outside of the recording.
 
     """
     whole_s = (last_ns - first_ns) / 1e9

@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Replay of several bags, or with several processes: one map of them all, in tiles.
+
+The map is a Parquet dataset, ``map/tile_i=*/tile_j=*/surfels.parquet``; picture and report show
+a sample of its surfels. All bags have to be in one fixed frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+import time
+from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.cluster.engines import begin_workers, engine, never
+from surfel_mapper.offline.request import Request
+
+if TYPE_CHECKING:
+    from surfel_mapper.cluster.running import Mapped
+    from surfel_mapper.config import Config
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ShelfResult:
+    """
+    Map and figures of a replay of several bags.
+
+    Attributes
+    ----------
+    mapped : Mapped
+        The map in tiles, and the results of the shards.
+    summary : dict of str
+        The content of summary.json.
+    written : list of Path
+        The dataset of tiles, picture, report and summary.
+
+    """
+
+    mapped: Mapped
+    summary: dict[str, Any]
+    written: list[Path]
+
+
+def replay_bags(
+    requests: Sequence[Request],
+    config: Config,
+    output: Path,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], object] = lambda done, total: None,
+    stopped: Callable[[], bool] = never,
+) -> ShelfResult:
+    """
+    Map recordings into one map in tiles and write it, with a picture, a report and a summary.
+
+    The same as ``surfel-mapper replay`` with several bags or with ``--workers``; seven parameters
+    because the first three suffice for most calls.
+
+    Parameters
+    ----------
+    requests : sequence of Request
+        The recordings.
+    config : Config
+        The configuration; all scans stay in the map.
+    output : Path
+        Directory to write to.
+    workers : int, optional
+        Number of processes on this machine; without, this process does the work.
+    scheduler : str, optional
+        Address of a Dask scheduler instead.
+    progress : callable
+        Called with the seconds of recordings that are mapped, and all.
+    stopped : callable
+        Asked again and again; once it returns True, no more shards are begun, and the summary
+        says ``interrupted``.
+
+    Returns
+    -------
+    ShelfResult
+
+    Raises
+    ------
+    MapError
+        If no scan was mapped.
+    BagError, ConfigError, FileFormatError
+        If a recording cannot be read, a setting cannot be followed, or a file not written.
+    ClusterError, DependencyError
+        If workers cannot be reached or are lost, or Dask is not installed.
+
+    """
+    began = time.perf_counter()
+    if workers is not None and scheduler is None:
+        begin_workers()  # they load their modules while this process loads its own
+    from surfel_mapper.cluster.running import map_bags
+    from surfel_mapper.cluster.shards import cut, shard_length_s
+
+    lengths_s, cuts = surveyed(requests, config)
+    recorded_s, done_s = sum(lengths_s), 0.0
+
+    def on_done(kind: str, amount: float) -> None:
+        nonlocal done_s
+        if kind == 'map' or recorded_s == 0.0:  # merging takes little of the time
+            done_s += amount
+            progress(round(done_s), round(recorded_s))
+
+    with engine(workers, scheduler) as running:
+        num_workers = running.num_workers
+        shard_s = shard_length_s(recorded_s, num_workers)
+        shards = [shard for request in requests for shard in cut(request, config, shard_s)]
+        mapped = map_bags(shards, running, output, on_done, stopped)
+        num_workers = running.num_workers
+    summary = {
+        'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
+        'bags': [str(request.path) for request in requests],
+        'recorded_s': recorded_s,
+        'replay_s': time.perf_counter() - began,
+        'interrupted': mapped.interrupted,
+        'cut': cuts,
+        **mapped.counts(),
+        **mapped.map.summary(),
+        'workers': num_workers,
+        'shards': len(mapped.results),
+        'shards_repeated': mapped.repeated,
+        'peak_memory_mb': {
+            'mapping': max(result.peak_bytes for result in mapped.results) // 10**6,
+            'merging': mapped.map.peak_bytes // 10**6,
+        },
+        'core_s': {
+            'mapping': round(sum(result.core_s for result in mapped.results), 1),
+            'merging': round(mapped.map.core_s, 1),
+        },
+        'settings': config.to_mapping(),
+    }
+    return ShelfResult(
+        mapped=mapped, summary=summary, written=write_overview(output, summary, mapped)
+    )
+
+
+def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], list[str]]:
+    """Return the duration of each recording, s, and the files that end too early."""
+    from surfel_mapper.offline.recording import open_recording
+
+    lengths_s: list[float] = []
+    cuts: list[str] = []
+    for request in requests:
+        with open_recording(request, config) as recording:
+            lengths_s.append(recording.recorded_s)
+            cuts += recording.cuts
+    return lengths_s, cuts
+
+
+def write_overview(output: Path, summary: dict[str, Any], mapped: Mapped) -> list[Path]:
+    """Write picture, report and summary of a map in tiles; return all that was written."""
+    from surfel_mapper.files.atomic import write_json
+    from surfel_mapper.offline.summary import rounded
+    from surfel_mapper.viz.picture import draw_map
+    from surfel_mapper.viz.report import write_report
+
+    tiled = mapped.map
+    picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
+    title = (
+        f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
+        f'{tiled.surfels} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
+    )
+    draw_map(tiled.sample, picture, title)
+    write_report(page, title, summary, tiled.sample, picture=picture)
+    write_json(figures, summary)
+    return [tiled.directory, picture, page, figures]

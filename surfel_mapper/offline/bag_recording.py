@@ -1,0 +1,311 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A bag through the pipeline: its clouds and poses into a Mapper, in the order of record time.
+
+That order is the one in which the node receives them, so that both make the same map; no message
+is looked up ahead, although a bag would allow it. ``BagRecording`` chooses topics and poses,
+``feed`` is the loop over messages.
+
+One module although it is long: choosing and feeding rely on the same rules about topics.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from functools import partial
+import math
+from typing import Any, TYPE_CHECKING
+
+from surfel_mapper.bags.reader import BagMessage, BagReader
+from surfel_mapper.bags.topics import CLOUD
+from surfel_mapper.config import Config
+from surfel_mapper.errors import BagError, CloudFormatError, PoseError
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
+from surfel_mapper.offline.request import part, Request, Span, WHOLE
+
+if TYPE_CHECKING:  # they load the compiler, which `info` does not need
+    from surfel_mapper.offline.image_feeds import Decode, DepthFeed, SceneFeed
+    from surfel_mapper.pipeline import Mapper, Update
+
+
+class BagRecording:
+    """
+    Clouds of a bag, with their poses.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    request : Request
+        Topics and part to map.
+    config : Config
+        Its ``pose.source`` and ``input`` choose the topics.
+    path : PosePath, optional
+        Poses from a file.
+
+    Raises
+    ------
+    BagError
+        If the bag lacks a topic or poses.
+
+    """
+
+    def __init__(
+        self, reader: BagReader, request: Request, config: Config, path: PosePath | None
+    ) -> None:
+        self.reader = reader
+        self.cuts = reader.cuts
+        self.topics = chosen_topics(reader, request, config)
+        check_mounts(request, self.topics, config)
+        if request.mounts:
+            config = config.replace({'frames.base_to_sensor': ()})
+        self.poses = self._poses(request, config, path)
+        self.config = config if path is None else config.replace({'pose.source': 'pose'})
+        self.span = part(
+            str(request.path),
+            reader.start_ns,
+            reader.end_ns,
+            start_s=request.start_s,
+            duration_s=request.duration_s,
+            every=request.every,
+        )
+
+    def _poses(self, request: Request, config: Config, path: PosePath | None) -> PoseTopics:
+        """Return the source of the poses."""
+        topics = self.reader.topics
+        if path is None:
+            found = pose_topics(topics, config, request.pose_topic)
+        elif request.pose_topic is not None:
+            raise BagError(f'{request.path}: poses of {request.pose_topic} or of {path.path}?')
+        elif not path.has_stamps and len(self.topics) > 1:
+            raise BagError(f'{path.path}: poses without times, for several topics of clouds')
+        else:
+            static = () if config.frames.base_to_sensor else static_topics(topics)
+            found = PoseTopics({}, static, path)
+        if request.mounts and config.pose.source != 'tf':
+            found = replace(found, static=())  # two poses of one sensor might disagree
+        return replace(found, mounts=request.mounts)
+
+    @property
+    def num_scans(self) -> int:
+        """Estimated number of scans in the part: clouds are taken as evenly spread."""
+        first_ns, last_ns = self.reader.start_ns, self.reader.end_ns
+        start_ns, stop_ns = self.span.clipped(first_ns, last_ns)
+        share = (stop_ns - start_ns) / (last_ns - first_ns) if last_ns > first_ns else 1.0
+        return math.ceil(share * self.reader.topics.num_messages(self.topics) / self.span.every)
+
+    @property
+    def recorded_s(self) -> float:
+        """Duration of the part that is mapped, s."""
+        start_ns, stop_ns = self.bounds_ns
+        return (stop_ns - start_ns) / 1e9
+
+    @property
+    def bounds_ns(self) -> tuple[int, int]:
+        """Record time of the first and last message of the part that is mapped."""
+        return self.span.clipped(self.reader.start_ns, self.reader.end_ns)
+
+    def describe(self) -> dict[str, Any]:
+        """Return the sources of clouds and poses, for the summary."""
+        path = self.poses.path
+        return {
+            'bag': str(self.reader.path),
+            'topics': self.topics,
+            'pose_topics': [*self.poses.kinds, *self.poses.static],
+            'poses': None if path is None else str(path.path),
+        }
+
+    def replay(
+        self, mapper: Mapper, stopped: Callable[[], bool] = lambda: False
+    ) -> Iterator[Update]:
+        """Feed the clouds to a mapper; yield the update of each."""
+        return feed(self.reader, mapper, self.topics, self.poses, span=self.span, stopped=stopped)
+
+
+def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[str]:
+    """Return the topics to map: those of the request, of the configuration, or the only one."""
+    configured = [f'/{name.lstrip("/")}' for name in config.input.topics]
+    named = [*request.topics] or [*request.mounts] or configured
+    names: list[str | None] = [*named] or [None]
+    choose: Callable[[str | None], str] = partial(reader.topics.choose, CLOUD)
+    if config.input.kind == 'depth':
+        choose = reader.topics.choose_image
+    topics = [choose(name) for name in dict.fromkeys(names)]
+    for name in config.tsdf.image_topics.values():
+        reader.topics.choose_image(f'/{name.lstrip("/")}')
+    return topics
+
+
+def check_mounts(request: Request, topics: list[str], config: Config) -> None:
+    """Refuse mounts that leave a sensor out, and one mount for several sensors."""
+    missing = [topic for topic in topics if topic not in request.mounts]
+    unknown = [topic for topic in request.mounts if topic not in topics]
+    if request.mounts and (missing or unknown):
+        raise BagError(
+            f'{request.path}: places of sensors for {", ".join(request.mounts)}, expected one '
+            f'for each of {", ".join(topics)}'
+        )
+    frames = config.frames
+    if len(topics) > 1 and not (request.mounts or frames.sensors) and frames.base_to_sensor:
+        raise BagError(
+            f'{request.path}: frames.base_to_sensor is the place of one sensor, not of '
+            f'{len(topics)}; name one for each topic with --mount, or their frames in '
+            'frames.sensors'
+        )
+
+
+def feed(
+    reader: BagReader,
+    mapper: Mapper,
+    cloud_topics: str | Collection[str],
+    poses: PoseTopics,
+    *,
+    span: Span = WHOLE,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Iterator[Update]:
+    """
+    Feed a bag to a mapper; yield the update of each scan.
+
+    Clouds and poses that cannot be decoded are counted; the first of each kind is logged.
+
+    Parameters
+    ----------
+    reader : BagReader
+        The bag.
+    mapper : Mapper
+        Maps it.
+    cloud_topics : str or collection of str
+        One topic of clouds, or several; their sensors are told apart by their frames.
+    poses : PoseTopics
+        Source of the poses.
+    span : Span
+        The part to map.
+    stopped : callable
+        Asked before every message; no more are read once it returns True.
+
+    Raises
+    ------
+    BagError
+        If the bag is damaged.
+
+    """
+    clouds = {cloud_topics} if isinstance(cloud_topics, str) else set(cloud_topics)
+    for topic, mount in poses.mounts.items():
+        base = mapper.config.frames.base
+        mapper.add_pose(base, topic, 0, mount[:3], mount[3:], static=True)
+    first = numbers_before(reader, clouds, poses, span)
+    seen: Counter[str] = Counter()
+
+    def add(message: BagMessage, number: int, decode: Decode = to_scan) -> None:
+        add_cloud(reader, mapper, message, poses, number, decode)
+
+    images = depth_feed(clouds, add) if mapper.config.input.kind == 'depth' else None
+    infos = images.info_topics if images else {}
+    scenes = scene_feed(mapper)
+    scene_topics = scenes.topics if scenes else set()
+    for message in messages(reader, {*clouds, *infos, *scene_topics}, poses, span):
+        if stopped():
+            break
+        if scenes and message.topic in scene_topics:
+            scenes.add(reader, message)
+        elif images and message.topic in infos:
+            add_camera_info(reader, mapper, message, images)
+        elif message.topic not in clouds:
+            add_poses(reader, mapper, message, poses)
+        elif span.holds(message.record_ns):
+            if seen[message.topic] % span.every == 0:
+                number = first[message.topic] + seen[message.topic]
+                (images.add_image if images else add)(message, number)
+            seen[message.topic] += 1
+        yield from mapper.insert_ready(more_follows=True)
+    if scenes:
+        mapper.end_images()
+    yield from mapper.insert_ready()
+    mapper.finish()
+
+
+def depth_feed(
+    clouds: Collection[str], add: Callable[[BagMessage, int, Decode], None]
+) -> DepthFeed:
+    """Return the feed of depth images; imported here because it loads the compiler."""
+    from surfel_mapper.offline.image_feeds import DepthFeed
+
+    return DepthFeed(clouds, add)
+
+
+def scene_feed(mapper: Mapper) -> SceneFeed | None:
+    """Return the feed of colour and label images; None if none are configured."""
+    if not mapper.config.tsdf.image_topics:
+        return None
+    from surfel_mapper.offline.image_feeds import SceneFeed
+
+    return SceneFeed(mapper)
+
+
+def messages(
+    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
+) -> Iterator[BagMessage]:
+    """Yield the messages for a part: earlier static transforms, then its clouds and poses."""
+    if poses.static and span.poses_start_ns is not None:
+        yield from reader.messages(poses.static, None, span.poses_start_ns)
+    names = {*clouds, *poses.kinds, *poses.static}
+    yield from reader.messages(names, span.poses_start_ns, span.poses_stop_ns)
+
+
+def numbers_before(
+    reader: BagReader, clouds: Collection[str], poses: PoseTopics, span: Span
+) -> Counter[str]:
+    """Count the clouds before a part by topic, if poses belong to clouds by number."""
+    if poses.path is None or poses.path.has_stamps or span.start_ns is None:
+        return Counter()
+    return Counter(message.topic for message in reader.messages(clouds, None, span.start_ns))
+
+
+def add_cloud(
+    reader: BagReader,
+    mapper: Mapper,
+    message: BagMessage,
+    poses: PoseTopics,
+    number: int,
+    decode: Decode = to_scan,
+) -> None:
+    """Decode a cloud or an image and queue it as a scan, with its pose if a file has it."""
+    try:
+        with mapper.counters.timed('decode'):
+            scan = decode(reader.decode(message), message.topic)
+    except (CloudFormatError, BagError) as error:
+        mapper.refuse_clouds('bad_cloud', message.topic, str(error))
+        return
+    if message.topic in poses.mounts:
+        scan = replace(scan, frame_id=message.topic)
+    if poses.path is not None:
+        poses.path.add_for(mapper, scan.stamp_ns, number)
+    mapper.add_scan(scan)
+
+
+def add_camera_info(
+    reader: BagReader, mapper: Mapper, message: BagMessage, images: DepthFeed
+) -> None:
+    """Decode a calibration, and map the images that waited for it; a bad one is counted."""
+    try:
+        images.add_info(message.topic, reader.decode(message))
+    except (CloudFormatError, BagError) as error:
+        mapper.ignore_message('bad_message', f'calibration ignored: {error}')
+
+
+def add_poses(reader: BagReader, mapper: Mapper, message: BagMessage, topics: PoseTopics) -> None:
+    """Enter the poses of a message; one that cannot be read is counted."""
+    kind, base = topics.kinds.get(message.topic, 'tf'), mapper.config.frames.base
+    try:
+        poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
+    except PoseError as error:
+        mapper.ignore_message('bad_message', f'pose ignored: {error}')
+        return
+    for pose in poses:
+        if topics.path is None or pose.child != base:  # the file has the pose of the base
+            mapper.add_pose(*pose, static=message.topic in topics.static)
