@@ -49,19 +49,23 @@ def progress(verb: str, unit: str) -> Iterator[Callable[[int, int], None]]:
 
 
 class Lines:
-    """Progress as plain lines, none within the first seconds."""
+    """Progress as plain lines; the clock starts when the first piece of work is done."""
 
     def __init__(self, verb: str, unit: str) -> None:
         self._verb, self._unit = verb, unit
-        self._start = self._last = time.monotonic()
+        self._start: tuple[float, int] | None = None
+        self._last = 0.0
 
     def show(self, done: int, total: int) -> None:
         """Print the progress, if the last line is old enough."""
         now = time.monotonic()
-        if now - self._last < EVERY_S or not done:
+        if self._start is None:
+            self._start, self._last = (now, done), now
+        start, before = self._start
+        if now - self._last < EVERY_S or done == before:
             return
         self._last = now
-        rate = done / (now - self._start)
+        rate = (done - before) / (now - start)
         left_s = max(total - done, 0) / rate
         print(
             f'surfel-mapper {self._verb}: {done} of {max(total, done)} {self._unit}s, '
