@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The configuration: what is accepted, the edges of every bound, and what is refused and how."""
+"""The configuration: accepted values, bounds, and refusals by name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUARTER_TURN = [1.0, 2.0, 3.0, 0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
 
 UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
 
-# A stage may refuse together what each bound accepts alone; these companions keep them apart.
+# A stage may refuse a combination of values within bounds; these companions avoid that.
 LEVEL = {'layers.tsdf.weight_dropoff': False}
 COMPANIONS = {
     'align.every_scans': {'window.keep_points': True},
@@ -40,7 +40,7 @@ COMPANIONS = {
 
 
 def configured(name, value):
-    """Return the configuration with one setting, and what it needs beside it."""
+    """Return the configuration with one setting and its companions."""
     return Config.from_mapping({**COMPANIONS.get(name, {}), name: value})
 
 
@@ -228,7 +228,7 @@ def test_a_rigid_transform_or_none_places_the_sensor(value):
         (7, 'expected a list of numbers'),
     ],
 )
-def test_what_does_not_place_the_sensor_is_refused(value, message):
+def test_invalid_poses_of_the_sensor_are_refused(value, message):
     with pytest.raises(ConfigError, match=rf'frames\.base_to_sensor: .*{message}'):
         configured('frames.base_to_sensor', value)
 
@@ -269,7 +269,7 @@ def test_a_file_may_be_of_ros_parameters_or_of_the_stages_alone(tmp_path, text):
     assert load_config(written(tmp_path, text)) == Config.from_mapping({'window.max_scans': 7})
 
 
-def test_what_a_file_tells_the_node_alone_is_passed_over(tmp_path):
+def test_parameters_of_rclpy_in_a_file_are_ignored(tmp_path):
     text = (
         '/**:\n  ros__parameters:\n    use_sim_time: true\n'
         '    qos_overrides: {/points: {subscription: {reliability: reliable}}}\n'

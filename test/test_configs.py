@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The files that repeat the settings say what the code says, to us and to ROS."""
+"""The files that repeat the settings agree with the code, as read by us and by ROS."""
 
 from __future__ import annotations
 

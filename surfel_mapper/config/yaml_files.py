@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-YAML files, read in time and memory that their size bounds.
+Reading of YAML files, in time and memory bounded by their size.
 
-A name may stand for what was written before (``&name``, ``*name``). A few lines of names that
-stand for names make a tree that no memory holds, so an alias may not stand inside of what has a
-name itself; and nothing is nested deeper than any setting is, which recursion would not survive.
+A YAML alias (``*name``) repeats an anchored node (``&name``). A few lines of nested aliases expand
+to a tree that no memory holds, so an alias inside of an anchored node is refused. So is nesting
+deeper than any setting, which would exhaust the recursion of the parser.
+
+Alone in its module because chains of filters and bags are read by it too, not only settings.
 """
 
 from __future__ import annotations
@@ -25,14 +27,14 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
     path : str or Path
         The file.
     as_text : bool
-        Leave every scalar the text that it is.
+        Leave every scalar as text.
 
     Raises
     ------
     OSError
-        If it cannot be read.
+        If the file cannot be read.
     ValueError
-        If it is not YAML, nested too deeply, or aliases stand inside of what they may stand for.
+        If it is not YAML, is nested too deeply, or has an alias inside of an anchored node.
 
     """
     import yaml
@@ -42,20 +44,20 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
         check_nesting(text)
         return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)
     except yaml.MarkedYAMLError as error:
-        # without the line itself: whoever may name a file may not be allowed to read it
+        # without the line itself: a caller may pass a path whose content is not theirs to read
         raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
     except yaml.YAMLError as error:
         raise ValueError('characters that YAML does not allow') from error
 
 
 def check_nesting(text: str) -> None:
-    """Raise ValueError where YAML is nested too deeply, or aliases inside of what has a name."""
+    """Raise ValueError if YAML is nested too deeply or has an alias inside of an anchored node."""
     import yaml
 
     are_named: list[bool] = []
     for event in yaml.parse(text, yaml.BaseLoader):
         if isinstance(event, yaml.AliasEvent) and any(are_named):
-            raise ValueError(f'an alias inside of what has a name{place(event.start_mark)}')
+            raise ValueError(f'an alias inside of an anchored node{place(event.start_mark)}')
         if isinstance(event, yaml.CollectionStartEvent):
             are_named.append(event.anchor is not None)
         elif isinstance(event, yaml.CollectionEndEvent):
@@ -65,5 +67,5 @@ def check_nesting(text: str) -> None:
 
 
 def place(mark: Any) -> str:
-    """Return where in a file something is."""
+    """Return a position in a file as words."""
     return f' in line {mark.line + 1}, column {mark.column + 1}' if mark else ''

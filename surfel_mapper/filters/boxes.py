@@ -53,7 +53,7 @@ def cut_into_boxes(points: Points, max_points: int) -> tuple[Ids, int]:
     points : (N, 3) float64
         Finite.
     max_points : int
-        A box with more is cut.
+        A box with more points is cut.
 
     """
     if not len(points):
@@ -73,9 +73,9 @@ class Boxes:
     rows : (N,) int64
         Box of every point.
     moments : Moments
-        Of the points in each of M boxes.
+        Moments of each of the M boxes.
     values, vectors : (M, 3) and (M, 3, 3) float64
-        Eigenvalues and eigenvectors, as shapes.eigen gives them.
+        Eigenvalues and eigenvectors, see shapes.eigen.
 
     """
 
@@ -87,7 +87,7 @@ class Boxes:
 
     @classmethod
     def of(cls, scan: Scan, max_points: int) -> Boxes:
-        """Return the boxes of a scan; nan and infinite points are refused."""
+        """Return the boxes of a scan."""
         points = coordinates(scan)
         rows, number = cut_into_boxes(points, max_points)
         moments = Moments.of_groups(points, rows, number)
@@ -115,7 +115,7 @@ class BoxFilter(ShapeFilter):
 
     ratio: float = parameter(
         0.5,
-        'Share of the points that stay, drawn by chance.',
+        'Share of the points that stay, drawn at random.',
         low=1e-7,
         high=1.0,
         libpointmatcher='ratio',
@@ -125,7 +125,7 @@ class BoxFilter(ShapeFilter):
     )
     sampling_method: int = parameter(
         0,
-        '0: draw points by chance; 1: one point for a box, the mean.',
+        '0: draw points at random; 1: one point per box, the mean.',
         low=0,
         high=1,
         libpointmatcher='samplingMethod',
@@ -137,7 +137,7 @@ class BoxFilter(ShapeFilter):
     )
     average_columns: bool = parameter(
         True,
-        'Where one point is made, 1: average the columns; 0: keep those of the first point.',
+        'Columns of a mean, 1: averages; 0: those of the first point.',
         libpointmatcher='averageExistingDescriptors',
     )
     keep_densities: bool = parameter(
@@ -145,10 +145,10 @@ class BoxFilter(ShapeFilter):
         'Add densities, points per m^3 of the ball about the mean of the box.',
         libpointmatcher='keepDensities',
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=INT32_MAX)
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the points drawn in their order, or means in the order of their first points."""
+        """Return the drawn points in their order, or means in the order of their first points."""
         boxes = Boxes.of(scan, self.max_points)
         fit = self.fit(scan, boxes)
         if self.sampling_method == 0:
@@ -165,7 +165,7 @@ class BoxFilter(ShapeFilter):
         return with_columns(sampled, **columns)
 
     def means(self, scan: Scan, boxes: Boxes, fit: Mask) -> tuple[Scan, Ids]:
-        """Return the scan of the means of the boxes that fit, and which boxes these are."""
+        """Return the means of the boxes that fit, and their boxes."""
         first = PointGroups.of(boxes.rows, len(boxes)).first
         chosen = np.flatnonzero(fit)
         chosen = chosen[np.argsort(first[chosen])]
@@ -185,7 +185,7 @@ class BoxFilter(ShapeFilter):
         return np.asarray(np.max(extents, axis=0) <= self.max_box_m, np.bool_)
 
     def columns_of(self, boxes: Boxes) -> Columns:
-        """Return the columns asked for, a row for each box."""
+        """Return the selected columns, one row per box."""
         columns = self.shape_columns(boxes.values, boxes.vectors)
         if self.keep_densities:
             columns[DENSITIES] = boxes.moments.density
@@ -205,14 +205,14 @@ class Ellipsoids(BoxFilter):
 
     ratio: float = parameter(
         0.5,
-        'Share of the points that stay, drawn by chance.',
+        'Share of the points that stay, drawn at random.',
         low=1e-7,
         high=0.9999999,
         libpointmatcher='ratio',
     )
     max_time_window: float = parameter(
         math.inf,
-        'Boxes whose points are farther apart in time are dropped; in the unit of their column '
+        'Boxes whose points are farther apart in time are dropped; in the unit of the column '
         f'({", ".join(TIME_COLUMNS)}).',
         libpointmatcher='maxTimeWindow',
     )
@@ -221,9 +221,9 @@ class Ellipsoids(BoxFilter):
         'Boxes less planar are dropped; 1 is a plane, 0 a line or a ball.',
         libpointmatcher='minPlanarity',
     )
-    keep_means: bool = parameter(False, 'Add means, of the box, m.', libpointmatcher='keepMeans')
+    keep_means: bool = parameter(False, 'Add means of the box, m.', libpointmatcher='keepMeans')
     keep_covariances: bool = parameter(
-        False, 'Add covariance, of the box, 9 numbers, m^2.', libpointmatcher='keepCovariances'
+        False, 'Add covariance of the box, 9 numbers, m^2.', libpointmatcher='keepCovariances'
     )
     keep_weights: bool = parameter(
         False, 'Add weights, the number of points in the box.', libpointmatcher='keepWeights'
@@ -239,7 +239,7 @@ class Ellipsoids(BoxFilter):
     )
 
     def fit(self, scan: Scan, boxes: Boxes) -> Mask:
-        """Return which boxes are sampled: small, planar and short enough, (M,) bool."""
+        """Return which boxes are sampled: small, planar and brief enough, (M,) bool."""
         fit = BoxFilter.fit(self, scan, boxes)
         if self.min_planarity > 0.0:
             fit = fit & (shares(boxes.values)[:, 0] >= self.min_planarity)
@@ -248,7 +248,7 @@ class Ellipsoids(BoxFilter):
         return fit
 
     def columns_of(self, boxes: Boxes) -> Columns:
-        """Return the columns asked for, a row for each box."""
+        """Return the selected columns, one row per box."""
         columns = BoxFilter.columns_of(self, boxes)
         if self.keep_means:
             columns['means'] = boxes.moments.mean

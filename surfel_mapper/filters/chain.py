@@ -1,20 +1,20 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Chain: filters one after another, and what each did to a scan.
+Chain: filters applied one after another, and a report of what each removed.
 
 A chain is written as libpointmatcher writes it, a YAML list:
 
     - RemoveNaNDataPointsFilter              a name: all parameters at their defaults
     - VoxelGridDataPointsFilter:             or one name with parameters below it
         vSizeX: 0.5
-    - range_limit: {min_m: 0.5}              our names, in any mixture
+    - range_limit: {min_m: 0.5}              our names and libpointmatcher's can be mixed
 
-Every scalar is read as text and cast by the parameter that it is for, as libpointmatcher does.
-Of a key that stands twice the last one counts, there and here.
+Every scalar is read as text and cast by its parameter, as libpointmatcher does. If a key is
+repeated, the last one counts, as there.
 
-A chain may stand inside a larger file, as those of ICP configurations do: ``FILE#key`` takes the
-list under a key of the top level, ``FILE#key.key`` one further down.
+A chain may be part of a larger file, as in configurations of ICP: ``FILE#key`` takes the list
+under a key of the top level, ``FILE#key.key`` one further down.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ from surfel_mapper.scan import Scan
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What one filter of a chain did to a scan."""
+    """Points and time of one filter of a chain on one scan."""
 
     name: str
     """Place in the chain and name: 2 voxel_grid."""
@@ -60,17 +60,16 @@ class Step:
 
 class Chain:
     """
-    Filters that a scan passes one after another.
+    Filters that are applied to a scan one after another.
 
     Parameters
     ----------
     filters : iterable of Filter
-        In order; none at all leaves every scan as it is.
+        In order; an empty chain returns every scan unchanged.
 
     """
 
     def __init__(self, filters: Iterable[Filter] = ()) -> None:
-        """Keep the filters and name them by their place."""
         self.filters = tuple(filters)
         self.names = tuple(
             f'{place} {each.name or type(each).__name__}'
@@ -80,7 +79,7 @@ class Chain:
     @classmethod
     def from_list(cls, items: Any, where: str = 'filters') -> Chain:
         """
-        Return the chain that a list describes, as it stands in YAML.
+        Return the chain described by a list with the structure of the YAML.
 
         Parameters
         ----------
@@ -92,7 +91,7 @@ class Chain:
         Raises
         ------
         ConfigError
-            If it is no such list, or a filter, parameter or value is refused.
+            If the list has another structure, or a filter, parameter or value is refused.
 
         """
         if items in (None, ''):
@@ -117,7 +116,7 @@ class Chain:
         Raises
         ------
         ConfigError
-            If the file cannot be read, is not YAML, or holds no chain that can be built.
+            If the file cannot be read, is not YAML, or holds no valid chain.
 
         """
         name, _, keys = str(path).partition('#')
@@ -136,7 +135,7 @@ class Chain:
         return cls.from_list(content, str(path))
 
     def to_list(self) -> list[dict[str, dict[str, Any]]]:
-        """Return the chain as ``from_list`` takes it and JSON holds it, all by our names."""
+        """Return the chain as a list for ``from_list`` or JSON, with our names."""
         return [
             {
                 each.name: {
@@ -152,17 +151,17 @@ class Chain:
         return len(self.filters)
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan as it leaves the chain; see run."""
+        """Return the filtered scan; see run."""
         return self.run(scan)[0]
 
     def run(self, scan: Scan) -> tuple[Scan, tuple[Step, ...]]:
         """
-        Return the scan as it leaves the chain, and what every filter did.
+        Return the filtered scan and a Step for every filter.
 
         Raises
         ------
         FilterError
-            If a filter cannot work on the scan; begins with its place and name.
+            If a filter refuses the scan; the message begins with its place and name.
 
         """
         steps = []
@@ -177,17 +176,17 @@ class Chain:
         return scan, tuple(steps)
 
     def warm_up(self) -> None:
-        """Compile the kernels of our filters, for all types that scans may have."""
+        """Compile the kernels of this package's filters for float32 and float64."""
         for dtype in (np.float32, np.float64):
             scan = example(dtype)
             for each in self.filters:
                 if type(each).__module__.startswith('surfel_mapper.'):
-                    with contextlib.suppress(FilterError):  # it needs what the example lacks
-                        replace(each).apply(scan)  # a copy: it may count its scans
+                    with contextlib.suppress(FilterError):  # needs a column that the example lacks
+                        replace(each).apply(scan)  # a copy: a filter may count its scans
 
 
 def example(dtype: npt.DTypeLike) -> Scan:
-    """Return a small scan with the columns that filters may need."""
+    """Return a small scan with the columns that some filters need."""
     rng = np.random.default_rng(0)
     points = np.asfortranarray(rng.uniform(-1.0, 1.0, (64, 3)).astype(dtype))
     ones = np.ones(len(points), dtype)
@@ -209,7 +208,7 @@ def example(dtype: npt.DTypeLike) -> Scan:
 
 
 def jsonable(value: Any) -> Any:
-    """Return the value of a parameter as JSON has it: infinite ones as text, lists for tuples."""
+    """Return the value of a parameter for JSON: infinity as text, tuples as lists."""
     if isinstance(value, tuple):
         return [jsonable(item) for item in value]
     return str(value) if isinstance(value, float) and math.isinf(value) else value
@@ -248,7 +247,7 @@ def made(item: Any, where: str) -> Filter:
     values = values_of(cls, given, f'{where}, {name}', libpointmatcher=name == cls.libpointmatcher)
     try:
         return cls(**values)
-    except ConfigError as error:  # what concerns several parameters
+    except ConfigError as error:  # a condition on several parameters
         raise ConfigError(f'{where}: {error}') from error
 
 

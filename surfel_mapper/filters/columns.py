@@ -42,15 +42,15 @@ Array = npt.NDArray[Any]
 NORMALS = 'normals'
 """(N, 3) unit normals."""
 OBSERVATION_DIRECTIONS = 'observationDirections'
-"""(N, 3) from the point to the sensor, m, not of unit length."""
+"""(N, 3) from the point to the sensor, m, not unit length."""
 DENSITIES = 'densities'
 """(N,) points per m^3 about the point."""
 EIGEN_VALUES = 'eigValues'
-"""(N, 3) of the covariance about the point, m^2, ascending where sorted."""
+"""(N, 3) of the covariance about the point, m^2, ascending."""
 EIGEN_VECTORS = 'eigVectors'
-"""(N, 9) their unit eigenvectors, one after another."""
+"""(N, 9) unit eigenvectors of eigValues, one after another."""
 INCIDENCE_ANGLES = 'incidenceAngles'
-"""(N,) between normal and direction to the sensor, rad."""
+"""(N,) angle between normal and direction to the sensor, rad."""
 MATCHED_IDS = 'matchedIds'
 """(N, K) indices of neighbours."""
 MEAN_DISTS = 'meanDists'
@@ -60,7 +60,7 @@ SENSOR_NOISE = 'simpleSensorNoise'
 
 
 class Kind(enum.Enum):
-    """What a column is, as far as merging it goes."""
+    """The kind of a column, which decides how it is merged."""
 
     NUMBER = 'number'
     DIRECTION = 'direction'
@@ -77,14 +77,14 @@ KINDS = {
     **dict.fromkeys(('label', 'labels', 'class', 'instance', 'object', 'id', 'tag'), Kind.FIRST),
     **dict.fromkeys(('ring', 'line', 'channel', 'laser_id', 'return_type'), Kind.FIRST),
 }
-"""Kind of the columns of these names; of all others it follows from their type."""
+"""Kind of columns by name; that of all others follows from their type."""
 
 NORMAL_FIELDS = ('normal_x', 'normal_y', 'normal_z')
-"""The normal as clouds bring it."""
+"""Fields of the normal in a PointCloud2."""
 
 
 def kind_of(name: str, column: npt.NDArray[Any]) -> Kind:
-    """Return what a column is."""
+    """Return the kind of a column."""
     if name in KINDS:
         return KINDS[name]
     if column.dtype.kind in 'fiub':
@@ -103,18 +103,18 @@ def with_normals(scan: Scan) -> Scan:
 
 class LazyColumns(Mapping[str, Array]):
     """
-    Columns of some rows of others, and further ones.
+    Some rows of other columns, taken when first read, and further columns.
 
     Parameters
     ----------
     base : mapping of str to array
-        The others; not changed as long as this is in use.
+        Columns to take rows from; must not change while this is in use.
     rows : (K,) int, optional
-        The rows wanted; None: all.
+        Rows to take; None: all.
     num_rows : int
-        How many these are.
+        Number of rows.
     own : mapping of str to (K, ...) array
-        Further columns, in place of those of the same name.
+        Further columns; they replace those of the same name.
 
     """
 
@@ -127,7 +127,6 @@ class LazyColumns(Mapping[str, Array]):
         num_rows: int,
         own: Mapping[str, Array] | None = None,
     ) -> None:
-        """Take nothing yet."""
         self._base = base
         self._rows = rows
         self._own = dict(own or {})
@@ -141,11 +140,11 @@ class LazyColumns(Mapping[str, Array]):
         return self._own[name]
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is such a column, without taking it."""
+        """Return whether the column exists, without taking it."""
         return name in self._own or name in self._base
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names: those of the base, then further ones."""
+        """Yield the names: those of the base, then the further ones."""
         yield from self._base
         yield from (name for name in self._own if name not in self._base)
 
@@ -154,7 +153,7 @@ class LazyColumns(Mapping[str, Array]):
         return sum(1 for _ in self)
 
     def _origin(self, name: str) -> tuple[Array, npt.NDArray[np.int64] | None]:
-        """Return the array that a column is part of, and which rows; None: it is all of it."""
+        """Return the array that holds a column, and its rows in it; None: all rows."""
         if name in self._own:
             return self._own[name], None
         if not isinstance(self._base, LazyColumns):
@@ -168,16 +167,16 @@ class LazyColumns(Mapping[str, Array]):
 @dataclass(frozen=True, slots=True, eq=False)
 class PointGroups:
     """
-    Which points become one.
+    Sets of points that are merged into one point each.
 
     Attributes
     ----------
     rows : (N,) int
-        The group of every point, 0 to K - 1; every group has a point.
+        Group of every point, 0 to K - 1; no group is empty.
     first : (K,) int
-        The first point of every group.
+        First point of every group.
     count : (K,) int
-        Points in every group.
+        Number of points in every group.
 
     """
 
@@ -195,20 +194,20 @@ class PointGroups:
 
 class MergedColumns(Mapping[str, Array]):
     """
-    The columns of the points that groups of points become, (K,) or (K, C) each.
+    The columns of merged points, (K,) or (K, C) each.
 
-    Each is made when it is first asked for: most never are (lazy_columns.py).
+    Each is computed when first read: most never are.
 
     Parameters
     ----------
     columns : mapping of str to (N, ...) array
-        Of the points before.
+        Columns of the points before merging.
     groups : PointGroups
-        Which of them become one.
+        The points that are merged.
     average : bool
-        Whether to average columns by their kind; else those of the first point are kept.
+        Whether to average columns by their kind; false keeps those of the first point.
     unit : bool
-        Whether mean directions get unit length again; else they are shorter where they differ.
+        Whether mean directions are scaled to unit length.
 
     """
 
@@ -222,7 +221,6 @@ class MergedColumns(Mapping[str, Array]):
         average: bool = True,
         unit: bool = True,
     ) -> None:
-        """Make nothing yet."""
         self._columns = columns
         self._groups = groups
         self._average = average
@@ -238,7 +236,7 @@ class MergedColumns(Mapping[str, Array]):
         return self._made[name]
 
     def __contains__(self, name: object) -> bool:
-        """Return whether there is such a column, without making it."""
+        """Return whether the column exists, without computing it."""
         return name in self._columns
 
     def __iter__(self) -> Iterator[str]:
@@ -250,13 +248,13 @@ class MergedColumns(Mapping[str, Array]):
         return len(self._columns)
 
     def _kind(self, name: str, column: Array) -> Kind:
-        """Return how a column is merged."""
+        """Return the kind by which a column is merged."""
         kind = kind_of(name, column) if self._average else Kind.FIRST
         return Kind.NUMBER if kind is Kind.DIRECTION and not self._unit else kind
 
 
 def merged(kind: Kind, column: Array, groups: PointGroups) -> Array:
-    """Return one column, averaged as its kind asks, in the type that it has."""
+    """Return one column merged by its kind, in its own dtype."""
     if kind is Kind.FIRST:
         return np.asarray(column[groups.first])
     if kind is Kind.TIME:
@@ -266,7 +264,7 @@ def merged(kind: Kind, column: Array, groups: PointGroups) -> Array:
     means = by_component(mean, column, groups)
     if kind is Kind.DIRECTION:
         lengths = np.sqrt((means * means).sum(axis=1, keepdims=True))
-        defined = lengths > 1e-6  # rounding of opposite float32 directions leaves less
+        defined = lengths > 1e-6  # the rounding of opposite float32 directions is smaller
         units = np.divide(means, lengths, out=means, where=defined)
         return np.asarray(np.where(defined, units, column[groups.first]), column.dtype)
     if column.dtype.kind in 'iu':
@@ -277,7 +275,7 @@ def merged(kind: Kind, column: Array, groups: PointGroups) -> Array:
 
 
 def by_component(average: Any, column: Array, groups: PointGroups) -> Array:
-    """Return the averages of a column, of each of its components if it has several."""
+    """Return the averages of a column, component by component."""
     if column.ndim == 1:
         return np.asarray(average(column, groups))
     parts = column.reshape(len(column), math.prod(column.shape[1:]))
@@ -294,10 +292,10 @@ def mean(values: Array, groups: PointGroups) -> npt.NDArray[np.float64]:
 
 def mean_time(values: Array, groups: PointGroups) -> Array:
     """
-    Return the means of 64-bit integers, towards zero as libpointmatcher has it.
+    Return the means of 64-bit integers, rounded towards zero as in libpointmatcher.
 
-    Their sum does not fit: seven stamps in ns since 1970 overflow. The upper and the lower half
-    of each are summed apart, which holds for 2^30 points.
+    Their sum does not fit in 64 bits: seven stamps in ns since 1970 overflow. The upper and lower
+    halves are summed separately, which is exact for up to 2^30 points.
     """
     upper, lower = np.zeros((2, len(groups.first)), values.dtype)
     np.add.at(upper, groups.rows, values >> 32)
@@ -310,7 +308,7 @@ def mean_time(values: Array, groups: PointGroups) -> Array:
 
 
 def mean_colour(column: Array, groups: PointGroups) -> Array:
-    """Return the mean colours of numbers of 32 bits, a channel in each byte."""
+    """Return the mean colours of 32-bit values with one channel per byte."""
     if column.dtype.itemsize != 4 or column.ndim != 1:
         return by_component(mean, column, groups).astype(column.dtype)
     channels = np.ascontiguousarray(column).view(np.uint8).reshape(-1, 4)

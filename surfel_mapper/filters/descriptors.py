@@ -24,7 +24,7 @@ from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
 TIME_COLUMNS = ('t', 'time', 'times', 'timestamp', 'time_stamp', 'timeStamp', 'offset_time')
-"""Names under which drivers give the time of a point."""
+"""Names that drivers give to the time of a point."""
 
 Array = npt.NDArray[Any]
 
@@ -43,11 +43,11 @@ class AddDescriptor(Filter):
         1, 'Numbers a point.', low=1, high=MAX_COMPONENTS, libpointmatcher='descriptorDimension'
     )
     values: tuple[float, ...] = parameter(
-        (), 'The value, so many numbers.', items=float, libpointmatcher='descriptorValues'
+        (), 'The value, num_components numbers.', items=float, libpointmatcher='descriptorValues'
     )
 
     def check(self) -> None:
-        """Refuse values that are too few or too many."""
+        """Refuse another number of values than num_components."""
         if len(self.values) != self.num_components:
             raise ConfigError(
                 f'{self.name}: values (descriptorValues): {len(self.values)} numbers, expected '
@@ -72,16 +72,18 @@ class CutAtDescriptorThreshold(Filter):
 
     column_name: str = parameter(
         'none',
-        'Name of the column; of several components the first counts.',
+        'Name of the column; if it has several components, the first.',
         libpointmatcher='descName',
     )
     use_larger_than: bool = parameter(
-        True, '1: drop what is above; 0: drop what is below.', libpointmatcher='useLargerThan'
+        True,
+        '1: drop points above the limit; 0: drop points below it.',
+        libpointmatcher='useLargerThan',
     )
     threshold: float = parameter(0.0, 'The limit.', libpointmatcher='threshold')
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; nan does not."""
+        """Return which points stay; those with nan do not."""
         values = self.column(scan, self.column_name)
         first = values if values.ndim == 1 else values.reshape(len(values), -1)[:, 0]
         if self.use_larger_than:
@@ -92,13 +94,13 @@ class CutAtDescriptorThreshold(Filter):
 @register(libpointmatcher='ObservationDirectionDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservationDirection(Filter):
-    """Add observationDirections, from each point to where the sensor is, m."""
+    """Add observationDirections, from each point to the sensor, m."""
 
     x_m: float = parameter(
         0.0, 'x of the sensor in the frame of the points, m.', libpointmatcher='x'
     )
-    y_m: float = parameter(0.0, 'y of it, m.', libpointmatcher='y')
-    z_m: float = parameter(0.0, 'z of it, m.', libpointmatcher='z')
+    y_m: float = parameter(0.0, 'y of the sensor, m.', libpointmatcher='y')
+    z_m: float = parameter(0.0, 'z of the sensor, m.', libpointmatcher='z')
 
     def apply(self, scan: Scan) -> Scan:
         """Return the scan with the column."""
@@ -109,14 +111,14 @@ class ObservationDirection(Filter):
 @register(libpointmatcher='OrientNormalsDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OrientNormals(Filter):
-    """Turn the normals to the side of the sensor, or all away; needs observationDirections."""
+    """Turn the normals towards the sensor, or away from it; needs observationDirections."""
 
     toward_sensor: bool = parameter(
         True, '1: towards the sensor; 0: away from it.', libpointmatcher='towardCenter'
     )
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the normals turned; those at a right angle stay as they are."""
+        """Return the scan with the normals turned; those at a right angle are unchanged."""
         scan = with_normals(scan)
         normals = self.column(scan, NORMALS)
         along = dot(normals, self.column(scan, OBSERVATION_DIRECTIONS))
@@ -130,11 +132,11 @@ class IncidenceAngle(Filter):
     """Add incidenceAngles, between normal and observation direction, 0 to pi rad."""
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the column; nan where a direction has no length."""
+        """Return the scan with the column; nan for directions of length 0."""
         scan = with_normals(scan)
         normals = self.column(scan, NORMALS)
         cosine = dot(normals, unit(self.column(scan, OBSERVATION_DIRECTIONS)))
-        angles = np.arccos(np.clip(cosine, -1.0, 1.0))  # rounding may leave 1.0000001
+        angles = np.arccos(np.clip(cosine, -1.0, 1.0))  # rounding may exceed 1
         return with_columns(scan, **{INCIDENCE_ANGLES: angles.astype(scan.points.dtype)})
 
 
@@ -145,7 +147,7 @@ def dot(a: Array, b: Array) -> Array:
 
 
 def unit(vectors: Array) -> Array:
-    """Return rows made unit length, in float64; nan where a row has no finite length."""
+    """Return rows scaled to unit length, in float64; nan for rows of length 0 or inf."""
     vectors = vectors.astype(np.float64)
     length = np.sqrt(dot(vectors, vectors))[:, None]
     has_length = (length > 0.0) & np.isfinite(length)
@@ -159,12 +161,12 @@ class Sphericality(Filter):
 
     keep_unstructureness: bool = parameter(
         False,
-        'Add unstructureness, the part of it that a ball has.',
+        'Add unstructureness, its part for a ball.',
         libpointmatcher='keepUnstructureness',
     )
     keep_structureness: bool = parameter(
         False,
-        'Add structureness, the part of it that a plane has.',
+        'Add structureness, its part for a plane.',
         libpointmatcher='keepStructureness',
     )
 
@@ -174,7 +176,7 @@ class Sphericality(Filter):
 
         With eigenvalues e0 <= e1 <= e2 unstructureness is e0 / e2, structureness is
         e1 / e2 (e1 - e0) / sqrt(e0^2 + e1^2), and sphericality is their difference. On a line
-        all are 0; they are nan where e2 is 0 or an eigenvalue is negative.
+        all are 0; they are nan if e2 is 0 or an eigenvalue is negative.
 
         Source: Kubelka et al. 2020, Radio propagation models for differential GNSS based on
         dense point clouds, equation 1.
@@ -202,23 +204,21 @@ class Sphericality(Filter):
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TimeSlice(Filter):
-    """Keep the points measured from one time on until another within their scan."""
+    """Keep the points measured within a time interval of their scan."""
 
-    start_s: float = parameter(0.0, 'First time that stays, s.')
-    end_s: float = parameter(math.inf, 'First time that does not, s.')
+    start_s: float = parameter(0.0, 'Start of the interval, s.')
+    end_s: float = parameter(math.inf, 'End of the interval, not included, s.')
     since: str = parameter(
         'first',
-        'Times count from the first point of the scan, from the stamp of the scan, or as they '
-        'are (zero).',
+        'Times count from the first point of the scan, from the stamp of the scan, or are taken '
+        'as they are (zero).',
         choices=('first', 'stamp', 'zero'),
     )
-    column_name: str = parameter('', 'Column of the times; empty: the first usual name found.')
-    unit_s: float = parameter(
-        0.0, 'Unit of the times, s; 0: whole numbers are ns, others s.', low=0.0
-    )
+    column_name: str = parameter('', 'Column of the times; empty: the first usual name present.')
+    unit_s: float = parameter(0.0, 'Unit of the times, s; 0: integers are ns, others s.', low=0.0)
 
     def check(self) -> None:
-        """Refuse an empty slice."""
+        """Refuse an empty interval."""
         if not self.start_s < self.end_s:
             raise ConfigError(
                 f'{self.name}: end_s: {self.end_s:g}, expected more than start_s '
@@ -231,7 +231,7 @@ class TimeSlice(Filter):
         return np.asarray((seconds >= self.start_s) & (seconds < self.end_s))
 
     def seconds(self, scan: Scan) -> npt.NDArray[np.float64]:
-        """Return the times of the points in seconds, counted from where they should."""
+        """Return the times of the points since the chosen origin, s."""
         names = [name for name in TIME_COLUMNS if name in scan.columns]
         times = self.column(scan, self.column_name or (names[0] if names else 'time'))
         whole = times.dtype.kind in 'iu'
@@ -239,7 +239,7 @@ class TimeSlice(Filter):
         times = times.astype(np.int64 if whole else np.float64)
         if self.since == 'first' and len(times):
             times = times - (times.min() if whole else np.nanmin(times))
-        elif self.since == 'stamp':  # subtracted as integers: no float holds ns since 1970
+        elif self.since == 'stamp':  # subtracted as integers: float64 cannot hold ns since 1970
             stamp = scan.stamp_ns if unit_s == 1e-9 else scan.stamp_ns / 1e9 / unit_s
             times = times - (round(stamp) if whole else stamp)
         return np.asarray(times * unit_s)
@@ -248,23 +248,23 @@ class TimeSlice(Filter):
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LabelMask(Filter):
-    """Drop, or keep, the points with certain labels."""
+    """Drop, or keep, the points that have one of some labels."""
 
     labels: tuple[int, ...] = parameter((), 'The labels.', items=int)
-    remove: bool = parameter(True, '1: drop the points that have one; 0: keep only those.')
+    remove: bool = parameter(True, '1: drop the points that have one of them; 0: keep only those.')
     column_name: str = parameter('label', 'Column of the labels.')
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points stay."""
         found = self.column(scan, self.column_name)
         listed = np.zeros(len(scan), np.bool_)
-        for label in self.labels:  # of few labels, a third of the time of np.isin
+        for label in self.labels:  # for few labels a third of the time of np.isin
             listed |= found == label
         return ~listed if self.remove else listed
 
 
 def times_of(scan: Scan) -> npt.NDArray[Any]:
-    """Return the times of the points as their column has them."""
+    """Return the times of the points in the unit of their column."""
     for name in TIME_COLUMNS:
         if name in scan.columns:
             times = scan.columns[name]

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Gestalt: few keypoints, each with a description of the relief around it.
+Gestalt: few keypoints, each with a descriptor of the relief around it.
 
-Around a keypoint 4 rings are cut into 8 sectors, beginning where the normal of the neighbourhood
-points, level; in every bin stand the mean and the variance of the heights above the keypoint. So
-two places can be compared that were seen from different sides. Keypoints whose neighbourhood is
+Around a keypoint 4 rings are divided into 8 sectors, starting at the horizontal direction of the
+normal of the neighbourhood; every bin holds the mean and the variance of the heights above the
+keypoint. So places seen from different sides can be compared. Keypoints whose neighbourhood is
 nearly a plane, or whose normal is nearly vertical, have no such direction and are dropped.
 
-libpointmatcher takes neighbours from a cube, leaves the sign of the normal to chance and writes
-the coordinates of arbitrary points to warpedXYZ. Here they are those within the radius, the normal
-points to the side of the sensor, and warpedXYZ is the mean of the neighbours.
+libpointmatcher takes neighbours from a cube, chooses the sign of the normal at random and writes
+the coordinates of arbitrary points to warpedXYZ. Here the neighbours are the points within the
+radius, the normal points towards the sensor, and warpedXYZ is the mean of the neighbours.
 
 Source: Bosse and Zlot 2013, Place recognition using keypoint voting in large 3D lidar datasets.
 """
@@ -38,7 +38,7 @@ BINS = RINGS * SECTORS
 
 MAX_PLANARITY = 0.9
 MIN_TILT = math.sin(math.radians(10.0))
-"""The normal has to lean from the vertical by this angle."""
+"""Least sine of the angle between normal and vertical."""
 
 SIZES = {
     'means': 3,
@@ -48,24 +48,24 @@ SIZES = {
     'warpedXYZ': 3,
     'gestaltShapes': 2,
 }
-"""Numbers in the columns that are only found here, a row."""
+"""Components of the columns that only this filter makes."""
 
 
 @register(libpointmatcher='GestaltDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gestalt(ShapeFilter):
-    """Keep some keypoints, add gestaltMeans and gestaltVariances of the relief about them."""
+    """Keep some keypoints and add gestaltMeans and gestaltVariances of the relief around them."""
 
     ratio: float = parameter(
         0.1,
-        'Share of the occupied voxels that get a keypoint.',
+        'Share of the occupied voxels from which a candidate is drawn.',
         low=1e-7,
         high=0.9999999,
         libpointmatcher='ratio',
     )
     radius_m: float = parameter(
         5.0,
-        'How far the description reaches, m.',
+        'Radius of the descriptor, m.',
         low=0.1,
         high=2.0**31 - 1,
         libpointmatcher='radius',
@@ -79,14 +79,14 @@ class Gestalt(ShapeFilter):
     )
     size_x_m: float = parameter(
         1.0,
-        'Edge along x of the voxels with one candidate each, m.',
+        'Edge along x of the voxels that give one candidate each, m.',
         low=0.001,
         libpointmatcher='vSizeX',
     )
     size_y_m: float = parameter(1.0, 'Edge along y, m.', low=0.001, libpointmatcher='vSizeY')
     size_z_m: float = parameter(1.0, 'Edge along z, m.', low=0.001, libpointmatcher='vSizeZ')
     keep_means: bool = parameter(
-        False, 'Add means, of the neighbours, m.', libpointmatcher='keepMeans'
+        False, 'Add means: mean of the neighbours, m.', libpointmatcher='keepMeans'
     )
     max_box_m: float = parameter(
         math.inf,
@@ -95,7 +95,7 @@ class Gestalt(ShapeFilter):
     )
     average_columns: bool = parameter(
         True,
-        'Makes no difference here: keypoints keep their columns.',
+        'No effect here: keypoints keep their columns.',
         libpointmatcher='averageExistingDescriptors',
     )
     max_time_window: float = parameter(
@@ -106,7 +106,7 @@ class Gestalt(ShapeFilter):
     )
     keep_covariances: bool = parameter(
         False,
-        'Add covariance, of the neighbours, 9 numbers, m^2.',
+        'Add covariance of the neighbours, 9 numbers, m^2.',
         libpointmatcher='keepCovariances',
     )
     keep_features: bool = parameter(
@@ -115,7 +115,7 @@ class Gestalt(ShapeFilter):
         'in the frame of the keypoint, m, and gestaltShapes: planarity, cylindricality.',
         libpointmatcher='keepGestaltFeatures',
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
     def apply(self, scan: Scan) -> Scan:
         """Return the keypoints, in the order of the points; nan is refused."""
@@ -144,7 +144,7 @@ class Gestalt(ShapeFilter):
         return with_columns(select(scan, rows), **columns)
 
     def candidates(self, scan: Scan, points: Points) -> Ids:
-        """Return the points that may become keypoints: of a share of the voxels, any of each."""
+        """Return the candidates: a random point from each of a share of the voxels."""
         if not len(points):
             return np.empty(0, np.int64)
         size = np.array([self.size_x_m, self.size_y_m, self.size_z_m])
@@ -170,13 +170,13 @@ class Gestalt(ShapeFilter):
 
 
 def describe(place: Points, around: Points, radius_m: float) -> dict[str, Any] | None:
-    """Return everything about a keypoint by the points around it, None where it has no sides."""
+    """Return the descriptor of a keypoint by the points around it; None: it has no direction."""
     moments = Moments.of_groups(around, np.zeros(len(around), np.int64), 1)
     values, vectors = eigen(moments.covariance)
     planarity, cylindricality, _ = shares(values)[0]
     normal = vectors[0, 0] * (-1.0 if vectors[0, 0] @ place > 0.0 else 1.0)
     level = math.hypot(normal[0], normal[1])
-    if not (planarity <= MAX_PLANARITY and level >= MIN_TILT):  # nor where the normal is nan
+    if not (planarity <= MAX_PLANARITY and level >= MIN_TILT):  # false if the normal is nan
         return None
     x, y = normal[0] / level, normal[1] / level
     R_keypoint_scan = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
@@ -196,9 +196,9 @@ def describe(place: Points, around: Points, radius_m: float) -> dict[str, Any] |
 
 def relief(points: Points, radius_m: float) -> tuple[Points, Points]:
     """
-    Return mean and variance of the heights in each bin, (4, 8) each, rings from the middle out.
+    Return mean and variance of the heights in each bin, (4, 8) each, rings from the centre out.
 
-    A bin without points takes over from the next one inwards, the innermost has 0.
+    An empty bin takes the values of the next bin inwards, an innermost one 0.
     """
     x, y, z = points.T
     ring = np.minimum((np.hypot(x, y) * (RINGS / radius_m)).astype(np.int64), RINGS - 1)

@@ -35,7 +35,7 @@ from surfel_mapper.kernels.voxel_grid import group_points
 from surfel_mapper.scan import Scan
 
 AXIS_BITS = 31
-"""At most 2^31 voxels along an axis: the conversion that is done several at once ends there."""
+"""At most 2^31 voxels along an axis: the limit of the vectorised conversion to int32."""
 
 KEY_BITS = 62
 """At most 2^62 voxels in the box of a scan, each axis rounded up to a power of two."""
@@ -61,21 +61,23 @@ class VoxelGrid(Filter):
     )
     unit_normals: bool = parameter(
         True,
-        '1: averaged normals get unit length again; 0: they stay as short as they become.',
+        '1: scale averaged normals to unit length; 0: leave them shorter.',
         libpointmatcher_default=False,
     )
     anchor: str = parameter(
         'origin',
-        'Where voxels begin: at the origin, so that they stay where they are, or at the lowest '
+        'Corner of the grid: the origin, the same for all scans, or the minimum of the '
         'coordinates of each scan.',
         choices=('origin', 'minimum'),
         libpointmatcher_default='minimum',
     )
 
     def check(self) -> None:
-        """Refuse voxels that have no centre."""
+        """Refuse infinite voxels without centroids."""
         if not self.use_centroid and not all(map(math.isfinite, self._size)):
-            raise ConfigError(f'{self.name}: a voxel of infinite size has no centre')
+            raise ConfigError(
+                f'{self.name}: a voxel of infinite size has no centre; set use_centroid'
+            )
 
     @property
     def _size(self) -> tuple[float, float, float]:
@@ -83,12 +85,12 @@ class VoxelGrid(Filter):
 
     def apply(self, scan: Scan) -> Scan:
         """
-        Return a point for every voxel with points.
+        Return one point for every occupied voxel.
 
         Raises
         ------
         FilterError
-            If a coordinate is not finite, or the scan extends over too many voxels.
+            If the scan extends over too many voxels, or a coordinate is not finite.
 
         """
         if not len(scan):
@@ -104,7 +106,7 @@ class VoxelGrid(Filter):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanVoxels:
-    """The voxels over a scan: index = floor(x / size - shift) - base along each axis."""
+    """Voxel grid over a scan: index = floor(x / size - shift) - base along each axis."""
 
     size: npt.NDArray[np.float64]
     shift: npt.NDArray[np.float64]
@@ -115,7 +117,7 @@ class ScanVoxels:
     def over(
         cls, points: npt.NDArray[Any], size: npt.NDArray[np.float64], anchor: str
     ) -> ScanVoxels:
-        """Return the grid that holds all points; refuse what no key can number."""
+        """Return the grid over all points; refuse an extent beyond the range of keys."""
         low = np.array([axis.min() for axis in points.T], np.float64)
         high = np.array([axis.max() for axis in points.T], np.float64)
         return cls.between(low, high, size, anchor)
@@ -128,7 +130,7 @@ class ScanVoxels:
         size: npt.NDArray[np.float64],
         anchor: str,
     ) -> ScanVoxels:
-        """Return the grid that holds what lies between two corners; refuse as over does."""
+        """Return the grid over the box between two corners; refuse as over does."""
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise FilterError(
                 'a coordinate is nan or infinite; put remove_nan or a box or range before it'
@@ -148,7 +150,7 @@ class ScanVoxels:
     def group(
         self, points: npt.NDArray[Any], with_rows: bool
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], PointGroups]:
-        """Return keys, sums of x y z and counts, and which points are in each voxel."""
+        """Return keys, sums of x y z with counts, and the points of each voxel."""
         number = len(points)
         keys, first = np.empty((2, number), np.int64)
         sums = np.empty((number, 4))
@@ -177,13 +179,11 @@ class OctreeGrid(Filter):
     """
     Replace the points of every leaf of an octree by one, in the order of leaves' first points.
 
-    The first, a random one and the medoid are points of the scan and keep their columns; for the
-    centroid columns are averaged.
+    The first point, a random one and the medoid keep their columns; for the centroid columns are
+    averaged.
     """
 
-    build_parallel: bool = parameter(
-        True, 'Makes no difference here.', libpointmatcher='buildParallel'
-    )
+    build_parallel: bool = parameter(True, 'No effect here.', libpointmatcher='buildParallel')
     max_points: int = parameter(
         1,
         'A cube with more points is cut into eight.',
@@ -199,16 +199,16 @@ class OctreeGrid(Filter):
     )
     sampling_method: int = parameter(
         0,
-        'What stands for a leaf, 0: its first point; 1: a random one; 2: the mean; 3: the one '
-        'nearest the mean.',
+        'Point that replaces a leaf, 0: its first point; 1: a random one; 2: the mean; 3: the one '
+        'nearest to the mean.',
         low=0,
         high=3,
         libpointmatcher='samplingMethod',
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
     def apply(self, scan: Scan) -> Scan:
-        """Return a point for every leaf; nan and infinite points are refused."""
+        """Return one point for every leaf."""
         points = coordinates(scan)
         rows, number = leaves(points, self.max_points, self.max_size_m)
         groups = PointGroups.of(rows, number)
@@ -228,7 +228,7 @@ class OctreeGrid(Filter):
 
 def leaves(points: Points, max_points: int, max_size_m: float) -> tuple[Ids, int]:
     """
-    Return the leaf of every point, (N,) int64, and how many there are.
+    Return the leaf of every point, (N,) int64, and the number of leaves.
 
     Leaves are numbered in the order in which their first points appear.
     """
@@ -237,8 +237,8 @@ def leaves(points: Points, max_points: int, max_size_m: float) -> tuple[Ids, int
     path, edge_m = paths(points)
     order = np.argsort(path, kind='stable')
     path = path[order]
-    starts = np.zeros(len(path), np.bool_)  # where a leaf starts among the sorted points
-    open_ = np.arange(len(path))  # points whose leaf is not found yet
+    starts = np.zeros(len(path), np.bool_)  # whether a leaf starts here in the sorted points
+    open_ = np.arange(len(path))  # points not assigned to a leaf yet
     for level in range(LEVELS + 1):
         cube = path[open_] >> np.int64(3 * (LEVELS - level))
         first = np.flatnonzero(np.diff(cube, prepend=-1))
@@ -263,9 +263,9 @@ def paths(points: Points) -> tuple[Ids, float]:
     if edge_m == 0.0:
         return np.zeros(len(points), np.int64), 0.0
     corner = 0.5 * low + 0.5 * high - 0.5 * edge_m
-    corner[low == high] = low[low == high]  # a layer is not cut in the middle
+    corner[low == high] = low[low == high]  # a layer is not cut in half
     cells = ((points - corner) / edge_m * 2.0**LEVELS).astype(np.int64)
-    cells = np.clip(cells, 0, 2**LEVELS - 1)  # the highest faces belong to the last cube
+    cells = np.clip(cells, 0, 2**LEVELS - 1)  # points on the highest faces belong to the last cube
     path = np.zeros(len(points), np.int64)
     for axis in range(3):
         path |= spread(cells[:, axis]) << np.int64(axis)
@@ -273,7 +273,7 @@ def paths(points: Points) -> tuple[Ids, float]:
 
 
 def spread(values: Ids) -> npt.NDArray[np.int64]:
-    """Return numbers of 21 bits with two zeros put before each bit."""
+    """Return 21-bit numbers with two zeros inserted before each bit."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
@@ -286,7 +286,7 @@ def spread(values: Ids) -> npt.NDArray[np.int64]:
 
 
 def least_of_each(values: Points, rows: Ids, number: int) -> Ids:
-    """Return the point with the least value of each group, the first one where several have it."""
+    """Return the point with the least value of each group, the first of equal ones."""
     order = np.lexsort((values, rows))
     starts = np.searchsorted(rows[order], np.arange(number))
     return np.asarray(order[starts], np.int64)

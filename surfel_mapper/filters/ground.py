@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Ground: which points lie on surfaces that are nearly level.
+Ground: selects the points on nearly level surfaces.
 
-Points are grouped into voxels that stand upright, and the surfel of a voxel, the plane through
-its points, says how steep the surface is there. Where the floor meets a wall the plane leans, and
-neither is ground; smaller voxels keep that strip narrow. A table or a roof is as level as the
-floor: ``max_height_m`` leaves out what is above the robot's wheels.
+Points are grouped into voxels aligned with the vertical, and the surfel of a voxel, the plane
+through its points, gives the slope of the surface. In voxels that hold both floor and wall the
+plane is tilted and neither is ground; smaller voxels keep that strip narrow. A table or a roof is
+as level as the floor: ``max_height_m`` excludes surfaces above the robot's wheels.
+
+Alone in its module: it combines grouping, shapes and poses, which no other filter does.
 """
 
 from __future__ import annotations
@@ -29,23 +31,21 @@ from surfel_mapper.scan import Scan
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ground(Filter):
-    """Split the points by whether the surface about them is level: keep one part, or mark both."""
+    """Select the points on level surfaces: keep them, keep the rest, or mark both."""
 
     keep_part: str = parameter(
         'mark',
-        'Keep the ground, all but the ground, or all points with the column ground (1 or 0).',
+        'Keep the ground, the rest, or all points with a column ground (1 or 0).',
         choices=('ground', 'rest', 'mark'),
     )
-    max_slope_deg: float = parameter(
-        15.0, 'Steepest surfel that is ground, deg.', low=0.0, high=90.0
-    )
+    max_slope_deg: float = parameter(15.0, 'Largest slope of ground, deg.', low=0.0, high=90.0)
     voxel_size_m: float = parameter(0.5, 'Edge of the voxels, m.', low=0.001)
     min_points: int = parameter(
-        5, 'With fewer points a voxel has no slope and is not ground.', low=3, high=2**31 - 1
+        5, 'Voxels with fewer points are not ground.', low=3, high=2**31 - 1
     )
     min_planarity: float = parameter(
         0.05,
-        'Surfels less planar have no slope: 1 is a plane, 0 a line or a ball.',
+        'Surfels less planar are not ground: 1 is a plane, 0 a line or a ball.',
         low=0.0,
         high=1.0,
     )
@@ -55,13 +55,12 @@ class Ground(Filter):
     )
     up: str = parameter(
         'fixed',
-        'Whose z is up: the fixed frame (level as far as its source knows), the robot, or the '
-        'sensor.',
+        'Frame whose z axis is up: fixed (level if its source is), base or sensor.',
         choices=('fixed', 'base', 'sensor'),
     )
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the part of the scan to keep, or all with the column; nan is refused."""
+        """Return the selected points, or all with the column."""
         points = coordinates(scan)
         is_ground = self.is_ground(scan, points)
         if self.keep_part == 'mark':
@@ -88,23 +87,23 @@ class Ground(Filter):
         return np.asarray(level[groups.rows])
 
     def upright(self, scan: Scan) -> Points:
-        """Return the rotation that takes the points to a frame whose z is up, (3, 3)."""
+        """Return the rotation from the frame of the points to one whose z is up, (3, 3)."""
         if self.up == 'sensor':
             return np.eye(3)
         pose = scan.T_map_sensor if self.up == 'fixed' else scan.T_base_sensor
         if pose is None:
             raise FilterError(
                 f'the pose of {scan.frame_id!r} in the {self.up} frame is not known, so up is '
-                'not; let poses come in, or set up: sensor'
+                'not; provide poses, or set up: sensor'
             )
         return np.asarray(pose[:3, :3], np.float64)
 
     def robot(self, scan: Scan) -> Points:
-        """Return where the origin of the robot is in the frame of the points, (3,) m."""
+        """Return the origin of the robot in the frame of the points, (3,) m."""
         if scan.T_base_sensor is None:
             raise FilterError(
                 f'the place of {scan.frame_id!r} on the robot is not known, so max_height_m has '
-                'no origin; set frames.base_to_sensor, or let /tf_static have it'
+                'no origin; set frames.base_to_sensor, or publish it on /tf_static'
             )
         R_base_sensor, sensor_in_base = scan.T_base_sensor[:3, :3], scan.T_base_sensor[:3, 3]
         return np.asarray(-R_base_sensor.T @ sensor_in_base, np.float64)

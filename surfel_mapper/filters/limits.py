@@ -40,7 +40,7 @@ from surfel_mapper.scan import Scan
 @register(libpointmatcher='IdentityDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Identity(Filter):
-    """Leave the scan as it is."""
+    """Return the scan unchanged."""
 
     def apply(self, scan: Scan) -> Scan:
         """Return the scan itself."""
@@ -50,7 +50,7 @@ class Identity(Filter):
 @register(name='remove_nan', libpointmatcher='RemoveNaNDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoveNaN(Filter):
-    """Drop the points with a coordinate that is not a number; infinite ones stay."""
+    """Drop the points with a nan coordinate; infinite ones stay."""
 
     def keep(self, scan: Scan) -> Mask:
         """Return which points have no nan."""
@@ -70,7 +70,7 @@ class BoundingBox(Filter):
     z_min_m: float = parameter(-1.0, 'Lowest z, m.', libpointmatcher='zMin')
     z_max_m: float = parameter(1.0, 'Highest z, m.', libpointmatcher='zMax')
     remove_inside: bool = parameter(
-        True, '1: drop what is inside; 0: keep only that.', libpointmatcher='removeInside'
+        True, '1: drop the points inside; 0: keep only those.', libpointmatcher='removeInside'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -102,14 +102,14 @@ def outside(points: npt.NDArray[Any], low: Any, high: Any) -> Mask:
 
 
 def rounded(bounds: Any, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
-    """Return bounds in the type of the coordinates; beyond its range they are infinite."""
+    """Return bounds in the dtype of the coordinates; infinite beyond its range."""
     with np.errstate(over='ignore'):
         return np.asarray(bounds, np.float64).astype(dtype)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AxisFilter(Filter):
-    """Base of those that compare a distance from the origin, or one coordinate."""
+    """Base of the filters that compare the distance from the origin or one coordinate."""
 
     axis: int = parameter(
         -1,
@@ -127,11 +127,11 @@ class DistanceLimit(AxisFilter):
 
     distance_m: float = parameter(
         1.0,
-        'The limit, m; points at it do not stay; of a distance its size counts.',
+        'The limit, m; points at it are dropped; for axis -1 its absolute value.',
         libpointmatcher='dist',
     )
     remove_inside: bool = parameter(
-        True, '1: keep what is beyond; 0: keep what is before.', libpointmatcher='removeInside'
+        True, '1: keep the points beyond; 0: keep those before.', libpointmatcher='removeInside'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -143,7 +143,7 @@ class DistanceLimit(AxisFilter):
 @register(libpointmatcher='MaxDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxDist(AxisFilter):
-    """Keep the points nearer than a distance; distance_limit can do the same and more."""
+    """Keep the points nearer than a distance; distance_limit replaces it."""
 
     max_m: float = parameter(
         1.0, 'Points here or farther are dropped, m.', libpointmatcher='maxDist'
@@ -157,7 +157,7 @@ class MaxDist(AxisFilter):
 @register(libpointmatcher='MinDistDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MinDist(AxisFilter):
-    """Keep the points farther than a distance; distance_limit can do the same and more."""
+    """Keep the points farther than a distance; distance_limit replaces it."""
 
     min_m: float = parameter(
         1.0, 'Points here or nearer are dropped, m.', libpointmatcher='minDist'
@@ -169,19 +169,19 @@ class MinDist(AxisFilter):
 
 
 def before(scan: Scan, axis: int, limit_m: float) -> Mask:
-    """Return which points lie before a limit along an axis, or for -1 within its size."""
+    """Return which points lie before a limit along an axis; -1: nearer to the origin."""
     measured, limit = measure(scan, axis, limit_m)
     return np.asarray(measured < limit, np.bool_)
 
 
 def beyond(scan: Scan, axis: int, limit_m: float) -> Mask:
-    """Return which points lie beyond a limit along an axis, or for -1 beyond its size."""
+    """Return which points lie beyond a limit along an axis; -1: farther from the origin."""
     measured, limit = measure(scan, axis, limit_m)
     return np.asarray(measured > limit, np.bool_)
 
 
 def measure(scan: Scan, axis: int, limit_m: float) -> tuple[npt.NDArray[Any], Any]:
-    """Return what is compared, a coordinate or the squared distance, and with what."""
+    """Return the values compared, coordinates or squared distances, and the limit."""
     if axis >= 0:
         return scan.points[:, axis], rounded(limit_m, scan.points.dtype)
     limit_sq = limit_m * limit_m if math.isfinite(limit_m) else math.inf
@@ -191,7 +191,7 @@ def measure(scan: Scan, axis: int, limit_m: float) -> tuple[npt.NDArray[Any], An
 def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the squared distances from the origin, in the type of the coordinates, m^2."""
     x, y, z = points.T
-    with np.errstate(over='ignore'):  # beyond the range of the type they are infinite
+    with np.errstate(over='ignore'):  # infinite beyond the range of the dtype
         total = x * x
         square = y * y
         total += square
@@ -203,7 +203,7 @@ def range_sq(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
 @register(libpointmatcher='AngleLimitDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AngleLimit(Filter):
-    """Drop, or keep, the points in a wedge of directions; points on its edge never stay."""
+    """Drop, or keep, the points in a wedge of directions; those on its edge are dropped."""
 
     phi_min_deg: float = parameter(
         -math.inf,
@@ -226,7 +226,7 @@ class AngleLimit(Filter):
         libpointmatcher_default=-math.inf,
     )
     remove_inside: bool = parameter(
-        True, '1: drop what is inside; 0: keep only that.', libpointmatcher='removeInside'
+        True, '1: drop the points inside; 0: keep only those.', libpointmatcher='removeInside'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -248,14 +248,14 @@ class AngleLimit(Filter):
 
 
 def phi_kind(limit_deg: float, *, below: bool) -> int:
-    """Return how phi, in (-180, 180] deg, is found to be above or below a limit."""
+    """Return the test by which phi, in (-180, 180] deg, is compared with a limit."""
     if not -180.0 <= limit_deg <= 180.0:
         return ALWAYS if (limit_deg > 180.0) == below else NEVER
     return BOTH if (limit_deg >= 0.0) != below else EITHER
 
 
 def theta_kind(limit_deg: float, *, below: bool) -> int:
-    """Return how theta, in [0, 180] deg, is found to be above or below a limit."""
+    """Return the test by which theta, in [0, 180] deg, is compared with a limit."""
     if not 0.0 <= limit_deg <= 180.0:
         return ALWAYS if (limit_deg > 180.0) == below else NEVER
     return BOTH
@@ -264,24 +264,24 @@ def theta_kind(limit_deg: float, *, below: bool) -> int:
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FieldOfView(Filter):
-    """Keep the points that a sensor with this field of view would see; its edges are in it."""
+    """Keep the points within a field of view, edges included."""
 
     azimuth_min_deg: float = parameter(
-        -180.0, 'Where it begins about z, from x towards y, deg.', low=-360.0, high=360.0
+        -180.0, 'Start of the azimuth about z, from x towards y, deg.', low=-360.0, high=360.0
     )
     azimuth_max_deg: float = parameter(
-        180.0, 'Where it ends, up to 360 deg further, deg.', low=-360.0, high=360.0
+        180.0, 'End of the azimuth, up to 360 deg after its start, deg.', low=-360.0, high=360.0
     )
     elevation_min_deg: float = parameter(
         -90.0, 'Lowest angle above the plane of x and y, deg.', low=-90.0, high=90.0
     )
     elevation_max_deg: float = parameter(
-        90.0, 'Highest angle above it, deg.', low=-90.0, high=90.0
+        90.0, 'Highest angle above the plane of x and y, deg.', low=-90.0, high=90.0
     )
     sensor: str = parameter('', 'Only scans in this frame are filtered; empty: all.')
 
     def check(self) -> None:
-        """Refuse fields of view that hold nothing or come round."""
+        """Refuse a field of view that is empty or wider than a turn."""
         if not 0.0 < self.azimuth_max_deg - self.azimuth_min_deg <= 360.0:
             raise ConfigError(
                 f'{self.name}: azimuth_max_deg: {self.azimuth_max_deg:g}, expected '
@@ -294,7 +294,7 @@ class FieldOfView(Filter):
             )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; one at the origin or not finite does not."""
+        """Return which points stay; those at the origin or not finite do not."""
         if self.sensor and self.sensor != scan.frame_id:
             return np.ones(len(scan), np.bool_)
         azimuth = (self.azimuth_min_deg, self.azimuth_max_deg)
@@ -317,7 +317,7 @@ class FieldOfView(Filter):
 
 
 def sine(angle_deg: float) -> float:
-    """Return a sine that is exactly 0 or 1 where it should be."""
+    """Return the sine of an angle in degrees, exact at multiples of 90."""
     turned = math.remainder(angle_deg, 360.0)
     if abs(turned) > 90.0:
         turned = math.copysign(180.0, turned) - turned
@@ -325,7 +325,7 @@ def sine(angle_deg: float) -> float:
 
 
 def cosine(angle_deg: float) -> float:
-    """Return a cosine as exact as the sine, and equal to it at 45 deg."""
+    """Return the cosine of an angle in degrees, exact at multiples of 90."""
     return sine(90.0 - abs(math.remainder(angle_deg, 360.0)))
 
 
@@ -340,14 +340,14 @@ class BodyBox(Filter):
     y_max_m: float = parameter(1.0, 'Highest y, m.')
     z_min_m: float = parameter(-1.0, 'Lowest z, m.')
     z_max_m: float = parameter(1.0, 'Highest z, m.')
-    remove_inside: bool = parameter(True, '1: drop what is inside; 0: keep only that.')
+    remove_inside: bool = parameter(True, '1: drop the points inside; 0: keep only those.')
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; the faces are outside, a nan is nowhere."""
+        """Return which points stay; the faces are outside, nan is dropped."""
         if scan.T_base_sensor is None:
             raise FilterError(
                 f'the place of {scan.frame_id!r} on the robot is not known; set '
-                'frames.base_to_sensor, or let /tf_static have it'
+                'frames.base_to_sensor, or publish it on /tf_static'
             )
         pose = np.ascontiguousarray(scan.T_base_sensor[:3], np.float64)
         low = np.array([self.x_min_m, self.y_min_m, self.z_min_m])
@@ -360,7 +360,7 @@ class BodyBox(Filter):
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RangeLimit(Filter):
-    """Keep the points between two distances from the sensor; both limits stay."""
+    """Keep the points between two distances from the sensor, limits included."""
 
     min_m: float = parameter(0.5, 'Nearest, m.', low=0.0)
     max_m: float = parameter(100.0, 'Farthest, m.', low=0.0)
@@ -374,7 +374,7 @@ class RangeLimit(Filter):
             )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; nan never does."""
+        """Return which points stay; nan is dropped."""
         if self.sensor and self.sensor != scan.frame_id:
             return np.ones(len(scan), np.bool_)
         distance_sq = range_sq(scan.points)

@@ -44,7 +44,7 @@ def coordinates(scan: Scan) -> Points:
     Raises
     ------
     FilterError
-        If a coordinate is nan or infinite: such a point is nobody's neighbour.
+        If a coordinate is nan or infinite: such a point has no neighbours.
 
     """
     points = np.ascontiguousarray(scan.points, np.float64)
@@ -57,7 +57,7 @@ def coordinates(scan: Scan) -> Points:
 
 def search_tree(points: Points) -> Any:
     """Return the search tree of points, (N, 3) finite."""
-    from scipy.spatial import cKDTree  # 0.3 s, which chains without neighbours need not pay
+    from scipy.spatial import cKDTree  # 0.3 s, only for chains that search
 
     return cKDTree(points)
 
@@ -73,9 +73,9 @@ def neighbourhoods(
     points : (N, 3) float64
         Finite.
     number : int
-        Neighbours of each, the point itself or one at the same place among them; at most N.
+        Neighbours of each, including the point itself or one at the same place; at most N.
     max_distance_m : float
-        Those farther away do not count.
+        Points farther away are no neighbours.
     epsilon : float
         A neighbour may be farther than the true one by this share.
 
@@ -84,16 +84,16 @@ def neighbourhoods(
     rows : slice
         The points of the piece.
     ids : (P, number) int64
-        Rows of their neighbours; N where there are no more.
+        Rows of their neighbours; N past the last.
     distances : (P, number) float64, m
-        inf where there are no more.
+        Distances to them; inf past the last.
 
     """
     if not len(points):
         return
     in_tree = np.append(worth_searching(points, number), len(points))
     tree = search_tree(points[in_tree[:-1]])
-    # scipy's bound is exclusive, and its square must not vanish
+    # scipy's bound is exclusive, and its square must not underflow
     bound = max(float(np.nextafter(max_distance_m, math.inf)), 1e-150)
     step = max(AT_ONCE // number, 1)
     for start in range(0, len(points), step):
@@ -105,7 +105,7 @@ def neighbourhoods(
 
 
 def worth_searching(points: Points, number: int) -> Ids:
-    """Return the rows of points without those that so many others precede at the same place."""
+    """Return the rows of points, at most ``number`` of those at each place."""
     order = np.lexsort(points.T)
     ordered = points[order]
     begins = np.ones(len(points), np.bool_)
@@ -121,19 +121,19 @@ INT32_MAX = 2**31 - 1
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StatisticalOutliers(Filter):
-    """Drop the points whose mean distance to their neighbours is unusual for the scan."""
+    """Drop the points whose mean distance to their neighbours is unusually large."""
 
     num_neighbours: int = parameter(
         20, 'Neighbours of each point, itself not counted.', low=1, high=INT32_MAX
     )
     std_ratio: float = parameter(
         2.0,
-        'Distances above mean + this times standard deviation, over all points, are unusual.',
+        'Largest mean distance that stays: the mean of all plus this times their deviation.',
         low=0.0,
     )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; nan and infinite ones are refused."""
+        """Return which points stay."""
         points = coordinates(scan)
         number = min(self.num_neighbours + 1, len(points))  # the nearest is the point itself
         if number < 2 or self.std_ratio == math.inf:
@@ -148,21 +148,23 @@ class StatisticalOutliers(Filter):
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadiusOutliers(Filter):
-    """Drop the points that have too few others around them."""
+    """Drop the points with too few others within a radius."""
 
-    radius_m: float = parameter(0.5, 'How far around a point, m; the limit is in.', low=0.0)
-    min_neighbours: int = parameter(2, 'Others that have to be there.', low=0, high=INT32_MAX)
+    radius_m: float = parameter(0.5, 'Radius around a point, m, included.', low=0.0)
+    min_neighbours: int = parameter(
+        2, 'Least number of other points within it.', low=0, high=INT32_MAX
+    )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; nan and infinite ones are refused."""
+        """Return which points stay."""
         points = coordinates(scan)
-        number = self.min_neighbours + 1  # the point itself among them
+        number = self.min_neighbours + 1  # including the point itself
         if number > len(points):
             return np.zeros(len(points), np.bool_)
         if number == 1:
             return np.ones(len(points), np.bool_)
         stays = np.empty(len(points), np.bool_)
-        # whether there are so many is settled by the last of the nearest so many
+        # the farthest of the neighbours asked for decides
         for rows, _, distances in neighbourhoods(points, number, self.radius_m):
             stays[rows] = np.isfinite(distances[:, -1])
         return stays

@@ -3,10 +3,10 @@
 """
 The registry: finds a filter by our name or by libpointmatcher's.
 
-Filters of this folder are registered when one is first asked for; those of other packages by the
+Filters of this folder are registered when one is first looked up; those of other packages by the
 decorator, or by an entry point of the group ``surfel_mapper.filters`` that names the class. An
-entry point is loaded only when its name is asked for, so that a package that is broken spoils no
-chain which does without it.
+entry point is loaded only when its name is looked up, so that a broken package affects only chains
+that use it.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def register(
     Raises
     ------
     ConfigError
-        If it is no filter, filters nothing, or another filter has the name.
+        If the class is no filter, implements neither method, or the name is taken.
 
     """
     if cls is None:
@@ -82,7 +82,7 @@ def _register(cls: F, *, name: str, libpointmatcher: str) -> F:
             raise ConfigError(
                 f'filter {each!r} of {cls.__module__}: {other.__module__} has one of this name'
             )
-        _FILTERS[each] = cls  # a module that is loaded anew replaces its filters
+        _FILTERS[each] = cls  # reloading a module replaces its filters
     return cls
 
 
@@ -96,12 +96,12 @@ def load_built_in() -> None:
 
 def find(name: str) -> type[Filter]:
     """
-    Return the filter of a name, ours or libpointmatcher's.
+    Return the filter class of a name, ours or libpointmatcher's.
 
     Raises
     ------
     ConfigError
-        If there is none, with the nearest name; or an entry point of this name does not load.
+        If the name is unknown (with the nearest known one), or its entry point fails to load.
 
     """
     load_built_in()
@@ -115,7 +115,7 @@ def find(name: str) -> type[Filter]:
 
 
 def all_filters() -> list[type[Filter]]:
-    """Return every filter, sorted by name; what does not load is warned about."""
+    """Return every filter, sorted by name; log a warning for entry points that fail to load."""
     load_built_in()
     for point in entry_points(group=GROUP):
         try:
@@ -126,11 +126,11 @@ def all_filters() -> list[type[Filter]]:
 
 
 def _load_entry_point(name: str) -> bool:
-    """Register what an entry point names; return whether there is one of this name."""
+    """Register the class of an entry point; return whether there is one of this name."""
     for point in entry_points(group=GROUP, name=name):
         try:
             cls = point.load()
-        except Exception as error:  # whatever the code of another package does
+        except Exception as error:  # the code of another package may raise anything
             raise ConfigError(
                 f'filter {name!r}: entry point {point.value} does not load: {error!r}'
             ) from error

@@ -42,13 +42,13 @@ class RandomSampling(Filter):
     """Keep each point with a probability."""
 
     probability: float = parameter(
-        0.75, 'Chance of a point to stay.', low=0.0, high=1.0, libpointmatcher='prob'
+        0.75, 'Probability that a point stays.', low=0.0, high=1.0, libpointmatcher='prob'
     )
     method: int = parameter(
-        0, 'Makes no difference here.', low=0, high=1, libpointmatcher='randomSamplingMethod'
+        0, 'No effect here.', low=0, high=1, libpointmatcher='randomSamplingMethod'
     )
     seed: int = parameter(
-        -1, 'Of the random numbers.', low=-1, high=INT32_MAX, libpointmatcher='seed'
+        -1, 'Seed of the random numbers.', low=-1, high=INT32_MAX, libpointmatcher='seed'
     )
 
     def keep(self, scan: Scan) -> Mask:
@@ -60,17 +60,17 @@ class RandomSampling(Filter):
 @register(libpointmatcher='MaxPointCountDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxPointCount(Filter):
-    """Keep so many points, drawn by chance, where there are more."""
+    """Keep a number of points, drawn at random, if there are more."""
 
     seed: int = parameter(
-        1, 'Of the random numbers.', low=0, high=INT32_MAX, libpointmatcher='seed'
+        1, 'Seed of the random numbers.', low=0, high=INT32_MAX, libpointmatcher='seed'
     )
     max_points: int = parameter(
         1000, 'At most this many points stay.', low=0, high=INT32_MAX, libpointmatcher='maxCount'
     )
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the points that stay, in their order."""
+        """Return the points that stay, in their order."""
         if len(scan) <= self.max_points:
             return scan
         draws = generator(scan, self.seed).random(len(scan))
@@ -81,13 +81,13 @@ class MaxPointCount(Filter):
 @register(libpointmatcher='FixStepSamplingDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixStepSampling(Filter):
-    """Keep every n-th point, from a random one on; the step n may change from scan to scan."""
+    """Keep every n-th point from a random start; the step n may change from scan to scan."""
 
     start_step: int = parameter(
         10, 'Step at the first scan.', low=1, high=INT32_MAX, libpointmatcher='startStep'
     )
     end_step: int = parameter(
-        10, 'Step at which it stops changing.', low=1, high=INT32_MAX, libpointmatcher='endStep'
+        10, 'Step at which the change ends.', low=1, high=INT32_MAX, libpointmatcher='endStep'
     )
     step_factor: float = parameter(
         1.0,
@@ -95,13 +95,13 @@ class FixStepSampling(Filter):
         low=1e-7,
         libpointmatcher='stepMult',
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=INT32_MAX)
     _calls: Iterator[int] = field(
         default_factory=itertools.count, init=False, repr=False, compare=False
     )
 
     def step(self, calls: int) -> int:
-        """Return the step after so many scans."""
+        """Return the step after a number of scans."""
         if calls == 0 or self.step_factor == 1.0:
             return self.start_step
         with np.errstate(over='ignore', under='ignore'):
@@ -110,7 +110,7 @@ class FixStepSampling(Filter):
         return int(limit(step, float(self.end_step)))
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the points that stay; the next scan may have another step."""
+        """Return the points that stay; the next scan may have another step."""
         step = self.step(next(self._calls))
         phase = int(generator(scan, self.seed).integers(step))
         return select(scan, np.arange(phase, len(scan), step))
@@ -119,15 +119,15 @@ class FixStepSampling(Filter):
 @register(libpointmatcher='MaxDensityDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MaxDensity(Filter):
-    """Thin points by chance where they are denser than a limit; needs densities."""
+    """Thin points at random to a largest density; needs densities."""
 
     max_density: float = parameter(
-        10.0, 'Density that remains, points per m^3.', low=1e-7, libpointmatcher='maxDensity'
+        10.0, 'Largest density, points per m^3.', low=1e-7, libpointmatcher='maxDensity'
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=INT32_MAX)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=INT32_MAX)
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; those whose density is nan do not."""
+        """Return which points stay; those of density nan do not."""
         densities = self.column(scan, DENSITIES)
         draws = generator(scan, self.seed).random(len(scan))
         return np.asarray(draws * densities < self.max_density, np.bool_)
@@ -141,17 +141,17 @@ class MaxQuantileOnAxis(Filter):
     axis: int = parameter(0, '0, 1, 2: x, y, z.', low=0, high=2, libpointmatcher='dim')
     ratio: float = parameter(
         0.5,
-        'The share of points below the quantile.',
+        'Share of the points below the quantile.',
         low=1e-7,
         high=0.9999999,
         libpointmatcher='ratio',
     )
     remove_beyond: bool = parameter(
-        True, '1: keep what is below; 0: keep what is above.', libpointmatcher='removeBeyond'
+        True, '1: keep the points below it; 0: keep those above.', libpointmatcher='removeBeyond'
     )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; the one at the quantile does not, nor does a nan."""
+        """Return which points stay; those at the quantile and nan do not."""
         values = scan.points[:, self.axis]
         known = values[values == values]
         if not len(known):
@@ -164,23 +164,23 @@ class MaxQuantileOnAxis(Filter):
 UINT32_MAX = 2**32 - 1
 
 UNHELD = 1e-9
-"""Motions held by less than this share of what holds the strongest are held by rounding."""
+"""Least eigenvalue, as a share of the largest, above rounding: a constrained motion."""
 
 
 @register(libpointmatcher='NormalSpaceDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NormalSpace(Filter):
-    """Keep so many points that their normals are spread over all directions; needs normals."""
+    """Keep a number of points with normals spread over all directions; needs normals."""
 
     num_points: int = parameter(
         5000,
-        'How many stay where there are more.',
+        'Number of points that stay.',
         low=1,
         high=UINT32_MAX,
         libpointmatcher='nbSample',
     )
     seed: int = parameter(
-        1, 'Of the random numbers.', low=0, high=UINT32_MAX, libpointmatcher='seed'
+        1, 'Seed of the random numbers.', low=0, high=UINT32_MAX, libpointmatcher='seed'
     )
     step_rad: float = parameter(
         0.09817477042,
@@ -194,8 +194,8 @@ class NormalSpace(Filter):
         """
         Return the scan with the points chosen.
 
-        One point is drawn from every bucket that has any left, again and again; in the last
-        round from buckets drawn by chance.
+        In every round one point is drawn from each bucket that has any left; in the last round
+        from randomly chosen buckets.
         """
         normals = normals_of(self, scan)
         if len(scan) <= self.num_points:
@@ -206,7 +206,7 @@ class NormalSpace(Filter):
         bucket = buckets(normals[usable], self.step_rad)
         order = np.argsort(bucket, kind='stable')
         starts = np.searchsorted(bucket[order], bucket[order])
-        draw = np.arange(len(order)) - starts  # how many of its bucket were drawn before
+        draw = np.arange(len(order)) - starts  # points of its bucket drawn before
         turn = np.argsort(draw + random.random(len(order)))
         return select(scan, np.sort(usable[order[turn[: self.num_points]]]))
 
@@ -215,8 +215,8 @@ def buckets(normals: Points, step_rad: float) -> Ids:
     """
     Return the bucket of every direction, (N,) int64.
 
-    Buckets are bands about z, each cut into as many parts as make all about equally large on the
-    sphere; libpointmatcher cuts every band into as many, and draws those about z more rarely.
+    Buckets are bands about z, each divided into parts of about equal area on the sphere;
+    libpointmatcher divides every band into the same number of parts, so those about z are small.
     """
     lengths = np.sqrt((normals * normals).sum(axis=1))
     cosine = np.divide(normals[:, 2], lengths, out=np.ones_like(lengths), where=lengths > 0.0)
@@ -234,19 +234,19 @@ def buckets(normals: Points, step_rad: float) -> Ids:
 @register(libpointmatcher='CovarianceSamplingDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CovarianceSampling(Filter):
-    """Keep so many points that hold all six directions of a rigid motion; needs normals."""
+    """Keep a number of points that constrain all six rigid motions; needs normals."""
 
     num_points: int = parameter(
         5000,
-        'How many stay where there are more.',
+        'Number of points that stay.',
         low=1,
         high=UINT32_MAX,
         libpointmatcher='nbSample',
     )
     torque_norm: int = parameter(
         1,
-        'Length that rotations are measured by, 0: 1 m; 1: the mean distance of the points from '
-        'their mean; 2: the largest.',
+        'Length that scales rotations, 0: 1 m; 1: the mean distance of the points from their '
+        'mean; 2: the largest.',
         low=0,
         high=2,
         libpointmatcher='torqueNorm',
@@ -254,13 +254,13 @@ class CovarianceSampling(Filter):
 
     def apply(self, scan: Scan) -> Scan:
         """
-        Return the scan with the points chosen; nan and infinite points are refused.
+        Return the scan with the points chosen.
 
-        Point to plane distances change with translation along n and rotation along p x n. The
-        eigenvectors of the sum of their products are motions that the scan resists, strongly or
-        weakly. Again and again the one resisted least by the points chosen so far gets the point
-        that resists it most. Motions that nothing resists, as along a tunnel, are left out; in
-        libpointmatcher they get all the points.
+        Point-to-plane distances change with translation along n and rotation along p x n. The
+        eigenvectors of the sum of their outer products are motions that the scan constrains,
+        strongly or weakly. Each step takes the motion constrained least by the points chosen so
+        far and adds the point that constrains it most. Motions that nothing constrains, as along
+        a tunnel, are ignored; in libpointmatcher they get all the points.
         """
         normals, points = normals_of(self, scan), coordinates(scan)
         if len(scan) <= self.num_points:
@@ -275,7 +275,7 @@ class CovarianceSampling(Filter):
 
 
 def resistance(points: Points, normals: Points, torque_norm: int) -> Points:
-    """Return how every point resists each motion that the scan resists at all, (N, up to 6)."""
+    """Return how each point constrains each motion that the scan constrains, (N, up to 6)."""
     if not len(points):
         return np.empty((0, 6))
     arms = points - points.mean(axis=0)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filters that know how a sensor errs: noise, bias at slant angles, points between two surfaces.
+Filters with a model of the sensor: noise, bias at grazing angles, points between two surfaces.
 
 Sources: Pomerleau et al. 2012, Noise characterization of depth sensors for surface inspections,
 for the noise; Laconte et al. 2019, Lidar measurement bias estimation via return waveform
@@ -49,7 +49,7 @@ KINECT_PER_M = 0.5 * 0.00285
 @register(libpointmatcher='SimpleSensorNoiseDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimpleSensorNoise(Filter):
-    """Add simpleSensorNoise, the radius within which a point may be, m."""
+    """Add simpleSensorNoise, the noise radius of each point, m."""
 
     sensor_type: int = parameter(
         0,
@@ -80,14 +80,14 @@ class Shadow(Filter):
 
     max_angle_rad: float = parameter(
         0.1,
-        'Up to this angle to the line of sight, rad.',
+        'Points whose surface is within this angle of the line of sight are dropped, rad.',
         low=0.0,
         high=3.1416,
         libpointmatcher='eps',
     )
 
     def keep(self, scan: Scan) -> Mask:
-        """Return which points stay; one without a normal or at the origin does not."""
+        """Return which points stay; those without a normal or at the origin do not."""
         normals = self.column(with_normals(scan), NORMALS)
         sine = np.abs(dot(unit(normals), unit(scan.points)))
         return np.asarray(sine > math.sin(min(self.max_angle_rad, math.pi / 2)), np.bool_)
@@ -109,10 +109,10 @@ BIASED = {
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoveSensorBias(Filter):
     """
-    Undo the bias of surfaces hit at a slant; needs incidenceAngles and observationDirections.
+    Undo the bias of range at grazing angles; needs incidenceAngles and observationDirections.
 
-    A beam that is not infinitely thin comes back stretched from a slanted surface, so that the
-    peak which a lidar times is not where the middle of the beam hits.
+    The pulse of a beam of finite width returns stretched from an inclined surface, so that its
+    peak, which a lidar times, is not that of the beam's axis.
     """
 
     sensor_type: int = parameter(
@@ -120,14 +120,14 @@ class RemoveSensorBias(Filter):
     )
     max_angle_deg: float = parameter(
         88.0,
-        'Points hit at this angle or more are dropped, deg.',
+        'Points with this angle of incidence or more are dropped, deg.',
         low=0.0,
         high=90.0,
         libpointmatcher='angleThreshold',
     )
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the points moved along their observation directions; without an angle, none."""
+        """Return the points that have an angle, moved along their observation directions."""
         angles = self.column(scan, INCIDENCE_ANGLES)
         self.column(scan, OBSERVATION_DIRECTIONS)
         scan = select(scan, (angles >= 0.0) & (angles < math.radians(self.max_angle_deg)))
@@ -140,14 +140,14 @@ class RemoveSensorBias(Filter):
 
 def bias_m(depth_m: Array, angle: Array, aperture: float, shift: float, bend: float) -> Array:
     """
-    Return by how much too far points were measured.
+    Return the bias of the measured range, m.
 
     Parameters
     ----------
     depth_m, angle : (N,) float64
         Distance, and angle between normal and line of sight, rad.
     aperture, shift, bend : float
-        Of the sensor.
+        Constants of the sensor, see BIASED.
 
     """
     a1, a2, a3 = waveform(depth_m, angle, aperture)
@@ -161,10 +161,9 @@ def bias_m(depth_m: Array, angle: Array, aperture: float, shift: float, bend: fl
 
 def waveform(depth_m: Array, angle: Array, aperture: float) -> tuple[Array, Array, Array]:
     """
-    Return the returning pulse as a cubic in time: its coefficients but the constant one.
+    Return the coefficients of the returning pulse as a cubic in time, without the constant.
 
-    The intensity of the pulse and the width of its waist multiply all and are left out, for only
-    ratios of coefficients are used.
+    Intensity and waist of the pulse scale all of them and are left out: only ratios are used.
     """
     length = PULSE_SIGMA_S * LIGHT_M_PER_S
     tan, cos, sin = np.tan(angle), np.cos(angle), np.sin(angle)

@@ -38,21 +38,21 @@ from surfel_mapper.kernels.eigen3 import decompose
 from surfel_mapper.scan import Scan
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-"""Rows of a symmetric matrix as it is stored: xx xy xz yy yz zz."""
+"""Row and column of each stored element of a symmetric matrix: xx xy xz yy yz zz."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moments:
     """
-    What M sets of points are like.
+    Moments of M sets of points.
 
     Attributes
     ----------
     count : (M,) int64
-        Points in each.
+        Number of points in each.
     mean : (M, 3) float64, m
     covariance : (6, M) float64, m^2
-        Rows as PAIRS says.
+        Rows in the order of PAIRS.
     radius : (M,) float64, m
         Distance from the mean to the farthest point.
 
@@ -65,7 +65,7 @@ class Moments:
 
     @classmethod
     def of_groups(cls, points: Points, rows: Ids, number: int) -> Moments:
-        """Return those of groups of points, from the group of each; every group has one."""
+        """Return the moments of groups, from the group of each point; no group is empty."""
         count, mean = np.zeros(number, np.int64), np.zeros((number, 3))
         covariance, radius = np.zeros((6, number)), np.zeros(number)
         group_moments(points, rows, count, mean, covariance, radius)
@@ -73,7 +73,7 @@ class Moments:
 
     @classmethod
     def of_neighbours(cls, points: Points, ids: Ids) -> Moments:
-        """Return those of neighbours by their rows (M, K); N, after all others, where none is."""
+        """Return the moments of neighbours from their rows (M, K), padded by N at the end."""
         count, mean = np.empty(len(ids), np.int64), np.empty((len(ids), 3))
         covariance, radius = np.empty((6, len(ids))), np.empty(len(ids))
         neighbour_moments(points, ids, count, mean, covariance, radius)
@@ -81,7 +81,7 @@ class Moments:
 
     @classmethod
     def joined(cls, parts: list[Moments]) -> Moments:
-        """Return those of all parts, one after another."""
+        """Return the moments of all parts, one after another."""
         if not parts:
             return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((6, 0)), np.empty(0))
         return cls(
@@ -93,7 +93,7 @@ class Moments:
 
     @property
     def density(self) -> Points:
-        """Points per m^3 of the ball about the mean; 0 where they are all at one place."""
+        """Points per m^3 of the ball about the mean; 0 if all are at one place."""
         volume = 4.0 / 3.0 * np.pi * self.radius**3
         density = np.divide(self.count, volume, out=np.zeros(len(volume)), where=volume > 0.0)
         return np.asarray(density, np.float64)
@@ -106,14 +106,14 @@ def eigen(matrices: Points) -> tuple[Points, Points]:
     Parameters
     ----------
     matrices : (6, M) float64
-        Positive semidefinite, rows as PAIRS says.
+        Positive semidefinite, rows in the order of PAIRS.
 
     Returns
     -------
     values : (M, 3) float64
         Ascending, none negative.
     vectors : (M, 3, 3) float64
-        vectors[:, i] are of unit length and belong to values[:, i]; nan where all values are 0.
+        vectors[:, i] are of unit length and belong to values[:, i]; nan if all values are 0.
 
     """
     matrices = np.ascontiguousarray(matrices)
@@ -126,12 +126,12 @@ def eigen(matrices: Points) -> tuple[Points, Points]:
 
 
 def as_matrices(rows: Points) -> Points:
-    """Return symmetric matrices (M, 3, 3) from their rows as PAIRS says, (6, M)."""
+    """Return symmetric matrices (M, 3, 3) from their rows in the order of PAIRS, (6, M)."""
     return np.asarray(rows[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
 
 
 def unit(vectors: Points) -> Points:
-    """Return vectors (..., 3) at unit length; those of length 0 become nan."""
+    """Return vectors (..., 3) scaled to unit length; those of length 0 become nan."""
     lengths = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
     units = np.divide(vectors, lengths, out=np.full_like(vectors, np.nan), where=lengths > 0.0)
     return np.asarray(units, np.float64)
@@ -141,8 +141,8 @@ def shares(values: Points) -> Points:
     """
     Return planarity, cylindricality and sphericality from ascending eigenvalues, (M, 3).
 
-    They are in [0, 1] and at most one of them is near 1: 2 (e1 - e0), e2 - e1 and 3 e0, over the
-    sum; 0 where that is 0.
+    They are 2 (e1 - e0), e2 - e1 and 3 e0 over the sum, and 0 if the sum is 0. Each is in [0, 1],
+    and they add up to 1.
     """
     e0, e1, e2 = values.T
     total = e0 + e1 + e2
@@ -153,7 +153,7 @@ def shares(values: Points) -> Points:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShapeFilter(Filter):
-    """Base of the filters that add what the points about a point are like."""
+    """Base of the filters that add normals and eigenvectors."""
 
     keep_normals: bool = parameter(True, 'Add the column normals.', libpointmatcher='keepNormals')
     keep_eigen_values: bool = parameter(
@@ -183,14 +183,18 @@ class SurfaceNormal(ShapeFilter):
     """Add the normals of the points, and other columns, from their nearest neighbours."""
 
     num_neighbours: int = parameter(
-        5, 'Neighbours, the point itself among them.', low=3, high=2**31 - 1, libpointmatcher='knn'
+        5,
+        'Number of neighbours, including the point itself.',
+        low=3,
+        high=2**31 - 1,
+        libpointmatcher='knn',
     )
     max_distance_m: float = parameter(
-        math.inf, 'Farther ones do not count, m.', low=0.0, libpointmatcher='maxDist'
+        math.inf, 'Largest distance of a neighbour, m.', low=0.0, libpointmatcher='maxDist'
     )
     epsilon: float = parameter(
         0.0,
-        'Neighbours may be farther than the nearest by this share.',
+        'Relative error of the distance of neighbours that the search may make.',
         low=0.0,
         libpointmatcher='epsilon',
     )
@@ -210,14 +214,14 @@ class SurfaceNormal(ShapeFilter):
         libpointmatcher='keepMeanDist',
     )
     sort_eigen: bool = parameter(
-        False, 'Makes no difference here: eigenvalues always ascend.', libpointmatcher='sortEigen'
+        False, 'No effect here: eigenvalues always ascend.', libpointmatcher='sortEigen'
     )
     smooth_normals: bool = parameter(
         False, 'Average the normals over the neighbours.', libpointmatcher='smoothNormals'
     )
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the columns added; nan and infinite points are refused."""
+        """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))
         ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
@@ -241,21 +245,21 @@ class SurfaceNormal(ShapeFilter):
 
     @property
     def needs_ids(self) -> bool:
-        """Whether the neighbours are wanted once all are known."""
+        """Whether the neighbours of all points are needed at the end."""
         return self.keep_matched_ids or self.smooth_normals
 
 
 def smoothed(normals: Points, ids: npt.NDArray[np.int32]) -> Points:
     """
-    Return the mean directions of normals (N, 3) over neighbours (N, K), -1 where there is none.
+    Return the mean directions of normals (N, 3) over neighbours (N, K), padded by -1.
 
-    A normal and its opposite are one: each neighbour's is turned to the side of the point's own.
+    A normal and its opposite are equivalent: each is turned to the side of the point's own.
     """
     total = np.zeros_like(normals)
     known = np.isfinite(normals[:, 0])
     for column in ids.T:
         counts = (column >= 0) & known[column]
-        theirs = np.where(counts[:, None], normals[column], 0.0)
-        side = np.einsum('ni,ni->n', theirs, normals)
-        total += np.where(side < 0.0, -1.0, 1.0)[:, None] * theirs
+        others = np.where(counts[:, None], normals[column], 0.0)
+        side = np.einsum('ni,ni->n', others, normals)
+        total += np.where(side < 0.0, -1.0, 1.0)[:, None] * others
     return unit(np.where(known[:, None], total, np.nan))

@@ -44,16 +44,16 @@ Columns = dict[str, npt.NDArray[Any]]
 @dataclass(frozen=True, slots=True, eq=False)
 class Votes:
     """
-    The votes that points have received, as eigenvalues and eigenvectors.
+    Sums of the votes for points, as eigenvalues and eigenvectors.
 
     Attributes
     ----------
     values : (N, 3) float64
-        Ascending; all 0 where no neighbour is near enough.
+        Ascending; all 0 if no neighbour is near enough.
     vectors : (N, 3, 3) float64
-        vectors[:, i] belong to values[:, i]; nan where all values are 0.
+        vectors[:, i] belong to values[:, i]; nan if all values are 0.
     num_neighbours : int
-        How many could vote.
+        Number of possible votes for a point.
 
     """
 
@@ -63,13 +63,13 @@ class Votes:
 
     @property
     def saliencies(self) -> Points:
-        """Of junction, curve and surface, (N, 3)."""
+        """Saliencies of junction, curve and surface, (N, 3)."""
         low, middle, high = self.values.T
         return np.stack([low, middle - low, high - middle], axis=1) / max(self.num_neighbours, 1)
 
     @property
     def tensors(self) -> Points:
-        """What is known of the points for another round: sticks and plates, no balls; (N, 6)."""
+        """Tensors for another round: sticks and plates, without balls; (N, 6)."""
         _, curve, surface = self.saliencies.T
         _, second, normal = (np.nan_to_num(self.vectors[:, i]).T for i in range(3))
         rows = [
@@ -79,7 +79,7 @@ class Votes:
         return np.ascontiguousarray(np.stack(rows, axis=1))
 
     def columns(self, *, normals: bool, labels: bool, tensors: bool) -> Columns:
-        """Return the columns that libpointmatcher names so."""
+        """Return the columns, with the names of libpointmatcher."""
         saliencies = self.saliencies
         columns: Columns = dict(
             zip(('pointness', 'curveness', 'surfaceness'), saliencies.T, strict=True)
@@ -99,7 +99,7 @@ class Votes:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Voting:
-    """Points and who votes for whom."""
+    """Points and the neighbours that vote for each."""
 
     points: Points
     ids: npt.NDArray[np.int32]
@@ -107,7 +107,7 @@ class Voting:
 
     @classmethod
     def among(cls, points: Points, num_neighbours: int, sigma: float) -> Voting:
-        """Return the voting in which so many nearest neighbours vote for each point."""
+        """Return the voting in which num_neighbours nearest neighbours vote for each point."""
         number = min(num_neighbours + 1, len(points))  # the nearest is the point itself
         ids = np.empty((len(points), number), np.int32)
         for rows, near, _ in neighbourhoods(points, number):
@@ -115,18 +115,18 @@ class Voting:
         return cls(points, ids, sigma)
 
     def first(self) -> Votes:
-        """Return the votes where nothing is known of the voters, sparse."""
+        """Return the votes of voters without tensors, sparse."""
         votes = np.empty((6, len(self.points)))
         first_votes(self.points, self.ids, self.sigma, votes)
         return self._decomposed(votes)
 
     def balls(self) -> Votes:
-        """Return the votes in closed form where nothing is known of the voters."""
+        """Return the votes of voters without tensors, in closed form."""
         ball = np.array([float(i == j) for i, j in PAIRS])
         return self.again(np.tile(ball, (len(self.points), 1)))
 
     def again(self, tensors: Points) -> Votes:
-        """Return the votes of voters of which tensors (N, 6) are known."""
+        """Return the votes of voters with tensors (N, 6)."""
         votes = np.empty((6, len(self.points)))
         closed_form_votes(self.points, self.ids, tensors, self.sigma, votes)
         return self._decomposed(votes)
@@ -144,7 +144,7 @@ class VotingFilter(Filter):
     )
     sigma: float = parameter(
         0.2,
-        'Scale of the votes: at d m they count exp(-d^2 / sigma), beyond 3 sigma m nothing.',
+        'Scale of the votes: exp(-d^2 / sigma) at a distance of d m, none beyond 3 sigma m.',
         low=0.0,
         libpointmatcher='sigma',
     )
@@ -161,7 +161,7 @@ class VotingFilter(Filter):
     )
 
     def with_votes(self, scan: Scan, votes: Votes, **more: npt.NDArray[Any]) -> Scan:
-        """Return the scan with the columns asked for."""
+        """Return the scan with the selected columns."""
         columns = votes.columns(
             normals=self.keep_normals, labels=self.keep_labels, tensors=self.keep_tensors
         )
@@ -174,20 +174,20 @@ class VotingFilter(Filter):
 @register(libpointmatcher='SaliencyDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Saliency(VotingFilter):
-    """Add surfaceness, curveness and pointness, by tensor voting, and what follows from them."""
+    """Add surfaceness, curveness and pointness by tensor voting, with normals and labels."""
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the columns added; nan and infinite points are refused."""
+        """Return the scan with the columns added."""
         voting = Voting.among(coordinates(scan), self.num_neighbours, self.sigma)
         return self.with_votes(scan, voting.again(voting.first().tensors))
 
 
 EVEN = 5
-"""Fewer points to go in a round mean that the density is even."""
+"""If fewer points are dropped in a round, the density is even."""
 
 
 RATIOS = np.array([[0.5, 1.0], [0.75, 0.75], [1.0, 1.0]])
-"""Of the smallest and the middle eigenvalue to the largest on a curve, a surface, in space."""
+"""Ratios of the smallest and middle eigenvalue to the largest: on a curve, a surface, in space."""
 
 
 @register(libpointmatcher='SpectralDecompositionDataPointsFilter')
@@ -197,22 +197,22 @@ class SpectralDecomposition(VotingFilter):
 
     radius_m: float = parameter(
         0.4,
-        'Within this of a point, half of it on curves, its neighbours are to be spread, m.',
+        'Radius that the neighbours of a point should fill, half of it on curves, m.',
         low=0.0,
         libpointmatcher='radius',
     )
     max_iterations: int = parameter(
-        10, 'Rounds of thinning at most.', low=1, high=2**32 - 1, libpointmatcher='itMax'
+        10, 'At most this many rounds of thinning.', low=1, high=2**32 - 1, libpointmatcher='itMax'
     )
     keep_lambdas: bool = parameter(
         True,
         'Add lambda1, lambda2, lambda3, the eigenvalues, descending.',
         libpointmatcher='keepLambdas',
     )
-    seed: int = parameter(0, 'Of the random numbers.', low=0, high=2**31 - 1)
+    seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the points that stay, with the columns; nan and infinite points are refused."""
+        """Return the points that stay, with the columns."""
         points, random = coordinates(scan), generator(scan, self.seed)
         rows = np.arange(len(points))
         voting, votes = self.vote(points)
@@ -233,14 +233,14 @@ class SpectralDecomposition(VotingFilter):
         return self.with_votes(select(scan, rows[voted_for]), votes, **lambdas)
 
     def vote(self, points: Points) -> tuple[Voting, Votes]:
-        """Return the votes where nothing is known of the points."""
+        """Return the votes of points without tensors."""
         voting = Voting.among(points, self.num_neighbours, self.sigma)
         return voting, voting.balls()
 
     def stays(self, votes: Votes, random: np.random.Generator) -> Mask:
         """Return which points stay for the next round."""
         lowest, middle, highest = votes.values.T / votes.num_neighbours
-        with np.errstate(invalid='ignore'):  # nan where there are no votes: then not dense either
+        with np.errstate(invalid='ignore'):  # nan without votes, then not dense
             ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
         nearest = ((ratios[:, None] - RATIOS) ** 2).sum(axis=2).argmin(axis=1)
         expected = np.array(
@@ -261,15 +261,15 @@ def mean_decay(dimension: int, sigma: float, radius_m: float) -> float:
     Parameters
     ----------
     dimension : int
-        1 for a ball on a curve, 2 on a surface, 3 in space.
+        1 on a curve, 2 on a surface, 3 in space.
     sigma : float
         Scale, m^2.
     radius_m : float
-        Of the ball.
+        Radius of the ball.
 
     """
     t = math.inf if sigma == 0.0 else radius_m / math.sqrt(sigma)
-    if not 1e-3 < t < math.inf:  # so near the limits that the formulas lose more than they add
+    if not 1e-3 < t < math.inf:  # rounding exceeds the difference to the limit
         return 0.0 if t == math.inf else 1.0
     if dimension == 1:
         return math.sqrt(math.pi) * math.erf(t) / (2.0 * t)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scans for the tests of filters, and filters by what a chain says of them."""
+"""Scans for the tests of filters, and filters made from an item of a chain."""
 
 from __future__ import annotations
 

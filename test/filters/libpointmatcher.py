@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What libpointmatcher registers: filters, parameters, defaults and bounds, restated as data.
+The filters, parameters, defaults and bounds that libpointmatcher registers, restated as data.
 
-Each parameter is (default, low, high), None for low and high where it checks no bounds; types
+Each parameter is (default, low, high), None for low and high if it checks no bounds; types
 are those of the defaults. Flags are True and False.
 """
 
@@ -178,4 +178,4 @@ NARROWER = {
     ('SimpleSensorNoise', 'sensorType'): (0, 4),
     **dict.fromkeys([('Gestalt', f'vSize{axis}') for axis in 'XYZ'], (0.001, inf)),
 }
-"""Where values within its bounds are refused there nevertheless, and here by the bounds."""
+"""Bounds here that are narrower: libpointmatcher refuses values within its own bounds."""

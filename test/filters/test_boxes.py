@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Boxes and what is sampled from them: SamplingSurfaceNormal, Ellipsoids."""
+"""SamplingSurfaceNormal and Ellipsoids: boxes and the points sampled from them."""
 
 from __future__ import annotations
 

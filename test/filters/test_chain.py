@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Chains: what their YAML may be, as libpointmatcher reads it; what they report and refuse."""
+"""Chains: the YAML that libpointmatcher reads, reports and refusals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_a_chain_runs_in_the_order_of_its_list(tmp_path):
     assert chain.filters[3] == VoxelGrid(size_x_m=0.25, size_y_m=0.5)
 
 
-def test_what_each_filter_did_is_told():
+def test_steps_report_points_and_time_of_each_filter():
     chain = Chain.from_list(['remove_nan', {'bounding_box': {'x_max_m': 5.0}}, 'max_dist'])
     points = [[np.nan, 0.0, 0.0], [0.5, 0.0, 0.0], [7.0, 0.0, 0.0], [0.0, 0.0, -9.0]]
     scan, steps = chain.run(scan_of(points, row=np.arange(4)))
@@ -90,12 +90,12 @@ def test_an_empty_file_is_a_chain_that_changes_nothing(tmp_path, text):
         ('- range_limit: {min_m: 5, max_m: 1}', 'max_m: 1, expected at least min_m'),
     ],
 )
-def test_what_is_no_chain_is_refused_in_words(tmp_path, text, expected):
+def test_content_that_is_no_chain_is_refused_in_words(tmp_path, text, expected):
     with pytest.raises(ConfigError, match=expected):
         load(tmp_path, text)
 
 
-def test_of_a_key_that_stands_twice_the_last_counts(tmp_path):
+def test_the_last_of_repeated_keys_counts(tmp_path):
     chain = load(tmp_path, '- VoxelGridDataPointsFilter: {vSizeX: 1, vSizeX: 2}')
     assert chain.filters[0].size_x_m == 2.0
 

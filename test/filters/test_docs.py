@@ -37,7 +37,7 @@ def test_the_chain_loads(tmp_path):
 def test_the_example_of_an_own_filter_runs_and_is_checked_like_others(tmp_path, monkeypatch):
     (tmp_path / 'documented_filter.py').write_text('\n'.join(blocks('python')))
     monkeypatch.syspath_prepend(tmp_path)
-    module = import_module('documented_filter')  # asserts what the page says
+    module = import_module('documented_filter')  # runs the assertions of the page
     assert registry.find('drop_dim') is module.DropDim
     with pytest.raises(ConfigError, match=r'min_intensity: -1, expected a value in \[0, inf\]'):
         Chain.from_list([{'drop_dim': {'min_intensity': -1}}])

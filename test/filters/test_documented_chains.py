@@ -207,7 +207,7 @@ def test_the_filters_of_the_registration_tutorial_thin_and_add_normals(tmp_path)
     np.testing.assert_array_equal(found.points, room().points)
 
 
-def test_what_is_no_filter_of_points_is_refused_by_name(tmp_path):
+def test_modules_that_are_no_filters_of_points_are_refused_by_name(tmp_path):
     with pytest.raises(ConfigError, match='TrimmedDistOutlierFilter: no such filter'):
         run(tmp_path, ICP, 'outlierFilters')
     with pytest.raises(ConfigError, match=r'a mapping, .*#readingDataPointsFilters'):

@@ -86,7 +86,7 @@ def test_relief_holds_mean_and_variance_of_heights_by_ring_and_sector():
     np.testing.assert_array_equal(variances, expected)
 
 
-def test_what_is_not_asked_for_is_not_added():
+def test_columns_not_asked_for_are_not_added():
     flags = {'keepNormals': 0, 'keepGestaltFeatures': 0, 'keepMeans': 1, 'keepCovariances': 1}
     found = filter_of(NAME, **EVERY, **flags, keepEigenValues=1).apply(scan_of(steps())).columns
     assert {name: column.shape[1] for name, column in found.items()} == {

@@ -61,7 +61,7 @@ def test_a_ramp_is_ground_where_the_slope_may_be_as_steep():
 
 
 @pytest.mark.parametrize('tilt_deg', [0.0, 30.0])
-def test_what_is_higher_than_the_limit_above_the_robot_is_no_ground(tilt_deg):
+def test_surfaces_above_the_height_limit_are_no_ground(tilt_deg):
     scan = room(tilt_deg)
     scan = replace(scan, T_base_sensor=scan.T_map_sensor)  # the robot stands on the floor
     floor, _, _, table = shares(scan, max_height_m=0.5)
@@ -93,7 +93,7 @@ def test_a_thin_line_of_points_or_too_few_have_no_slope():
     assert filter_of('ground', min_points=4).apply(scan_of(corner)).columns['ground'].all()
 
 
-def test_what_is_not_known_of_the_sensor_is_named():
+def test_an_unknown_pose_of_the_sensor_is_named():
     scan = room()
     with pytest.raises(FilterError, match="pose of 'sensor' in the fixed frame is not known"):
         filter_of('ground').apply(replace(scan, T_map_sensor=None))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A chain in the pipeline: what filters learn of the robot, and what is reported of them."""
+"""A chain in the pipeline: poses for filters, and the report of points and times."""
 
 from __future__ import annotations
 

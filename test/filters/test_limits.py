@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Filters by place: what is in, what is out, what lies on the limit, what nan does."""
+"""Filters by position and direction, against the coordinates and angles themselves."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from surfel_mapper.errors import ConfigError, FilterError
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
 NAN, INF = np.nan, np.inf
@@ -27,7 +30,7 @@ def test_remove_nan_drops_points_with_a_nan_in_any_coordinate_and_keeps_infinite
     assert kept('RemoveNaNDataPointsFilter', points) == [0, 4, 5]
 
 
-def test_where_nothing_is_removed_the_scan_itself_comes_back():
+def test_the_scan_itself_is_returned_if_all_points_stay():
     scan = random_scan(10)
     assert filter_of('remove_nan').apply(scan) is scan
 
@@ -69,7 +72,7 @@ def test_distances_are_limited_strictly_on_both_sides(dtype):
     assert kept('DistanceLimitDataPointsFilter', points, dist=5, removeInside=0) == [0]
 
 
-def test_of_a_negative_distance_the_size_counts():
+def test_a_negative_distance_counts_by_its_absolute_value():
     assert kept('MaxDistDataPointsFilter', LINE, maxDist=-5.01) == [0, 1, 2]
     assert kept('DistanceLimitDataPointsFilter', LINE, dist=-5) == [3]
 
@@ -99,3 +102,161 @@ def test_all_can_be_removed():
     scan = scan_of([[0.0, 0.0, 0.0]], intensity=[1.0])
     found = filter_of('bounding_box').apply(scan)
     assert (found.points.shape, found.columns['intensity'].shape) == ((0, 3), (0,))
+
+
+INF = np.inf
+
+RNG = np.random.default_rng(3)
+BALL = RNG.normal(size=(2000, 3))
+X, Y, Z = BALL.T
+PHI = np.degrees(np.arctan2(Y, X))
+THETA = np.degrees(np.arccos(Z / np.sqrt(X * X + Y * Y + Z * Z)))
+
+
+@pytest.mark.parametrize(
+    ('phi', 'theta'),
+    [
+        ((-30.0, 60.0), (20.0, 110.0)),
+        ((90.0, 180.0), (0.0, 180.0)),
+        ((-180.0, -90.0), (0.0, 45.0)),
+        ((-170.0, 170.0), (100.0, 179.0)),
+        ((-INF, INF), (80.0, INF)),
+        ((-200.0, 10.0), (-5.0, 200.0)),
+        ((50.0, 20.0), (0.0, 180.0)),
+    ],
+)
+def test_angle_limit_keeps_what_is_beyond_or_within_the_angles(phi, theta):
+    limits = dict(zip(('phiMin', 'phiMax', 'thetaMin', 'thetaMax'), (*phi, *theta), strict=True))
+    inside = (phi[0] < PHI) & (phi[1] > PHI) & (theta[0] < THETA) & (theta[1] > THETA)
+    outside = (phi[1] < PHI) | (phi[0] > PHI) | (theta[1] < THETA) | (theta[0] > THETA)
+    name = 'AngleLimitDataPointsFilter'
+    assert kept(name, BALL, **limits, removeInside=0) == np.flatnonzero(inside).tolist()
+    assert kept(name, BALL, **limits, removeInside=1) == np.flatnonzero(outside).tolist()
+
+
+def test_under_libpointmatchers_name_the_defaults_remove_nothing_and_under_ours_all():
+    assert len(kept('AngleLimitDataPointsFilter', BALL)) == len(BALL)
+    assert kept('angle_limit', BALL) == []
+
+
+def test_on_an_axis_there_is_no_angle():
+    points = [[0.0, 0.0, 5.0], [0.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]
+    assert kept('angle_limit', points, phi_min_deg=-90.0, remove_inside=False) == []
+    assert kept('angle_limit', points, phi_min_deg=-90.0, phi_max_deg=90.0) == []
+
+
+@pytest.mark.parametrize(
+    ('azimuth', 'elevation'),
+    [
+        ((-45.0, 45.0), (-90.0, 90.0)),
+        ((100.0, 260.0), (-20.0, 30.0)),
+        ((-180.0, 180.0), (-25.0, 3.0)),
+        ((-10.0, 300.0), (-90.0, 0.0)),
+        ((-270.0, -200.0), (0.0, 90.0)),
+        ((0.0, 180.0), (10.0, 40.0)),
+    ],
+)
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_field_of_view_keeps_what_a_sensor_would_see(azimuth, elevation, dtype):
+    points = BALL.astype(dtype)
+    x, y, z = points.T.astype(np.float64)
+    turn = (np.degrees(np.arctan2(y, x)) - azimuth[0]) % 360.0
+    height = np.degrees(np.arctan2(z, np.hypot(x, y)))
+    seen = (turn <= azimuth[1] - azimuth[0]) & (elevation[0] <= height) & (height <= elevation[1])
+    found = kept(
+        'field_of_view',
+        points,
+        azimuth_min_deg=azimuth[0],
+        azimuth_max_deg=azimuth[1],
+        elevation_min_deg=elevation[0],
+        elevation_max_deg=elevation[1],
+    )
+    assert found == np.flatnonzero(seen).tolist()
+
+
+def test_the_edges_of_a_field_of_view_are_in_it():
+    points = [[1.0, 1.0, 0.0], [1.0, -1.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
+    assert kept('field_of_view', points, azimuth_min_deg=-90, azimuth_max_deg=45) == [0, 1, 3]
+    assert kept('field_of_view', points, elevation_min_deg=0, elevation_max_deg=0) == [0, 1, 2, 3]
+
+
+def test_nothing_is_seen_at_the_sensor_or_where_no_place_is():
+    points = [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [INF, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    assert kept('field_of_view', points) == [3]
+
+
+def test_a_field_of_view_may_be_that_of_one_sensor():
+    narrow = {'azimuth_min_deg': -1.0, 'azimuth_max_deg': 1.0}
+    points = [[-1.0, 0.0, 0.0]]
+    assert kept('field_of_view', points, **narrow, sensor='another') == [0]
+    assert kept('field_of_view', points, **narrow, sensor='sensor') == []
+
+
+@pytest.mark.parametrize(
+    ('settings', 'expected'),
+    [
+        ({'azimuth_min_deg': 10, 'azimuth_max_deg': 10}, 'azimuth_max_deg: 10, expected more'),
+        ({'azimuth_min_deg': -200}, 'by up to 360'),
+        ({'elevation_min_deg': 5, 'elevation_max_deg': 4}, 'elevation_max_deg: 4, expected at l'),
+    ],
+)
+def test_a_field_that_holds_nothing_or_comes_round_is_refused(settings, expected):
+    with pytest.raises(ConfigError, match=expected):
+        filter_of('field_of_view', **settings)
+
+
+NS = 10**18
+
+
+def kept_rows(name, scan, /, **parameters):
+    scan = replace(scan, columns={**scan.columns, 'row': np.arange(len(scan))})
+    return filter_of(name, **parameters).apply(scan).columns['row'].tolist()
+
+
+def test_the_body_box_stands_in_the_frame_of_the_robot():
+    # the sensor is 1 m ahead of the robot and 2 m up, and looks to the left
+    T_base_sensor = np.array(
+        [[0.0, -1.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 2.0], [0, 0, 0, 1.0]]
+    )
+    points = [[0.0, 1.0, -2.0], [0.0, 0.0, 0.0], [0.5, 0.5, -2.5], [np.nan, 0, 0], [0, 0, -2.0]]
+    scan = replace(scan_of(points), T_base_sensor=T_base_sensor)
+    in_base = [(0.0, 0.0, 0.0), (1.0, 0.0, 2.0), (0.5, 0.5, -0.5), None, (1.0, 0.0, 0.0)]
+    inside = [i for i, p in enumerate(in_base) if p is not None and max(map(abs, p)) < 1.0]
+    assert kept_rows('body_box', scan, remove_inside=False) == inside == [0, 2]
+    assert kept_rows('body_box', scan) == [1, 4]  # a face is outside, a nan nowhere
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_a_turned_body_box_keeps_what_numpy_says(dtype):
+    rng = np.random.default_rng(2)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, [0.3, -0.2, 1.0]
+    scan = replace(random_scan(3000, dtype=dtype), T_base_sensor=pose)
+    in_base = scan.points.astype(np.float64) @ rotation.T + pose[:3, 3]
+    outside = ~(np.abs(in_base) < 1.0).all(axis=1)
+    assert 0 < np.count_nonzero(outside) < 3000
+    assert kept_rows('body_box', scan) == np.flatnonzero(outside).tolist()
+
+
+def test_without_the_place_of_the_sensor_the_body_box_says_how_to_give_it():
+    scan = replace(random_scan(3), T_base_sensor=None)
+    with pytest.raises(FilterError, match=r"'sensor' on the robot is not known; set frames.base"):
+        filter_of('body_box').apply(scan)
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_range_limit_keeps_both_limits(dtype):
+    points = np.array(
+        [[0.0, 0, 0], [0, 3, 4], [0, 0, 5.001], [6, 0, 8], [0, 10.01, 0], [np.nan, 0, 0]], dtype
+    )
+    assert kept('range_limit', points, min_m=5.0, max_m=10.0) == [1, 2, 3]
+    assert kept('range_limit', points, min_m=0.0, max_m='inf') == [0, 1, 2, 3, 4]
+
+
+def test_range_limit_may_be_for_one_sensor():
+    points = [[50.0, 0.0, 0.0]]
+    assert kept('range_limit', points, max_m=10.0, sensor='sensor') == []
+    assert kept('range_limit', points, max_m=10.0, sensor='another') == [0]
+    with pytest.raises(ConfigError, match=r'max_m: 1, expected at least min_m \(2\)'):
+        filter_of('range_limit', min_m=2.0, max_m=1.0)

@@ -31,7 +31,7 @@ def test_neighbours_are_the_nearest_and_begin_with_the_point_itself(number):
     np.testing.assert_allclose(distances, np.sort(apart, axis=1)[:, :number], atol=1e-15)
 
 
-def test_those_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
+def test_points_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
     ids, distances = all_neighbours(points, 3, 1.0)
     assert ids.tolist() == [[0, 1, 3], [1, 0, 3], [2, 3, 3]]
@@ -85,7 +85,7 @@ def test_eigenvalues_and_eigenvectors_rebuild_the_matrix(scale):
     assert (largest > 0.0).all()
 
 
-def test_of_nothing_there_are_no_eigenvectors():
+def test_no_matrices_have_no_eigenvectors():
     values, vectors = eigen(np.zeros((6, 1)))
     assert values.tolist() == [[0.0] * 3]
     assert np.isnan(vectors).all()
@@ -125,7 +125,7 @@ def test_on_a_sphere_normals_are_radial():
     assert np.median(np.degrees(np.arccos(np.minimum(cosine, 1.0)))) < 1.0
 
 
-def test_what_else_neighbours_say_is_added_where_asked():
+def test_further_columns_of_neighbours_are_added_on_request():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [0.0, 2.0, 0], [10.0, 0, 0]])
     found = (
         filter_of(

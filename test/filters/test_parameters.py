@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How values and texts become parameters, and what is refused."""
+"""Parameters of filters: values, texts and refusals."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Finding filters: by either name, by decorator, by entry point; and what is refused."""
+"""Registration and look-up of filters: either name, decorator, entry point, refusals."""
 
 from __future__ import annotations
 

@@ -99,7 +99,7 @@ def test_planes_lines_and_clouds_are_told_apart():
     )
     assert (columns['labels'][plane] == SURFACE).all()
     assert (columns['labels'][line] == CURVE).all()
-    # within an even cloud nobody knows a direction to vote for
+    # within an even cloud no direction is preferred
     assert columns['surfaceness'][ball].max() < 0.01 * columns['surfaceness'][plane].min()
     assert columns['curveness'][ball].max() < 0.01 * columns['curveness'][line].min()
     inside = middle(found.points, [50.0, 0, 0])

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Cut the space of points into boxes that hold few each.
+Cut the space of points into boxes of few points each.
 
-A box is cut at the middle one of its points across its longest edge, found by partial sorting: 14
+A box is cut at the median of its points across its longest edge, found by partial sorting: 14
 levels for 131,072 points and boxes of 10, and every level touches each point two or three times.
-Points of equal coordinate are told apart by their rows, so that every order of work gives the
-same boxes.
+Points of equal coordinate are ordered by their rows, so that the boxes do not depend on the
+order of work.
 
 Source: Hoare 1961 (Algorithm 65: find) for the partial sorting.
 """
@@ -15,13 +15,13 @@ from numba import njit
 import numpy as np
 
 DEPTH = 64
-"""Boxes that wait to be cut; each cut leaves one waiting, and halves what is cut next."""
+"""Depth of the stack of boxes to be cut; each cut pushes one and halves the next."""
 
 
 @njit(cache=True, nogil=True)
 def cut(points, max_points, order, rows):
     """
-    Cut until no box has more than max_points; return how many boxes.
+    Cut until no box has more than max_points; return the number of boxes.
 
     points  (N, 3) float64, finite
     order   (N,) int64, in: 0 to N - 1, out: the points box by box
@@ -45,7 +45,7 @@ def cut(points, max_points, order, rows):
         axis = (highs[box] - lows[box]).argmax()
         middle = last - (last - first) // 2
         split(points, axis, order, first, last, middle)
-        # the upper part waits in the place of the box, the lower comes next
+        # the upper part replaces the box on the stack, the lower one is cut next
         lower = waiting
         lows[lower], highs[lower] = lows[box], highs[box]
         spans[lower, 0], spans[lower, 1] = first, middle
@@ -57,9 +57,9 @@ def cut(points, max_points, order, rows):
 
 @njit(cache=True, nogil=True)
 def split(points, axis, order, first, last, middle):
-    """Move order[first:last] about until none before middle comes after one from there on."""
+    """Partition order[first:last] at middle."""
     low, high = first, last - 1
-    chance = np.uint32(last - first)  # for pivots that no order of the points can foresee
+    chance = np.uint32(last - first)  # pseudo-random pivots: no input order is slow
     while low < high:
         chance = chance * np.uint32(1664525) + np.uint32(1013904223)
         pivot = order[low + np.int64(chance >> np.uint32(8)) % (high - low + 1)]

@@ -15,12 +15,12 @@ import numpy as np
 @njit(cache=True, nogil=True, error_model='numpy')
 def outside_box(xyz, pose, low, high, is_outside):
     """
-    Find which points lie outside of a box or on its faces, and which nowhere.
+    Find which points lie outside of a box or on its faces.
 
     xyz         (3, N) float32 or float64, m
     pose        (3, 4) float64, takes points to the frame of the box
     low, high   (3,) float64, corners of the box, m
-    is_outside  (N,) int8, out: 1 outside, 0 inside, -1 where a nan leaves it open
+    is_outside  (N,) int8, out: 1 outside, 0 inside, -1 undecided because of nan
     """
     r00, r01, r02, t0 = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     r10, r11, r12, t1 = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
@@ -39,7 +39,7 @@ def outside_box(xyz, pose, low, high, is_outside):
 
 
 NEVER, ALWAYS, BOTH, EITHER = range(4)
-"""How an angle compares with a limit: as its range says, or by side and edge."""
+"""How an angle compares with a limit: constant, or by side and edge."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -50,9 +50,9 @@ def in_field_of_view(xyz, edges, has_azimuth, is_wide, has_low, has_high, seen):
     xyz      (3, N) float32 or float64, m
     edges    (6,) of the type of xyz: cosine and sine of the start of the azimuth, of its end;
              tangents of the lowest and of the highest elevation
-    has_azimuth, has_low, has_high  whether these limit anything
+    has_azimuth, has_low, has_high  whether these bounds apply
     is_wide  whether the azimuth is more than half a turn
-    seen     (N,) bool, out; never at the origin or where a coordinate is not finite
+    seen     (N,) bool, out; false at the origin and for coordinates that are not finite
     """
     start_cos, start_sin, end_cos, end_sin = edges[0], edges[1], edges[2], edges[3]
     low, high = edges[4], edges[5]
@@ -77,8 +77,8 @@ def in_wedge(xyz, cosines, kinds, want_all, found):
     xyz       (3, N) float32 or float64, m
     cosines   (4,) of the type of xyz, of the limits: phi above, phi below, theta above, below
     kinds     (4,) int64: for phi any, for theta NEVER, ALWAYS or BOTH
-    want_all  whether all four have to hold, or one of them
-    found     (N,) bool, out; an angle that is not defined is beyond nothing
+    want_all  whether all four must hold, or any
+    found     (N,) bool, out; an undefined angle is beyond no limit
     """
     c0, c1, c2, c3 = cosines[0], cosines[1], cosines[2], cosines[3]
     always0, both0, either0 = kinds[0] == ALWAYS, kinds[0] == BOTH, kinds[0] == EITHER

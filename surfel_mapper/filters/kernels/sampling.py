@@ -1,9 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Choose points one by one, each for the motion that those chosen before hold least.
+Choose points one by one, each for the motion constrained least so far.
 
-Every choice depends on all before it, which numpy cannot do at once.
+Every choice depends on all before it, so numpy cannot vectorise it. Alone in its module because
+it is the one compiled loop of filters/sampling.py.
 """
 
 from numba import njit
@@ -15,8 +16,8 @@ def choose(resists, by_motion, number, chosen):
     """
     Choose points.
 
-    resists    (N, M) float64, how each point resists each motion
-    by_motion  (M, N) int64, points by how much they resist a motion, most first
+    resists    (N, M) float64, how much each point constrains each motion
+    by_motion  (M, N) int64, points sorted by that, most first
     number     points to choose, at most N
     chosen     (N,) bool, in: false, out: whether chosen
     """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What several points are like: moments of groups and of neighbours, and eigenvectors.
+Moments of groups and of neighbours, and eigenvectors.
 
-In one loop, where numpy needs the coordinates of all neighbours in memory and a pass for each of
-two dozen products: a tenth of the time.
+One loop takes a tenth of the time of numpy, which needs the coordinates of all neighbours in
+memory and a pass for each of two dozen products.
 """
 
 import math
@@ -15,10 +15,10 @@ from numba import njit
 @njit(cache=True, nogil=True, error_model='numpy')
 def group_moments(points, rows, count, mean, covariance, radius):
     """
-    Find the moments of groups of points.
+    Compute the moments of groups of points.
 
     points      (N, 3) float64, m
-    rows        (N,) int32 or int64, the group of every point; every group has one
+    rows        (N,) int32 or int64, group of every point; no group is empty
     count       (M,) int64, in: 0, out: points in each
     mean        (M, 3) float64, in: 0, out, m
     covariance  (6, M) float64, in: 0, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
@@ -53,11 +53,11 @@ def group_moments(points, rows, count, mean, covariance, radius):
 @njit(cache=True, nogil=True, error_model='numpy')
 def neighbour_moments(points, ids, count, mean, covariance, radius):
     """
-    Find the moments of the neighbours of points.
+    Compute the moments of the neighbours of points.
 
     points      (N, 3) float64, m
-    ids         (P, K) int64, rows of the neighbours; N where there is none, after all others
-    count       (P,) int64, out: how many there are
+    ids         (P, K) int64, rows of the neighbours, padded by N at the end
+    count       (P,) int64, out: number of neighbours
     mean        (P, 3) float64, out, m
     covariance  (6, P) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
     radius      (P,) float64, out: from the mean to the farthest, m
@@ -94,16 +94,16 @@ def neighbour_moments(points, ids, count, mean, covariance, radius):
 @njit(cache=True, nogil=True, error_model='numpy')
 def eigenvectors(matrices, values, smallest, vectors):
     """
-    Find all eigenvectors from those of the smallest eigenvalues.
+    Compute all eigenvectors from those of the smallest eigenvalues.
 
     matrices  (6, M) float64, symmetric, xx xy xz yy yz zz
     values    (3, M) float64, their eigenvalues, ascending
     smallest  (3, M) float64, unit eigenvectors of values[0]
     vectors   (M, 3, 3) float64, out: vectors[:, k] belong to values[k], are of unit length, and
-              their component of largest magnitude is positive; nan where all values are 0
+              their component of largest magnitude is positive; nan if all values are 0
 
-    Across the smallest a matrix is 2 by 2, and its larger eigenvector follows from a square root;
-    the third is across both.
+    In the plane orthogonal to the smallest one the matrix is 2 by 2, and its larger eigenvector
+    follows from a square root; the third is orthogonal to both.
     """
     for i in range(matrices.shape[1]):
         if not values[2, i] > 0.0:
@@ -125,12 +125,12 @@ def eigenvectors(matrices, values, smallest, vectors):
         uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
         ww = (wx * pwx + wy * pwy) + wz * pwz
         half = 0.5 * (uu - ww)
-        scale = max(abs(half), abs(uw))  # the squares of what is tiny vanish
-        equal = scale == 0.0  # every direction is as good
+        scale = max(abs(half), abs(uw))  # squares of tiny numbers underflow
+        equal = scale == 0.0  # any direction
         half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
         spread = math.sqrt(half * half + uw * uw)
         cosine, sine = half / spread, uw / spread
-        # of an angle whose double is known, scaled
+        # half-angle formulas, scaled
         first = 1.0 + cosine if cosine >= 0.0 else sine
         second = sine if cosine >= 0.0 else 1.0 - cosine
         length = math.sqrt(first * first + second * second)

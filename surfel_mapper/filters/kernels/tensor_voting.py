@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tensor votes: what the neighbours of a point say of the surface, curve or corner it is on.
+Tensor votes: evidence of the neighbours of a point for a surface, curve or junction at it.
 
 A vote is a symmetric matrix, and six million of them are cast among the points of a scan with 50
-neighbours each: one loop needs no memory for them, numpy 48 bytes each and a dozen passes.
+neighbours each: one loop needs no memory for them, numpy needs 48 bytes each and a dozen passes.
 
 Source: Wu et al. 2012, A closed-form solution to tensor voting, equation 11, made symmetric:
 c R K (1 - r r^T / 2) R for a neighbour with tensor K in the direction r, R = 1 - 2 r r^T, and
-decay c = exp(-distance^2 / sigma). For the first round, where nothing is known of the neighbours,
-Guy and Medioni 1997: what lies across r, 1 - r r^T.
+decay c = exp(-distance^2 / sigma). For the first round, without tensors of the neighbours,
+Guy and Medioni 1997: the plane orthogonal to r, 1 - r r^T.
 """
 
 import math
@@ -17,7 +17,7 @@ import math
 from numba import njit
 
 REACH = 3.0
-"""Votes come no farther than this times sigma."""
+"""Range of the votes over sigma."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -36,14 +36,14 @@ def direction(points, own, other):
 @njit(cache=True, nogil=True, error_model='numpy')
 def first_votes(points, ids, sigma, votes):
     """
-    Cast the votes of neighbours of which nothing is known, added to the point's own ball.
+    Sum the votes of neighbours without tensors and the ball of the point itself.
 
     points  (N, 3) float64, m
-    ids     (P, K) int32, neighbours of P points, the point itself first; N where there is none
+    ids     (P, K) int32, neighbours of P points, the point itself first; padded by N
     sigma   scale of the votes
     votes   (6, P) float64, out: their sum, xx xy xz yy yz zz
 
-    The weight is z^2 (z - 3)^4 / 16, z the distance over sigma: most from about one sigma away.
+    The weight is z^2 (z - 3)^4 / 16, z the distance over sigma; largest at z = 1.
     """
     for i in range(len(ids)):
         own = ids[i, 0]
@@ -71,10 +71,10 @@ def first_votes(points, ids, sigma, votes):
 @njit(cache=True, nogil=True, error_model='numpy')
 def closed_form_votes(points, ids, tensors, sigma, votes):
     """
-    Cast the votes of neighbours with tensors.
+    Sum the votes of neighbours with tensors.
 
     points   (N, 3) float64, m
-    ids      (P, K) int32, neighbours of P points, the point itself first; N where there is none
+    ids      (P, K) int32, neighbours of P points, the point itself first; padded by N
     tensors  (N, 6) float64, of the neighbours, xx xy xz yy yz zz
     sigma    scale of the votes
     votes    (6, P) float64, out: their sum

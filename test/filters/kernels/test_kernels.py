@@ -3,8 +3,8 @@
 """
 The kernels of filters run without the compiler as they do with it, and at their edges.
 
-What each computes is tested where its filter is; here is that compiled and interpreted agree to
-the bit, and what happens when the table of voxels has to grow.
+Results are tested with the filters; here, compiled and interpreted runs agree to the bit, and the
+table of voxels grows.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ def test_filters_give_the_same_to_the_bit_without_the_compiler():
 
 @both
 @pytest.mark.parametrize('kept', [[], [0], [4], [0, 1, 2, 3, 4], [1, 3]])
-def test_what_stays_moves_together(call, kept):
+def test_compact_moves_the_kept_values_together(call, kept):
     values = np.arange(10.0).reshape(2, 5)
     keep = np.zeros(5, np.bool_)
     keep[kept] = True

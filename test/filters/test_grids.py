@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""VoxelGrid against what libpointmatcher gave, against a slow twin, and at its limits."""
+"""VoxelGrid and OctreeGrid against the golden values of libpointmatcher and slow twins."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 
 from surfel_mapper.errors import ConfigError, FilterError
 from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.grids import leaves, LEVELS, spread
 from surfel_mapper.scan import Scan
 from test.filters.examples import filter_of, random_scan, scan_of
 
 GOLDEN = Path(os.environ.get('SURFEL_MAPPER_TEST_DATA', '')) / 'golden'
-THEIRS = 'VoxelGridDataPointsFilter'
+LIBPOINTMATCHER = 'VoxelGridDataPointsFilter'
 
 
 def golden_cases():
@@ -70,17 +71,17 @@ def scan_in(case, arrays):
 
 
 def filtered(case, arrays):
-    return Chain.from_list([{THEIRS: case['params']}]).apply(scan_in(case, arrays))
+    return Chain.from_list([{LIBPOINTMATCHER: case['params']}]).apply(scan_in(case, arrays))
 
 
 @needs_golden
 @pytest.mark.parametrize('name', [n for n in names() if not n.startswith('real')])
-def test_centroids_columns_and_order_are_libpointmatchers(name, arrays):
+def test_centroids_columns_and_order_equal_libpointmatcher(name, arrays):
     case = CASES[name]
     found = filtered(case, arrays)
     expected = arrays[f'out/{name}/features'][:, : case['dim']]
     assert len(found) == case['n_out'] == case['n_out_f64_arithmetic']
-    # their sums in float32 err by what the case states, and each rounds the result once
+    # float32 sums of libpointmatcher are off by the tolerance of the case; each rounds once
     tolerance = case['max_abs_centroid_diff_vs_f64'] + np.spacing(np.float32(abs(expected).max()))
     np.testing.assert_allclose(found.points[:, : case['dim']], expected, rtol=0.0, atol=tolerance)
     descriptors = split(arrays[f'out/{name}/descriptors'], case['descriptor_labels'])
@@ -92,7 +93,7 @@ def test_centroids_columns_and_order_are_libpointmatchers(name, arrays):
 
 @needs_golden
 @pytest.mark.parametrize('name', [n for n in names() if n.startswith('real')])
-def test_of_a_real_scan_all_centroids_but_those_at_a_face_are_libpointmatchers(name, arrays):
+def test_centroids_of_a_real_scan_equal_libpointmatcher_except_at_faces(name, arrays):
     case = CASES[name]
     found = filtered(case, arrays).points.astype(np.float64)
     expected = arrays[f'out/{name}/features'][:, :3].astype(np.float64)
@@ -105,7 +106,7 @@ def test_of_a_real_scan_all_centroids_but_those_at_a_face_are_libpointmatchers(n
 
 @needs_golden
 @pytest.mark.parametrize('name', names(centroid=False))
-def test_where_their_centres_are_wrong_ours_are_centres_of_the_same_voxels(name, arrays):
+def test_centres_are_those_of_libpointmatchers_voxels(name, arrays):
     case = CASES[name]
     scan, found = scan_in(case, arrays), filtered(case, arrays)
     assert len(found) == case['n_out']
@@ -117,7 +118,7 @@ def test_where_their_centres_are_wrong_ours_are_centres_of_the_same_voxels(name,
 
 @needs_golden
 @pytest.mark.parametrize('name', names(status=1))
-def test_what_libpointmatcher_refuses_is_refused(name, arrays):
+def test_cases_that_libpointmatcher_refuses_are_refused(name, arrays):
     with pytest.raises((ConfigError, FilterError)):
         filtered(CASES[name], arrays)
 
@@ -138,7 +139,7 @@ def slow(scan, size, anchor, centroid=True):
 @pytest.mark.parametrize('centroid', [True, False])
 @pytest.mark.parametrize('dtype', [np.float32, np.float64])
 @pytest.mark.parametrize('number', [1, 40, 9000])
-def test_it_does_what_its_slow_twin_does(anchor, centroid, dtype, number):
+def test_voxel_grid_equals_its_slow_twin(anchor, centroid, dtype, number):
     scan = random_scan(number, dtype=dtype)
     size = (0.5, 0.3, 0.7)
     found = filter_of(
@@ -169,7 +170,7 @@ def test_a_voxel_of_each_axis_has_its_own_size():
     np.testing.assert_allclose(found.points, [[1.1 / 3, 4.1 / 3, 0.1], [0.1, 0.1, 0.3]])
 
 
-def test_of_columns_the_first_are_kept_where_averages_are_not_wanted():
+def test_columns_of_the_first_point_are_kept_without_averaging():
     scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], intensity=[1.0, 3.0], label=[4, 5])
     averaged = filter_of('voxel_grid').apply(scan).columns
     first = filter_of('voxel_grid', average_columns=False).apply(scan).columns
@@ -181,7 +182,7 @@ def test_averaged_normals_have_unit_length_but_under_libpointmatchers_name():
     normals = [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
     scan = scan_of([[0.1, 0.0, 0.0], [0.3, 0.0, 0.0]], normals=normals)
     ours = filter_of('voxel_grid').apply(scan).columns['normals']
-    theirs = filter_of(THEIRS).apply(scan).columns['normals']
+    theirs = filter_of(LIBPOINTMATCHER).apply(scan).columns['normals']
     np.testing.assert_allclose(ours, [[0.5**0.5, 0.0, 0.5**0.5]], rtol=1e-15)
     np.testing.assert_allclose(theirs, [[0.5, 0.0, 0.5]])
 
@@ -217,3 +218,102 @@ def test_a_voxel_may_be_infinite_but_has_no_centre_then():
     np.testing.assert_allclose(found.points, [scan.points.mean(axis=0)], rtol=0.0, atol=1e-5)
     with pytest.raises(ConfigError, match='has no centre'):
         filter_of('voxel_grid', size_x_m=np.inf, use_centroid=False)
+
+
+OCTREE = 'OctreeGridDataPointsFilter'
+
+
+def slow_leaves(points, max_points, max_size):
+    """Return the leaves as sets of rows, by cutting cubes one after another."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = (high - low).max()
+    corner = 0.5 * (low + high) - 0.5 * edge
+    corner[low == high] = low[low == high]
+    open_, found = [(corner, edge, np.arange(len(points)))], []
+    while open_:
+        corner, edge, rows = open_.pop()
+        if len(rows) <= max_points or edge <= max_size:
+            found.append(frozenset(rows.tolist()))
+            continue
+        upper = points[rows] >= corner + 0.5 * edge
+        for which in np.unique(upper, axis=0):
+            inside = rows[(upper == which).all(axis=1)]
+            open_.append((corner + 0.5 * edge * which, 0.5 * edge, inside))
+    return set(found)
+
+
+@pytest.mark.parametrize(
+    ('max_points', 'max_size'), [(1, 0.0), (5, 0.0), (1, 0.3), (40, 0.6), (1, 9.0), (1000, 0.0)]
+)
+@pytest.mark.parametrize('flat', [False, True])
+def test_leaves_are_those_of_a_tree(max_points, max_size, flat):
+    points = np.random.default_rng(1).uniform(-2.0, 2.0, (600, 3))
+    points[:, 2] *= 0.0 if flat else 0.2
+    rows, number = leaves(points, max_points, max_size)
+    found = {frozenset(np.flatnonzero(rows == leaf).tolist()) for leaf in range(number)}
+    assert found == slow_leaves(points, max_points, max_size)
+    _, first = np.unique(rows, return_index=True)
+    assert (np.diff(first) > 0).all()  # numbered as they first appear
+
+
+def test_paths_take_a_bit_of_every_axis_in_turn():
+    values = np.array([0, 1, 0b101, 2**LEVELS - 1])
+    expected = [int('0' + '00'.join(f'{v:b}'), 2) for v in values]
+    assert spread(values).tolist() == expected
+
+
+SQUARE = [[0.0, 0, 0], [0.2, 0, 0], [0.1, 0.25, 0], [4.0, 4.0, 0], [0.1, 0.1, 0], [0.0, 4.0, 0]]
+"""Four points in the lowest cube of an edge of 1, and two alone."""
+
+
+def sampled(method, **columns):
+    scan = scan_of(SQUARE, row=range(6), **columns)
+    return filter_of(OCTREE, maxSizeByNode=1.0, samplingMethod=method).apply(scan)
+
+
+def test_the_first_point_stands_for_its_leaf():
+    assert sampled(0).columns['row'].tolist() == [0, 3, 5]
+
+
+def test_a_random_point_stands_for_its_leaf_and_any_may():
+    found = {
+        filter_of(OCTREE, maxSizeByNode=1.0, samplingMethod=1, seed=seed)
+        .apply(scan_of(SQUARE, row=range(6)))
+        .columns['row'][0]
+        for seed in range(60)
+    }
+    assert found == {0, 1, 2, 4}
+
+
+def test_the_mean_stands_for_its_leaf_with_averaged_columns():
+    found = sampled(2, intensity=[1.0, 2.0, 3.0, 9.0, 6.0, 7.0], label=[5, 6, 7, 8, 9, 10])
+    np.testing.assert_allclose(found.points, [[0.1, 0.0875, 0], [4.0, 4.0, 0], [0.0, 4.0, 0]])
+    assert found.columns['intensity'].tolist() == [3.0, 9.0, 7.0]
+    assert found.columns['label'].tolist() == [5, 8, 10]
+
+
+def test_the_point_nearest_the_mean_stands_for_its_leaf():
+    assert sampled(3).columns['row'].tolist() == [4, 3, 5]
+
+
+def test_by_default_every_place_keeps_one_point():
+    scan = random_scan(200)
+    twice = scan.select(np.concatenate([np.arange(200), np.arange(200)]))
+    found = filter_of(OCTREE).apply(twice)
+    np.testing.assert_array_equal(found.points, scan.points)
+
+
+@pytest.mark.parametrize('method', range(4))
+def test_points_nearer_than_paths_can_tell_stay_together(method):
+    near = np.nextafter(np.float64(1.0), 2.0)
+    scan = scan_of([[1.0, 0, 0], [near, 0, 0], [-1.0, 0, 0]])
+    assert len(filter_of(OCTREE, samplingMethod=method).apply(scan)) == 2
+
+
+def test_a_leaf_is_no_larger_than_asked():
+    scan = random_scan(3000)
+    found = filter_of('octree_grid', max_size_m=0.5, sampling_method=2).apply(scan)
+    edge = 8.0 / 2 ** np.ceil(np.log2(8.0 / 0.5))
+    # as many as the occupied cubes of that edge, give or take those of the moved grid
+    cubes = {tuple(cell) for cell in np.floor(scan.points / edge)}
+    assert 0.8 < len(found) / len(cubes) < 1.2
