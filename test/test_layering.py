@@ -171,7 +171,7 @@ FORBIDDEN = (
 )
 
 ALLOWED = (
-    ('kernels/moments.py', 'numba.njit'),
+    ('kernels/grouping.py', 'numba.njit'),
     ('tsdf/kernels/lookup.py', 'numba.njit'),
     ('config/stages.py', 'surfel_mapper.config._fields.setting'),
     ('mapping/surfel_map.py', 'surfel_mapper.mapping.surfels'),

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scans are moved until they agree: with each other, or with a map."""
+"""Alignment of scans: to each other by LUM, or to a map by registration."""
 
 from surfel_mapper.alignment.correspondences import (
     Limits,

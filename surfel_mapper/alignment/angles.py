@@ -3,9 +3,9 @@
 """
 Poses as x y z roll pitch yaw: m and rad, T = translation Rz(yaw) Ry(pitch) Rx(roll).
 
-Angles are not wrapped. Every rotation has two triples of angles and all that differ from them by
-whole turns; of these the one nearest to the triple before is taken, so that a pose that is
-corrected a little never jumps by a turn.
+Angles are not wrapped. A rotation has two triples of angles, and further ones that differ by full
+turns. The triple nearest to the previous one is chosen, so that a small correction of a pose never
+jumps by a turn.
 """
 
 from __future__ import annotations
@@ -41,20 +41,20 @@ def transforms(poses: Floats) -> Floats:
 
 def poses_of(matrices: Floats, near: Floats) -> Floats:
     """
-    Return the poses of transforms, each with the angles nearest to those of another pose.
+    Return the poses of transforms, with the angles nearest to those of reference poses.
 
     Parameters
     ----------
     matrices : (V, 4, 4) float64
         Rigid transforms.
     near : (V, 6) float64
-        Poses whose angles tell which of the equal ones to take.
+        Reference poses, which select one of the equivalent triples of angles.
 
     Returns
     -------
     (V, 6) float64
-        At a pitch of a quarter turn, where roll and yaw are the same motion, any yaw would do;
-        the roll always belongs to the yaw returned.
+        At a pitch of a quarter turn roll and yaw are the same motion, and the yaw is arbitrary;
+        the roll is consistent with it.
 
     """
     R = matrices[:, :3, :3]
@@ -72,7 +72,7 @@ def poses_of(matrices: Floats, near: Floats) -> Floats:
 
 
 def skew(vectors: Floats) -> Floats:
-    """Return the matrices (V, 3, 3) that multiply by vectors (V, 3) from the left, as x does."""
+    """Return the matrices (V, 3, 3) of the cross product with vectors (V, 3) on the left."""
     x, y, z = vectors.T
     zero = np.zeros_like(x)
     rows = [zero, -z, y, z, zero, -x, -y, x, zero]
@@ -81,9 +81,9 @@ def skew(vectors: Floats) -> Floats:
 
 def pcl_incidence(poses: Floats) -> Floats:
     """
-    Return PCL's Jacobian of poses: what turns dp into a motion about the origin of the map.
+    Return PCL's Jacobian of poses, from dp to a motion about the origin of the map.
 
-    It is that of the order Rx(roll) Ry(pitch) Rz(yaw), which is not the order of ``transforms``.
+    It belongs to the order Rx(roll) Ry(pitch) Rz(yaw), which is not the order of ``transforms``.
 
     Parameters
     ----------

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which points of two scans belong together, and which scans are worth asking.
+Correspondences between the points of two scans, and the pairs of scans to compare.
 
-A scan is stood for by samples: its own points, or the centroids of its surfels, which have a
-normal, and say how sure they are of both. Nearest neighbours come from scipy's k-d tree, built
-once a scan in the scan's own frame, whatever its pose becomes. Points are paired to points;
-surfels pull across the surface only, for the centroids of one wall seen from two places differ
-along it: the rings of a lidar on the road go with the lidar, and points paired to points would
-hold it back. Away from its centroid a surfel is the less sure the narrower it is; counting that
-halves the errors of the angles.
+A scan is represented by samples: its points, or the centroids of its surfels with normals and
+variances. Nearest neighbours come from scipy's k-d tree, built once for each scan in the frame of
+the scan, so that it stays valid when the pose changes. Points are weighted equally in all
+directions, surfels only across the surface: the centroids of one wall seen from two places differ
+along it, as the rings of a lidar on the road move with the lidar, and would hold the scans back.
+Away from its centroid the uncertainty of a surfel grows, the more the narrower it is; weighting by
+it halves the angular errors.
 
 Source: Chen and Medioni 1992 for points and planes; Segal, Haehnel and Thrun 2009.
 """
@@ -28,38 +28,38 @@ from surfel_mapper.mapping.surfels import Surfels
 Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.int32]
 
-LONG_WAY = 3.0
-"""The way to where a loop closes is at least so many times the distance that counts as near."""
+LOOP_FACTOR = 3.0
+"""Minimum length of a loop, as a multiple of the distance between its ends."""
 
 LOOPS_A_SCAN = 3
-"""A scan is compared with so many of an earlier pass."""
+"""Maximum number of loop candidates of a scan."""
 
 ROUGHNESS_M = 0.005
-"""A point is off its surface by so much at least, however flat the surfel: no wall is a plane."""
+"""Minimum standard deviation of a point from its surface, because no wall is an exact plane."""
 
 MIN_PLANARITY = 0.2
-"""Surfels that are less planar have no normal to rely on, as where a voxel holds one ring."""
+"""Surfels of less planarity are ignored: their normal is unreliable, as in a voxel of one ring."""
 
 
 class Samples:
     """
-    What stands for a scan, in its own frame.
+    Samples that represent a scan, in the frame of the scan.
 
     Parameters
     ----------
     position : (N, 3) float, m
-        All finite.
+        Positions, all finite.
     normal : (N, 3) float, optional
-        Unit normals, needed where angles are compared.
+        Unit normals, required to compare angles.
     variance : (N,) float, optional
-        Of the position across the surface, m^2: with it samples are surfels.
+        Variance of the position across the surface, m^2; required for surface weights.
     tilt_variance : (N,) float, optional
-        Of the normal, rad^2; surfels have it.
+        Variance of the normal, rad^2; required for surface weights.
 
     Raises
     ------
     AlignmentError
-        If a number is not finite or shapes do not fit.
+        If a number is not finite or shapes do not match.
 
     """
 
@@ -70,7 +70,6 @@ class Samples:
         variance: npt.ArrayLike | None = None,
         tilt_variance: npt.ArrayLike | None = None,
     ) -> None:
-        """Check the arrays and build the tree."""
         self.position = np.ascontiguousarray(position, np.float64)
         if self.position.ndim != 2 or self.position.shape[1] != 3:
             raise AlignmentError(f'samples: shape {self.position.shape}, expected (N, 3)')
@@ -88,7 +87,7 @@ class Samples:
         ):
             if values is not None and (values.shape != shape or not np.isfinite(values).all()):
                 raise AlignmentError(f'samples: {name} is not {shape} and finite')
-        from scipy.spatial import cKDTree  # 0.4 s, which mapping without alignment need not pay
+        from scipy.spatial import cKDTree  # 0.4 s, only alignment pays
 
         self.tree = cKDTree(self.position)
 
@@ -98,7 +97,7 @@ class Samples:
 
     @classmethod
     def of_surfels(cls, surfels: Surfels, min_points: int = 1) -> Samples:
-        """Return the samples of those surfels that are planar enough."""
+        """Return the samples of sufficiently planar surfels."""
         flat = (surfels.planarity >= MIN_PLANARITY) & (surfels.num_points >= min_points)
         chosen = surfels.select(flat)
         e0, e1, _ = chosen.eigenvalues.T
@@ -109,16 +108,16 @@ class Samples:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
     """
-    Which samples may belong together.
+    Limits of a correspondence.
 
     Attributes
     ----------
     max_distance_m : float
-        Apart at most.
+        Maximum distance.
     max_angle_deg : float
-        Between their normals at most; 180: normals are not asked for.
+        Maximum angle between the normals; 180: normals are not compared.
     reciprocal : bool
-        Whether each has to be the nearest to the other.
+        Whether each sample must be the nearest of the other.
 
     """
 
@@ -136,16 +135,16 @@ class Limits:
 
 def match(source: Samples, target: Samples, T_target_source: Floats, limits: Limits) -> Pairs:
     """
-    Return every sample of a scan with the nearest one of another, where that may be.
+    Pair every sample of a scan with the nearest one of another, within limits.
 
     Parameters
     ----------
     source, target : Samples
-        Each in its own frame.
+        Samples of the two scans.
     T_target_source : (4, 4) float64
         Pose of the source in the frame of the target.
     limits : Limits
-        Which pairs there may be.
+        Limits of a correspondence.
 
     Returns
     -------
@@ -155,7 +154,7 @@ def match(source: Samples, target: Samples, T_target_source: Floats, limits: Lim
     Raises
     ------
     AlignmentError
-        If angles are to be compared and a scan has no normals.
+        If angles are compared and a scan has no normals.
 
     """
     moved = _moved(source.position, T_target_source)
@@ -178,11 +177,11 @@ def surface_weights(
     source: Samples, target: Samples, pairs: Pairs, T_target_source: Floats, scale_m: float
 ) -> Floats:
     """
-    Return by what the gaps of pairs of surfels count, (K, 3, 3), in the frame of the target.
+    Return the weight matrices (K, 3, 3) of the gaps of pairs, in the frame of the target.
 
-    Across the surface it is one over the variance of both ends, that of the target where its
-    plane is extended to the source; less for gaps beyond the scale (Geman and McClure), so that
-    what is no pair does not pull.
+    Across the surface the weight is the inverse of the variance of both ends, that of the target
+    taken at the position of the source. It decreases for gaps beyond the scale (Geman and
+    McClure), so that wrong pairs have little effect.
     """
     if source.variance is None or target.variance is None or target.tilt_variance is None:
         raise AlignmentError('samples are not surfels: they have no variance')
@@ -200,20 +199,20 @@ def surface_weights(
 
 def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[int, int]]:
     """
-    Return the scans that are near each other although the way between them is long.
+    Return the pairs of scans that are close although the path between them is long.
 
     Parameters
     ----------
     T_map_sensor : (S, 4, 4) float64
-        Poses, in the order of the way.
+        Poses, in the order of the path.
     max_distance_m : float
-        Scans farther apart are no candidates; 0: none are.
+        Maximum distance of candidates; 0 disables loops.
 
     Returns
     -------
     list of (int, int)
-        The later scan first; for each the few that are nearest. The way between them is at least
-        three times ``max_distance_m``.
+        The later scan first; for each the nearest ones. The path between them is at least three
+        times ``max_distance_m`` long.
 
     """
     if max_distance_m <= 0.0:
@@ -222,9 +221,9 @@ def loop_candidates(T_map_sensor: Floats, max_distance_m: float) -> list[tuple[i
 
     position = T_map_sensor[:, :3, 3]
     steps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    way_m = np.concatenate([[0.0], np.cumsum(steps)])
+    path_m = np.concatenate([[0.0], np.cumsum(steps)])
     pairs = cKDTree(position).query_pairs(max_distance_m, output_type='ndarray')
-    near = pairs[way_m[pairs[:, 1]] - way_m[pairs[:, 0]] >= LONG_WAY * max_distance_m]
+    near = pairs[path_m[pairs[:, 1]] - path_m[pairs[:, 0]] >= LOOP_FACTOR * max_distance_m]
     distance = np.linalg.norm(position[near[:, 1]] - position[near[:, 0]], axis=1)
     num_of: dict[int, int] = {}
     found = []
@@ -246,9 +245,9 @@ def _alike(
     pairs: tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]],
     max_angle_deg: float,
 ) -> npt.NDArray[np.bool_]:
-    """Return which pairs have normals that differ by no more than an angle."""
+    """Return which pairs have normals within an angle."""
     if source.normal is None or target.normal is None:
-        raise AlignmentError('samples have no normals, so max_angle_deg cannot be held')
+        raise AlignmentError('samples have no normals, which max_angle_deg below 180 requires')
     normal = source.normal[pairs[0]] @ R_target_source.T
     cosine = (normal * target.normal[pairs[1]]).sum(axis=1)
     return np.asarray(cosine >= math.cos(math.radians(max_angle_deg)))

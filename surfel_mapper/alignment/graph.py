@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Graph: scans with their poses, and which of their points belong together.
+Graph: clouds with poses, and edges with the correspondences between their points.
 
-Vertex 0 is the reference, at the origin for good. There is at most one edge from a vertex to
-another, and one back. Everything is checked on its way in and copied, so that what is in a graph
-is consistent at any time and the sums over the pairs of an edge need be taken only once.
+Vertex 0 is the reference, fixed at the origin. There is at most one edge from a vertex to another,
+and one back. All input is checked and copied, so that a graph is consistent at any time and the
+sums over the pairs of an edge are computed only once.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
 @dataclass(slots=True)
 class Edge:
-    """Pairs of points of two vertices, their weights if any, and the sums over them."""
+    """Pairs of points of two vertices, optional weights, and the cached sums over them."""
 
     pairs: Pairs
     weights: Floats | None = None
@@ -39,10 +39,9 @@ class Edge:
 
 
 class Graph:
-    """Vertices are clouds and poses, edges are pairs of their points; see LUM."""
+    """Vertices with clouds and poses, edges with pairs of points; see LUM."""
 
     def __init__(self) -> None:
-        """Make a graph without vertices."""
         self._points: list[Points] = []
         self._poses: list[Floats] = []
         self._edges: dict[tuple[int, int], Edge] = {}
@@ -54,7 +53,7 @@ class Graph:
 
     @property
     def ends(self) -> npt.NDArray[np.int64]:
-        """Source and target of every edge, (E, 2), in the order in which they came."""
+        """Source and target of every edge, (E, 2), in the order of insertion."""
         return np.array(list(self._edges), np.int64).reshape(-1, 2)
 
     @property
@@ -68,7 +67,7 @@ class Graph:
         return np.array(self._poses).reshape(-1, 6)
 
     def add_vertex(self, points: npt.ArrayLike, pose: npt.ArrayLike | None) -> int:
-        """Add a cloud at a pose, at the origin without one; return its number."""
+        """Add a cloud at a pose, by default the origin; return its vertex number."""
         number = self.num_vertices
         checked_points, checked = _points(number, points), _pose(number, pose)
         self._points.append(checked_points)
@@ -80,7 +79,7 @@ class Graph:
         return self._points[self._known(vertex)]
 
     def set_points(self, vertex: int, points: npt.ArrayLike) -> None:
-        """Give a vertex other points; its pairs stay, so all that they name must be there."""
+        """Replace the points of a vertex; its pairs stay and must refer to existing points."""
         checked = _points(self._known(vertex), points)
         for ends, edge in self._edges.items():
             for column, end in enumerate(ends):
@@ -98,11 +97,11 @@ class Graph:
     def set_pose(self, vertex: int, pose: npt.ArrayLike) -> None:
         """Move a vertex other than the reference."""
         if self._known(vertex) == 0:
-            raise AlignmentError('vertex 0 is the reference: its pose is the origin for good')
+            raise AlignmentError('vertex 0 is the reference: its pose is fixed at the origin')
         self._poses[vertex] = _pose(vertex, pose)
 
     def set_poses(self, poses: Floats) -> None:
-        """Move all vertices, to poses that are known to be right."""
+        """Set the poses of all vertices, (V, 6), unchecked."""
         self._poses = list(np.array(poses))
 
     def edge(self, source: int, target: int) -> Edge:
@@ -125,7 +124,7 @@ class Graph:
         if rows.ndim != 2 or rows.shape[1] != 2 or rows.dtype.kind not in 'iu':
             raise AlignmentError(
                 f'edge {source} -> {target}: pairs of shape {rows.shape} and type {rows.dtype}, '
-                'expected (K, 2) whole numbers'
+                'expected (K, 2) integers'
             )
         for column, end in enumerate(ends):
             _check_rows(ends, end, rows[:, column], len(self._points[end]))
@@ -134,7 +133,7 @@ class Graph:
         )
 
     def moments(self, weighted: bool) -> Floats:
-        """Return the sums over the pairs of the edges with weights, or of those without."""
+        """Return the sums over the pairs of all weighted edges, or of all others."""
         rows = [
             self._sum(ends, edge)
             for ends, edge in self._edges.items()
@@ -145,7 +144,7 @@ class Graph:
     def residual(
         self, T_source: Floats, T_target: Floats, center: Floats, motion: Floats
     ) -> Floats:
-        """Return what is left of the gaps after motions (E, 6) about centers, squared, m^2."""
+        """Return the squared residual gaps after motions (E, 6) about centers, (E,) m^2."""
         result = np.zeros(len(self._edges))
         for row, ((s, t), edge) in enumerate(self._edges.items()):
             about = (T_source[row], T_target[row], center[row], motion[row])
@@ -164,7 +163,7 @@ class Graph:
         return edge.moments
 
     def _known(self, vertex: int) -> int:
-        """Return a vertex that is there."""
+        """Return a vertex number; AlignmentError if there is no such vertex."""
         if not 0 <= vertex < self.num_vertices:
             raise AlignmentError(f'there is no vertex {vertex} among {self.num_vertices}')
         return vertex
@@ -209,7 +208,7 @@ def _weights(ends: tuple[int, int], weights: npt.ArrayLike | None, num: int) -> 
 def _check_rows(
     ends: tuple[int, int], vertex: int, rows: npt.NDArray[np.integer], num_points: int
 ) -> None:
-    """Refuse pairs that name points which a vertex does not have."""
+    """Raise AlignmentError if pairs refer to points that a vertex does not have."""
     beyond = np.flatnonzero((rows < 0) | (rows >= num_points))
     if len(beyond):
         raise AlignmentError(

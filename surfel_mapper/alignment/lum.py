@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-LUM: the poses of many scans that agree best with each other, all at once.
+LUM: globally consistent poses of many scans by the method of Lu and Milios.
 
-The graph and its names are those of pcl::registration::LUM, whose results ``jacobian='pcl'``
-gives. The default differs where PCL fails: it takes the Jacobian of the poses that are used and
-so converges at any yaw and after full turns, weighs exact pairs instead of dropping them, lets
-the edges of both directions act on both scans, and works in float64 with a sparse solver, so
-that a graph 1 km from the origin, or of a thousand scans, is none that differs.
+The interface is that of pcl::registration::LUM, whose results ``jacobian='pcl'`` reproduces. The
+default differs where PCL fails: it uses the Jacobian of its own pose parameters and so converges
+at any yaw and after full turns, weighs exact pairs instead of dropping them, lets the edges of
+both directions act on both scans, and works in float64 with a sparse solver, so that graphs 1 km
+from the origin or of a thousand scans are solved equally well.
 
 Source: Lu and Milios 1997.
 """
@@ -24,10 +24,15 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.angles import transforms
-from surfel_mapper.alignment.edge_terms import edge_sums, EdgeTerms, exact_terms, pcl_terms
+from surfel_mapper.alignment.edge_terms import (
+    edge_sums,
+    EdgeTerms,
+    exact_terms,
+    pcl_terms,
+    weighted_terms,
+)
 from surfel_mapper.alignment.graph import Graph, Points
 from surfel_mapper.alignment.solver import components, exact_step, pcl_step
-from surfel_mapper.alignment.weighted_terms import weighted_terms
 from surfel_mapper.errors import AlignmentError
 
 _log = logging.getLogger(__name__)
@@ -41,25 +46,25 @@ JACOBIANS = ('exact', 'pcl')
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class LumResult:
     """
-    How an alignment ended.
+    Result of an alignment.
 
     Attributes
     ----------
     converged : bool
         Whether the last step was below the threshold.
     iterations : int
-        Steps taken.
+        Number of steps.
     residuals : mapping of (source, target) to float, m
-        Root of the mean squared distance of the pairs of every edge at the poses found; nan
-        without pairs.
+        Root mean square distance of the pairs of every edge at the final poses; nan without
+        pairs.
     dropped : mapping of (source, target) to str
-        Edges that did not count in the last step, and why.
+        Edges that were ignored in the last step, and the reason.
     unconnected : tuple of int
-        Vertices that no edge that counts connects to vertex 0: they stay where they were.
+        Vertices that no used edge connects to vertex 0: their poses are unchanged.
     open_motions : mapping of (source, target) to (K, 6) float64
-        Edges whose pairs say nothing of some motion, and that motion, translation first, about
-        their middle: it was left to other edges. Pairs on a line leave the rotation about it
-        open, weights across the walls of a tunnel the way along it.
+        Edges whose pairs do not determine all motions, and the undetermined motions, translation
+        first, about the center of the pairs. Pairs on a line leave the rotation about it open,
+        weights across the walls of a tunnel the translation along it.
 
     """
 
@@ -73,18 +78,18 @@ class LumResult:
 
 class LUM:
     """
-    Aligns the clouds of a graph, given which of their points belong together.
+    Aligns the clouds of a graph, given the correspondences between their points.
 
     Poses are x y z in m, roll pitch yaw in rad, T = translation Rz(yaw) Ry(pitch) Rx(roll), of
-    the cloud in the frame of vertex 0. Whatever is refused changes nothing.
+    the cloud in the frame of vertex 0. A call that raises changes nothing.
 
     Parameters
     ----------
     max_iterations : int
-        At most so many steps; one or more.
+        Maximum number of steps, at least one.
     convergence_threshold : float
-        Steps end when poses change by at most so much, the mean over the vertices other than 0
-        of the length of the change (m and rad together).
+        Iteration ends when the change of the poses is at most this: the length of the change (m
+        and rad together), averaged over the vertices other than 0.
     jacobian : str
         ``exact``, or ``pcl`` for the steps that PCL takes.
 
@@ -102,7 +107,6 @@ class LUM:
         convergence_threshold: float = 0.0,
         jacobian: str = 'exact',
     ) -> None:
-        """Make an empty graph."""
         self.graph = Graph()
         self.jacobian = jacobian
         self.max_iterations = max_iterations
@@ -126,7 +130,7 @@ class LUM:
 
     @property
     def max_iterations(self) -> int:
-        """At most so many steps."""
+        """Maximum number of steps."""
         return self._max_iterations
 
     @max_iterations.setter
@@ -137,7 +141,7 @@ class LUM:
 
     @property
     def convergence_threshold(self) -> float:
-        """Steps end when poses change by at most so much on average."""
+        """Mean change of a pose at which iteration ends."""
         return self._convergence_threshold
 
     @convergence_threshold.setter
@@ -150,8 +154,8 @@ class LUM:
         """
         Add a cloud (N, 3), m, at a pose (6,) or at the origin; return its vertex.
 
-        The first one becomes the reference, at the origin; a pose given to it is ignored with a
-        warning. Points may hold nan; pairs of such points are passed over.
+        The first cloud is the reference at the origin; its pose is ignored with a warning. Points
+        may contain nan; pairs of such points are ignored.
         """
         if pose is not None and not self.num_vertices:
             _log.warning('the pose of vertex 0 is ignored: it is the reference, at the origin')
@@ -159,11 +163,11 @@ class LUM:
         return self.graph.add_vertex(points, pose)
 
     def point_cloud(self, vertex: int) -> Points:
-        """Return the points of a vertex in their own frame; they cannot be written to."""
+        """Return the points of a vertex in its own frame, read-only."""
         return self.graph.points(vertex)
 
     def set_point_cloud(self, vertex: int, points: npt.ArrayLike) -> None:
-        """Give a vertex other points; correspondences stay as they are."""
+        """Replace the points of a vertex; correspondences stay unchanged."""
         self.graph.set_points(vertex, points)
 
     def pose(self, vertex: int) -> Floats:
@@ -196,7 +200,7 @@ class LUM:
         weights: npt.ArrayLike | None = None,
     ) -> None:
         """
-        Say which points of two clouds belong together, in place of what was said before.
+        Set the correspondences between two clouds, replacing previous ones.
 
         Parameters
         ----------
@@ -205,9 +209,9 @@ class LUM:
         pairs : (K, 2) int
             Row of a point of the source, row of a point of the target.
         weights : (K, 3, 3) float, optional
-            By what the gap of each pair counts in which direction, symmetric, in the frame of
-            the target: the inverse of its covariance. Where gaps are larger than that, all of
-            the edge count less.
+            Symmetric weight matrix of the gap of each pair, in the frame of the target: the
+            inverse of its covariance. If the gaps are larger than that, the whole edge is
+            weighted down.
 
         """
         self.graph.set_edge(source, target, pairs, weights)
@@ -218,13 +222,13 @@ class LUM:
 
     def compute(self) -> LumResult:
         """
-        Find the poses; they are in the graph afterwards.
+        Compute the poses and store them in the graph.
 
         Raises
         ------
         AlignmentError
-            If there are fewer than two vertices, or no finite poses follow; in that case the
-            poses are those from before. With ``jacobian='pcl'`` also for pairs with weights.
+            If there are fewer than two vertices, the solution is not finite, or pairs have weights
+            with ``jacobian='pcl'``; poses are unchanged then.
 
         """
         num_others = self.num_vertices - 1
@@ -245,10 +249,10 @@ class LUM:
         return self._result(converged, iterations, ends, terms)
 
     def _terms(self, ends: npt.NDArray[np.int64], poses: Floats) -> tuple[EdgeTerms, Floats]:
-        """Return the terms of all edges at some poses, and the root mean square of the gaps."""
+        """Return the terms of all edges at given poses, and the root mean square gaps."""
         weighted = self.graph.is_weighted
         if weighted.any() and self.jacobian == 'pcl':
-            raise AlignmentError("pairs with weights, which PCL has not; use jacobian='exact'")
+            raise AlignmentError("PCL does not support pairs with weights; use jacobian='exact'")
         T = transforms(poses)
         T_source, T_target = T[ends[:, 0]], T[ends[:, 1]]
         plain = ~weighted

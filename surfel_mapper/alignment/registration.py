@@ -1,18 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Registration: where a scan belongs on a map of surfels.
+Registration: the pose of a scan on a map of surfels, by point-to-plane Gauss-Newton.
 
-The scan is reduced to the means of its cells, and Gauss-Newton brings these onto the planes of
-the surfels in whose voxels they lie; there is no search for neighbours. Where the prediction may
-be off by more than a voxel, larger voxels come first, made of the same exact moments. A scan
-that does not fit in the end is tried from other headings, as a hand turns a lidar faster than any
-prediction.
+The scan is reduced to the means of its cells, and Gauss-Newton moves these onto the planes of the
+surfels of their voxels; there is no neighbour search. If the prediction may be off by more than a
+voxel, larger voxels come first, made of the same exact moments. A scan that finally does not fit
+is tried from other headings, because a hand turns a lidar faster than any prediction.
 
-The eigenvalues of the normal equations, turns scaled by the mean distance of what is seen, tell
-which directions of motion the scan says nothing about (a tunnel, a plain). There the prediction
-stays, after Zhang, Kaess and Singh 2016; the share of the information is compared, not its
-amount, for which every sensor would need a threshold of its own.
+The eigenvalues of the normal equations, rotations scaled by the mean lever, tell the directions of
+motion that the scan does not determine (a tunnel, a plain). In these the prediction is kept, after
+Zhang, Kaess and Singh 2016. The share of the information is compared, not its amount, which would
+need a threshold for every sensor.
 """
 
 from __future__ import annotations
@@ -24,8 +23,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.plane_levels import PlaneLevels
-from surfel_mapper.alignment.surfel_planes import SurfelPlanes
+from surfel_mapper.alignment.surfel_planes import PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import compose, pose_matrix, q_xyzw, se3_exp, Transform
 from surfel_mapper.kernels.layout import BITS, HALF
@@ -34,45 +32,47 @@ from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 TOLERANCE_M = 1e-4
-"""A step that moves what is seen by less is the last."""
+"""Displacement of the points by a step, m, below which iteration ends."""
 
 COARSE_TOLERANCE = 0.01
-"""In coarser voxels: by less than this share of one."""
+"""The same in coarser voxels, as a share of the voxel size."""
 
 SEARCH_STEP_DEG = 7.5
+"""Step of the heading search, deg."""
+
 SEARCH_CELLS = 3000
-"""Headings are compared so many degrees apart, by so many cells."""
+"""Maximum number of cells that the heading search uses."""
 
 SEARCH_STARTS = 3
-"""From the best so many headings the scan is aligned."""
+"""Number of best headings from which the scan is aligned."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RegistrationResult:
     """
-    Where a scan belongs.
+    Pose of a scan, and measures of its reliability.
 
     Attributes
     ----------
     T_map_sensor : (4, 4) float64
         Pose of the sensor.
     num_cells : int
-        How many cells the scan has.
+        Number of cells of the scan.
     overlap : float
-        Share of them that meet a surfel which says something, in [0, 1].
+        Share of the cells that hit a usable surfel, in [0, 1].
     fit : float
-        Share of these that fit it, in [0, 1].
+        Share of these cells that fit the surfel, in [0, 1].
     converged : bool
-        Whether the last step was small.
+        Whether the last step was below the tolerance.
     iterations : int
-        Steps taken.
+        Number of steps.
     information : (6, 6) float64
-        Inverse of a covariance of position (m) and turn (rad) about the sensor, along the axes of
-        the map; too large where neighbouring points are off alike.
+        Inverse covariance of position (m) and rotation (rad) about the sensor, along the axes of
+        the map; too large if the errors of neighbouring points are correlated.
     degenerate : (D, 6) float64
-        Directions in which the prediction stayed, unit vectors, turns scaled by ``radius_m``.
+        Directions in which the prediction is kept, unit vectors, rotations scaled by ``radius_m``.
     radius_m : float
-        Root mean square of the levers by which what is seen says something about turns.
+        Root mean square lever of the cells, by which rotations are scaled.
 
     """
 
@@ -88,7 +88,7 @@ class RegistrationResult:
 
     @property
     def support(self) -> float:
-        """Share of all cells that fit: what is best where the scan belongs."""
+        """Share of all cells that fit, the score of a pose."""
         return self.overlap * self.fit
 
 
@@ -101,12 +101,11 @@ class Registration:
     config : RegistrationConfig
         The settings; may be replaced at any time.
     voxel_size_m : float
-        Of the maps.
+        Voxel size of the maps.
 
     """
 
     def __init__(self, config: RegistrationConfig, voxel_size_m: float) -> None:
-        """Keep the settings."""
         self.config = config
         self._voxel_size_m = voxel_size_m
         self._reducer = Reducer(config.cell_m or 0.5 * voxel_size_m)
@@ -114,7 +113,7 @@ class Registration:
     def cells(
         self, points: npt.ArrayLike, min_range_m: float = 0.0, max_range_m: float = math.inf
     ) -> npt.NDArray[np.float64]:
-        """Return the means of the points (N, 3) of a scan in its cells, (K, 3) float64, m."""
+        """Return the mean of the points (N, 3) of a scan in each cell, (K, 3) float64, m."""
         size_m = self.config.cell_m or 0.5 * self._voxel_size_m
         if size_m != self._reducer.voxel_size_m:
             self._reducer = Reducer(size_m)
@@ -131,22 +130,22 @@ class Registration:
         expected_support: float = 0.0,
     ) -> RegistrationResult:
         """
-        Return where a scan belongs on a map.
+        Return the pose of a scan on a map.
 
         Parameters
         ----------
         cells : (K, 3) float64, m
-            As ``cells`` returns them.
+            Cells of the scan, from ``cells``.
         surfel_map : SurfelMap
-            Of the voxel size stated.
+            A map of the given voxel size.
         starts : sequence of (4, 4) float64
-            Where it may be, the likeliest first; degenerate directions stay as there. The others
-            are tried where that does not fit.
+            Possible poses, the likeliest first; degenerate directions keep its value. The others
+            are tried if it does not fit.
         deviation_m : float
-            How far cells may be off at the first start; decides where to begin and how much is
-            believed.
+            Expected error of the cells at the first start; determines the coarsest level and the
+            width of the robust kernel.
         expected_support : float
-            Other starts and headings are tried where less of the scan fits.
+            Other starts and headings are tried if less of the scan fits.
 
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
@@ -161,7 +160,7 @@ class Registration:
         return found
 
     def fits(self, alignment: RegistrationResult) -> bool:
-        """Return whether an alignment may be right, by what it says itself."""
+        """Return whether overlap and fit reach their minimum."""
         config = self.config
         return (
             alignment.fit >= config.min_fit_ratio and alignment.overlap >= config.min_overlap_ratio
@@ -174,7 +173,7 @@ class Registration:
         start: Transform,
         deviation_m: float,
     ) -> RegistrationResult:
-        """Align from the level that a deviation asks for down to the map itself."""
+        """Align from the level that a deviation requires down to the map itself."""
         reach = max(3.0 * deviation_m / levels.voxel_size_m(0), 1.0)
         coarsest = min(self.config.coarse_levels, math.ceil(math.log2(reach)))
         found, iterations = None, 0
@@ -185,7 +184,7 @@ class Registration:
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
             finer = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
             iterations += finer.iterations
-            # the first scans of few beams may fill larger voxels only: they are better than none
+            # the first scans of few beams may only fill the larger voxels
             if found is None or finer.overlap >= self.config.min_overlap_ratio:
                 found = finer
         assert found is not None, 'there is always level 0'
@@ -199,7 +198,7 @@ class Registration:
         width_m: float,
         tolerance_m: float,
     ) -> RegistrationResult:
-        """Take Gauss-Newton steps until they are small."""
+        """Iterate Gauss-Newton steps until they are below the tolerance."""
         pose, iteration, moved_m = start, 0, math.inf
         least = self.config.min_information_ratio
         while True:
@@ -225,7 +224,7 @@ class Registration:
     def _headings(
         self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]
     ) -> list[Transform]:
-        """Return the starts that fit best, turned to all headings searched."""
+        """Return the best starts and headings of the heading search."""
         num = int(self.config.search_deg / SEARCH_STEP_DEG)
         if not num:
             return list(starts[1:])
@@ -259,18 +258,18 @@ def solve(
     Parameters
     ----------
     hessian, gradient : (6, 6), (6,) float64
-        Of position, m, and turn, rad.
+        For position, m, and rotation, rad.
     min_ratio : float
-        Smallest eigenvalue of a direction that counts, where those of positions sum up to 1 and
-        those of turns, scaled, as well.
+        Smallest eigenvalue of a determined direction, scaled so that the eigenvalues of position
+        sum to 1 and those of rotation too.
 
     Returns
     -------
     step : (6,) float64
     degenerate : (D, 6) float64
-        The directions left out, unit vectors, turns scaled.
+        The undetermined directions, unit vectors, rotations scaled.
     radius_m : float
-        By which turns are scaled.
+        Scale of rotations.
 
     """
     weight = float(np.trace(hessian[:3, :3]))
@@ -286,7 +285,7 @@ def solve(
 
 
 def moved(T_map_sensor: Transform, step: npt.NDArray[np.float64]) -> Transform:
-    """Return a pose moved by step[:3], m, and turned about itself by the vector step[3:], rad."""
+    """Return a pose moved by step[:3], m, and rotated in place by the vector step[3:], rad."""
     turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))
     turned = compose(turn, T_map_sensor)
     return pose_matrix(T_map_sensor[:3, 3] + step[:3], q_xyzw(turned))

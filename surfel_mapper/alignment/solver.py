@@ -3,15 +3,15 @@
 """
 One step of the alignment: from the terms of all edges to a correction of every pose.
 
-Row i of the linear system says that the information of the edges at vertex i is in balance; it is
-sparse, and SuperLU with an ordering of minimum degree solves it in time linear in the edges of
-graphs that are chains with loops (200 vertices and 10 loops: 3 ms; dense QR, as in PCL: 288 ms).
-The motion of a vertex is taken about the mean of the centers of its edges, not about the origin of
-the map, so that far from the origin nothing cancels.
+Block row i of the linear system balances the edges at vertex i. The system is sparse; SuperLU with
+a minimum degree ordering solves it in time linear in the edges for chains with loops (200 vertices
+and 10 loops: 3 ms; dense QR, as in PCL: 288 ms). The motion of a vertex is taken about the mean of
+the centers of its edges, not about the origin of the map, so that nothing cancels far from the
+origin.
 
-The step of ``exact_step`` is right to second order in the angle: an edge measures halfway between
-its two ends, c = (a + b) / 2, which makes its rotation vector that of Cayley, tan(angle / 2), so
-that one pair of scans with exact pairs meets in a single step whatever the angle is.
+``exact_step`` is correct to second order in the angle: an edge measures halfway between its two
+ends, c = (a + b) / 2, so that its rotation vector is Cayley's, tan(angle / 2), and a pair of scans
+with exact correspondences converges in a single step for any angle.
 """
 
 from __future__ import annotations
@@ -30,21 +30,21 @@ Ints = npt.NDArray[np.int64]
 
 
 HUGE = 1e12
-"""Motions of so many m or rad are no solution but a system that is singular."""
+"""Motions beyond this, m or rad, mean that the system is singular."""
 
 
 class Entries(NamedTuple):
     """
-    Which edges enter the rows of which vertices: line c is one edge in one row.
+    Contributions of edges to the rows of vertices, one a line.
 
     Attributes
     ----------
     edges : (C,) int64
-        The edge.
+        Row of the edge.
     ij : (C, 2) int64
-        The vertex of the row, and the other end of the edge.
+        Vertex of the row, and the other end of the edge.
     sign : (C,) float64
-        1 in the row of the source, -1 in that of the target.
+        1 in the row of the source, -1 in the row of the target.
 
     """
 
@@ -53,13 +53,13 @@ class Entries(NamedTuple):
     sign: Floats
 
     def chosen(self, lines: npt.NDArray[np.bool_]) -> Entries:
-        """Return some of the lines."""
+        """Return selected lines."""
         return Entries(self.edges[lines], self.ij[lines], self.sign[lines])
 
 
 def components(num_vertices: int, ends: Ints) -> Ints:
-    """Return a number for each vertex, (V,), equal where edges with these ends (E, 2) connect."""
-    from scipy.sparse import coo_array  # 0.4 s, which mapping without alignment need not pay
+    """Return the connected component of each vertex, (V,), in the graph of edges (E, 2)."""
+    from scipy.sparse import coo_array  # 0.4 s, only alignment pays
     from scipy.sparse.csgraph import connected_components
 
     ones = np.ones(len(ends), np.int8)
@@ -74,11 +74,11 @@ def exact_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     Parameters
     ----------
     poses : (V, 6) float64
-        Vertex 0 stays; so do vertices that no edge that counts connects to it.
+        Vertex 0 and vertices that no used edge connects to it do not move.
     ends : (E, 2) int64
         Source and target of every edge.
     terms : EdgeTerms
-        At these poses.
+        Terms at these poses.
 
     Raises
     ------
@@ -103,11 +103,11 @@ def exact_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
 
 def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
     """
-    Return the poses after a step as PCL does it, for comparison.
+    Return the poses after a step as PCL computes it, for comparison.
 
-    The row of a vertex knows only the edge that leaves it where two vertices have edges in both
-    directions; the pose is corrected by the Jacobian of another order of rotations. In a
-    component without vertex 0 the last vertex stays.
+    If two vertices have edges in both directions, the row of a vertex uses only the edge that
+    leaves it; the pose is corrected by the Jacobian of another order of rotations. In a component
+    without vertex 0 the last vertex stays fixed.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
 
 
 def _used(ends: Ints, terms: EdgeTerms) -> Ints:
-    """Return the rows of the edges that count."""
+    """Return the rows of the edges that are not dropped."""
     counts = np.ones(len(ends), bool)
     counts[list(terms.dropped)] = False
     return np.flatnonzero(counts)
 
 
 def _pivots(num_vertices: int, ends: Ints, centers: Floats) -> Floats:
-    """Return the mean (V, 3) of the centers of the edges at every vertex."""
+    """Return the mean (V, 3) of the edge centers at every vertex."""
     total, number = np.zeros((num_vertices, 3)), np.zeros(num_vertices)
     for column in (0, 1):
         np.add.at(total, ends[:, column], centers)
@@ -167,7 +167,7 @@ def _solve(
     *,
     symmetric: bool,
 ) -> Floats:
-    """Return the motions (V, 6) of all vertices about their pivots, zero where not free."""
+    """Return the motions (V, 6) of all vertices about their pivots, zero if not free."""
     motion = np.zeros((len(free), 6))
     edges, ij, sign = entries.chosen(free[entries.ij[:, 0]])
     if not len(edges):
@@ -190,7 +190,7 @@ def _solve(
 def _solve_blocks(
     blocks: Floats, rows: Ints, columns: Ints, right: Floats, *, symmetric: bool
 ) -> Floats:
-    """Solve the system of blocks (B, 6, 6), those of one place added up, for right (F, 6)."""
+    """Solve the system of blocks (B, 6, 6), summed by row and column, for right (F, 6)."""
     from scipy.sparse import coo_array
     from scipy.sparse.linalg import splu
 
@@ -201,7 +201,7 @@ def _solve_blocks(
     system = coo_array((blocks.ravel(), (i.ravel(), j.ravel())), shape=(size, size)).tocsc()
     try:
         if symmetric:
-            # positive definite, so the diagonal is as good a pivot as any and fill stays small
+            # positive definite: pivoting on the diagonal is stable and keeps the fill small
             factors = splu(
                 system,
                 permc_spec='MMD_AT_PLUS_A',
@@ -219,7 +219,7 @@ def _solve_blocks(
 
 
 def _arms(lengths: Floats) -> Floats:
-    """Return the matrices (B, 6, 6) that take a motion about a pivot to one about a center."""
+    """Return the matrices (B, 6, 6) from motions about a pivot to motions about a center."""
     result = np.zeros((len(lengths), 6, 6))
     result[:] = np.eye(6)
     result[:, :3, 3:] = -skew(lengths)
@@ -228,12 +228,12 @@ def _arms(lengths: Floats) -> Floats:
 
 def _cayley(T: Floats, pivots: Floats, motion: Floats) -> Floats:
     """
-    Return transforms (V, 4, 4) after taking back motions about pivots.
+    Return transforms (V, 4, 4) after reverting motions about pivots.
 
-    A point u about the pivot goes to v with v - u = -(t + w x (u + v) / 2).
+    A point u about the pivot moves to v with v - u = -(t + w x (u + v) / 2).
     """
     half = 0.5 * motion[:, 3:]
-    # the inverse of 1 + [half]x, written out: never singular, however large a turn
+    # the inverse of 1 + [half]x in closed form: never singular
     inverse = np.eye(3) + half[:, :, None] * half[:, None] - skew(half)
     inverse /= 1.0 + (half * half).sum(axis=1)[:, None, None]
     R = inverse @ (np.eye(3) - skew(half))

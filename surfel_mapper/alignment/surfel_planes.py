@@ -1,23 +1,28 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The surfels of a map as planes for the cells of a scan, derived only where a cell meets them.
+The surfels of a map as planes for the cells of a scan, derived only for the voxels that cells hit.
 
-What an alignment costs depends on the scan and not on the size of the map. How far a cell may
-be from a plane comes from the fit of the plane itself: the variance of a prediction is that of
-the points about the plane, and grows with the distance from their mean as the normal is unsure,
-by e0 e1 / (n (e1 - e0)^2). So a surfel of few points, of one ring of a lidar, or of a pole or a
-bush says little without a threshold that would have to be set.
+The cost of an alignment depends on the scan and not on the size of the map. The tolerance of a
+cell comes from the fit of the plane: the variance of a predicted distance is the variance of the
+points about the plane, and grows with the distance from their mean by the uncertainty of the
+normal, e0 e1 / (n (e1 - e0)^2). So a surfel of few points, of one ring of a lidar, or of a pole or
+a bush gets little weight without a threshold to be tuned.
 
 A surface that lies in a face between two voxels is cut in two by its own noise, each half with a
-mean 0.8 standard deviations off; cells would stay on the side they start from. So surfels
-near a face are merged with what continues them behind it.
+mean 0.8 standard deviations off, and cells would stay on the side where they start. So surfels
+near a face are merged with their continuation behind it.
+
+PlaneLevels makes the planes of the map and of its coarser levels when first requested. Most
+alignments need only the map itself. A coarser level is made of the voxels within reach of the
+scan, so that its cost does not depend on the size of the map either.
 
 Source: Kanatani 1996 (Statistical Optimization for Geometric Computation) for the normal.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 import math
 
 import numpy as np
@@ -33,6 +38,7 @@ from surfel_mapper.alignment.kernels.registration import (
     sum_equations,
     VARIANCE,
 )
+from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import Transform
 from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.moments import pack_keys
@@ -40,34 +46,34 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 
 NOISE_IN_PLANE = 3.0
-"""So many variances of a range may lie across a ring of a lidar, along the beam."""
+"""Upper bound of the variance across a ring of a lidar, along the beam, in variances of a
+range."""
 
 MAX_TILT_SQ = 0.1
-"""The variance of a normal, rad^2, from which on it is none."""
+"""Largest variance of a normal, rad^2; surfels with more are ignored."""
 
 SIGMAS = 3.0
-"""So many standard deviations from a face a surface may be cut by it."""
+"""Distance in standard deviations within which a face may cut a surface."""
 
 ALIKE = 0.9
-"""Cosine between the normals of two surfels that may be one."""
+"""Minimum cosine between the normals of two surfels to be merged."""
 
 
 class SurfelPlanes:
     """
-    Planes of one map, which must not change meanwhile.
+    Planes of a map, which must not change meanwhile.
 
     Parameters
     ----------
     surfel_map : SurfelMap
     min_points : int
-        Surfels of fewer points do not count.
+        Surfels of fewer points are ignored.
     noise_m : float
-        Standard deviation of a range: no plane is sharper.
+        Standard deviation of a range, added to the thickness of every plane.
 
     """
 
     def __init__(self, surfel_map: SurfelMap, min_points: int, noise_m: float) -> None:
-        """Begin without any plane."""
         self._map = surfel_map
         self._min_points = min_points
         self._noise_sq = noise_m * noise_m
@@ -79,7 +85,7 @@ class SurfelPlanes:
         self, cells: npt.NDArray[np.float64], T_map_sensor: Transform, width_m: float
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float, float]:
         """
-        Return the normal equations of a step from a pose.
+        Return the normal equations of a Gauss-Newton step at a pose.
 
         Parameters
         ----------
@@ -88,17 +94,17 @@ class SurfelPlanes:
         T_map_sensor : (4, 4) float64
             The pose.
         width_m : float
-            Of the robust kernel.
+            Width of the robust kernel.
 
         Returns
         -------
         hessian : (6, 6) float64
-            Of position and turn about the sensor, along the axes of the map.
+            For position and rotation about the sensor, along the axes of the map.
         gradient : (6,) float64
         overlap : float
-            Share of the cells that meet a surfel which says something, in [0, 1].
+            Share of the cells that hit a usable surfel, in [0, 1].
         fit : float
-            Share of these that fit it, in [0, 1].
+            Share of these cells that fit the surfel, in [0, 1].
 
         """
         pose = np.ascontiguousarray(T_map_sensor[:3])
@@ -112,7 +118,7 @@ class SurfelPlanes:
     def _place(
         self, cells: npt.NDArray[np.float64], pose: npt.NDArray[np.float64]
     ) -> npt.NDArray[np.int32]:
-        """Return the row of the plane that each cell meets at a pose, -1 for none."""
+        """Return the row of the plane that each cell hits at a pose, -1 if none."""
         keys = np.empty(len(cells), np.int64)
         cell_keys(cells, pose, self._scale, BITS + self._map.level, keys)
         found = self._map.find(keys)
@@ -128,8 +134,8 @@ class SurfelPlanes:
         return found
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
-        """Return surfels as rows of planes; those that say nothing have an infinite variance."""
-        surfels = self._continued(surfels)
+        """Return surfels as rows of planes; unusable surfels get an infinite variance."""
+        surfels = self._merged_across_faces(surfels)
         planes = np.empty((len(surfels), PLANE))
         planes[:, MEAN : MEAN + 3] = surfels.position
         planes[:, NORMAL : NORMAL + 3] = surfels.normal
@@ -139,16 +145,16 @@ class SurfelPlanes:
         gap = np.maximum(middle - surfels.eigenvalues[:, 0] - by_noise, 1e-9 * low)
         planes[:, VARIANCE] = low * (1.0 + 1.0 / count)
         planes[:, SPREAD] = low * middle / (count * gap * gap)
-        says_nothing = (
+        unusable = (
             (count < self._min_points)
             | np.isnan(surfels.planarity)
             | (planes[:, SPREAD] > MAX_TILT_SQ)
         )
-        planes[says_nothing, VARIANCE] = math.inf
+        planes[unusable, VARIANCE] = math.inf
         return planes
 
-    def _continued(self, surfels: Surfels) -> Surfels:
-        """Merge surfels near a face of their voxels with those behind it, where they are one."""
+    def _merged_across_faces(self, surfels: Surfels) -> Surfels:
+        """Merge surfels near a face of their voxel with their continuation behind it."""
         size_m = self._map.voxel_size_m
         every = np.arange(len(surfels))
         axis = np.argmax(np.abs(np.nan_to_num(surfels.normal)), axis=1)
@@ -170,6 +176,66 @@ class SurfelPlanes:
         return surfels
 
 
+class PlaneLevels:
+    """
+    Planes of a map and of its coarser levels around a scan.
+
+    Parameters
+    ----------
+    config : RegistrationConfig
+    surfel_map : SurfelMap
+        The map, level 0.
+    cells : (K, 3) float64, m
+        Cells of the scan in the sensor frame; they determine its reach.
+    starts : iterable of (4, 4) float64
+        Possible poses of the sensor.
+
+    """
+
+    def __init__(
+        self,
+        config: RegistrationConfig,
+        surfel_map: SurfelMap,
+        cells: npt.NDArray[np.float64],
+        starts: Iterable[Transform],
+    ) -> None:
+        self._config = config
+        self._map = surfel_map
+        self._cells = cells
+        self._starts = list(starts)
+        self._planes: dict[int, SurfelPlanes] = {}
+
+    def voxel_size_m(self, level: int) -> float:
+        """Return the edge of a voxel of a level."""
+        return float(self._map.voxel_size_m * 2**level)
+
+    def planes(self, level: int) -> SurfelPlanes:
+        """
+        Return the planes of a level.
+
+        Raises
+        ------
+        MapLimitError
+            If a voxel of that level would hold too many points; see SurfelMap.coarsen.
+
+        """
+        if level not in self._planes:
+            target = self._map.coarsen(level, self._box()) if level else self._map
+            self._planes[level] = SurfelPlanes(
+                target, self._config.min_points, self._config.noise_m
+            )
+        return self._planes[level]
+
+    def _box(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Return the box of voxels within reach of the scan at any heading."""
+        reach_m = math.sqrt(float((self._cells**2).sum(axis=1).max(initial=0.0)))
+        reach_m += self.voxel_size_m(self._config.coarse_levels)
+        at = np.array([start[:3, 3] for start in self._starts])
+        low = np.floor((at.min(axis=0) - reach_m) / self._map.voxel_size_m)
+        high = np.floor((at.max(axis=0) + reach_m) / self._map.voxel_size_m)
+        return low.astype(np.int64), high.astype(np.int64)
+
+
 def merge(
     surfels: Surfels,
     rows: npt.NDArray[np.int64],
@@ -177,18 +243,18 @@ def merge(
     across_m: npt.NDArray[np.float64],
 ) -> None:
     """
-    Merge surfels into some rows of others of about the same normals, in place.
+    Merge surfels pairwise into others of similar normals, in place.
 
     Parameters
     ----------
     surfels : Surfels
-        Those that are changed.
+        Surfels to change.
     rows : (K,) int64
-        Which of them.
+        Rows to merge into.
     other : Surfels
-        K more, one for each.
+        K surfels to merge, one for each row.
     across_m : (K,) float64
-        How far these are along the normals of the first.
+        Distance of these from the first along the normals of the first.
 
     """
     first, second = surfels.num_points[rows], other.num_points

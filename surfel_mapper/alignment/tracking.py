@@ -1,13 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tracking: the pose of scan after scan, each predicted from those before.
+Tracking: the pose of scan after scan, each predicted from the previous ones.
 
-What carries the sensor is taken to go on as it moved between the last two scans. By how much
-that was wrong lately decides how far the next alignment looks and how much of what is off it
-believes; how much of a scan fitted lately decides whether the next one is in the right place.
+The body that carries the sensor is assumed to continue its motion between the last two scans. The
+recent errors of this prediction determine the search distance and the width of the robust kernel
+of the next alignment; the recent shares of fitting cells determine whether the next result is
+accepted.
 
-Source: Vizzo et al. 2023 (KISS-ICP) for the threshold out of deviations.
+Source: Vizzo et al. 2023 (KISS-ICP) for the adaptive threshold.
 """
 
 from __future__ import annotations
@@ -31,62 +32,61 @@ from surfel_mapper.geometry import (
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 REMEMBERED = 10
-"""Deviations and supports of so many scans are remembered."""
+"""Number of scans whose deviations and supports are kept."""
 
 EXPECTED_SUPPORT = 0.85
-"""A scan of which less than this share of what is usual fits may be in the wrong place."""
+"""Minimum support of a scan, as a share of the median support of recent scans."""
 
 FLOOR_NOISES = 3.0
-"""No deviation is taken to be less than so many standard deviations of a range."""
+"""Minimum expected deviation, in standard deviations of a range."""
 
 
 class Tracker:
     """
-    Follows a sensor, or what carries it, on a map.
+    Tracks a sensor, or the body that carries it, on a map.
 
     Parameters
     ----------
     registration : Registration
         Aligns the scans.
     start : (4, 4) float64
-        Where it is at first.
+        Initial pose.
 
     Attributes
     ----------
     pose : (4, 4) float64
-        T_fixed_body, where it was last.
+        The last T_fixed_body.
     twist : (6,) float64
-        How it moved there, m/s and rad/s, in its own frame.
+        The last velocity, m/s and rad/s, in the frame of the body.
 
     """
 
     def __init__(self, registration: Registration, start: Transform) -> None:
-        """Begin at a pose, with nothing known of the motion."""
         self._registration = registration
         self.restart(start)
 
     def restart(self, T_fixed_body: Transform) -> None:
-        """Go on from a pose, with nothing known of the motion."""
+        """Continue from a pose, at rest."""
         self.pose = T_fixed_body
         self.twist = np.zeros(6)
         self._stamp_ns: int | None = None
-        self._forget()
+        self._clear_history()
 
     def begin(self, stamp_ns: int, twist: npt.NDArray[np.float64]) -> None:
-        """Say when and how it moves (6,), m/s and rad/s, where it is to start from."""
+        """Set the initial stamp and velocity (6,), m/s and rad/s."""
         self._stamp_ns, self.twist = stamp_ns, twist
 
-    def _forget(self) -> None:
+    def _clear_history(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
         self._supports: deque[float] = deque(maxlen=REMEMBERED)
 
     @property
     def is_new(self) -> bool:
-        """Whether there was no scan yet since the last restart."""
+        """Whether no scan was tracked since the last restart."""
         return self._stamp_ns is None
 
     def predict(self, stamp_ns: int) -> Transform:
-        """Return T_fixed_body at a stamp, if the motion goes on as before."""
+        """Return T_fixed_body at a stamp, assuming constant velocity."""
         if self._stamp_ns is None:
             return self.pose
         step = se3_exp(self.twist * ((stamp_ns - self._stamp_ns) / 1e9))
@@ -94,7 +94,7 @@ class Tracker:
 
     @property
     def deviation_m(self) -> float:
-        """How far from the prediction points may be: what it lately was."""
+        """Expected distance of points from the prediction, m: the recent root mean square."""
         config = self._registration.config
         if not self._deviations:
             return config.max_deviation_m
@@ -109,23 +109,23 @@ class Tracker:
         T_map_fixed: Transform,
     ) -> RegistrationResult:
         """
-        Align a scan, and go on from where it belongs.
+        Align a scan, and continue from its pose.
 
         Parameters
         ----------
         cells : (K, 3) float64, m
-            Of the scan, in the frame that is followed.
+            Cells of the scan, in the frame of the body.
         stamp_ns : int
-            Its time, after that of the one before.
+            Its time, after that of the previous scan.
         surfel_map : SurfelMap
             The map.
         T_map_fixed : (4, 4) float64
-            From the frame of the poses to that of the map.
+            From the fixed frame to the frame of the map.
 
         Raises
         ------
         AlignmentError
-            If the scan does not fit the map. The motion is trusted less then.
+            If the scan does not fit the map. The predicted velocity is halved then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
@@ -136,8 +136,8 @@ class Tracker:
         found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
         is_steady = found.converged or found.support >= expected > 0.0
         if not (is_steady and self._registration.fits(found)):
-            self._forget()
-            self.twist = 0.5 * self.twist  # it is not what it was; in the end, at rest
+            self._clear_history()
+            self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
             raise AlignmentError(self._refusal(found))
         self._supports.append(found.support)
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
@@ -145,7 +145,7 @@ class Tracker:
         return found
 
     def _refusal(self, found: RegistrationResult) -> str:
-        """Return why a scan was not followed."""
+        """Return the reason why a scan was rejected."""
         config = self._registration.config
         said = (
             f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
@@ -160,16 +160,16 @@ class Tracker:
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """
-        Go on from a pose, and learn from it about the motion.
+        Continue from a known pose, and update velocity and deviations.
 
         Parameters
         ----------
         T_fixed_body : (4, 4) float64
-            Where it is.
+            The pose.
         stamp_ns : int
-            When.
+            Its stamp.
         reach_m : float
-            How far away what it sees is, by which a wrong turn counts.
+            Root mean square distance of the points, which scales rotational errors.
 
         """
         if self._stamp_ns is not None and stamp_ns > self._stamp_ns:

@@ -147,7 +147,7 @@ def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) ->
 
 def trajectories(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of a trajectory, and lines that state them."""
-    from surfel_mapper.alignment.trajectory_errors import compare
+    from surfel_mapper.evaluation.trajectory_errors import compare
     from surfel_mapper.evaluation.truth import read_poses, true_poses
 
     estimated_ns, estimated = read_poses(args.map)

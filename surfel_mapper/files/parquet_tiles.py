@@ -44,8 +44,7 @@ from surfel_mapper.files.parquet import (
     VIEWS,
 )
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.digest import digest_of
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.moments import digest_of, pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 TILE_BITS = 8

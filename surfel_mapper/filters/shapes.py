@@ -31,10 +31,10 @@ from surfel_mapper.filters.columns import (
     MEAN_DISTS,
     NORMALS,
 )
-from surfel_mapper.filters.kernels.shapes import eigenvectors, group_moments, neighbour_moments
+from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
 from surfel_mapper.filters.neighbours import coordinates, Ids, neighbourhoods, Points
 from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.eigen3 import decompose
+from surfel_mapper.kernels.symmetric3 import decompose, eigenvectors
 from surfel_mapper.scan import Scan
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))

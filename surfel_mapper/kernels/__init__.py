@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Compiled loops that two or more parts share; those of one part are in ``<part>/kernels/``.
+Compiled loops that two or more parts share; kernels of a single part are in ``<part>/kernels/``.
 
-Only folders of this name import numba. Ubuntu 24.04, the system of ROS 2 Jazzy, has no package of
-numba, so rosdep cannot install it there and it is missing on many robots at first. Importing a
-kernel then raises an error that says how to install it.
+Only folders of this name import numba. Ubuntu 24.04, the system of ROS 2 Jazzy, does not package
+numba, so rosdep cannot install it. If it is missing, importing a kernel raises DependencyError
+with the commands that install it.
 
-If numba finds no writable directory for its cache, it refuses to load any kernel; the kernels are
-then cached in a temporary directory and compiled at every start.
+If numba finds no writable cache directory, it refuses to load any kernel; the kernels are then
+cached in a temporary directory and compiled at every start.
 
-numba compiles a kernel anew if its own file changed, but not if a kernel that it calls did: after
-an update, cached kernels would disagree on the layout of a table. So any change in any folder of
+numba recompiles a kernel if its own file changed, but not if a kernel that it calls did: after an
+update, cached kernels could disagree on the layout of a table. So any change in any folder of
 kernels discards the whole cache.
 """
 
@@ -26,12 +26,12 @@ from types import FunctionType
 from surfel_mapper.errors import DependencyError
 
 HOW_TO_INSTALL = (
-    'It compiles the kernels of surfel_mapper. Install it with\n'
+    'surfel_mapper needs it to compile its kernels. Install it with\n'
     '    pip install numba\n'
-    'Ubuntu 24.04 has no apt package of it and guards the system against pip; there, either\n'
+    'On Ubuntu 24.04, which has no apt package of numba, use a virtual environment:\n'
     '    python3 -m venv --system-site-packages ~/surfel_mapper_venv\n'
     '    . ~/surfel_mapper_venv/bin/activate && pip install numba\n'
-    'and start ROS nodes from the shell with that venv active, or, for all users of the machine,\n'
+    'and start ROS nodes from the shell with that venv active; or install it for all users:\n'
     '    sudo pip install --break-system-packages numba'
 )
 
@@ -44,17 +44,17 @@ except ImportError as error:
 _log = logging.getLogger(__name__)
 
 STAMP = 'kernels.sha256'
-"""File beside the cached kernels: the hash of all sources that they were compiled from."""
+"""File beside the cached kernels: hash of the sources that they were compiled from."""
 
 _PACKAGE = Path(__file__).parents[1]
 
 
 def _probe() -> None:
-    """Take the place of a kernel, to find the cache of its folder; never compiled."""
+    """Stand in for a kernel to locate the cache directory of a folder; never compiled."""
 
 
 def _cache_of(folder: Path) -> Path:
-    """Return numba's cache directory of a folder; RuntimeError if it can write none."""
+    """Return numba's cache directory of a folder; RuntimeError if none is writable."""
     code = _probe.__code__.replace(co_filename=str(folder / '__init__.py'))
     path = _numba.njit(cache=True)(FunctionType(code, {})).stats.cache_path
     assert path is not None, 'cache=True was given'
@@ -62,7 +62,7 @@ def _cache_of(folder: Path) -> Path:
 
 
 def _discard_stale(directory: Path, digest: bytes) -> None:
-    """Remove the cached kernels of a directory unless they were compiled from these sources."""
+    """Remove the cached kernels of a directory if they were compiled from other sources."""
     stamp = directory / STAMP
     try:
         if stamp.exists() and stamp.read_bytes() == digest:
@@ -81,8 +81,8 @@ except RuntimeError:
     atexit.register(shutil.rmtree, _directory, ignore_errors=True)
     _numba.config.CACHE_DIR = _directory  # type: ignore[attr-defined]
     _log.warning(
-        'compiled kernels cannot be kept, so every start takes half a minute: set NUMBA_CACHE_DIR '
-        'to a directory that can be written'
+        'no writable cache directory for compiled kernels, so every start takes half a minute: '
+        'set NUMBA_CACHE_DIR to a writable directory'
     )
 else:
     if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]

@@ -3,18 +3,19 @@
 """
 The hash table of a map: voxel key to row of the slab.
 
-The table is a directory of segments (extendible hashing), because one large table stops the
-world when it grows: here a full segment of 512 buckets splits on its own. The directory is
-indexed by the highest bits of a 32-bit hash, the bucket within a segment by the lowest; within
-a segment probing is linear and a removal shifts later buckets back, so no tombstones remain.
+The table is a directory of segments (extendible hashing). A single large table would have to be
+rehashed as a whole when it grows; here each full segment of 512 buckets splits separately. The
+directory is indexed by the highest bits of a 32-bit hash, the bucket within a segment by the
+lowest; within a segment probing is linear and a removal shifts later buckets back, so no
+tombstones remain.
 
-A bucket is one int64: the hash in the upper 32 bits and row + 1 in the lower, 0 where empty.
-Splitting and shifting need the hash only, never the rows; a lookup that finds an equal hash
-confirms it by the key in the row, which is about to be used anyway.
+A bucket is one int64: the hash in the upper 32 bits and row + 1 in the lower, 0 if empty.
+Splitting and shifting need only the hash, never the rows; a look-up that finds an equal hash
+confirms it by the key in the row, which the caller is about to use.
 
 The kernels take the table as one tuple: directory (2^depth,) int32, the segment of each prefix of
 the hash; buckets (S * 512,) int64; held (S,) int32, rows in each segment; local_depth (S,) int8,
-how many bits of the hash all rows of a segment share. Its depth is in the map's state.
+number of hash bits that all rows of a segment share. Its depth is in the map's state.
 
 Source: Fagin et al. 1979, Extendible hashing; deletion after Knuth, vol. 3, 6.4, algorithm R.
 """
@@ -28,20 +29,20 @@ SEGMENT = 512
 """Buckets of a segment: 4 KiB."""
 
 FULLEST = SEGMENT * 3 // 4
-"""No segment holds more; see is_full."""
+"""Maximum number of rows in a segment; see is_full."""
 
-# Scalars of a map that kernels write: an int64 array of these.
+# Entries of the state of a map, an int64 array that kernels write.
 FREE_ROW = 0
-"""First row of the chain of free rows, -1 where there is none."""
+"""First row of the chain of free rows, -1 if the chain is empty."""
 ROWS_USED = 1
-"""Rows ever used; rows from here on are untouched."""
+"""Number of rows ever used; later rows are untouched."""
 VOXELS = 2
 SEGMENTS = 3
 DEPTH = 4
 """The directory has 2^DEPTH entries."""
 POINTS = 5
 CHANGED = 6
-"""Rows that the operation under way has changed so far."""
+"""Number of rows that the current operation has changed so far."""
 STATE = 7
 
 _LOW = np.int64(0xFFFFFFFF)
@@ -65,16 +66,16 @@ def first_bucket(hashed, directory, depth):
 
 @njit(cache=True, nogil=True, inline='always')
 def next_bucket(bucket):
-    """Return the bucket after this one, round within its segment."""
+    """Return the next bucket, cyclically within the segment."""
     return (bucket & ~(SEGMENT - 1)) | ((bucket + 1) & (SEGMENT - 1))
 
 
 @njit(cache=True, nogil=True, inline='always')
 def likely_row(hashed, directory, buckets, depth):
     """
-    Return the first row of a hash, or -1 if the map has none.
+    Return the first row with a hash, or -1 if not found.
 
-    Of two voxels in one segment with the same hash it finds one; the key in the row tells.
+    Two voxels of one segment may have the same hash: compare the key in the row.
     """
     bucket = first_bucket(hashed, directory, depth)
     entry = buckets[bucket]
@@ -89,9 +90,9 @@ def is_full(hashed, table, depth):
     """
     Return whether the segment of a hash has to split before the next insertion.
 
-    Segments are full at 1/2 to 3/4 of their buckets, each at another share (by multiples of the
-    golden ratio). If all had the same they would split at the same time, since hashes are
-    uniform, and a look-up take twice as long before that as after it.
+    Segments are full at 1/2 to 3/4 of their buckets, the share spread by multiples of the golden
+    ratio. With an equal share all segments would split at the same time, since hashes are uniform,
+    and look-ups would take twice as long before that moment as after it.
     """
     directory, _, held, _ = table
     segment = np.int64(directory[hashed >> (32 - depth)])
@@ -101,7 +102,7 @@ def is_full(hashed, table, depth):
 @njit(cache=True, nogil=True)
 def find_row(key, rows, table, depth):
     """
-    Return the row of a voxel, or -1 if the map has none.
+    Return the row of a voxel, or -1 if not found.
 
     rows  (R, 16) int64, the slab
     """
@@ -121,7 +122,7 @@ def find_row(key, rows, table, depth):
 
 @njit(cache=True, nogil=True)
 def insert_row(hashed, row, table, depth):
-    """Put the row of a voxel that is not in the table into the first empty bucket."""
+    """Insert the row of a voxel that is not in the table."""
     directory, buckets, held, _ = table
     bucket = first_bucket(hashed, directory, depth)
     held[bucket // SEGMENT] += 1
@@ -133,9 +134,9 @@ def insert_row(hashed, row, table, depth):
 @njit(cache=True, nogil=True)
 def remove_row(key, row, table, depth):
     """
-    Take the row of a voxel out of the table and close the gap.
+    Remove the row of a voxel from the table and close the gap.
 
-    A later bucket moves into the gap unless its search starts behind the gap.
+    A later bucket moves into the gap unless its search starts after the gap.
     """
     directory, buckets, held, _ = table
     bucket = first_bucket(hash_key(key), directory, depth)
@@ -157,13 +158,13 @@ def remove_row(key, row, table, depth):
 @njit(cache=True, nogil=True)
 def split_segment(hashed, table, state):
     """
-    Divide the segment of a hash in two by its next bit; return whether there was room.
+    Split the segment of a hash by the next bit of the hashes; return whether there was room.
 
     hashed  int64, any hash of the segment
     state   (STATE,) int64
 
-    Without room for one more segment, or when the directory would have to double, nothing is
-    changed and the result is False.
+    Without room for another segment, or if the directory would have to double, nothing changes
+    and the result is False.
     """
     directory, buckets, held, local_depth = table
     depth = state[DEPTH]
@@ -177,7 +178,7 @@ def split_segment(hashed, table, state):
     entries = buckets[old * SEGMENT : (old + 1) * SEGMENT].copy()
     buckets[old * SEGMENT : (old + 1) * SEGMENT] = 0
     buckets[new * SEGMENT : (new + 1) * SEGMENT] = 0
-    # The entries of the directory that share the old prefix: the upper half gets the new one.
+    # the upper half of the directory entries with the old prefix gets the new segment
     span = 1 << (depth - bits)
     first = (hashed >> (32 - bits)) << (depth - bits) if bits > 0 else 0
     directory[first + span // 2 : first + span] = new

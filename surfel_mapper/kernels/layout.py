@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Numbers that the kernels of the map share: the lattice, the voxel key, a row of the slab.
+Constants that all kernels of the map share: the lattice, the voxel key, a row of the slab.
 
 A voxel key packs the three indices, each of 21 bits and offset by 2^20, into 63 bits of an
-int64, x highest. A map keeps one row of 16 int64 a voxel: 128 bytes, two neighbouring cache
-lines, so that a voxel costs one miss (a separate array for each moment would cost thirteen).
+int64, x highest. A map keeps one row of 16 int64 for each voxel: 128 bytes, two neighbouring cache
+lines, so that a voxel costs one cache miss (separate arrays of each moment would cost thirteen).
+
+Stands alone because files and messages read it too, which need no kernel.
 """
 
 BITS = 16
@@ -23,13 +25,13 @@ INDEX_OFFSET = 1 << (INDEX_BITS - 1)
 INDEX_MASK = (1 << INDEX_BITS) - 1
 
 MAX_SCAN_COUNT = 1 << 23
-"""Points in one voxel of one scan: up to here float64 sums of the moments are exact."""
+"""Maximum number of points of one scan in a voxel: float64 sums of their moments are exact."""
 
 MAX_MAP_COUNT = 1 << 31
-"""Points in one voxel of a map: up to here int64 sums of the moments do not overflow."""
+"""Maximum number of points of a map in a voxel: int64 sums of their moments do not overflow."""
 
 VIEW_SCALE = 1 << 14
-"""Length of the integer unit vectors that say from where a voxel was seen."""
+"""Length of the integer vectors that point from a voxel to the sensor."""
 
 # Columns of a row. A free row has COUNT 0 and the next free row in KEY.
 KEY = 0

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Ask for a row of memory ahead of its use.
+Prefetch memory into the cache.
 
-The kernels of the map visit rows in an order that no hardware predicts, and know it some
-iterations ahead. Asking early hides most of the cache misses.
+The kernels of the map visit rows in an order that the hardware cannot predict but the kernel
+knows some iterations ahead. Prefetching hides most of the cache misses.
+
+Stands alone: it is the one place that emits an instruction of LLVM.
 """
 
 from llvmlite import ir
@@ -15,7 +17,7 @@ from numba.extending import intrinsic, overload
 
 def prefetch(array, index):
     """
-    Ask for the cache line of array[index]; changes nothing. The index is not checked.
+    Prefetch the cache line of array[index]; changes nothing. The index is not checked.
 
     array  one-dimensional, contiguous
     index  int64
@@ -45,5 +47,5 @@ def _prefetch(typingctx, array, index):
 
 @overload(prefetch, inline='always')
 def _compiled_prefetch(array, index):
-    # the instruction where it is compiled; the interpreter runs the empty function above
+    # compiled code emits the instruction; the interpreter runs the empty function above
     return lambda array, index: _prefetch(array, index)

@@ -1,16 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Where points fall in the image of a camera or a spinning lidar.
+Project points into the image of a camera or a spinning lidar.
 
-Angles come from a polynomial that the compiler turns into vector instructions, eight points at a
-time; 1 microradian off at most, a three-thousandth of a pixel of a lidar of 2048 columns. All is
-float32: the points are differences to the sensor, which were taken in float64.
+Angles come from a polynomial that the compiler vectorises, eight points at a time; the error is at
+most 1 microradian, 1/3000 of a pixel of a lidar of 2048 columns. All values are float32: points
+are relative to the sensor, subtracted in float64.
 
 A sensor is eight float32 numbers. Camera: fx, fy, cx, cy, columns, rows. Lidar: azimuth of column
 0, angle between columns, elevation of row 0, angle between rows (all rad), columns, rows, columns
-of a full turn, smallest column number (0 where the last column neighbours the first, else -0.5).
-A point that is in no pixel has column OUTSIDE.
+of a full turn, smallest column number (0 if the last column neighbours the first, else -0.5).
+A point outside of the image has column OUTSIDE.
 """
 
 import math
@@ -21,7 +21,7 @@ import numpy as np
 CAMERA = 0
 LIDAR = 1
 LIDAR_TABLE = 2
-"""A lidar whose rows are not evenly spaced: their elevations are a table."""
+"""A lidar with unevenly spaced rows: their elevations are in a table."""
 
 OUTSIDE = np.float32(-2.0)
 
@@ -33,7 +33,7 @@ _ONE = np.float32(1.0)
 _TINY = np.float32(1e-30)
 _LARGE = np.float32(1e30)
 
-# atan(a) / a as a polynomial of a^2 through the Chebyshev nodes of [0, 1]: 1.2e-8 rad off at most.
+# atan(a) / a as a polynomial of a^2 through the Chebyshev nodes of [0, 1]: error below 1.2e-8 rad.
 _A0 = np.float32(0.9999999842426361)
 _A1 = np.float32(-0.3333306678069206)
 _A2 = np.float32(0.1999248357850854)
@@ -63,14 +63,14 @@ def arc_tangent(y, x):
 @njit(cache=True, nogil=True, error_model='numpy')
 def project(x, y, z, kind, sensor, elevations, distance, u, v):
     """
-    Find distance and place in the image of points.
+    Compute range, column and row of points.
 
     x, y, z         (N,) float32 m, in the frame of the sensor
-    elevations      (rows,) float32 rad, descending; used by LIDAR_TABLE alone
+    elevations      (rows,) float32 rad, descending; used by LIDAR_TABLE only
     distance, u, v  (N,) float32, out
 
-    Every loop writes one array and reads few, or the compiler gives up proving that arrays do
-    not overlap and computes one point at a time.
+    Every loop writes one array and reads few: with more, the compiler cannot prove that arrays do
+    not overlap, and does not vectorise.
     """
     for n in range(len(x)):
         distance[n] = np.sqrt(x[n] * x[n] + y[n] * y[n] + z[n] * z[n])
@@ -94,21 +94,21 @@ def project(x, y, z, kind, sensor, elevations, distance, u, v):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def perspective(across, depth, focal, centre, pixel):
-    """Find the column of points, or the row."""
+    """Project one coordinate of points to a column or row."""
     for n in range(len(across)):
         pixel[n] = focal * (across[n] / depth[n]) + centre
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def keep_within(values, low, high, u):
-    """Put points outside whose value is not between two bounds."""
+    """Set u to OUTSIDE for points whose value is not within bounds."""
     for n in range(len(u)):
         u[n] = u[n] if (values[n] >= low) & (values[n] <= high) else OUTSIDE
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def columns_of(x, y, sensor, u):
-    """Find the column of points; OUTSIDE beyond the last unless columns go all around."""
+    """Compute the column of points; OUTSIDE beyond the last, unless columns are a full turn."""
     first, per_column, turn, lowest = sensor[0], _ONE / sensor[1], sensor[6], sensor[7]
     beyond = turn + lowest
     end = beyond if lowest == _ZERO else sensor[4] - _HALF
@@ -121,14 +121,14 @@ def columns_of(x, y, sensor, u):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def elevations_of(x, y, z, elevation):
-    """Find the angle of points above the horizon."""
+    """Compute the angle of points above the horizon."""
     for n in range(len(x)):
         elevation[n] = arc_tangent(z[n], np.sqrt(x[n] * x[n] + y[n] * y[n]))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def rows_of_table(elevations, v):
-    """Turn elevations into rows of unevenly spaced beams, in place."""
+    """Convert elevations to rows of unevenly spaced beams, in place."""
     last = len(elevations) - 1
     for n in range(len(v)):
         low, high = 0, last

@@ -1,10 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Move the points that stay, or that belong together.
+Copy selected points: by a mask, or by ranges of rows.
 
-By a mask every value is written, and the place to write to moves on only past those that stay:
-without a branch that a mask of noise would mispredict.
+With a mask every value is written and the write position advances only after a kept one, which
+avoids a branch that a random mask would mispredict.
+
+Stands alone: filters and models share it.
 """
 
 from numba import njit
@@ -13,11 +15,11 @@ from numba import njit
 @njit(cache=True, nogil=True)
 def compact(values, keep, out):
     """
-    Copy the items of each row that stay, in order.
+    Copy the selected items of each row, in order.
 
     values  (R, N) any type
     keep    (N,) bool
-    out     (R, K) of the same type, K the number of items that stay
+    out     (R, K) of the same type, K the number of items kept
     """
     num_out = out.shape[1]
     for r in range(values.shape[0]):
@@ -33,11 +35,11 @@ def compact(values, keep, out):
 @njit(cache=True, nogil=True)
 def copy_ranges(points, ranges, out):
     """
-    Copy ranges of rows, one after the other.
+    Concatenate ranges of rows.
 
     points  (N, 3) float64
-    ranges  (K, 2) int64, first row of each, and the one after its last
-    out     (M, 3) float64, M the number of their rows
+    ranges  (K, 2) int64, first row of each range, and the row after its last
+    out     (M, 3) float64, M the number of rows of all ranges
     """
     place = 0
     for k in range(len(ranges)):
@@ -50,11 +52,11 @@ def copy_ranges(points, ranges, out):
 @njit(cache=True, nogil=True)
 def number_ranges(ranges, numbers, order, out):
     """
-    Give every item the number of its range, where it was before they were put in order.
+    Assign the number of a range to its items, at their positions before sorting.
 
-    ranges   (K, 2) int64, first place of each, and the one after its last
-    numbers  (K,) int64
-    order    (M,) int64, where each was
+    ranges   (K, 2) int64, first item of each range, and the item after its last
+    numbers  (K,) int64, number of each range
+    order    (M,) int64, position of each sorted item before sorting
     out      (M,) int32, out
     """
     for k in range(len(ranges)):

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How old what a map says is: when each voxel was last seen, by the scans of the window.
+Ages of voxels: the stamp at which a scan of the window last observed each voxel.
 
-A window of 100 scans holds three million voxel keys, and going through them takes 15 ms. Where
-only some surfels of a map are drawn, they are those whose keys have small hashes (thinning.py),
-so of each scan the keys with small hashes are kept aside once, a tenth of them. Of those the ones
-that a newer scan saw too are left out, as long as no scan leaves before an older one: on a drive
-through a street a quarter is left.
+A window of 100 scans holds three million voxel keys, and a pass over them takes 15 ms. If only
+some surfels of a map are drawn, they are those with small mixed keys (mapping/kernels/queries.py),
+so the small keys of each scan, a tenth of all, are cached. Keys that a newer scan observed too are
+dropped from the cache as long as scans leave the window in order: on a drive through a street a
+quarter remains.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.queries import build_table
-from surfel_mapper.mapping.kernels.thinning import keys_within, mark_seen, mix_keys
+from surfel_mapper.kernels.grouping import build_table
+from surfel_mapper.mapping.kernels.queries import keys_within, mark_seen, mix_keys
 from surfel_mapper.mapping.moments import pack_keys
-from surfel_mapper.mapping.windowed_scan import WindowedScan
+from surfel_mapper.mapping.window import WindowedScan
 
 Keys = npt.NDArray[np.int64]
 
 LARGEST_HASH = 2**64 - 1
+
 SLACK = 5 / 4
-"""Keys are kept up to this many times the limit, which moves a little between drawings."""
+"""Factor between cached and requested limit, since the limit varies between drawings."""
 
 
 class ThinnedKeys(NamedTuple):
-    """The keys of a scan whose hashes are at most a limit, but for some that newer scans saw."""
+    """The cached keys of a scan: mixed key at most limit, without keys of newer scans."""
 
     all_keys: Keys
     limit: int
@@ -39,29 +40,28 @@ class ThinnedKeys(NamedTuple):
 
 
 class Ages:
-    """Tells when voxels were last seen; made once, and asked again and again about one window."""
+    """Stamps at which voxels were last observed, cached between calls for the same window."""
 
     def __init__(self) -> None:
-        """Know no scan."""
         self._thinned: dict[int, ThinnedKeys] = {}
 
     def last_seen_ns(
         self, voxel_index: npt.NDArray[np.int32], scans: Iterable[WindowedScan]
     ) -> npt.NDArray[np.int64]:
         """
-        Return the stamp of the newest scan that saw each voxel.
+        Return the stamp of the newest scan that observed each voxel.
 
         Parameters
         ----------
         voxel_index : (K, 3) int32
-            Each voxel once.
+            Voxel indices without duplicates.
         scans : iterable of WindowedScan
-            Those of the window; looked through from the newest on, until all voxels are found.
+            Scans of the window; searched from the newest on until all voxels are found.
 
         Returns
         -------
         (K,) int64
-            Nanoseconds; -1 for voxels that none of them saw.
+            Nanoseconds; -1 for voxels that no scan observed.
 
         """
         keys = pack_keys(voxel_index)
@@ -72,7 +72,7 @@ class Ages:
         limit = mixed.max(initial=0)
         stamps = np.full(len(keys), -1, np.int64)
         newest_first = sorted(scans, key=lambda scan: scan.stamp_ns, reverse=True)
-        self._forget_unless_behind(newest_first)
+        self._clear_if_out_of_order(newest_first)
         missing, thinned = len(keys), {}
         for scan in newest_first:
             if not missing:
@@ -85,15 +85,15 @@ class Ages:
         self._thinned = thinned
         return stamps
 
-    def _forget_unless_behind(self, newest_first: list[WindowedScan]) -> None:
-        """Forget what is kept, if a scan has left while an older one, which it may hide, stays."""
+    def _clear_if_out_of_order(self, newest_first: list[WindowedScan]) -> None:
+        """Clear the cache if a scan left before an older one whose keys it may hide."""
         kept = [id(scan.moments.key) for scan in newest_first]
         stay = [number for number in kept if number in self._thinned]
         if stay != list(self._thinned)[: len(stay)]:
             self._thinned = {}
 
     def _thin(self, keys: Keys, limit: int) -> ThinnedKeys:
-        """Return the keys of a scan up to a limit, those kept aside where they reach that far."""
+        """Return the keys of a scan up to a limit, from the cache if it suffices."""
         kept = self._thinned.get(id(keys))
         if kept is not None and kept.all_keys is keys and kept.limit >= limit:
             return kept

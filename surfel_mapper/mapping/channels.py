@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Channels: intensity and colour of points as integers, so that a map sums them exactly too.
+Channels: intensity and colour of points as integers, so that a map sums them exactly.
 
 Intensity is quantised once to 1/256 (sensors give 8 or 16 bits, or reflectivities up to some
-thousands); colours are whole numbers from 0 to 255 already. What is no number counts as 0.
+thousands); colours are integers from 0 to 255. nan counts as 0.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 CHANNELS = {'intensity': ('intensity',), 'rgb': ('red', 'green', 'blue')}
-"""Columns of a scan that a map can sum, and the channels that each is made of."""
+"""Columns of a scan that a map can sum, and the channels of each."""
 
 UNITS = {'intensity': 256.0, 'red': 1.0, 'green': 1.0, 'blue': 1.0}
-"""Integers a unit of each channel."""
+"""Integer steps per unit of each channel."""
 
 LARGEST = float(2**31 - 256)
-"""Quantised values are cut off here, so that 2^31 of them do not overflow an int64."""
+"""Quantised values are clipped to this magnitude, so that 2^31 of them fit into an int64."""
 
 
 def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
@@ -32,7 +32,7 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
     Raises
     ------
     ValueError
-        If a column is none that a map can sum.
+        If a map cannot sum a column.
 
     """
     unknown = [name for name in columns if name not in CHANNELS]
@@ -42,7 +42,7 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def missing_columns(columns: Mapping[str, npt.NDArray[Any]], names: tuple[str, ...]) -> list[str]:
-    """Return which of the named columns are not there; ``rgba`` will do for ``rgb``."""
+    """Return the named columns that are missing; ``rgba`` can replace ``rgb``."""
     return [n for n in names if n not in columns and not (n == 'rgb' and 'rgba' in columns)]
 
 
@@ -55,10 +55,10 @@ def quantised(
     Parameters
     ----------
     columns : mapping of str to (N,) array
-        ``intensity``: numbers. ``rgb``: three bytes packed into float32 or uint32, as PCL and
-        RViz have them, or an (N, 3) array of 0 to 255; ``rgba`` will do for it.
+        ``intensity``: numbers. ``rgb``: three bytes packed into float32 or uint32, as in PCL and
+        RViz, or an (N, 3) array of 0 to 255; ``rgba`` can replace it.
     names : tuple of str
-        Which columns.
+        Columns to quantise.
     num_points : int
         N.
 

@@ -1,53 +1,59 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-ScanMoments: a scan reduced to the exact moments of its voxels.
+ScanMoments: a scan reduced to the exact moments of its voxels; their keys, levels and digest.
 
-Some 10^4 voxels stand for 10^5 points, in 78 bytes each. A map adds them, a window keeps them,
-and a removal subtracts them again, so the cost of a scan depends on neither the length of the
-window nor the size of the map.
+Some 10^4 voxels represent 10^5 points, in 78 bytes each. A map adds them, a window keeps them, and
+a removal subtracts them again, so the cost of a scan depends on neither the length of the window
+nor the size of the map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+import hashlib
+import struct
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.layout import BITS, INDEX_BITS, INDEX_MASK, INDEX_OFFSET
+from surfel_mapper.mapping.kernels.voxels import coarsen
+
+HASHED_ARRAYS = ('key', 'count', 'total', 'product', 'view')
+"""The arrays of ScanMoments in the order in which a digest hashes them."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ScanMoments:
     """
-    Exact moments of the points of K voxels; each voxel stands once.
+    Exact moments of the points of K voxels; each voxel occurs once.
 
     Attributes
     ----------
     voxel_size_m : float
-        Voxel size of the map that they are for.
+        Voxel size of the map.
     level : int
-        The lattice unit is ``voxel_size_m / 2^(16 + level)``; 0 for all scans.
+        The lattice unit is ``voxel_size_m / 2^(16 + level)``; 0 for scans.
     key : (K,) int64
-        Voxel indices, packed.
+        Packed voxel indices.
     count : (K,) int32 or int64
-        Points in each voxel.
+        Number of points of each voxel.
     total : (K, 3) int32 or int64
-        Sum of the places q of the points, in lattice units about the voxel centre.
+        Sum of the positions q of the points, in lattice units about the voxel centre.
     product : (K, 6) int64
         Sum of q q^T, order xx xy xz yy yz zz.
     view : (K, 3) int16 or int64
-        int16: 2^14 times the unit vector to the sensor, the same for all points of the voxel;
-        int64: the sum of these over the points.
+        int16: 2^14 times the unit vector to the sensor, equal for all points of the voxel;
+        int64: its sum over the points.
     channel_names : tuple of str
-        Names of the channels, where the map has any: intensity, red, green, blue.
+        Names of the summed channels: intensity, red, green, blue.
     channels : (K, C) int64
-        Their sums over the points; see mapping/channels.py for the units.
+        Sums of the channels over the points; units in mapping/channels.py.
     left_out : mapping of str to int
-        Points that are not in here, by cause: not_finite, too_near, too_far, beyond_map.
+        Number of points left out by cause: not_finite, too_near, too_far, beyond_map.
 
     """
 
@@ -63,7 +69,7 @@ class ScanMoments:
     left_out: Mapping[str, int] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Without channels every voxel has a row of none."""
+        """Default to zero channels for every voxel."""
         if self.channels is None:
             object.__setattr__(self, 'channels', np.empty((len(self.key), 0), np.int64))
 
@@ -98,11 +104,11 @@ class ScanMoments:
 
     @property
     def view_is_sum(self) -> int:
-        """1 where the view is a sum over points already, 0 where it is one point's."""
+        """1 if the view is a sum over points, 0 if it is the view of a single point."""
         return int(self.view.dtype == np.int64)
 
     def select(self, voxels: slice | npt.NDArray[Any]) -> ScanMoments:
-        """Return the moments of some voxels: a slice, a mask (K,) bool or row numbers."""
+        """Return the moments of selected voxels: a slice, a mask (K,) bool or row indices."""
         names = ('key', 'count', 'total', 'product', 'view', 'channels')
         return replace(self, **{name: getattr(self, name)[voxels] for name in names})
 
@@ -110,10 +116,10 @@ class ScanMoments:
 def point_keys(
     points: npt.NDArray[Any], T_map_sensor: npt.NDArray[np.float64], voxel_size_m: float
 ) -> npt.NDArray[np.int64]:
-    """Return the key of the voxel of each point, (N,); -1 where it is in none."""
+    """Return the voxel key of each point, (N,) int64; -1 if it is outside of the grid."""
     x, y, z = points.astype(np.float64).T
     scale = (1 << BITS) / voxel_size_m
-    with np.errstate(invalid='ignore'):  # nan and inf are in no voxel
+    with np.errstate(invalid='ignore'):  # nan and inf are outside of the grid
         lattice = [
             np.floor((((r[0] * x + r[1] * y) + r[2] * z) + r[3]) * scale) for r in T_map_sensor[:3]
         ]
@@ -136,3 +142,83 @@ def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
     index = ((key[:, None] >> shifts) & INDEX_MASK) - INDEX_OFFSET
     return np.asarray(index, np.int32)
+
+
+def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
+    """
+    Return the moments of voxels 2^level times larger, exactly.
+
+    Parameters
+    ----------
+    moments : ScanMoments
+        Moments of a map, with summed views.
+    level : int
+        0 or more.
+
+    """
+    num_fine = len(moments)
+    table = np.full(1 << max(2 * num_fine - 1, 1).bit_length(), -1, np.int32)
+    keys, rows = np.empty(num_fine, np.int64), np.empty(num_fine, np.int64)
+    sums = np.zeros((num_fine, 13), np.int64)
+    num = coarsen(moments.arrays, moments.level, level, table, keys, sums, rows)
+    channels = np.zeros((num, moments.channels.shape[1]), np.int64)
+    np.add.at(channels, rows, moments.channels)
+    return replace(
+        moments,
+        voxel_size_m=moments.voxel_size_m * 2**level,
+        level=moments.level + level,
+        key=keys[:num],
+        count=sums[:num, 0].copy(),
+        total=sums[:num, 1:4].copy(),
+        product=sums[:num, 4:10].copy(),
+        view=sums[:num, 10:13].copy(),
+        channels=channels,
+    )
+
+
+def digest_of(
+    voxel_size_m: float,
+    level: int,
+    num_voxels: int,
+    columns: tuple[str, ...],
+    parts: Callable[[str], Iterable[npt.NDArray[Any]]],
+) -> str:
+    """
+    Return the SHA-256 of the state of a map in hexadecimal.
+
+    The arrays are hashed one after the other and in parts, so that a map larger than the memory
+    can be hashed too.
+
+    Parameters
+    ----------
+    voxel_size_m : float
+        Edge of a voxel, m.
+    level : int
+        See SurfelMap.
+    num_voxels : int
+        Voxels of the whole map.
+    columns : tuple of str
+        Columns of the points that the map sums.
+    parts : callable
+        Yields the array of a name of HASHED_ARRAYS, or of ``channels``, in any number of parts:
+        a row for each voxel, sorted by key.
+
+    Notes
+    -----
+    Hashed are: the text ``surfel map 1``, the voxel size as float64, level and number of voxels;
+    the keys, counts, sums (x y z), products (xx xy xz yy yz zz) and view sums (x y z) of all
+    voxels, array by array and sorted by key; if the map has columns, their comma-separated names
+    and the channel sums. All numbers but the voxel size are int64, all are little-endian. The
+    key of voxel (i, j, k) is ((i + 2^20) 2^21 + (j + 2^20)) 2^21 + (k + 2^20).
+
+    """
+    state = hashlib.sha256(b'surfel map 1')
+    state.update(struct.pack('<dqq', voxel_size_m, level, num_voxels))
+    for name in HASHED_ARRAYS:
+        for part in parts(name):
+            state.update(np.ascontiguousarray(part, dtype='<i8').data)
+    if columns:
+        state.update(','.join(columns).encode())
+        for part in parts('channels'):
+            state.update(np.ascontiguousarray(part, dtype='<i8').data)
+    return state.hexdigest()

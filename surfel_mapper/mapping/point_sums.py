@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-PointSums: count, sum and scatter of points in float64, to be merged and taken apart again.
+PointSums: count, sum and scatter of points in float64, with addition and removal.
 
-What Surfel is made of. Sums are of deviations from an anchor, one of the points: subtracting near
-numbers is exact, so 10 km from the origin costs no digits. The scatter is about the mean. A batch
-is centred first, then merged; a point is a batch of one, so there is one formula for adding and
-one for removing. Taking apart undoes merging but for the rounding of float64, and how large that
-may have become is kept along, so that a residue is not taken for a shape.
+The state of a Surfel. Sums are of deviations from an anchor, one of the points: subtracting close
+numbers is exact, so 10 km from the origin cost no digits. The scatter is about the mean. A batch
+is centred first, then merged; a point is a batch of one, so one formula adds and one removes.
+Removing undoes adding up to the rounding of float64. A bound of that rounding is updated with each
+step, so that a residue is not mistaken for a shape.
 
 Source: Chan, Golub and LeVeque 1983 for centred batches and their merging.
 """
@@ -22,10 +22,10 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 
 ROWS, COLUMNS = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
-"""Where the six numbers xx xy xz yy yz zz stand in a symmetric matrix."""
+"""Row and column of the entries xx xy xz yy yz zz of a symmetric matrix."""
 
 ROUNDING = 4.0 * float(np.finfo(np.float64).eps)
-"""What a few operations on the scatter may be off by, as a share of its trace."""
+"""Bound of the rounding error of a few operations on the scatter, as a share of its trace."""
 
 ZERO = np.zeros(3)
 NO_SCATTER = np.zeros(6)
@@ -34,19 +34,19 @@ NO_SCATTER = np.zeros(6)
 @dataclass(frozen=True, slots=True, eq=False)
 class PointSums:
     """
-    Count, sum and scatter of points; arrays are shared and never written to.
+    Count, sum and scatter of points; arrays are shared and must not be written to.
 
     Attributes
     ----------
     num_points : int
     anchor : (3,) float64, m
-        Near the points, or where the first one was.
+        The first point, or the mean.
     total : (3,) float64, m
         Sum of the deviations from the anchor.
     scatter : (6,) float64, m^2
         Sum of the products of deviations from the mean, xx xy xz yy yz zz.
     rounding : float, m^2
-        What the scatter may be off by: the sum over the steps that led to it.
+        Bound of the error of the scatter, summed over all additions and removals.
 
     """
 
@@ -58,7 +58,7 @@ class PointSums:
 
     @classmethod
     def without_scatter(cls, num_points: int, anchor: Array, total: Array = ZERO) -> PointSums:
-        """Return the sums of no point, or of one."""
+        """Return the sums of zero points or of one."""
         return cls(num_points, anchor, total, NO_SCATTER, 0.0)
 
     @classmethod
@@ -70,18 +70,18 @@ class PointSums:
         anchor = points[0].copy()
         if count == 1:
             return cls.without_scatter(1, anchor)
-        # An axis a row: numpy sums along contiguous memory pairwise, else one after the other.
+        # one row for each axis: numpy sums contiguous memory pairwise, which rounds less
         deviation = np.ascontiguousarray((points - anchor).T)
         total = deviation.sum(axis=1)
         deviation -= (total / count)[:, None]
-        residual = deviation.sum(axis=1)  # not quite 0: the mean was rounded
+        residual = deviation.sum(axis=1)  # not 0, because the mean was rounded
         scatter = (deviation[ROWS] * deviation[COLUMNS]).sum(axis=1)
         scatter -= _products(residual) / count
         return cls(count, anchor, total, scatter, ROUNDING * _trace(scatter))
 
     @classmethod
     def of_stats(cls, total: Array, scatter: Array, num_points: int) -> PointSums:
-        """Return the sums of a given sum (3,), kept bit for bit, and scatter (6,)."""
+        """Return the sums for a given sum (3,), preserved bit for bit, and scatter (6,)."""
         if num_points == 0:
             return NO_POINTS
         anchor = total / num_points
@@ -93,13 +93,13 @@ class PointSums:
         return total
 
     def mean(self) -> Array:
-        """Return the mean of the points, (3,), m; nan without any."""
+        """Return the mean of the points, (3,), m; nan if empty."""
         if self.num_points == 0:
             return np.full(3, np.nan)
         return self.anchor + self.total / self.num_points
 
     def with_added(self, other: PointSums) -> PointSums:
-        """Return the sums of the points of both."""
+        """Return the sums of the union of both sets of points."""
         if other.num_points == 0:
             return self
         if self.num_points == 0:
@@ -116,7 +116,7 @@ class PointSums:
         )
 
     def with_removed(self, other: PointSums) -> PointSums:
-        """Return the sums without the points of another; none if it has as many or more."""
+        """Return the sums without the points of another; empty if it has as many or more."""
         left = self.num_points - other.num_points
         if other.num_points == 0:
             return self
@@ -136,7 +136,7 @@ class PointSums:
         )
 
     def _total_about(self, anchor: Array) -> Array:
-        """Return the sum of deviations from another anchor."""
+        """Return the sum of deviations from a given anchor."""
         return self.total + self.num_points * (self.anchor - anchor)
 
 
@@ -144,7 +144,7 @@ NO_POINTS = PointSums.without_scatter(0, ZERO)
 
 
 def _between(num_a: int, total_a: Array, num_b: int, total_b: Array) -> Array:
-    """Return the scatter (6,) of two sets of points that comes of the distance of their means."""
+    """Return the scatter (6,) between the means of two sets of points."""
     weight = num_a / (num_a + num_b) * num_b
     return weight * _products(total_a / num_a - total_b / num_b)
 
@@ -156,5 +156,5 @@ def _products(vector: Array) -> Array:
 
 
 def _trace(scatter: Array) -> float:
-    """Return the size of a scatter given by its six numbers: the sum of its diagonal."""
+    """Return the trace of a scatter (6,), of absolute values."""
     return abs(float(scatter[0])) + abs(float(scatter[3])) + abs(float(scatter[5]))

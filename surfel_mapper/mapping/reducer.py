@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Reducer: from the points of a scan to its moments.
+Reducer: reduces the points of a scan to moments.
 
-Works in scratch memory that it keeps from scan to scan, every thread in its own, so that several
-may reduce scans at the same time.
+The scratch memory is kept from scan to scan; concurrent calls use separate memory, so several
+threads may reduce scans at the same time.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
-from surfel_mapper.kernels.moments import (
+from surfel_mapper.mapping.channels import channel_names, quantised
+from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
     look_back,
     NOT_FINITE,
     pack_sums,
     reduce_points,
+    sum_channels,
     TOO_FAR,
     TOO_NEAR,
 )
-from surfel_mapper.kernels.queries import build_table
-from surfel_mapper.mapping.channels import channel_names, quantised
-from surfel_mapper.mapping.kernels.channels import sum_channels
 from surfel_mapper.mapping.moments import ScanMoments
 
 NARROW_COUNT = 1 << 16
-"""Below so many points in every voxel the sums fit into int32."""
+"""If every voxel holds fewer points, the sums fit into int32."""
 
 CAUSES = {
     'not_finite': NOT_FINITE,
@@ -42,7 +42,7 @@ CAUSES = {
     'too_far': TOO_FAR,
     'beyond_map': BEYOND,
 }
-"""Why points are left out, and where a kernel counts them."""
+"""Causes why points are left out, and the rows in which the kernel counts them."""
 
 
 Quantisation = tuple[npt.NDArray[np.float64], float, npt.NDArray[np.float64]]
@@ -50,26 +50,25 @@ Quantisation = tuple[npt.NDArray[np.float64], float, npt.NDArray[np.float64]]
 
 
 class Scratch:
-    """Memory in which a kernel sums points by voxel."""
+    """Scratch memory of a kernel that sums points by voxel."""
 
     def __init__(self) -> None:
-        """Start with room for few voxels."""
         self.left_out = np.zeros(4, np.int64)
         self.reserve(2048)
 
     def reserve(self, num_voxels: int) -> None:
-        """Make room for so many voxels; what was there is lost."""
+        """Allocate room for num_voxels voxels; previous content is lost."""
         self.table = np.full(2 * num_voxels, -1, np.int32)
         self.keys = np.empty(num_voxels, np.int64)
         self.sums = np.empty((num_voxels, 10))
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """As the kernels take them."""
+        """Table, keys and sums as the kernels take them."""
         return self.table, self.keys, self.sums
 
     def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
-        """Sum points by voxel, with more room if need be; return how many voxels."""
+        """Sum points by voxel, enlarging the memory if needed; return the number of voxels."""
         while True:
             num = reduce_points(xyz, *quantisation, self.arrays, self.left_out)
             if num >= 0:
@@ -77,25 +76,25 @@ class Scratch:
             self.reserve(2 * len(self.keys))
 
     def clear(self) -> None:
-        """Empty the table: faster as a whole than by the entries in use, which lie anywhere."""
+        """Empty the table: filling it is faster than visiting the scattered entries in use."""
         self.table.fill(-1)
 
     def causes(self) -> dict[str, int]:
-        """Return how many points were left out, by cause; causes that did not occur are not in."""
+        """Return the number of points left out, by cause; only causes that occurred."""
         counts = {name: int(self.left_out[row]) for name, row in CAUSES.items()}
         return {name: number for name, number in counts.items() if number}
 
 
 class Reducer:
     """
-    Reduces scans to moments, over and over in the same scratch memory.
+    Reduces scans to moments, reusing its scratch memory.
 
     Parameters
     ----------
     voxel_size_m : float
         Edge of a voxel.
     columns : tuple of str
-        Columns of the points to sum as well.
+        Columns of the points to sum in addition.
 
     """
 
@@ -138,7 +137,7 @@ class Reducer:
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
         try:
             scratch = self._idle.pop()
-        except IndexError:  # all are in use by other threads
+        except IndexError:  # all in use by other threads
             scratch = Scratch()
         num = scratch.fill(points.T, quantisation)
         scratch.clear()
@@ -153,7 +152,7 @@ class Reducer:
         return moments
 
     def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
-        """Turn the sums into integers."""
+        """Convert the sums to integers."""
         key, sums = scratch.keys[:num].copy(), scratch.sums[:num]
         largest = sums[:, 0].max(initial=0.0)
         if largest > MAX_SCAN_COUNT:
@@ -178,7 +177,7 @@ class Reducer:
 def within(
     points: npt.NDArray[Any], min_range_m: float, max_range_m: float
 ) -> npt.NDArray[np.bool_]:
-    """Return which points (N, 3) the range lets enter, just as the kernel has it; 0: no limit."""
+    """Return which points (N, 3) are within range, by the rule of the kernel; max 0: no limit."""
     x, y, z = points.astype(np.float64).T
     range_sq = (x * x + y * y) + z * z
     far_sq = max_range_m**2 if max_range_m else np.inf
@@ -187,9 +186,9 @@ def within(
 
 def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     """
-    Return points as the kernels take them: (N, 3) float32 or float64, column by column.
+    Return points as the kernels take them: (N, 3) float32 or float64 in Fortran order.
 
-    Arrays that are so already (Fortran order, writeable) are not copied.
+    Arrays that fulfil this and are writeable are not copied.
     """
     array = np.asarray(points)
     if array.size == 0 and array.ndim < 2:

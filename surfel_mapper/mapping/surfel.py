@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfel: what a handful of points say about their surface, as one object.
+Surfel: statistics of a set of points as an object: mean, covariance, normal, planarity.
 
-For single use and for tests; the map holds exact integers instead (surfel_map.py). Removing
-undoes adding up to the rounding of float64. That rounding is accounted for (point_sums.py), and
-an eigenvalue no larger counts as 0, so a line or a repeated point is known as such even after
-other points were removed.
+For single use and for tests; the map stores exact integers instead (surfel_map.py). Removing
+undoes adding up to the rounding of float64. A bound of that rounding is kept (point_sums.py), and
+smaller eigenvalues count as 0, so a line or a repeated point is recognised even after other points
+were removed.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from surfel_mapper.mapping.point_sums import COLUMNS, NO_POINTS, PointSums, ROUN
 Array = npt.NDArray[np.float64]
 
 MAX_COORDINATE_M = 1e100
-"""Beyond this a scatter could overflow."""
+"""Largest coordinate accepted: beyond it a scatter could overflow."""
 
 MAX_POINTS = 2**53
-"""Up to here float64 holds every count."""
+"""Largest number of points: float64 holds every count up to it."""
 
 
 class Surfel:
     """
-    Count, sum and scatter of points, and the normal and planarity that follow from them.
+    Count, sum and scatter of points, from which normal and planarity are derived.
 
-    Points may be float64, float32 or integers; everything inside is float64. ``+`` and ``-``
-    return a new surfel, ``+=`` and ``-=`` are add and remove, ``==`` compares num_points, sum
-    and sum_squares to the last bit, which the order of adding may change.
+    Points may be float64, float32 or integers; all arithmetic is float64. ``+`` and ``-`` return
+    a new surfel, ``+=`` and ``-=`` are add and remove, ``==`` compares num_points, sum and
+    sum_squares bit for bit; the last bits depend on the order of adding.
 
-    Of no point the mean is nan; of fewer than two, or of equal ones, the eigenvalues are 0 and
-    normal, planarity and curvature nan; on a line the two smaller eigenvalues and the planarity
-    are 0 and the normal is some unit vector orthogonal to the line. No eigenvalue is negative.
+    Degenerate points: if empty, the mean is nan. For fewer than two or identical points the
+    eigenvalues are 0, and normal, planarity and curvature nan. On a line the two smaller
+    eigenvalues and the planarity are 0, and the normal is some unit vector orthogonal to the
+    line. No eigenvalue is negative.
     """
 
     __slots__ = ('_sums',)
 
     def __init__(self) -> None:
-        """Make a surfel of no points."""
         self._sums = NO_POINTS
 
     @classmethod
     def from_points(cls, points: npt.ArrayLike) -> Surfel:
         """
-        Return the surfel of some points.
+        Return the surfel of points.
 
         Parameters
         ----------
         points : (N, 3) or (3,) of numbers, m
-            Several, none or one.
+            A batch, which may be empty, or a single point.
 
         Raises
         ------
         ValueError
-            If the shape is another, or a coordinate is no number, nan or beyond 1e100.
+            If the shape differs, or a coordinate is not a number, nan or beyond 1e100.
 
         """
         surfel = cls()
@@ -74,7 +74,7 @@ class Surfel:
         num_points: int,
     ) -> Surfel:
         """
-        Return the surfel of given statistics.
+        Return the surfel with given statistics.
 
         Parameters
         ----------
@@ -83,12 +83,12 @@ class Surfel:
         sum_squares : (6,) of numbers, m^2
             Scatter about the mean, xx xy xz yy yz zz.
         num_points : int
-            0 gives the empty surfel, whatever the sums.
+            Number of points; 0 gives the empty surfel and ignores the sums.
 
         Raises
         ------
         ValueError
-            If a shape is another, a number is nan or too large, or num_points is negative or
+            If a shape differs, a number is nan or too large, or num_points is negative or
             beyond 2^53.
 
         """
@@ -107,7 +107,7 @@ class Surfel:
         cls, position: npt.ArrayLike, scatter: npt.ArrayLike | None = None
     ) -> Surfel:
         """
-        Return the surfel of one point that may bring a scatter along.
+        Return the surfel of a single point, optionally with a scatter.
 
         Parameters
         ----------
@@ -119,7 +119,7 @@ class Surfel:
         Raises
         ------
         ValueError
-            If a shape is another, or a number is nan or too large.
+            If a shape differs, or a number is nan or too large.
 
         """
         matrix = np.zeros((3, 3))
@@ -129,12 +129,12 @@ class Surfel:
 
     @property
     def empty(self) -> bool:
-        """Whether no point is held."""
+        """Whether the surfel holds no points."""
         return self._sums.num_points == 0
 
     @property
     def num_points(self) -> int:
-        """How many points are held."""
+        """Number of points."""
         return self._sums.num_points
 
     @property
@@ -148,25 +148,25 @@ class Surfel:
         return np.array(self._sums.scatter)
 
     def add(self, points: Surfel | npt.ArrayLike) -> None:
-        """Add a point (3,), a batch (N, 3), or what another surfel holds; see from_points."""
+        """Add a point (3,), a batch (N, 3) or the points of another surfel; see from_points."""
         self._sums = self._sums.with_added(_sums_of(points))
 
     def remove(self, points: Surfel | npt.ArrayLike) -> None:
         """
-        Remove a point (3,), a batch (N, 3), or what another surfel holds; see from_points.
+        Remove a point (3,), a batch (N, 3) or the points of another surfel; see from_points.
 
-        Removing as many points as are held, or more, empties the surfel; one point left has no
-        scatter. Points that were never added cannot be told from others: what is left then may
-        be the scatter of no points, whose eigenvalues below 0 are given as 0.
+        Removing at least num_points points empties the surfel; a single remaining point has no
+        scatter. Removing points that were never added is not detected: the remaining scatter may
+        then belong to no set of points, and its negative eigenvalues are reported as 0.
         """
         self._sums = self._sums.with_removed(_sums_of(points))
 
     def clear(self) -> None:
-        """Forget all points."""
+        """Remove all points."""
         self._sums = NO_POINTS
 
     def copy(self) -> Surfel:
-        """Return another surfel that holds the same."""
+        """Return an independent copy."""
         copy = Surfel()
         copy._sums = self._sums
         return copy
@@ -202,11 +202,11 @@ class Surfel:
         return f'<Surfel of {self.num_points} points, mean {self.mean().tolist()}>'
 
     def mean(self) -> Array:
-        """Return the mean of the points, (3,), m; nan without any."""
+        """Return the mean of the points, (3,), m; nan if empty."""
         return self._sums.mean()
 
     def covariance(self) -> Array:
-        """Return the covariance, (3, 3) m^2: scatter / (n - 1); 0 of fewer than two points."""
+        """Return the covariance, (3, 3) m^2: scatter / (n - 1); 0 for fewer than two points."""
         matrix = np.zeros((3, 3))
         if self.num_points > 1:
             matrix[ROWS, COLUMNS] = self._sums.scatter / (self.num_points - 1)
@@ -214,19 +214,19 @@ class Surfel:
         return matrix
 
     def eigenvalues(self) -> Array:
-        """Return the eigenvalues of the covariance, (3,), ascending, m^2; none below 0."""
+        """Return the eigenvalues of the covariance, (3,), ascending, m^2; none negative."""
         return self._spectrum()[0]
 
     def eigenvectors(self) -> Array:
         """
         Return unit eigenvectors as the columns of (3, 3), in the order of the eigenvalues.
 
-        Of each, the component of largest magnitude is positive. nan where there is no normal.
+        The component of largest magnitude of each is positive. nan if all eigenvalues are 0.
         """
         return self._spectrum()[1]
 
     def normal(self) -> Array:
-        """Return the unit eigenvector of the smallest eigenvalue, (3,); nan where all are 0."""
+        """Return the unit eigenvector of the smallest eigenvalue, (3,); nan if all are 0."""
         return np.array(self._spectrum()[1][:, 0])
 
     def planarity(self) -> float:
@@ -235,12 +235,12 @@ class Surfel:
         return 2.0 * (e1 - e0) / (e0 + e1 + e2) if e2 > 0.0 else float('nan')
 
     def curvature(self) -> float:
-        """Return e0 / (e0 + e1 + e2), from 0 to 1/3; nan where all eigenvalues are 0."""
+        """Return e0 / (e0 + e1 + e2), from 0 to 1/3; nan if all eigenvalues are 0."""
         e0, e1, e2 = self.eigenvalues().tolist()
         return e0 / (e0 + e1 + e2) if e2 > 0.0 else float('nan')
 
     def _spectrum(self) -> tuple[Array, Array]:
-        """Return eigenvalues (3,) and eigenvectors (3, 3), residues of rounding set to 0."""
+        """Return eigenvalues (3,) and eigenvectors (3, 3), with rounding residues set to 0."""
         unknown = np.full((3, 3), np.nan)
         if self.num_points < 2:
             return np.zeros(3), unknown
@@ -254,7 +254,7 @@ class Surfel:
 
 
 def _sums_of(points: Surfel | npt.ArrayLike) -> PointSums:
-    """Return the sums of points, or those that a surfel holds."""
+    """Return the sums of points or of a surfel."""
     if isinstance(points, Surfel):
         return points._sums
     return PointSums.of_points(_checked('points', points).reshape(-1, 3))
@@ -266,7 +266,7 @@ def _checked(
     shape: tuple[int, ...] | None = None,
     limit: float = MAX_COORDINATE_M,
 ) -> Array:
-    """Return numbers as a new float64 array of a shape, or of (3,) or (N, 3); else ValueError."""
+    """Return numbers as a new float64 array of a shape, by default (3,) or (N, 3)."""
     found = np.asarray(numbers)
     if found.dtype.kind not in 'fiu':
         raise ValueError(f'{name}: dtype {found.dtype}, expected real numbers')
@@ -274,7 +274,7 @@ def _checked(
     if not fits:
         raise ValueError(f'{name}: shape {found.shape}, expected {shape or "(3,) or (N, 3)"}')
     array = found.astype(np.float64)
-    good = np.abs(array) <= limit  # which nan is not
+    good = np.abs(array) <= limit  # false for nan
     if not good.all():
         raise ValueError(f'{name}: found {array[~good][0]}, expected numbers up to {limit:g}')
     return array

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Surfels as the columns of a cloud: what ~/normals, PCD files and bags of normals have."""
+"""
+Convert surfels to the columns of a cloud, as in ~/normals, PCD files and bags of normals.
+
+Stands alone because importing Surfels loads the compiler, which reading a PCD file does not need.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +13,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-if TYPE_CHECKING:  # it brings the compiler, which reading a PCD file does not need
+if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
 
 
@@ -17,7 +21,7 @@ def surfel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
     """
     Return the columns of ~/normals and ~/changed: float32, and uint32 for num_points.
 
-    Where the map has them, the mean intensity and, packed as RViz draws it, the mean colour.
+    If the map sums them, also the mean intensity, and the mean colour packed as RViz draws it.
     """
     values = {
         **dict(zip('xyz', surfels.position.T, strict=True)),
@@ -35,7 +39,7 @@ def surfel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
 
 
 def packed_rgb(surfels: Surfels) -> npt.NDArray[np.float32]:
-    """Return the mean colours as three bytes of a float32 each: red, green and blue last."""
+    """Return the mean colours packed into float32: bytes 0, red, green, blue from the highest."""
     red, green, blue = (
         np.rint(surfels.channels[name]).astype(np.uint32) for name in ('red', 'green', 'blue')
     )

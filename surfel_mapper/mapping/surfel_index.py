@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-SurfelIndex: surfels that can be asked by place.
+SurfelIndex: look up surfels by position.
 
-A snapshot: it does not follow the map it was taken of, and any thread may ask it.
+A snapshot: it does not follow later changes of the map, and any thread may query it.
 """
 
 from __future__ import annotations
@@ -14,29 +14,29 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.kernels.queries import best_around, build_table, rows_at
+from surfel_mapper.mapping.kernels.queries import best_around, rows_at
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 
 
 class SurfelIndex:
     """
-    Surfels of one map, found by place.
+    Surfels of a map, indexed by position.
 
     Parameters
     ----------
     surfels : Surfels
-        Those that are to be found; answers are row numbers of it.
+        Surfels to index; results are row indices into them.
     voxel_size_m : float
-        Edge of a voxel of their map, m.
+        Edge of a voxel of the map, m.
     level : int
-        Level of their map.
+        Level of the map.
 
     """
 
     def __init__(self, surfels: Surfels, voxel_size_m: float, *, level: int = 0) -> None:
-        """Build the hash table."""
         self.surfels = surfels
         self.voxel_size_m = voxel_size_m
         self._bits = BITS + level
@@ -57,7 +57,7 @@ class SurfelIndex:
         Returns
         -------
         (N,) int64
-            Rows of ``surfels``; -1 where there is none.
+            Rows of ``surfels``; -1 if the voxel has no surfel.
 
         """
         places = _places(points)
@@ -70,21 +70,21 @@ class SurfelIndex:
         self, points: npt.ArrayLike, max_distance_m: float
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
         """
-        Return the surfel whose position is nearest to each point.
+        Return the surfel nearest to each point.
 
         Parameters
         ----------
         points : (N, 3) float, m
             In the frame of the map.
         max_distance_m : float
-            Surfels farther away do not count; the cost grows with its cube.
+            Maximum distance of a surfel; the cost grows with its cube.
 
         Returns
         -------
         rows : (N,) int64
-            Rows of ``surfels``; -1 where there is none.
+            Rows of ``surfels``; -1 if none is near.
         distance : (N,) float64, m
-            To the position; inf where there is none.
+            Distance to the position of the surfel; inf if none is near.
 
         """
         places = _places(points)
@@ -104,15 +104,15 @@ class SurfelIndex:
         points : (N, 3) float, m
             In the frame of the map.
         k : int
-            How many.
+            Number of surfels for each point.
         max_distance_m : float
-            From point to surfel position; the cost grows with its cube.
+            Maximum distance from point to surfel position; the cost grows with its cube.
 
         Returns
         -------
         (N, k) int64
-            Rows of ``surfels``, the most planar first; -1 where there are fewer. Surfels
-            without a planarity never count.
+            Rows of ``surfels``, the most planar first, padded with -1. Surfels without a
+            planarity are ignored.
 
         Raises
         ------
@@ -125,7 +125,7 @@ class SurfelIndex:
         return self._best(_places(points), max_distance_m, k, -self.surfels.planarity)
 
     def in_box(self, low: npt.ArrayLike, high: npt.ArrayLike) -> npt.NDArray[np.int64]:
-        """Return the rows of the surfels in a box, m, faces included, in ascending order."""
+        """Return the rows of the surfels in a box, m, including its faces, ascending."""
         position = self.surfels.position
         lowest, highest = np.asarray(low, np.float64), np.asarray(high, np.float64)
         if lowest.shape != (3,) or highest.shape != (3,):
@@ -133,7 +133,7 @@ class SurfelIndex:
         return np.flatnonzero(((position >= lowest) & (position <= highest)).all(axis=1))
 
     def in_radius(self, center: npt.ArrayLike, radius_m: float) -> npt.NDArray[np.int64]:
-        """Return the rows of the surfels at most so far from a point, in ascending order."""
+        """Return the rows of the surfels within a distance of a point, ascending."""
         step = self.surfels.position - _places(np.reshape(np.asarray(center), (1, 3)))
         return np.flatnonzero((step * step).sum(axis=1) <= radius_m * radius_m)
 
@@ -141,21 +141,21 @@ class SurfelIndex:
         self, points: npt.ArrayLike, max_distance_m: float = 0.0
     ) -> npt.NDArray[np.float64]:
         """
-        Return how far each point is from the plane of its surfel.
+        Return the distance of each point from the plane of its surfel.
 
         Parameters
         ----------
         points : (N, 3) float, m
             In the frame of the map.
         max_distance_m : float
-            0: the surfel of the voxel that the point lies in; else the nearest surfel whose
-            position is at most so far.
+            0: use the surfel of the voxel that the point lies in; else the nearest surfel
+            within this distance.
 
         Returns
         -------
         (N,) float64, m
-            normal . (point - position), positive on the side from which the surfel was seen;
-            nan where there is no surfel, or it has no normal.
+            normal . (point - position), positive on the side of the sensor; nan if there is no
+            surfel, or it has no normal.
 
         """
         places = _places(points)

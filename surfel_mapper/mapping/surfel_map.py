@@ -3,17 +3,17 @@
 """
 SurfelMap: a hashed voxel map of exact, reversible surfels.
 
-A voxel is one row of integers in a slab: count, sum and second moment of its points in units of
-voxel_size / 65536 about the voxel centre, and from where it was seen. Adding a scan is integer
-addition and removing it integer subtraction, so that after any sequence of both the map equals,
-bit for bit, the map built from the scans that are left: 2.5 to 6 % off in the smallest
-eigenvalue at 1 km is what float32 moments give after 1e5 cycles, and nothing is what these do.
+A voxel is a row of integers in a slab: count, sum and second moment of its points in units of
+voxel_size / 65536 about the voxel centre, and the sum of the directions to the sensor. Adding a
+scan is integer addition and removing it integer subtraction, so that after any sequence of both
+the map equals, bit for bit, the map of the remaining scans. With float32 moments the smallest
+eigenvalue is 2.5 to 6 % off at 1 km after 1e5 cycles.
 
-Numbers that bound it: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m),
-2^23 points a voxel in one scan, 2^31 in the map.
+Limits: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m), 2^23 points of a
+scan in a voxel, 2^31 points of the map in a voxel.
 
-(Longer than other files: most of it is the description of what users call. The work is done in
-voxel_table, reducer, surfels, levels, change_log and digest.)
+(One module of 500 lines because it is one class, the main one; most of it is the description of
+its methods. The work is done in voxel_table, reducer, surfels and moments.)
 """
 
 from __future__ import annotations
@@ -28,16 +28,19 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
-from surfel_mapper.mapping.change_log import ChangeLog
 from surfel_mapper.mapping.channels import channel_names, means
-from surfel_mapper.mapping.digest import digest_of
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
-from surfel_mapper.mapping.levels import coarse_moments
-from surfel_mapper.mapping.moments import pack_keys, ScanMoments, unpack_keys
+from surfel_mapper.mapping.moments import (
+    coarse_moments,
+    digest_of,
+    pack_keys,
+    ScanMoments,
+    unpack_keys,
+)
 from surfel_mapper.mapping.reducer import Reducer
 from surfel_mapper.mapping.surfel_index import SurfelIndex
 from surfel_mapper.mapping.surfels import derive, Surfels
-from surfel_mapper.mapping.voxel_table import VoxelTable
+from surfel_mapper.mapping.voxel_table import ChangeLog, VoxelTable
 
 Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 """Lowest and highest voxel index, (3,) each."""
@@ -45,28 +48,28 @@ Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 class SurfelMap:
     """
-    A map of surfels that scans are added to and removed from, exactly.
+    A map of surfels with exact addition and removal of scans.
 
-    Not safe for several threads: one writes, the others read what ``surfels`` or ``moments``
-    returned to it.
+    Not thread-safe: one thread uses the map; others may read the arrays that its methods
+    returned.
 
     Parameters
     ----------
     voxel_size_m : float
         Edge of a voxel, m.
     columns : tuple of str
-        What else of the points is summed, exactly too: ``intensity``, ``rgb``.
+        Columns of the points to sum exactly as well: ``intensity``, ``rgb``.
     threads : int
-        How many threads share the work; the result has the same bits for any number.
+        Number of threads that share the work; results do not depend on it.
     level : int
-        The lattice unit is ``voxel_size_m / 2^(16 + level)``; other than 0 only in maps made
-        from finer ones, which take the moments of no scan.
+        The lattice unit is ``voxel_size_m / 2^(16 + level)``; not 0 only in maps that
+        ``coarsen`` returned, to which no scan can be added.
 
     Raises
     ------
     ValueError
-        If the voxel size is not positive and finite, a column is none that can be summed,
-        there is no thread, or the level is negative or beyond 20.
+        If the voxel size is not positive and finite, a column cannot be summed, threads is less
+        than 1, or the level is negative or beyond 20.
 
     """
 
@@ -78,7 +81,6 @@ class SurfelMap:
         threads: int = 1,
         level: int = 0,
     ) -> None:
-        """Make an empty map."""
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         if threads < 1:
@@ -105,17 +107,17 @@ class SurfelMap:
 
     @property
     def num_voxels(self) -> int:
-        """Voxels that hold at least one point."""
+        """Number of voxels that hold at least one point."""
         return self._table.num_voxels
 
     @property
     def num_points(self) -> int:
-        """Points in the map."""
+        """Number of points in the map."""
         return self._table.num_points
 
     @property
     def nbytes(self) -> int:
-        """Bytes in use for voxels and their hash table."""
+        """Size of voxels and hash table in use, bytes."""
         return self._table.nbytes
 
     def add(
@@ -134,17 +136,17 @@ class SurfelMap:
             In the frame of the map. Points with nan or inf are left out and counted in
             ``left_out`` of the result.
         origin : (3,) float, m, optional
-            Where the sensor was; normals turn towards it.
+            Position of the sensor; normals turn towards it.
         columns : mapping of str to (N,) array, optional
-            What else the points carry; needed where the map has columns.
+            Further columns of the points; required if the map has columns.
 
         Raises
         ------
         ValueError
             If shapes or types are wrong.
         MapLimitError
-            If a point lies beyond the voxel indices, or a voxel would hold too many. Nothing
-            has changed then.
+            If a point lies beyond the voxel indices, or a voxel would hold too many points.
+            Nothing is changed.
 
         """
         moments = self.reduce(points, origin=origin, columns=columns)
@@ -171,10 +173,10 @@ class SurfelMap:
         """
         Return the moments that points have in this map, without adding them.
 
-        Neither reads nor changes what the map holds, so another thread may reduce the next scan
-        while this one is inserted.
+        Does not access the voxels of the map, so another thread may reduce the next scan while
+        this one is inserted.
 
-        A point p is quantised once, X = floor((((R0 x + R1 y) + R2 z) + t) 65536 / voxel size)
+        A point is quantised once, X = floor((((R0 x + R1 y) + R2 z) + t) 65536 / voxel size)
         in float64; the voxel index is X >> 16 and the place in the voxel (X & 65535) - 32768.
 
         Parameters
@@ -182,13 +184,13 @@ class SurfelMap:
         points : (N, 3) float, m
             In the frame of the sensor.
         T_map_sensor : (4, 4) float64, optional
-            Takes them to the frame of the map; without it they are there already.
+            Pose of the sensor; by default the points are in the frame of the map.
         origin : (3,) float, m, optional
-            Where the sensor was, in the frame of the map.
+            Position of the sensor in the frame of the map.
         min_range_m, max_range_m : float
-            Distances from the origin of the points' frame between which points enter.
+            Range of distances from the origin of the points' frame; other points are left out.
         columns : mapping of str to (N,) array, optional
-            What else the points carry; needed where the map has columns.
+            Further columns of the points; required if the map has columns.
 
         """
         return self._reducer.reduce(
@@ -207,8 +209,8 @@ class SurfelMap:
         Raises
         ------
         MapError
-            If they are for another voxel size, or a voxel would hold more than 2^31 points
-            (2^31 / 4^level in a coarser map). Nothing has changed then.
+            If their voxel size differs, or a voxel would hold more than 2^31 points
+            (2^31 / 4^level in a coarser map). Nothing is changed.
 
         """
         self._check_lattice(moments)
@@ -224,23 +226,23 @@ class SurfelMap:
         Parameters
         ----------
         moments : ScanMoments
-            As ``add`` returned them.
+            Moments that ``add`` returned.
         min_points : int
-            From how many points on a voxel counts for the result.
+            Number of points of a surfel, for the result.
 
         Returns
         -------
         (E, 3) int32
-            Indices of the voxels that held ``min_points`` before and hold fewer now.
+            Indices of the voxels that held at least ``min_points`` before and hold fewer now.
 
         Raises
         ------
         MapError
-            If they are for another voxel size.
+            If their voxel size differs.
         NotInMapError
-            If a voxel holds fewer points, or as many with other sums. Nothing has changed then.
-            Moments that were not added go unnoticed only where other scans have more points
-            than they in every one of their voxels.
+            If a voxel holds fewer points, or equally many with other sums. Nothing is changed.
+            Moments that were never added are detected unless every one of their voxels holds
+            more points of other scans.
 
         """
         self._check_lattice(moments)
@@ -259,57 +261,57 @@ class SurfelMap:
 
     def merge(self, other: SurfelMap) -> None:
         """
-        Add all that another map of equal voxel size holds: the exact union.
+        Add all points of another map of equal voxel size: the exact union.
 
         Raises
         ------
         MapError
-            If the voxel sizes differ, or a voxel would hold too many points.
+            If the voxel sizes differ, or a voxel would hold too many points; see ``insert``.
 
         """
         self.insert(other.moments())
 
     def subtract(self, other: SurfelMap) -> None:
         """
-        Remove all that another map of equal voxel size holds: the exact inverse of ``merge``.
+        Remove all points of another map of equal voxel size: the exact inverse of ``merge``.
 
         Raises
         ------
         MapError
             If the voxel sizes differ.
         NotInMapError
-            If this map does not hold all of it. Nothing has changed then.
+            If this map does not hold all of them. Nothing is changed.
 
         """
         self.remove(other.moments())
 
     def __eq__(self, other: object) -> bool:
-        """Return whether two maps hold the same, to the bit."""
+        """Return whether two maps are equal, to the bit."""
         if not isinstance(other, SurfelMap):
             return NotImplemented
         return self.num_voxels == other.num_voxels and self.digest() == other.digest()
 
-    __hash__ = None  # type: ignore[assignment]  # a map changes
+    __hash__ = None  # type: ignore[assignment]  # a map is mutable
 
     def coarsen(self, level: int, within: Box | None = None) -> SurfelMap:
         """
-        Return the map of voxels 2^level times larger, from the moments of this one alone.
+        Return the map with voxels 2^level times larger, computed from the moments of this map.
 
-        The lattice unit stays that of the finer map, so count, sum and second moment are those
-        of the quantised points regrouped, to the bit. View sums are added as they are; they
-        were taken from the centres of the finer voxels.
+        The lattice unit remains that of the finer map, so count, sum and second moment are
+        exactly those of the quantised points in the larger voxels. View sums, which refer to
+        the centres of the finer voxels, are added unchanged.
 
         Parameters
         ----------
         level : int
             1 doubles the edge of a voxel; 0 copies the map.
         within : two (3,) int, optional
-            Lowest and highest voxel index of what is to be in it.
+            Lowest and highest voxel index to include; by default all voxels.
 
         Raises
         ------
         ValueError
-            If the level is negative or makes a voxel of more than 2^20 finer ones an axis.
+            If the level is negative or beyond 20.
         MapLimitError
             If a voxel would hold more than 2^31 / 4^level points.
 
@@ -327,21 +329,22 @@ class SurfelMap:
         return coarse
 
     def copy(self) -> SurfelMap:
-        """Return a map of its own with the same content."""
+        """Return an independent copy."""
         other = SurfelMap(self.voxel_size_m, columns=self.columns, level=self.level)
         other.insert(self.moments())
         return other
 
     def surfels(self, min_points: int = 1, at_most: int | None = None) -> Surfels:
         """
-        Return the surfels of all voxels with at least so many points, in no stated order.
+        Return the surfels of all voxels of at least min_points points, in unspecified order.
 
         Parameters
         ----------
         min_points : int
-            Voxels with fewer points are passed over.
+            Voxels with fewer points are skipped.
         at_most : int, optional
-            If there are more, so many are returned, evenly spread and always the same ones.
+            Maximum number of surfels; a larger map is subsampled evenly in space, by a hash of
+            the voxel, so that the selection changes little while the map grows.
 
         """
         if at_most is None:
@@ -349,46 +352,46 @@ class SurfelMap:
         return self._derive(self._table.thinned(min_points, at_most))
 
     def num_surfels(self, min_points: int = 1) -> int:
-        """Return how many voxels hold at least so many points."""
+        """Return the number of voxels of at least min_points points."""
         return len(self._table.changed_after(-1, min_points))
 
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
-        """Return the keys of the voxels with at least so many points, (K,), in no stated order."""
+        """Return the keys (K,) of the voxels of at least min_points points, in any order."""
         rows = self._table.changed_after(-1, min_points)
         return np.asarray(self._table.rows[rows, layout.KEY])
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-        """Return the row of each voxel key (K,), -1 for none; rows hold until the map changes."""
+        """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
         return self._table.find(key)
 
     def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
-        """Return the surfels of some rows (K,), which ``find`` gave."""
+        """Return the surfels of rows (K,) that ``find`` returned."""
         return self._derive(rows)
 
     def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-        """Return the covariances of the points of rows (K,), (K, 6): xx xy xz yy yz zz, m^2."""
+        """Return the covariances of rows (K,): (K, 6), xx xy xz yy yz zz, m^2."""
         found = np.empty((len(rows), 6))
         bits = layout.BITS + self.level
         derive_covariances(self._table.rows, rows, self.voxel_size_m, bits, found)
         return found
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
-        """Return the voxel keys of some rows (K,), -1 for those that hold no points."""
+        """Return the voxel keys of rows (K,), -1 for empty rows."""
         slab = self._table.rows
         keys = np.where(slab[rows, layout.COUNT] > 0, slab[rows, layout.KEY], -1)
         return np.asarray(keys, np.int64)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
         """
-        Return the rows (K,) whose voxels changed after a version, emptied ones too, each once.
+        Return the rows (K,) that changed after a version, each once, including emptied ones.
 
-        What was there before the map was cleared (``cleared_at``, a version) is not among them.
+        Rows from before the map was cleared (``cleared_at``, a version) are not included.
         """
         changed = self._changes.since(since, self._table.rows, 0)
         return self._table.emptied_or_changed_after(since) if changed is None else changed
 
     def index(self, min_points: int = 1) -> SurfelIndex:
-        """Return the surfels with at least so many points, to be asked by place: a snapshot."""
+        """Return a snapshot of the surfels of at least min_points points for spatial queries."""
         return SurfelIndex(self.surfels(min_points), self.voxel_size_m, level=self.level)
 
     def surfels_changed(self, since: int | None = None, min_points: int = 1) -> Surfels:
@@ -398,9 +401,9 @@ class SurfelMap:
         Parameters
         ----------
         since : int, optional
-            A ``version`` of the map; without it: since the last call without it.
+            A ``version`` of the map; by default the version at the last call without ``since``.
         min_points : int
-            Voxels with fewer points are passed over.
+            Voxels with fewer points are skipped.
 
         """
         if since is None:
@@ -417,7 +420,7 @@ class SurfelMap:
         Parameters
         ----------
         voxel_index : (K, 3) int, optional
-            Of these voxels, as far as the map holds them; without it, of all.
+            The voxels; those that the map does not contain are skipped. By default all.
 
         """
         if voxel_index is None:
@@ -428,7 +431,7 @@ class SurfelMap:
         return self._moments_of(chosen[np.argsort(self._table.rows[chosen, layout.KEY])])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
-        """Return the moments of some rows, in their order; a copy."""
+        """Return the moments of rows, in the given order; a copy."""
         rows = self._table.rows[chosen]
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
@@ -447,11 +450,8 @@ class SurfelMap:
         Return the SHA-256 of the state in hexadecimal.
 
         It covers voxel size, level, voxel indices and integer moments, sorted by voxel: equal
-        digests mean equal maps, whatever way they came about.
-
-        Notes
-        -----
-        What is hashed, and in which order, stands in mapping/digest.py.
+        digests mean equal maps, independent of the order of insertion. ``digest_of`` in
+        mapping/moments.py specifies the hashed bytes.
 
         """
         moments = self.moments()
@@ -464,7 +464,7 @@ class SurfelMap:
         )
 
     def clear(self) -> None:
-        """Remove everything."""
+        """Remove all voxels."""
         self.version += 1
         self._reset()
 
@@ -489,10 +489,10 @@ class SurfelMap:
             )
 
     def _check_counts(self, moments: ScanMoments) -> None:
-        """Refuse moments by which a voxel would hold more points than the integers allow."""
+        """Raise MapLimitError if a voxel would hold more points than the integers allow."""
         limit = layout.MAX_MAP_COUNT >> (2 * self.level)
         if self.num_points + moments.num_points <= limit:
-            return  # the usual case: not even all points together are too many
+            return  # usual: even all points in one voxel would be allowed
         found = self._table.find(moments.key)
         held = np.where(found >= 0, self._table.rows[found, layout.COUNT], 0)
         largest = int((held + moments.count).max(initial=0))

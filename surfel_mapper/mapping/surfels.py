@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfels: what a map says about its voxels, as arrays.
+Surfels: position, normal and shape of the voxels of a map, as arrays.
 
-Derived from the exact moments in float64 whenever they are asked for, and only for the voxels
-asked for; a map stores none of it.
+Derived from the exact moments in float64 on request, and only for the requested voxels; a map
+does not store them.
 """
 
 from __future__ import annotations
@@ -23,28 +23,28 @@ from surfel_mapper.threads import share
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfels:
     """
-    Surfels of K voxels, one row each, in the frame of the map.
+    Surfels of K voxels, a row each, in the frame of the map.
 
     Attributes
     ----------
     position : (K, 3) float64, m
         Mean of the points.
     normal : (K, 3) float64
-        Unit eigenvector of the smallest eigenvalue, turned towards the sensor that saw the
-        voxel; where that is unknown, the component of largest magnitude is positive. nan for
-        one point and for points that are all equal.
+        Unit eigenvector of the smallest eigenvalue, turned towards the sensor; if its position
+        is unknown, the component of largest magnitude is positive. nan for a single point and
+        for identical points.
     planarity : (K,) float64
-        2 (e1 - e0) / (e0 + e1 + e2) in [0, 1]; nan where the normal is.
+        2 (e1 - e0) / (e0 + e1 + e2) in [0, 1]; nan if the normal is nan.
     curvature : (K,) float64
-        e0 / (e0 + e1 + e2) in [0, 1/3] (Pauly et al. 2002); nan where the normal is.
+        e0 / (e0 + e1 + e2) in [0, 1/3] (Pauly et al. 2002); nan if the normal is nan.
     eigenvalues : (K, 3) float64, m^2
-        Of the covariance scatter / (n - 1), ascending; 0 for one point.
+        Eigenvalues of the covariance scatter / (n - 1), ascending; 0 for a single point.
     num_points : (K,) int64
-        How many points.
+        Number of points.
     voxel_index : (K, 3) int32
         floor(point / voxel size).
     channels : mapping of str to (K,) float64
-        Means of what else the map sums: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
+        Means of the channels of the map: ``intensity``; ``red``, ``green``, ``blue`` in 0 to 255.
 
     """
 
@@ -62,7 +62,7 @@ class Surfels:
         return len(self.num_points)
 
     def select(self, rows: npt.NDArray[Any]) -> Surfels:
-        """Return some of the surfels: by a mask (K,) bool, or by their row numbers."""
+        """Return selected surfels: by a mask (K,) bool or by row indices."""
         return Surfels(
             position=self.position[rows],
             normal=self.normal[rows],
@@ -76,7 +76,7 @@ class Surfels:
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """All but the channels, in the order they are declared."""
+        """All arrays but the channels, in the order of declaration."""
         return (
             self.position,
             self.normal,
@@ -96,12 +96,12 @@ def derive(
     threads: int = 1,
 ) -> Surfels:
     """
-    Derive the surfels of some rows of a map's slab.
+    Derive the surfels of selected rows of a slab.
 
     Parameters
     ----------
     rows : (R, 16) int64
-        Laid out as kernels/layout.py says.
+        In the layout of kernels/layout.py.
     chosen : (K,) int32
         Rows that hold points.
     voxel_size_m : float
@@ -109,7 +109,7 @@ def derive(
     bits : int
         A voxel is 2^bits lattice units wide.
     threads : int
-        How many threads share the work.
+        Number of threads that share the work.
 
     """
     num = len(chosen)

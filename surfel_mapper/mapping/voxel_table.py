@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-VoxelTable: the memory of a map, one row of integers a voxel, found by hash.
+VoxelTable: the memory of a map, a row of integers for each voxel, found by hash.
 
-Owns the arrays that the kernels work on and makes them larger when a kernel asks for room. Rows
-and buckets grow without being copied and a full part of the hash table splits on its own, so
-that no scan waits for the whole map.
+Owns the arrays that the kernels work on and enlarges them when a kernel has no room. Rows and
+buckets grow without being copied and a full segment of the hash table splits separately, so that
+no scan waits while the whole map is rehashed.
+
+ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
+every row of the map. It is bounded; a request for older changes looks at all rows.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import replace
+from itertools import takewhile
 from typing import Any
 
 import numpy as np
@@ -18,10 +23,12 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import hashing, layout
-from surfel_mapper.kernels.queries import keys_in_box
-from surfel_mapper.mapping.hash_table import HashTable
-from surfel_mapper.mapping.kernels.surfels import rows_changed_after
-from surfel_mapper.mapping.kernels.thinning import rows_held
+from surfel_mapper.mapping.kernels.queries import (
+    keys_in_box,
+    rows_changed_after,
+    rows_changed_at,
+    rows_held,
+)
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
@@ -29,26 +36,27 @@ from surfel_mapper.mapping.kernels.voxels import (
     subtract_moments,
 )
 from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.slab import Slab
-from surfel_mapper.mapping.thinning import smallest
+from surfel_mapper.mapping.storage import HashTable, Slab
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
 
+LEAST = 1 << 18
+"""Minimum capacity of the change log, rows; 1 MiB."""
+
 
 class VoxelTable:
     """
-    Rows of voxels, laid out as kernels/layout.py says, and the hash table that finds them.
+    Rows of voxels in the layout of kernels/layout.py, and the hash table that finds them.
 
     Parameters
     ----------
     num_channels : int
-        Channels that are summed beside the moments, in rows of their own.
+        Number of channels that are summed beside the moments, in rows of their own.
 
     """
 
     def __init__(self, num_channels: int = 0) -> None:
-        """Make an empty table."""
         self._rows = Slab(1024, layout.ROW)
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH)
@@ -56,17 +64,17 @@ class VoxelTable:
 
     @property
     def rows(self) -> npt.NDArray[np.int64]:
-        """The rows, (R, 16) int64; only until the table grows."""
+        """The rows, (R, 16) int64; valid until the table grows."""
         return self._rows.array
 
     @property
     def num_voxels(self) -> int:
-        """Voxels that hold at least one point."""
+        """Number of voxels that hold at least one point."""
         return self._hash.num_keys
 
     @property
     def num_points(self) -> int:
-        """Points of all voxels."""
+        """Number of points of all voxels."""
         return int(self._state[hashing.POINTS])
 
     @property
@@ -77,12 +85,12 @@ class VoxelTable:
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
-        Add moments to their voxels; return the rows changed, each once.
+        Add moments to their voxels; return the changed rows, each once.
 
         Raises
         ------
         MapLimitError
-            If there is no room for the voxels; the table holds what it held before.
+            If there is no memory for the voxels; the table is unchanged.
 
         """
         changed = np.empty(len(moments), np.int32)
@@ -108,13 +116,13 @@ class VoxelTable:
         return changed[: self._state[hashing.CHANGED]]
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
-        """Return the row of each voxel key, -1 where there is none."""
+        """Return the row of each voxel key, -1 if not found."""
         found = np.empty(len(key), np.int32)
         find_rows(key, self.rows, self._hash.arrays, self._state, found)
         return found
 
     def first_missing(self, moments: ScanMoments, found: npt.NDArray[np.int32]) -> int:
-        """Return the first voxel that does not hold its moments in its row found, or -1."""
+        """Return the first voxel whose row does not hold its moments, or -1."""
         return int(first_missing(moments.arrays, moments.view_is_sum, self.rows, found))
 
     def subtract(
@@ -142,18 +150,18 @@ class VoxelTable:
         return fallen[:num_fallen]
 
     def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-        """Return the sums of the channels of some rows, (K, C)."""
+        """Return the channel sums of some rows, (K, C)."""
         if not self._channels:
             return np.empty((len(chosen), 0), np.int64)
         return np.asarray(self._channels.array[chosen])
 
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
-        """Return the rows changed after a version that hold at least so many points."""
+        """Return the rows of at least min_points points that were changed after a version."""
         used = self._hash.rows_used
         return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
 
     def emptied_or_changed_after(self, version: int) -> npt.NDArray[Any]:
-        """Return the rows changed after a version, those that hold no points any more too."""
+        """Return the rows changed after a version, including emptied ones."""
         return np.asarray(rows_changed_after(self.rows, self._hash.rows_used, version, 0))
 
     def keys_in_box(
@@ -164,25 +172,74 @@ class VoxelTable:
         return np.asarray(keys_in_box(self.rows, used, low, high), np.int64)
 
     def thinned(self, min_points: int, at_most: int) -> npt.NDArray[np.int32]:
-        """Return the rows with at least so many points, or of more than at_most some; sorted."""
+        """Return at most at_most rows of at least min_points points, sorted."""
         used = self._hash.rows_used
         chosen, mixed = np.empty(used, np.int32), np.empty(used, np.uint64)
         num = rows_held(self.rows, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
     def _make_room_or_undo(self, added: ScanMoments, version: int) -> None:
-        """Make room for one more voxel; if that fails, take out again what was added."""
+        """Make room for another voxel; if that fails, subtract the moments added so far."""
         try:
             self._make_room()
         except MapLimitError:
-            if self._channels:  # they would have been added last
+            if self._channels:  # not added yet
                 added = replace(added, channels=np.zeros_like(added.channels))
             self.subtract(added, version, self.find(added.key))
             raise
 
     def _make_room(self) -> None:
-        """Enlarge what kept add_moments from placing a new voxel."""
+        """Enlarge the array that had no room for a new voxel."""
         if self._hash.lacks_row(len(self.rows)):
             self._rows.grow(2 * len(self.rows))
         else:
             self._hash.grow()
+
+
+class ChangeLog:
+    """
+    Rows changed by the latest versions of a map.
+
+    Parameters
+    ----------
+    version : int
+        Version of the map at the start of the log.
+
+    """
+
+    def __init__(self, version: int) -> None:
+        self._entries: deque[tuple[int, npt.NDArray[np.int32]]] = deque()
+        self._num_rows = 0
+        self._start = version
+
+    def add(self, version: int, rows: npt.NDArray[np.int32], num_voxels: int) -> None:
+        """Record the rows that a version changed; drop the oldest entries beyond the capacity."""
+        if not len(rows):
+            return
+        self._entries.append((version, rows))
+        self._num_rows += len(rows)
+        while self._num_rows > max(LEAST, num_voxels):
+            self._start, forgotten = self._entries.popleft()
+            self._num_rows -= len(forgotten)
+
+    def since(
+        self, version: int, slab: npt.NDArray[np.int64], min_points: int
+    ) -> npt.NDArray[np.int32] | None:
+        """
+        Return the rows of at least min_points points changed after a version, each once.
+
+        With min_points of 0 emptied rows are included. None if the log does not reach back to
+        the version.
+        """
+        if version < self._start:
+            return None
+        entries = takewhile(lambda entry: entry[0] > version, reversed(self._entries))
+        parts = [rows_changed_at(slab, rows, at, min_points) for at, rows in entries]
+        return np.concatenate(parts) if parts else np.empty(0, np.int32)
+
+
+def smallest(mixed: npt.NDArray[np.uint64], number: int) -> npt.NDArray[np.int64]:
+    """Return the sorted indices of the ``number`` smallest values, or of all if fewer."""
+    if len(mixed) <= number:
+        return np.arange(len(mixed))
+    return np.sort(np.argpartition(mixed, number - 1)[:number])

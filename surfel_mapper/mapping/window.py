@@ -1,18 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-SlidingWindow: which scans a map holds, and which leave it when a new one comes.
+SlidingWindow: the scans that a map holds, and the limits that evict the oldest.
 
-The window keeps the moments of every scan; a scan that leaves is subtracted from the map, so
-the map is at any time the sum of the scans in the window, to the bit. A new scan is added
-before old ones leave, so that a voxel seen by both never comes and goes.
+The window keeps the moments of every scan; an evicted scan is subtracted from the map, so the map
+equals the sum of the scans in the window at any time, to the bit. A new scan is added before old
+ones are evicted, so that a voxel observed by both is not removed and created again.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -20,25 +20,56 @@ import numpy.typing as npt
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import MapError
-from surfel_mapper.mapping.moments import unpack_keys
+from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.windowed_scan import WindowedScan as WindowedScan  # handed on
-from surfel_mapper.mapping.windowed_scan import without
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class WindowedScan:
+    """
+    A scan in the window.
+
+    Attributes
+    ----------
+    moments : ScanMoments
+        Its moments, which the map holds.
+    stamp_ns : int
+        Time of the scan.
+    T_map_sensor : (4, 4) float64
+        The pose at which it was added.
+    points : (N, 3) float32 or float64, m, optional
+        Its points in the sensor frame, if kept: the points of the moments, no others.
+    columns : mapping of str to (N,) array
+        Columns of these points that the map sums.
+
+    """
+
+    moments: ScanMoments
+    stamp_ns: int
+    T_map_sensor: npt.NDArray[np.float64]
+    points: npt.NDArray[Any] | None = None
+    columns: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    @property
+    def nbytes(self) -> int:
+        """Size of moments, points and columns, bytes."""
+        kept = [*self.columns.values(), *([] if self.points is None else [self.points])]
+        return self.moments.nbytes + sum(array.nbytes for array in kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Eviction:
     """
-    A scan that left the window.
+    A scan that was evicted from the window.
 
     Attributes
     ----------
     scan : WindowedScan
     limit : str
-        The limit that it had reached: max_scans, max_age_s, max_distance_m, max_bytes or
+        The limit that it exceeded: max_scans, max_age_s, max_distance_m, max_bytes or
         max_voxels.
     fallen : (E, 3) int32
-        Indices of the voxels that fell below the number of points that makes a surfel.
+        Indices of the voxels that fell below min_points, the number of points of a surfel.
 
     """
 
@@ -54,11 +85,11 @@ class SlidingWindow:
     Parameters
     ----------
     surfel_map : SurfelMap
-        Scans are added to it and removed from it by the window alone.
+        The map; only the window may add scans to it and remove them.
     config : WindowConfig, optional
-        The limits; may be replaced at any time and hold from the next scan on.
+        The limits; may be replaced at any time and apply from the next scan on.
     max_voxels : int
-        The oldest scans leave while the map holds more voxels; 0: no such limit.
+        Scans are evicted while the map holds more voxels; 0 means no such limit.
 
     """
 
@@ -69,14 +100,13 @@ class SlidingWindow:
         *,
         max_voxels: int = 0,
     ) -> None:
-        """Make an empty window."""
         self.config = config or WindowConfig()
         self.max_voxels = max_voxels
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._scans.clear()
         self._num_settled = 0
         self._travelled_m = 0.0
@@ -87,38 +117,38 @@ class SlidingWindow:
         return self._num_settled + len(self._scans)
 
     def __iter__(self) -> Iterator[WindowedScan]:
-        """Iterate over the scans that are kept, oldest first; see ``insert``."""
+        """Iterate over the kept scans, oldest first; see ``insert``."""
         return (scan for scan, _ in self._scans)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the scans that are kept."""
+        """Size of the kept scans, bytes."""
         return self._nbytes
 
     @property
     def newest(self) -> WindowedScan | None:
-        """The scan added last."""
+        """The scan added last, None if empty."""
         return self._scans[-1][0] if self._scans else None
 
     def insert(self, scan: WindowedScan, min_points: int = 1) -> list[Eviction]:
         """
-        Add a scan to the map and remove those that are beyond a limit now.
+        Add a scan to the map and evict the scans that exceed a limit.
 
-        The newest scan stays, whatever the limits are. Without any limit no scan will leave;
-        then, unless points are to be kept, only the newest is kept, and memory does not grow
-        with the number of scans.
+        The newest scan always stays. Without any limit no scan is evicted; then, unless
+        ``keep_points`` is set, only the newest scan is kept, and memory does not grow with the
+        number of scans.
 
         Parameters
         ----------
         scan : WindowedScan
             The newest scan.
         min_points : int
-            From how many points on a voxel counts as a surfel, for what an eviction states.
+            Number of points of a surfel, for ``Eviction.fallen``.
 
         Raises
         ------
         MapError
-            If the map refuses the scan; nothing has changed then.
+            If the map refuses the scan; nothing is changed.
 
         """
         self._map.insert(scan.moments)
@@ -133,12 +163,12 @@ class SlidingWindow:
 
     def restore(self, scans: Iterable[WindowedScan]) -> None:
         """
-        Take scans that the map holds already, oldest first, as a saved window.
+        Restore the scans of a saved window, oldest first, which the map already holds.
 
         Raises
         ------
         ValueError
-            If there are scans in the window.
+            If the window is not empty.
 
         """
         if self._scans:
@@ -150,21 +180,21 @@ class SlidingWindow:
         self, voxel_index: npt.NDArray[Any], min_points: int = 1
     ) -> npt.NDArray[np.int32]:
         """
-        Empty voxels of the map, and take them out of the scans, so that these leave exactly.
+        Remove voxels from the map and from the scans, so that evictions stay exact.
 
-        Points that are kept go with their voxels.
+        Kept points in these voxels are removed too.
 
         Parameters
         ----------
         voxel_index : (K, 3) int
-            The voxels; those that the map does not hold are passed over.
+            The voxels; those that the map does not contain are ignored.
         min_points : int
-            From how many points on a voxel counts for the result.
+            Number of points of a surfel, for the result.
 
         Returns
         -------
         (E, 3) int32
-            Indices of the voxels that held ``min_points`` and are empty now.
+            Indices of the voxels that held at least ``min_points`` and are empty now.
 
         """
         held = self._map.moments(voxel_index)
@@ -179,25 +209,25 @@ class SlidingWindow:
         self, scans: Mapping[int, WindowedScan], min_points: int = 1
     ) -> npt.NDArray[np.int32]:
         """
-        Move scans: remove them where they are, add them where they are to be.
+        Move scans to other poses: replace their moments in the map.
 
         Parameters
         ----------
         scans : mapping of int to WindowedScan
-            Places in the window, counted from the oldest scan that is kept, and what is to be
-            there: the same scan with the moments that it has at another pose.
+            Position in the window, counted from the oldest kept scan, and the same scan with its
+            moments at another pose.
         min_points : int
-            From how many points on a voxel counts for the result.
+            Number of points of a surfel, for the result.
 
         Returns
         -------
         (E, 3) int32
-            Indices of the voxels that held ``min_points`` before and hold fewer now.
+            Indices of the voxels that held at least ``min_points`` before and hold fewer now.
 
         Raises
         ------
         MapError
-            If the map refuses a scan; nothing has changed then.
+            If the map refuses a scan; nothing is changed.
 
         """
         old = list(self)
@@ -222,13 +252,13 @@ class SlidingWindow:
         return unpack_keys(np.setdiff1d(full, self._full(left, min_points)))
 
     def _full(self, keys: npt.NDArray[np.int64], min_points: int) -> npt.NDArray[np.int64]:
-        """Return the keys of those of some voxels that hold enough points."""
+        """Return those of the keys whose voxels hold at least min_points points."""
         held = self._map.moments(unpack_keys(keys))
         return held.key[held.count >= min_points]
 
     def clear(self) -> None:
-        """Forget all scans and clear the map."""
-        self._forget()
+        """Remove all scans and clear the map."""
+        self._reset()
         self._map.clear()
 
     def _append(self, scan: WindowedScan) -> None:
@@ -240,7 +270,7 @@ class SlidingWindow:
 
     @property
     def _keeps_nothing(self) -> bool:
-        """Whether no scan can leave and none is wanted for anything else."""
+        """Whether no limit can evict a scan and points are not kept."""
         config = self.config
         limits = (config.max_scans, config.max_age_s, config.max_distance_m, config.max_bytes)
         return not (any(limits) or self.max_voxels or config.keep_points)
@@ -253,7 +283,7 @@ class SlidingWindow:
         return Eviction(scan=scan, limit=limit, fallen=fallen)
 
     def _limit_reached(self) -> str:
-        """Return the name of a limit that the oldest scan is beyond, or an empty string."""
+        """Return the name of a limit that the oldest scan exceeds, or an empty string."""
         config = self.config
         (oldest, travelled_m), (newest, _) = self._scans[0], self._scans[-1]
         age_ns = newest.stamp_ns - oldest.stamp_ns
@@ -266,3 +296,23 @@ class SlidingWindow:
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')
+
+
+def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:
+    """Return a scan without the voxels of sorted keys."""
+    hit = contains(keys, scan.moments.key)
+    if not hit.any():
+        return scan
+    rest = replace(scan, moments=scan.moments.select(~hit))
+    if scan.points is None:
+        return rest
+    size_m = scan.moments.voxel_size_m
+    stay = ~contains(keys, point_keys(scan.points, scan.T_map_sensor, size_m))
+    columns = {name: column[stay] for name, column in scan.columns.items()}
+    return replace(rest, points=scan.points[stay], columns=columns)
+
+
+def contains(keys: npt.NDArray[np.int64], wanted: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Return which of the wanted keys are among the sorted keys."""
+    at = np.searchsorted(keys, wanted)
+    return np.asarray(keys[np.minimum(at, len(keys) - 1)] == wanted)

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.geometry import inverse, Transform
+from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.kernels.queries import build_table
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels

@@ -17,7 +17,7 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.windowed_scan import WindowedScan
+from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.reduction import reduced
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool

@@ -22,8 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
-from surfel_mapper.mapping.hash_table import HashTable
-from surfel_mapper.mapping.slab import Slab
+from surfel_mapper.mapping.storage import HashTable, Slab
 from surfel_mapper.tsdf.kernels.blocks import (
     find_blocks,
     FREE,

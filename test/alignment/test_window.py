@@ -189,5 +189,5 @@ def test_what_cannot_be_aligned_is_refused(num_scans, poses, message):
 def test_scans_with_nothing_to_match_are_refused():
     scan = NOTHING
 
-    with pytest.raises(AlignmentError, match=r'0 of 3 scans have surfels of 1 m'):
+    with pytest.raises(AlignmentError, match=r'0 of 3 scans have enough surfels of 1 m'):
         align_scans([scan] * 3, np.array([np.eye(4)] * 3))

@@ -26,9 +26,9 @@ from time import perf_counter, thread_time
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.trajectory_errors import absolute_errors, drift, relative_errors
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import Config
+from surfel_mapper.evaluation.trajectory_errors import absolute_errors, drift, relative_errors
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.pose_messages import poses_in

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from surfel_mapper.alignment.trajectory_errors import compare
 from surfel_mapper.cli.main import main
+from surfel_mapper.evaluation.trajectory_errors import compare
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw

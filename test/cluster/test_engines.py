@@ -32,7 +32,7 @@ def refuse(_):
 
 def what_is_there():
     """Return whether all that tasks need is loaded, Ctrl-C ignored, and what libraries read."""
-    modules = ('surfel_mapper.cluster.shards', 'surfel_mapper.kernels.moments')
+    modules = ('surfel_mapper.cluster.shards', 'surfel_mapper.mapping.kernels.reduction')
     return (
         all(name in sys.modules for name in modules),
         signal.getsignal(signal.SIGINT) is signal.SIG_IGN,

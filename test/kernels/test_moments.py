@@ -12,17 +12,14 @@ import numpy as np
 import pytest
 
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels.moments import (
+from surfel_mapper.kernels.grouping import CHUNK, find_runs, hash_shift, home
+from surfel_mapper.kernels.quantisation import quantise
+from surfel_mapper.mapping.kernels.reduction import (
     add_runs,
     BEYOND,
-    CHUNK,
-    find_runs,
-    hash_shift,
-    home,
     look_back,
     NOT_FINITE,
     pack_sums,
-    quantise,
     reason,
     reduce_points,
     TOO_FAR,

@@ -7,7 +7,7 @@ import pytest
 
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.windowed_scan import WindowedScan
+from surfel_mapper.mapping.window import WindowedScan
 
 
 def scans(num, num_points, seed):

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels.queries import build_table
-from surfel_mapper.mapping.kernels.thinning import mark_seen
+from surfel_mapper.kernels.grouping import build_table
+from surfel_mapper.mapping.kernels.queries import mark_seen
 from surfel_mapper.mapping.moments import point_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.kernels.attach import attach_surfels

@@ -12,10 +12,11 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
+from surfel_mapper.kernels.symmetric3 import eigen_frame
 from surfel_mapper.models import fit
 from surfel_mapper.models.clusters import clusters_of, surfaces_of
 from surfel_mapper.models.fitting import thin
+from surfel_mapper.models.kernels.frames import orient, range_moments
 from surfel_mapper.models.kernels.joining import agree, gap
 from test.models.scenes import A, room, sheet, VIEW
 

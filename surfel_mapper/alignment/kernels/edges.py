@@ -1,14 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the pairs of an edge come to: means and second moments of both ends.
+Moments of the pairs of an edge: means and second moments of both ends.
 
-Every sum that the alignment of scans needs of the pairs of two clouds is a polynomial in the two
-poses, whose coefficients are 28 numbers, or 74 where each pair has a weight of its own. So the
-pairs are read once, whatever the number of iterations, and an iteration costs the same for 10
-pairs as for 10^6: 100 edges of 5000 pairs take 6 ms once, where the sums themselves would take
-that in each iteration. The 28 are taken about the means, because about the origin nothing is left
-of a few millimetres at 1 km.
+Every sum over the pairs of two clouds that the alignment needs is a polynomial in the two poses.
+Its coefficients are 28 numbers, or 74 if each pair has its own weight. So the pairs are read only
+once, and an iteration costs the same for 10 pairs as for 10^6: 100 edges of 5000 pairs take 6 ms
+once instead of in each iteration. The 28 are taken about the means, because about the origin
+float64 cancellation would swallow millimetres at 1 km.
 """
 
 import math
@@ -24,7 +23,7 @@ TARGET_SCATTER = 13
 CROSS_SCATTER = 19
 NUM_MOMENTS = 28
 
-# Entries of the moments of an edge whose pairs have weights.
+# Entries of the moments of an edge of weighted pairs.
 GAP_SQ = 1
 LINEAR = 2
 QUADRATIC = 14
@@ -34,7 +33,7 @@ NUM_WEIGHTED = 74
 @njit(cache=True, nogil=True)
 def pair_moments(source, target, pairs, moments):
     """
-    Sum up pairs of points; pairs with a coordinate that is not finite are passed over.
+    Sum the moments of pairs of points; pairs with a coordinate that is not finite are skipped.
 
     source   (N, 3) float32 or float64, m
     target   (M, 3) float32 or float64, m
@@ -146,7 +145,7 @@ def fit_residual(source, target, pairs, T_source, T_target, center, motion):
 @njit(cache=True, nogil=True)
 def weighted_moments(source, target, pairs, weights, moments):
     """
-    Sum up pairs of points whose gaps count by weights; see ``pair_moments``.
+    Sum the moments of weighted pairs of points; see ``pair_moments``.
 
     source   (N, 3) float32 or float64, m
     target   (M, 3) float32 or float64, m
@@ -156,8 +155,8 @@ def weighted_moments(source, target, pairs, weights, moments):
              (source, 1) (12: x by source x y z 1, then y, z); sums of W by (source, 1) by
              (source, 1) (60: W xx xy xz yy yz zz, each by xx xy xz x yy yz y zz z 1)
 
-    The squared gap of a pair after source has been moved by T is a quadratic form in the entries
-    of T, of which these are the coefficients.
+    These are the coefficients of the squared gap as a quadratic form in the entries of the
+    transform T that moves the source.
     """
     moments[:] = 0.0
     for k in range(len(pairs)):

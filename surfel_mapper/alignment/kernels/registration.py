@@ -3,9 +3,8 @@
 """
 Normal equations of a scan against the planes of a map's surfels.
 
-A cell is the mean of some points of the scan; the surfel of the voxel that it lies in says how
-far it is from the surface, and how sure that is. Sums run in the order of the cells, so that
-equal scans give equal bits.
+A cell is the mean of some points of the scan; the surfel of its voxel gives the distance from the
+surface and its variance. Sums run in the order of the cells, so that equal scans give equal bits.
 """
 
 import math
@@ -13,12 +12,12 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.queries import in_range, pack
+from surfel_mapper.kernels.quantisation import in_range, pack
 
 SIGMAS_SQ = 9.0
-"""A cell fits its surfel where its distance is at most 3 standard deviations."""
+"""Squared distance, in variances, at which a cell counts as half a fit."""
 
-# Columns of a row that stands for a surfel: 64 bytes, a cache line.
+# Columns of the row of a plane: 64 bytes, a cache line.
 MEAN = 0
 NORMAL = 3
 VARIANCE = 6
@@ -29,13 +28,13 @@ PLANE = 8
 @njit(cache=True, nogil=True)
 def cell_keys(cells, pose, scale, bits, keys):
     """
-    Find the voxel that each cell lies in.
+    Compute the key of the voxel that each cell lies in.
 
     cells  (K, 3) float64, m, in the sensor frame
     pose   (3, 4) float64, T_map_sensor
     scale  float64, lattice units a metre
     bits   a voxel is 2^bits lattice units wide
-    keys   (K,) int64, out: of the voxels; -1 where a map has none
+    keys   (K,) int64, out: voxel keys, -1 outside of the grid
     """
     voxel = float(1 << bits)
     for i in range(len(cells)):
@@ -55,11 +54,11 @@ def cell_keys(cells, pose, scale, bits, keys):
 @njit(cache=True, nogil=True)
 def number_rows(found, number, known, num_known):
     """
-    Give the rows of a map that are new here the next numbers; return how many are known now.
+    Assign numbers to the rows of a map in the order of first use; return the next number.
 
-    found   (K,) int32: in, rows of a map, -1 for none; out, their numbers, -1 for none
-    number  (R,) int32, number of each row of the map, -1 where it has none yet
-    known   (K,) int32 or longer, out: the rows by their numbers
+    found   (K,) int32, in: rows of a map, -1 for none; out: their numbers, -1 for none
+    number  (R,) int32, in and out: number of each row of the map, -1 if not numbered
+    known   (K,) int32 or longer, out: the rows by number
     """
     for i in range(len(found)):
         row = found[i]
@@ -76,19 +75,21 @@ def number_rows(found, number, known, num_known):
 @njit(cache=True, nogil=True, error_model='numpy')
 def sum_equations(cells, pose, place, planes, width_sq, hessian, gradient):
     """
-    Sum the normal equations of one Gauss-Newton step.
+    Sum the normal equations of a Gauss-Newton step.
 
     cells     (K, 3) float64, m, in the sensor frame
     pose      (3, 4) float64, T_map_sensor
     place     (K,) int32, row of planes for each cell, -1 for none
     planes    (P, 8) float64: mean (m), unit normal, variance of a distance from the plane at the
-              mean (m^2), and by how much it grows with the squared distance from the mean
-    width_sq  float64, m^2: Geman and McClure's kernel halves the pull of a cell at some half of it
-    hessian   (6, 6) float64, out: of position (m) and turn (rad) about the sensor, map axes
+              mean (m^2), and its increase with the squared distance from the mean
+    width_sq  float64, m^2: squared width of Geman and McClure's kernel
+    hessian   (6, 6) float64, out: for position (m) and rotation (rad) about the sensor, map axes
     gradient  (6,) float64, out
 
-    Returns how many cells met a surfel that says something, and how many of these fit: one on its
-    plane counts 1, one three deviations off a half.
+    Returns the number of cells that hit a usable surfel, and of those that fit it: a cell on its
+    plane counts 1, a cell three standard deviations off a half.
+
+    Not split although it has 90 lines: most of them are the 27 sums in registers.
     """
     a00 = a01 = a02 = a11 = a12 = a22 = 0.0
     b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = 0.0

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Moments of groups and of neighbours, and eigenvectors.
+Moments of groups of points and of neighbours.
 
 One loop takes a tenth of the time of numpy, which needs the coordinates of all neighbours in
 memory and a pass for each of two dozen products.
@@ -89,65 +89,3 @@ def neighbour_moments(points, ids, count, mean, covariance, radius):
         covariance[0, i], covariance[1, i], covariance[2, i] = xx / free, xy / free, xz / free
         covariance[3, i], covariance[4, i], covariance[5, i] = yy / free, yz / free, zz / free
         radius[i] = math.sqrt(far_sq)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def eigenvectors(matrices, values, smallest, vectors):
-    """
-    Compute all eigenvectors from those of the smallest eigenvalues.
-
-    matrices  (6, M) float64, symmetric, xx xy xz yy yz zz
-    values    (3, M) float64, their eigenvalues, ascending
-    smallest  (3, M) float64, unit eigenvectors of values[0]
-    vectors   (M, 3, 3) float64, out: vectors[:, k] belong to values[k], are of unit length, and
-              their component of largest magnitude is positive; nan if all values are 0
-
-    In the plane orthogonal to the smallest one the matrix is 2 by 2, and its larger eigenvector
-    follows from a square root; the third is orthogonal to both.
-    """
-    for i in range(matrices.shape[1]):
-        if not values[2, i] > 0.0:
-            vectors[i, :, :] = math.nan
-            continue
-        xx, xy, xz = matrices[0, i], matrices[1, i], matrices[2, i]
-        yy, yz, zz = matrices[3, i], matrices[4, i], matrices[5, i]
-        nx, ny, nz = smallest[0, i], smallest[1, i], smallest[2, i]
-        # u and w: a basis across n (Duff et al. 2017)
-        sign = 1.0 if nz >= 0.0 else -1.0
-        a = -1.0 / (sign + nz)
-        b = nx * ny * a
-        ux, uy, uz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
-        wx, wy, wz = b, sign + ny * ny * a, -ny
-        pux, puy = (xx * ux + xy * uy) + xz * uz, (xy * ux + yy * uy) + yz * uz
-        puz = (xz * ux + yz * uy) + zz * uz
-        pwx, pwy = (xx * wx + xy * wy) + xz * wz, (xy * wx + yy * wy) + yz * wz
-        pwz = (xz * wx + yz * wy) + zz * wz
-        uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
-        ww = (wx * pwx + wy * pwy) + wz * pwz
-        half = 0.5 * (uu - ww)
-        scale = max(abs(half), abs(uw))  # squares of tiny numbers underflow
-        equal = scale == 0.0  # any direction
-        half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
-        spread = math.sqrt(half * half + uw * uw)
-        cosine, sine = half / spread, uw / spread
-        # half-angle formulas, scaled
-        first = 1.0 + cosine if cosine >= 0.0 else sine
-        second = sine if cosine >= 0.0 else 1.0 - cosine
-        length = math.sqrt(first * first + second * second)
-        first, second = first / length, second / length
-        lx, ly, lz = first * ux + second * wx, first * uy + second * wy, first * uz + second * wz
-        store(vectors, i, 0, nx, ny, nz)
-        store(vectors, i, 1, ny * lz - nz * ly, nz * lx - nx * lz, nx * ly - ny * lx)
-        store(vectors, i, 2, lx, ly, lz)
-
-
-@njit(cache=True, nogil=True, inline='always')
-def store(vectors, i, k, x, y, z):
-    """Store a vector, turned so that its component of largest magnitude, the first such, > 0."""
-    leading = x
-    if abs(y) > abs(leading):
-        leading = y
-    if abs(z) > abs(leading):
-        leading = z
-    side = -1.0 if leading < 0.0 else 1.0
-    vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the moments of voxels say: mean, eigenvalues, normal, planarity, curvature.
+Derive surfels from the moments of voxels: mean, eigenvalues, normal, planarity, curvature.
 
-Moments are first moved, in integers, from the voxel centre to the lattice point nearest to the
-mean. Only then are they made float64, so that nothing cancels: points that are all equal give a
-scatter of exactly 0 wherever in the voxel they lie. Voxels are gathered in chunks that stay in
-the cache and are decomposed several at a time.
+Moments are first moved, in exact arithmetic, from the voxel centre to the lattice point nearest to
+the mean. The scatter is taken there, so nothing cancels: identical points give a scatter of
+exactly 0 anywhere in the voxel. Voxels are gathered in chunks that stay in the cache and are
+decomposed with vector instructions.
 """
 
 import math
@@ -14,7 +14,6 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.eigen3 import decompose
 from surfel_mapper.kernels.layout import (
     COUNT,
     INDEX_BITS,
@@ -24,17 +23,20 @@ from surfel_mapper.kernels.layout import (
     PRODUCT,
     ROW,
     SUM,
-    VERSION,
     VIEW,
 )
 from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.symmetric3 import decompose
 
 CHUNK = 256
+"""Voxels processed at once: their moments stay in the first-level cache."""
+
 AHEAD = 16
+"""Number of rows between the prefetch of a row and its use."""
 
 EXACT_BITS = 54
-"""A product of moments of n points of b bits is below n 4^(b - 1): a float64 for n < 2^(54 - 2 b),
-with a factor to spare."""
+"""A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
+n < 2^(54 - 2 b), with a margin of two."""
 
 # Rows of the chunk of moments: count, sums, products and views as in a row of the slab.
 N = 0
@@ -56,7 +58,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     outputs     position (K, 3) float64 m, normal (K, 3), planarity (K,), curvature (K,),
                 eigenvalues (K, 3) m^2, num_points (K,) int64, voxel_index (K, 3) int32
 
-    One point, or all equal: eigenvalues 0; normal, planarity and curvature nan.
+    A single point or identical points: eigenvalues 0; normal, planarity and curvature nan.
     """
     position, normal, planarity, curvature, eigenvalues, num_points, voxel_index = outputs
     moments = np.empty((MOMENTS, CHUNK))
@@ -76,7 +78,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
         turn(normals, num, moments)
         for i in range(num):
             out = start + i
-            # a factor, because half of the branches would miss
+            # a factor instead of a branch, which would be mispredicted half of the time
             known = math.nan if math.isnan(planarity[out]) else 1.0
             for axis in range(3):
                 normal[out, axis] = normals[axis, i] * known
@@ -111,7 +113,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
 @njit(cache=True, nogil=True)
 def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     """
-    Collect the moments of num voxels from start on; return the largest count.
+    Gather the moments of num voxels from start on; return the largest count.
 
     moments      (MOMENTS, CHUNK) float64, out
     num_points   (K,) int64, out
@@ -143,13 +145,13 @@ def gather(rows, chosen, start, num, moments, num_points, voxel_index):
 @njit(cache=True, nogil=True, error_model='numpy')
 def center(moments, num, mean, scatter):
     """
-    Write the means and the scatters about them, lattice units, of a chunk.
+    Compute mean and scatter of the voxels of a chunk, in lattice units.
 
-    moments  (MOMENTS, CHUNK) float64, of not too many points each, see EXACT_BITS
+    moments  (MOMENTS, CHUNK) float64, of a number of points that EXACT_BITS allows
     mean     (3, CHUNK) float64, out: about the centre of the voxel
     scatter  (6, CHUNK) float64, out: sum of products of deviations from the mean
 
-    All but the last product and the last difference are of whole numbers below 2^53, so exact.
+    All but the last product and the last difference are of integers below 2^53, so exact.
     """
     for i in range(num):
         n = moments[N, i]
@@ -170,7 +172,7 @@ def center(moments, num, mean, scatter):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def center_exactly(rows, chosen, scatter):
-    """Write the scatters that ``center`` gives for any number of points, through int64."""
+    """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     for i in range(len(chosen)):
         row = np.int64(chosen[i])
         n = rows[row, COUNT]
@@ -191,7 +193,7 @@ def center_exactly(rows, chosen, scatter):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def place(mean, num, voxel_size, bits, voxel_index, position):
-    """Write the means of a chunk as positions, (num, 3) m."""
+    """Convert the means of a chunk to positions, (num, 3) m."""
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     for i in range(num):
@@ -203,15 +205,16 @@ def place(mean, num, voxel_size, bits, voxel_index, position):
 @njit(cache=True, nogil=True, error_model='numpy')
 def derive_shape(values, num, moments, unit, planarity, curvature, start):
     """
-    Write planarity and curvature of a chunk, from start on; turn scatter into covariance.
+    Compute planarity and curvature of a chunk; scale eigenvalues of scatter to covariance.
 
-    values  (3, CHUNK) float64: eigenvalues of the scatter, lattice units; out: of the
+    values  (3, CHUNK) float64, in: eigenvalues of the scatter, lattice units; out: of the
             covariance, m^2
+    start   first row of the chunk in planarity and curvature
     """
     for i in range(num):
         e0, e1, e2 = values[0, i], values[1, i], values[2, i]
         inverse = 1.0 / ((e0 + e1) + e2)
-        planarity[start + i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as it should be
+        planarity[start + i] = 2.0 * (e1 - e0) * inverse  # 0 times inf is nan, as documented
         curvature[start + i] = e0 * inverse
         scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
         values[0, i] = e0 * scale
@@ -222,10 +225,10 @@ def derive_shape(values, num, moments, unit, planarity, curvature, start):
 @njit(cache=True, nogil=True)
 def turn(normals, num, moments):
     """
-    Turn the normals (3, CHUNK) of a chunk to the side from which their voxels were seen.
+    Turn the normals (3, CHUNK) of a chunk towards the sensor.
 
-    Where that is unknown or exactly sideways: so that the component of largest magnitude is
-    positive; of equal ones the first counts.
+    If its direction is unknown or orthogonal to the normal, the component of largest magnitude
+    becomes positive, the first of equal ones.
     """
     for i in range(num):
         nx, ny, nz = normals[0, i], normals[1, i], normals[2, i]
@@ -236,31 +239,3 @@ def turn(normals, num, moments):
         normals[0, i] = nx * side
         normals[1, i] = ny * side
         normals[2, i] = nz * side
-
-
-@njit(cache=True, nogil=True)
-def rows_changed_at(rows, changed, version, min_points):
-    """Return the rows whose last change was at a version and that hold at least so many points."""
-    kept = np.empty(len(changed), np.int32)
-    flat = rows.ravel()
-    num = 0
-    for place in range(len(changed)):
-        if place + AHEAD < len(changed):
-            prefetch(flat, np.int64(changed[place + AHEAD]) * ROW)
-        row = changed[place]
-        if rows[row, VERSION] == version and rows[row, COUNT] >= min_points:
-            kept[num] = row
-            num += 1
-    return kept[:num]
-
-
-@njit(cache=True, nogil=True)
-def rows_changed_after(rows, used, version, min_points):
-    """Return the rows changed after a version that hold at least so many points."""
-    kept = np.empty(used, np.int32)
-    num = 0
-    for row in range(used):
-        if rows[row, VERSION] > version and rows[row, COUNT] >= min_points:
-            kept[num] = row
-            num += 1
-    return kept[:num].copy()

@@ -1,16 +1,21 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Add the moments of a scan to a map and subtract them again.
+Add the moments of a scan to a map, subtract them again, and sum them into coarser voxels.
 
-Both are integer sums by voxel, so that the second undoes the first to the bit, in any order.
-Rows of the slab are visited in the order of the scan; the bucket and then the row of voxels
-further on are asked for ahead, which hides most of the cache misses.
+All are integer sums by voxel, so that a subtraction undoes an addition to the bit, in any order.
+Rows of the slab are visited in the order of the scan; the hash bucket and the row of later voxels
+are prefetched, which hides most of the cache misses.
+
+A voxel of level L consists of 2^L finer voxels an axis and keeps their lattice unit. A point at q
+about the centre of its fine voxel lies at q + d about the coarse centre, d an integer vector: the
+sum becomes S + n d, the second moment M + d S^T + S d^T + n d d^T.
 """
 
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     CHANGED,
     DEPTH,
@@ -27,25 +32,37 @@ from surfel_mapper.kernels.hashing import (
     split_segment,
     VOXELS,
 )
-from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION, VIEW
+from surfel_mapper.kernels.layout import (
+    BITS,
+    COUNT,
+    INDEX_BITS,
+    INDEX_MASK,
+    INDEX_OFFSET,
+    KEY,
+    PRODUCT,
+    ROW,
+    SUM,
+    VERSION,
+    VIEW,
+)
 from surfel_mapper.kernels.prefetch import prefetch
 
 AHEAD = 16
-"""Rows known beforehand are asked for so many voxels ahead."""
+"""Number of voxels between the prefetch of a row and its use."""
 
 BLOCK = 32
-"""Voxels looked up together: all buckets are asked for, then all rows, then the rows used."""
+"""Voxels looked up together: prefetch all buckets, then all rows, then use the rows."""
 
 
 @njit(cache=True, nogil=True, inline='always')
 def look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely):
     """
-    Find the rows of num voxels from start on, and ask for them.
+    Find the likely rows of num voxels from start on, and prefetch them.
 
     flat    (R * 16,) int64, the rows
     hashes  (BLOCK,) int64, out
-    likely  (BLOCK,) int64, out: a row with the hash of the voxel, and almost surely its key;
-            -1 where the map has none
+    likely  (BLOCK,) int64, out: a row with the hash of the voxel, to be confirmed by its key;
+            -1 if not found
     """
     for i in range(num):
         hashed = hash_key(keys[start + i])
@@ -65,7 +82,7 @@ def find_rows(keys, rows, table, state, found):
     Look up the row of every voxel.
 
     keys   (K,) int64
-    found  (K,) int32, out: row, -1 where the map has no such voxel
+    found  (K,) int32, out: row, -1 if not found
     """
     directory, buckets, _, _ = table
     flat = rows.ravel()
@@ -84,15 +101,15 @@ def find_rows(keys, rows, table, state, found):
 @njit(cache=True, nogil=True)
 def add_moments(moments, view_weight, rows, table, state, version, start, changed):
     """
-    Add the moments of a scan from row start on; return how many rows are done.
+    Add the moments of a scan from voxel start on; return the number of voxels done.
 
     moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
     view_weight  0: the view is multiplied by the count; 1: it is a sum already
     version      int64, marks the rows as changed
-    changed      (K,) int32, out: rows changed, each once; state says how many
+    changed      (K,) int32, out: rows changed, each once; their number is state[CHANGED]
 
-    Fewer than K are done when rows, segments or the directory are too small for a new voxel:
-    make room and go on from there.
+    Fewer than K are done if slab, segments or directory have no room for a new voxel: make room
+    and continue from there.
     """
     keys, count, total, product, view = moments
     directory, buckets, _, _ = table
@@ -135,7 +152,7 @@ def add_moments(moments, view_weight, rows, table, state, version, start, change
 
 @njit(cache=True, nogil=True)
 def new_row(key, hashed, rows, table, state):
-    """Return a row of zeros for a voxel that the map has not, or -1 where there is no room."""
+    """Insert a voxel with a row of zeros; return the row, or -1 if there is no room."""
     depth = state[DEPTH]
     while is_full(hashed, table, depth):
         if not split_segment(hashed, table, state):
@@ -163,8 +180,8 @@ def first_missing(moments, view_weight, rows, found):
 
     found  (K,) int32, row of each voxel
 
-    A voxel must hold at least the points subtracted, and exactly their sums where it holds no
-    others.
+    A voxel must hold at least as many points as are subtracted; if it holds no others, its sums
+    must be equal.
     """
     keys, count, total, product, view = moments
     for place in range(len(keys)):
@@ -187,13 +204,11 @@ def first_missing(moments, view_weight, rows, found):
 @njit(cache=True, nogil=True)
 def subtract_moments(moments, view_weight, rows, table, state, version, found, min_points, fallen):
     """
-    Subtract moments that the map holds, and free the rows that become empty.
+    Subtract moments; free the rows that become empty; return the number of fallen voxels.
 
     found       (K,) int32, row of each voxel
-    min_points  from how many points on a voxel counts, at least 1
-    fallen      (K,) int64, out: keys of the voxels that counted before and do not any more
-
-    Returns how many voxels have fallen.
+    min_points  smallest number of points of a surfel, at least 1
+    fallen      (K,) int64, out: keys of the voxels that held min_points before and hold fewer now
     """
     keys, count, total, product, view = moments
     depth = state[DEPTH]
@@ -226,3 +241,61 @@ def subtract_moments(moments, view_weight, rows, table, state, version, found, m
         for pair in range(6):
             rows[row, PRODUCT + pair] -= product[place, pair]
     return num_fallen
+
+
+@njit(cache=True, nogil=True)
+def coarsen(moments, fine_level, level, table, keys, sums, rows):
+    """
+    Sum moments into voxels 2^level times larger; return the number of coarse voxels.
+
+    moments     keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
+    fine_level  level of the given moments
+    table       (B,) int32, B a power of two and at least 2 K, all -1
+    keys        (K,) int64, out: voxel keys in the order of first appearance
+    sums        (K, 13) int64, zeros, out: count, total, product, view
+    rows        (K,) int64, out: row of the coarse voxel of each fine voxel
+    """
+    fine_keys, count, total, product, view = moments
+    shift = hash_shift(len(table))
+    mask = len(table) - 1
+    fine = np.int64(1) << (BITS + fine_level)
+    middle = fine // 2 - (fine << level) // 2
+    below = (np.int64(1) << level) - 1
+    num = 0
+    for i in range(len(fine_keys)):
+        key = fine_keys[i]
+        x = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        y = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        z = (key & INDEX_MASK) - INDEX_OFFSET
+        coarse = ((x >> level) + INDEX_OFFSET) << (2 * INDEX_BITS)
+        coarse |= (((y >> level) + INDEX_OFFSET) << INDEX_BITS) | ((z >> level) + INDEX_OFFSET)
+        place = home(coarse, shift)
+        row = np.int64(table[place])
+        while row >= 0 and keys[row] != coarse:
+            place = (place + 1) & mask
+            row = np.int64(table[place])
+        if row < 0:
+            row = np.int64(num)
+            num += 1
+            table[place] = row
+            keys[row] = coarse
+        rows[i] = row
+        # d: from the coarse centre to the fine centre
+        n = np.int64(count[i])
+        dx = (x & below) * fine + middle
+        dy = (y & below) * fine + middle
+        dz = (z & below) * fine + middle
+        sx, sy, sz = np.int64(total[i, 0]), np.int64(total[i, 1]), np.int64(total[i, 2])
+        sums[row, 0] += n
+        sums[row, 1] += sx + n * dx
+        sums[row, 2] += sy + n * dy
+        sums[row, 3] += sz + n * dz
+        sums[row, 4] += product[i, 0] + dx * sx + dx * sx + n * dx * dx
+        sums[row, 5] += product[i, 1] + dx * sy + dy * sx + n * dx * dy
+        sums[row, 6] += product[i, 2] + dx * sz + dz * sx + n * dx * dz
+        sums[row, 7] += product[i, 3] + dy * sy + dy * sy + n * dy * dy
+        sums[row, 8] += product[i, 4] + dy * sz + dz * sy + n * dy * dz
+        sums[row, 9] += product[i, 5] + dz * sz + dz * sz + n * dz * dz
+        for axis in range(3):
+            sums[row, 10 + axis] += np.int64(view[i, axis])
+    return num

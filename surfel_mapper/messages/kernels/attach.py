@@ -7,8 +7,8 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.moments import CHUNK, hash_shift, quantise
-from surfel_mapper.kernels.queries import find_key
+from surfel_mapper.kernels.grouping import CHUNK, find_key, hash_shift
+from surfel_mapper.kernels.quantisation import quantise
 
 
 @njit(cache=True, nogil=True)

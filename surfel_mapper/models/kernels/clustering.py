@@ -17,7 +17,8 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.eigen_frames import eigen_frame, orient
+from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.models.kernels.frames import orient
 from surfel_mapper.models.kernels.halving import (
     cluster_moments,
     count_beyond,

@@ -11,7 +11,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.eigen_frames import eigen_frame
+from surfel_mapper.kernels.symmetric3 import eigen_frame
 
 MEANS_ITERATIONS = 20
 

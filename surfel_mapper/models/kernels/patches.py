@@ -11,7 +11,8 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.eigen_frames import eigen_frame, orient, range_moments
+from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.models.kernels.frames import orient, range_moments
 
 LEAST_CELLS = 8
 """With fewer cells the bend of a patch is not looked at."""

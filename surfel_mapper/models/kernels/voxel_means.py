@@ -16,7 +16,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.moments import find_runs
+from surfel_mapper.kernels.grouping import find_runs
 from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.voxel_grid import find_keys
 

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.alignment.angles import transforms
-from surfel_mapper.alignment.edge_terms import edge_sums
+from surfel_mapper.alignment.edge_terms import edge_sums, weighted_terms
 from surfel_mapper.alignment.kernels import edges
-from surfel_mapper.alignment.weighted_terms import weighted_terms
 
 PAIR_MOMENTS = [edges.pair_moments, edges.pair_moments.py_func]
 WEIGHTED_MOMENTS = [edges.weighted_moments, edges.weighted_moments.py_func]

@@ -15,7 +15,7 @@ from surfel_mapper.alignment.kernels.registration import (
 )
 from surfel_mapper.geometry import se3_exp
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.kernels.queries import keys_in_box
+from surfel_mapper.mapping.kernels.queries import keys_in_box
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.kernels.modes import both

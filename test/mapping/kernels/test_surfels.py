@@ -12,15 +12,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION, VIEW
-from surfel_mapper.mapping.kernels.surfels import (
-    CHUNK,
-    derive_surfels,
-    MOMENTS,
-    rows_changed_after,
-    rows_changed_at,
-    turn,
-    V,
-)
+from surfel_mapper.mapping.kernels.queries import rows_changed_after, rows_changed_at
+from surfel_mapper.mapping.kernels.surfels import CHUNK, derive_surfels, MOMENTS, turn, V
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
 from test.kernels.modes import both

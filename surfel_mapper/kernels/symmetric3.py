@@ -1,19 +1,22 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Eigenvalues of many symmetric 3 by 3 matrices, with the eigenvector of the smallest.
+Eigenvalues and eigenvectors of symmetric 3 by 3 matrices, of many at once or of one.
 
-No trigonometry, no iteration of unknown length and no branches, so that the compiler works on
-several matrices at once. The deviator scaled to B (trace 0, |B|^2 = 6) has eigenvalues t with
-t^3 - 3 t = det B. The one farthest from the other two is a well-conditioned root, at least
-3^(1/2) away from both; its eigenvector is the longest cross product of two rows of B - t I. The
-remaining two come from the 2 by 2 matrix across that eigenvector, which stays accurate where
-they coincide. Only multiplication, addition, division and square roots are used, so every
-machine gives the same bits.
+``decompose`` finds the eigenvalues and the eigenvector of the smallest one, ``eigenvectors`` the
+other two eigenvectors, ``eigen_frame`` all of a single matrix. No trigonometry, no iteration of
+unknown length and no branches, so that the compiler vectorises the loops.
 
-Every step is a loop of its own: as one loop its divisions and roots wait for each other, and
-it is too long for a processor to begin with the next matrices meanwhile (25 against 16.5 ns a
-matrix; 100 to 200 for acos and cos).
+The deviator scaled to B (trace 0, |B|^2 = 6) has eigenvalues t with t^3 - 3 t = det B. The one
+farthest from the other two is a well-conditioned root, at least 3^(1/2) away from both; its
+eigenvector is the longest cross product of two rows of B - t I. The other two eigenvalues come
+from the 2 by 2 matrix in the plane across that eigenvector, which is accurate even if they
+coincide. Only multiplication, addition, division and square roots are used, so every machine
+gives the same bits.
+
+Every step is a loop of its own. In a single loop divisions and roots wait for each other, and it
+is too long for the processor to overlap iterations (25 against 16.5 ns a matrix; 100 to 200 ns
+with acos and cos).
 
 Source: Smith 1961 for the scaled cubic; Eberly 2014 (A robust eigensolver for 3 x 3 symmetric
 matrices) for deflation; Duff et al. 2017 for the basis across a unit vector.
@@ -25,7 +28,7 @@ from numba import njit
 import numpy as np
 
 NOISE = 1e-15
-"""Eigenvalues below this share of the trace are rounding, and count as 0."""
+"""Eigenvalues below this share of the trace are rounding errors, and become 0."""
 
 SIXTH = 1.0 / 6.0
 
@@ -38,8 +41,8 @@ def decompose(scatter, num, eigenvalues, normals):
     scatter      (6, C) float64, xx xy xz yy yz zz, positive semidefinite
     num          <= C
     eigenvalues  (3, C) float64, out: ascending, none negative
-    normals      (3, C) float64, out: unit eigenvectors of the smallest; sign arbitrary.
-                 Where the two smallest coincide: a unit vector across the third; all three: z
+    normals      (3, C) float64, out: unit eigenvectors of the smallest; sign arbitrary. If the
+                 two smallest coincide: orthogonal to the third eigenvector; if all coincide: z
     """
     deviators, sizes = np.empty((6, num)), np.empty((3, num))
     roots, vectors, planes = np.empty(num), np.empty((3, num)), np.empty((4, num))
@@ -54,12 +57,12 @@ def decompose(scatter, num, eigenvalues, normals):
 @njit(cache=True, nogil=True, error_model='numpy')
 def normalise(scatter, num, deviators, sizes):
     """
-    Take the mean of the eigenvalues away and scale what is left.
+    Subtract the mean eigenvalue and scale the deviator.
 
-    deviators  (6, num), out: B of trace 0 and |B|^2 = 6; for a ball, or nothing, of all that
-               could be there the one with the normal z
-    sizes      (3, num), out: trace, spread (B is times that), and what brings both back where
-               squares and cubes of tiny or of huge entries would be no float64
+    deviators  (6, num), out: B of trace 0 and |B|^2 = 6; for a multiple of the identity, the one
+               with the normal z
+    sizes      (3, num), out: trace, spread (the factor taken out of B), and the factor that undoes
+               the scaling of tiny or huge matrices, whose squares and cubes would leave float64
     """
     for i in range(num):
         axx, axy, axz = scatter[0, i], scatter[1, i], scatter[2, i]
@@ -87,7 +90,7 @@ def normalise(scatter, num, deviators, sizes):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def isolate(deviators, num, roots):
-    """Find the eigenvalue of each deviator that is farthest from the other two, in [-2, 2]."""
+    """Find the eigenvalue of each deviator farthest from the other two, in [-2, 2]."""
     for i in range(num):
         bxx, bxy, bxz = deviators[0, i], deviators[1, i], deviators[2, i]
         byy, byz, bzz = deviators[3, i], deviators[4, i], deviators[5, i]
@@ -134,8 +137,8 @@ def deflate(deviators, roots, vectors, num, planes):
     """
     Solve for the other two eigenvalues, in the plane across the isolated eigenvector.
 
-    planes  (4, num), out: half of their difference, and an eigenvector of the lower one, of any
-            length but 0
+    planes  (4, num), out: half of their difference, and an eigenvector of the lower one, not
+            normalised, never 0
     """
     for i in range(num):
         bxx, bxy, bxz = deviators[0, i], deviators[1, i], deviators[2, i]
@@ -181,7 +184,7 @@ def write_eigenvalues(sizes, roots, planes, num, eigenvalues):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def write_normals(roots, vectors, planes, num, normals):
-    """Write the unit eigenvectors of the lowest eigenvalues: of the isolated one or another."""
+    """Write the unit eigenvectors of the lowest eigenvalues, isolated or not."""
     for i in range(num):
         px, py, pz = planes[1, i], planes[2, i], planes[3, i]
         scale = 1.0 / math.sqrt((px * px + py * py) + pz * pz)
@@ -189,3 +192,88 @@ def write_normals(roots, vectors, planes, num, normals):
         normals[0, i] = vectors[0, i] if isolated else px * scale
         normals[1, i] = vectors[1, i] if isolated else py * scale
         normals[2, i] = vectors[2, i] if isolated else pz * scale
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def eigenvectors(matrices, values, smallest, vectors):
+    """
+    Find all eigenvectors, given those of the smallest eigenvalues.
+
+    matrices  (6, M) float64, symmetric, xx xy xz yy yz zz
+    values    (3, M) float64, their eigenvalues, ascending
+    smallest  (3, M) float64, unit eigenvectors of values[0]
+    vectors   (M, 3, 3) float64, out: vectors[:, k] belong to values[k], are of unit length, and
+              their component of largest magnitude is positive; nan where all values are 0
+
+    In the plane across the smallest, the matrix is 2 by 2; its larger eigenvector follows from a
+    square root. The third is the cross product of both.
+    """
+    for i in range(matrices.shape[1]):
+        if not values[2, i] > 0.0:
+            vectors[i, :, :] = math.nan
+            continue
+        xx, xy, xz = matrices[0, i], matrices[1, i], matrices[2, i]
+        yy, yz, zz = matrices[3, i], matrices[4, i], matrices[5, i]
+        nx, ny, nz = smallest[0, i], smallest[1, i], smallest[2, i]
+        # u and w: a basis across n (Duff et al. 2017)
+        sign = 1.0 if nz >= 0.0 else -1.0
+        a = -1.0 / (sign + nz)
+        b = nx * ny * a
+        ux, uy, uz = 1.0 + sign * nx * nx * a, sign * b, -sign * nx
+        wx, wy, wz = b, sign + ny * ny * a, -ny
+        pux, puy = (xx * ux + xy * uy) + xz * uz, (xy * ux + yy * uy) + yz * uz
+        puz = (xz * ux + yz * uy) + zz * uz
+        pwx, pwy = (xx * wx + xy * wy) + xz * wz, (xy * wx + yy * wy) + yz * wz
+        pwz = (xz * wx + yz * wy) + zz * wz
+        uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
+        ww = (wx * pwx + wy * pwy) + wz * pwz
+        half = 0.5 * (uu - ww)
+        scale = max(abs(half), abs(uw))  # the squares of what is tiny vanish
+        equal = scale == 0.0  # any direction will do
+        half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
+        spread = math.sqrt(half * half + uw * uw)
+        cosine, sine = half / spread, uw / spread
+        # cosine and sine of half of the angle, scaled
+        first = 1.0 + cosine if cosine >= 0.0 else sine
+        second = sine if cosine >= 0.0 else 1.0 - cosine
+        length = math.sqrt(first * first + second * second)
+        first, second = first / length, second / length
+        lx, ly, lz = first * ux + second * wx, first * uy + second * wy, first * uz + second * wz
+        store(vectors, i, 0, nx, ny, nz)
+        store(vectors, i, 1, ny * lz - nz * ly, nz * lx - nx * lz, nx * ly - ny * lx)
+        store(vectors, i, 2, lx, ly, lz)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def store(vectors, i, k, x, y, z):
+    """Store a vector with its component of largest magnitude, the first of equal ones, > 0."""
+    leading = x
+    if abs(y) > abs(leading):
+        leading = y
+    if abs(z) > abs(leading):
+        leading = z
+    side = -1.0 if leading < 0.0 else 1.0
+    vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def eigen_frame(matrix, values, vectors):
+    """
+    Decompose one matrix.
+
+    matrix   (3, 3) float64, positive semidefinite
+    values   (3,) float64, out: ascending, none negative
+    vectors  (3, 3) float64, out: row k is the unit eigenvector of values[k], its component of
+             largest magnitude positive; the identity if all values are 0
+    """
+    upper, found = np.empty((6, 1)), np.empty((3, 1))
+    smallest, frame = np.empty((3, 1)), np.empty((1, 3, 3))
+    upper[0, 0], upper[1, 0], upper[2, 0] = matrix[0, 0], matrix[0, 1], matrix[0, 2]
+    upper[3, 0], upper[4, 0], upper[5, 0] = matrix[1, 1], matrix[1, 2], matrix[2, 2]
+    decompose(upper, 1, found, smallest)
+    eigenvectors(upper, found, smallest, frame)
+    known = found[2, 0] > 0.0
+    for i in range(3):
+        values[i] = found[i, 0]
+        for j in range(3):
+            vectors[i, j] = frame[0, i, j] if known else (1.0 if i == j else 0.0)

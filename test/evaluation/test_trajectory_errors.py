@@ -14,7 +14,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.alignment.trajectory_errors import (
+from surfel_mapper.evaluation.trajectory_errors import (
     absolute_errors,
     best_motion,
     common_stamps,

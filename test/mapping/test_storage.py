@@ -5,7 +5,7 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.mapping.slab import Slab
+from surfel_mapper.mapping.storage import Slab
 
 
 @pytest.mark.parametrize('width', [16, 512])

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.eigen3 import decompose
+from surfel_mapper.kernels.symmetric3 import decompose
 from test.kernels.modes import both, compiled, interpreted
 
 pytestmark = pytest.mark.filterwarnings('error')

@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Storage that grows without a pause: rows of integers, and the hash table that finds them.
+
+Slab: rows live in an anonymous memory map. Growing moves pages, not bytes (mremap: 0.1 ms for
+256 MiB; allocating and copying takes 0.7 s), and a page costs memory only once a row in it is
+written, so the slab may double.
+
+HashTable: the arrays of kernels/hashing.py. Kernels stop when there is no room; the caller makes
+room and calls again. The table grows by segments, each of which splits separately, so that no step
+is long.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import mmap
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import MapLimitError
+from surfel_mapper.kernels import hashing
+
+HUGE_FROM = 1 << 21
+"""Size in bytes from which huge pages are requested: fewer misses of address translation save 40 %
+of the time of a merge at 0.2 m."""
+
+
+class Slab:
+    """
+    Rows of int64, zero until written.
+
+    Attributes
+    ----------
+    array : (R, width) int64, C order
+        The rows; replaced when the slab grows, so it must not be kept.
+
+    """
+
+    def __init__(self, num_rows: int, width: int) -> None:
+        self._width = width
+        self._memory = _anonymous(num_rows * width * 8)
+        self.array = self._view()
+
+    def grow(self, num_rows: int) -> None:
+        """
+        Enlarge to num_rows rows; existing rows keep their index and content.
+
+        Raises
+        ------
+        MapLimitError
+            If the system refuses the memory.
+
+        """
+        num_bytes = num_rows * self._width * 8
+        del self.array  # a view would pin the memory
+        try:
+            self._memory.resize(num_bytes)
+        except (BufferError, SystemError, OSError, ValueError):
+            # a view is held elsewhere, the system has no mremap, or memory is exhausted
+            self._memory = self._copied(num_bytes)
+        finally:
+            self.array = self._view()
+        if num_bytes >= HUGE_FROM and hasattr(mmap, 'MADV_HUGEPAGE'):
+            with contextlib.suppress(OSError):  # only a hint
+                self._memory.madvise(mmap.MADV_HUGEPAGE)
+
+    def _copied(self, num_bytes: int) -> mmap.mmap:
+        """Return a larger memory map with the content of this one."""
+        try:
+            memory = _anonymous(num_bytes)
+        except OSError as error:
+            raise MapLimitError(
+                f'no memory for a map of {num_bytes / 2**20:.0f} MiB ({error}); '
+                'set map.max_voxels or a window limit'
+            ) from error
+        memory[: len(self._memory)] = self._memory[:]
+        return memory
+
+    def _view(self) -> npt.NDArray[np.int64]:
+        return np.frombuffer(self._memory, dtype=np.int64).reshape(-1, self._width)
+
+
+def _anonymous(num_bytes: int) -> mmap.mmap:
+    """Return zeroed private memory of whole pages."""
+    size = -(-num_bytes // mmap.PAGESIZE) * mmap.PAGESIZE
+    return mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+
+
+class HashTable:
+    """
+    Hash table from key to row of a slab.
+
+    Parameters
+    ----------
+    max_depth : int
+        The directory has at most 2^max_depth entries.
+
+    Attributes
+    ----------
+    state : (STATE,) int64
+        The scalars that kernels write; see kernels/hashing.py.
+
+    """
+
+    def __init__(self, max_depth: int) -> None:
+        self._max_depth = max_depth
+        self._buckets = Slab(1, hashing.SEGMENT)
+        self._directory = np.zeros(1, np.int32)
+        self._held = np.zeros(1, np.int32)
+        self._local_depth = np.zeros(1, np.int8)
+        self.state = np.zeros(hashing.STATE, np.int64)
+        self.state[hashing.FREE_ROW] = -1
+        self.state[hashing.SEGMENTS] = 1
+
+    @property
+    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
+        """Directory, buckets, held, local_depth, as the kernels take them."""
+        buckets = self._buckets.array.reshape(-1)
+        return self._directory, buckets, self._held, self._local_depth
+
+    @property
+    def num_keys(self) -> int:
+        """Number of keys in the table."""
+        return int(self.state[hashing.VOXELS])
+
+    @property
+    def rows_used(self) -> int:
+        """Number of rows of the slab ever used; later rows are untouched."""
+        return int(self.state[hashing.ROWS_USED])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes in use."""
+        buckets = int(self.state[hashing.SEGMENTS]) * hashing.SEGMENT * 8
+        return buckets + self._directory.nbytes + self._held.nbytes
+
+    def lacks_row(self, num_rows: int) -> bool:
+        """Return whether a slab of num_rows rows has no free row for a new key."""
+        return bool(self.state[hashing.FREE_ROW] < 0 and self.rows_used == num_rows)
+
+    def grow(self) -> None:
+        """
+        Enlarge the part of the table that had no room for a key.
+
+        Raises
+        ------
+        MapLimitError
+            If the table has its maximum size, or memory is exhausted.
+
+        """
+        num_segments = len(self._held)
+        if self.state[hashing.SEGMENTS] == num_segments:
+            self._buckets.grow(2 * num_segments)
+            self._held = np.append(self._held, np.zeros_like(self._held))
+            self._local_depth = np.append(self._local_depth, np.zeros_like(self._local_depth))
+        elif self.state[hashing.DEPTH] < self._max_depth:
+            self._directory = np.repeat(self._directory, 2)
+            self.state[hashing.DEPTH] += 1
+        else:
+            raise MapLimitError(f'{self.num_keys} keys: the hash table is full')
