@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What happened so far: scans used and dropped, points left out, milliseconds by stage.
+Counters of a pipeline: scans used and dropped, points left out, milliseconds by stage.
 
-Everything that is dropped is counted here under a cause, so that the numbers of the summary and
-of the diagnostics add up: scans received = mapped + gated + localised + dropped + waiting.
+Every dropped scan is counted under a cause, so that the numbers of the summary and of the
+diagnostics add up: scans received = mapped + gated + localised + dropped + waiting.
 """
 
 from __future__ import annotations
@@ -33,20 +33,20 @@ STAGES = (
     'models',
     'total',
 )
-"""What is timed, in the order in which a scan goes through it; ``total``: all but decoding."""
+"""Timed stages in the order of a scan; ``total`` is all but decoding."""
 
 LATEST = 1000
-"""Times of so many scans are kept for the percentiles."""
+"""Number of scans whose times are kept for the percentiles."""
 
 MOST_FRAMES = 128
-"""Drops of so many frames and topics are told apart; those of all further ones are OTHERS."""
+"""Number of frames and topics with separate counts of drops; further ones count as OTHERS."""
 
 OTHERS = '(others)'
 
 
 @dataclass(slots=True)
 class FilterCounts:
-    """What one filter of the chain did so far: points in and out, its latest times."""
+    """Counts of a filter of the chain: points in and out, latest times."""
 
     points_in: int = 0
     points_out: int = 0
@@ -61,28 +61,28 @@ class Counters:
     Attributes
     ----------
     received, mapped, gated, localised : int
-        Scans that came in, entered the map, were left out by the motion gate, were only aligned
-        to a frozen map.
+        Scans received, added to the map, skipped by the motion gate, aligned to a frozen map
+        without being added.
     evicted : Counter of str
-        Scans that left the map again, by the limit reached.
+        Scans evicted from the map, by the limit exceeded.
     cleared_voxels : int
-        Voxels emptied because scans see through them.
+        Voxels emptied because scans saw through them.
     resets : int
-        How often the map was cleared because time went back.
+        Number of times that the map was cleared because time went back.
     dropped : Counter of str
         Scans dropped, by cause.
     dropped_by_frame : dict of str to Counter of str
-        The same by frame; by topic, where the frame could not be read.
+        The same by frame, or by topic if the frame could not be read.
     points : int
-        Points that entered the map.
+        Points added to the map.
     points_left_out : Counter of str
-        Points that did not, by cause.
+        Points not added, by cause.
     messages_ignored : Counter of str
         Other messages (transforms, odometry) not used, by cause.
     milliseconds : dict of str to deque of float
-        Time of every stage for the latest scans.
+        Times of every stage for the latest scans.
     filters : dict of str to FilterCounts
-        The same by filter, in the order of the chain.
+        Counts of every filter, in the order of the chain.
 
     """
 
@@ -119,18 +119,18 @@ class Counters:
         self.dropped_by_frame.setdefault(frame_id, Counter())[cause] += number
 
     def add_time(self, stage: str, milliseconds: float) -> None:
-        """Add the time that one scan spent in a stage."""
+        """Add the time of a scan in a stage."""
         self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(milliseconds)
 
     def add_filter(self, name: str, points_in: int, points_out: int, milliseconds: float) -> None:
-        """Add what one filter did to one scan."""
+        """Add the counts and time of a filter for a scan."""
         counts = self.filters.setdefault(name, FilterCounts())
         counts.points_in += points_in
         counts.points_out += points_out
         counts.milliseconds.append(milliseconds)
 
     def summary(self) -> dict[str, Any]:
-        """Return everything as plain numbers, with median and 99th percentile of the times."""
+        """Return all counters as plain numbers, with median and 99th percentile of the times."""
         filters = {
             name: {
                 'points_in': counts.points_in,
@@ -160,10 +160,9 @@ class Counters:
 
 
 class Laps:
-    """The times of stages that follow each other."""
+    """Times of consecutive stages."""
 
     def __init__(self) -> None:
-        """Start the first stage."""
         self._start = self._lap = time.perf_counter()
         self._stages: dict[str, float] = {}
 
@@ -175,7 +174,7 @@ class Laps:
 
     @property
     def milliseconds(self) -> dict[str, float]:
-        """Return the time of every stage that has ended, and ``total``, that of all."""
+        """Return the time of every ended stage, and their ``total``."""
         return {**self._stages, 'total': (self._lap - self._start) * 1e3}
 
 

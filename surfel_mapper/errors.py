@@ -1,26 +1,26 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Every exception that this package raises on purpose.
+Exceptions of this package.
 
     SurfelMapperError
       ConfigError          a setting is unknown, of the wrong type or out of bounds  (ValueError)
       CloudFormatError     a PointCloud2 that cannot be decoded                       (ValueError)
-      PoseError            no pose for a scan, and waiting will not bring one
-        PoseNotYetError    the transforms needed are older than the stamp: wait
+      PoseError            no pose for a scan, and waiting will not provide one
+        PoseNotYetError    the newest transform is older than the stamp: wait
       MapError             an operation that a surfel map cannot carry out
-        MapLimitError      a voxel index or a count beyond what the integers hold     (ValueError)
-        NotInMapError      removing moments that the map does not hold                (ValueError)
+        MapLimitError      a voxel index or a count beyond the range of the integers  (ValueError)
+        NotInMapError      removing moments that the map does not contain             (ValueError)
       FilterError          a filter cannot work on a scan                             (ValueError)
-      AlignmentError       scans, pairs or poses from which no poses follow           (ValueError)
-      ModelError           points that no models can be fitted to                     (ValueError)
-      BagError             a bag that cannot be read, or lacks what is asked of it
+      AlignmentError       scans, pairs or poses that do not determine poses          (ValueError)
+      ModelError           points to which no models can be fitted                    (ValueError)
+      BagError             a bag that cannot be read, or lacks a topic or poses
       FileFormatError      any other file that cannot be read or is damaged           (ValueError)
-      SubscriberError      nobody subscribes to what is to be published
-      ClusterError         workers or a scheduler that cannot be reached, or die again and again
+      SubscriberError      a topic to be published has no subscriber
+      ClusterError         workers or a scheduler that cannot be reached, or die repeatedly
       DependencyError      an optional package is missing; says how to install it     (ImportError)
 
-A caller that only wants to go on with the next scan catches SurfelMapperError.
+A caller that wants to continue with the next scan catches SurfelMapperError.
 """
 
 
@@ -37,11 +37,11 @@ class CloudFormatError(SurfelMapperError, ValueError):
 
 
 class PoseError(SurfelMapperError):
-    """There is no pose at the stamp asked for, and waiting will not bring one."""
+    """There is no pose at the requested stamp, and waiting will not provide one."""
 
 
 class PoseNotYetError(PoseError):
-    """The newest transform needed is older than the stamp asked for: it may still come."""
+    """The newest transform is older than the requested stamp: a newer one may arrive."""
 
 
 class MapError(SurfelMapperError):
@@ -49,7 +49,7 @@ class MapError(SurfelMapperError):
 
 
 class MapLimitError(MapError, ValueError):
-    """A voxel index or a number of points is beyond what the integers of the map hold."""
+    """A voxel index or a number of points is beyond the range of the integers of the map."""
 
 
 class NotInMapError(MapError, ValueError):
@@ -57,19 +57,19 @@ class NotInMapError(MapError, ValueError):
 
 
 class FilterError(SurfelMapperError, ValueError):
-    """A filter cannot work on a scan: a column is missing, or a value is not what it takes."""
+    """A filter cannot process a scan: a column is missing, or a value is unusable."""
 
 
 class AlignmentError(SurfelMapperError, ValueError):
-    """A graph of scans, its pairs or its poses are not fit for alignment; nothing has changed."""
+    """Scans, pairs or poses are not suitable for alignment; nothing is changed."""
 
 
 class ModelError(SurfelMapperError, ValueError):
-    """Points, or a viewpoint, that no models can be fitted to."""
+    """Points, or a viewpoint, to which no models can be fitted."""
 
 
 class BagError(SurfelMapperError):
-    """A bag cannot be read, or lacks the topic or the poses asked for."""
+    """A bag cannot be read, or lacks the requested topic or poses."""
 
 
 class FileFormatError(SurfelMapperError, ValueError):
@@ -77,11 +77,11 @@ class FileFormatError(SurfelMapperError, ValueError):
 
 
 class SubscriberError(SurfelMapperError):
-    """Nobody subscribes to what is to be published."""
+    """A topic to be published has no subscriber."""
 
 
 class ClusterError(SurfelMapperError):
-    """Workers or their scheduler cannot be reached, or died again and again."""
+    """Workers or their scheduler cannot be reached, or died repeatedly."""
 
 
 class DependencyError(SurfelMapperError, ImportError):

@@ -3,10 +3,10 @@
 """
 Rigid transforms as (4, 4) float64 matrices ``T_a_b``, quaternions xyzw, normals of triangles.
 
-The pose of a scan decides where its points are quantised, and maps made on different machines are
-compared bit for bit. So whatever leads to a pose (pose_matrix, compose, inverse, interpolate) uses
-only + - * / and sqrt, which IEEE 754 rounds in one way, as Python floats in a fixed order: no
-BLAS, no fused multiply-add, no sine whose last bit depends on the mathematical library.
+The pose of a scan determines how its points are quantised, and maps made on different machines are
+compared bit for bit. So the functions that compute poses (pose_matrix, compose, inverse,
+interpolate) use only + - * / and sqrt, which IEEE 754 rounds in one way, on Python floats in a
+fixed order: no BLAS, no fused multiply-add, no sine whose last bit depends on the math library.
 rotation_angle, se3_exp and se3_log need such functions and may differ in that bit.
 
 Sources: Shepperd 1978 for the quaternion of a matrix; Eberly 2011 (A Fast and Accurate Algorithm
@@ -26,10 +26,10 @@ Transform = npt.NDArray[np.float64]
 """A (4, 4) float64 matrix; takes points in frame b to frame a if called T_a_b."""
 
 MAX_NORM_ERROR = 1e-3
-"""A quaternion whose norm differs from 1 by more is no rounded unit quaternion but a mistake."""
+"""Tolerance of the norm of a quaternion: larger deviations are not rounding but errors."""
 
 SMALL_ANGLE_SQ = 1e-8
-"""Below this, rad^2, two terms of a series are exact to float64 where a quotient is 0/0."""
+"""Squared angle, rad^2, below which two terms of a series are exact to float64."""
 
 
 def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
@@ -78,7 +78,7 @@ def q_xyzw(T_a_b: Transform) -> npt.NDArray[np.float64]:
     """
     Return the rotation of a transform as a unit quaternion (4,), order x y z w, w >= 0.
 
-    The largest of the four components is found first and divides the others, so none loses
+    The largest of the four components is computed first and divides the others, so none loses
     digits at any angle. At half a turn (w = 0) the sign is that of this division.
     """
     return np.array(_quaternion(T_a_b))
@@ -110,14 +110,14 @@ def inverse(T_a_b: Transform) -> Transform:
 
 def interpolate(T0: Transform, T1: Transform, alpha: float) -> Transform:
     """
-    Return the transform between two: the translation linear, the rotation by slerp.
+    Interpolate two transforms: the translation linearly, the rotation by slerp.
 
     Parameters
     ----------
     T0, T1 : (4, 4) float64
-        Transforms of the same two frames at two times. The rotation goes the shorter way.
+        Transforms of the same two frames at two times. The rotation takes the shorter way.
     alpha : float
-        Where between them, in [0, 1]; 0 and 1 give T0 and T1 bit for bit.
+        Weight of T1, in [0, 1]; 0 and 1 return T0 and T1 bit for bit.
 
     Raises
     ------
@@ -134,7 +134,7 @@ def interpolate(T0: Transform, T1: Transform, alpha: float) -> Transform:
     q0, q1 = _quaternion(T0), _quaternion(T1)
     if (q0[0] * q1[0] + q0[1] * q1[1]) + (q0[2] * q1[2] + q0[3] * q1[3]) < 0.0:
         q1 = tuple(-v for v in q1)
-    # cos(angle) - 1 from the chord: near 0 the cosine itself would have lost the angle
+    # cos(angle) - 1 from the chord: near 0 the cosine itself has no digits of the angle
     dx, dy, dz, dw = (b - a for a, b in zip(q0, q1, strict=True))
     drop = -0.5 * ((dx * dx + dy * dy) + (dz * dz + dw * dw))
     w0, w1 = _slerp_weight(1.0 - alpha, drop), _slerp_weight(alpha, drop)
@@ -197,7 +197,7 @@ def se3_log(T_a_b: Transform) -> npt.NDArray[np.float64]:
     -------
     (6,) float64
         Translation first: velocity in m, then rotation vector in rad, at most pi long. At pi
-        itself either direction of the vector is right; one is returned.
+        both directions of the vector are valid; one is returned.
 
     """
     x, y, z, w = _quaternion(T_a_b)
@@ -208,7 +208,7 @@ def se3_log(T_a_b: Transform) -> npt.NDArray[np.float64]:
     if angle_sq < SMALL_ANGLE_SQ:
         second = 1.0 / 12.0 + angle_sq / 720.0
     else:
-        # angle / 2 times its cotangent, which near pi is exact where the tangent is infinite
+        # angle / 2 times its cotangent, which is exact near pi, unlike the tangent
         second = (1.0 - 0.5 * angle * (w / sine)) / angle_sq
     t = T_a_b[:3, 3]
     turned = _cross(phi, t)
@@ -219,8 +219,8 @@ def face_normals(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """
     Return normals (F, 3) of triangles (F, 3, 3), each as long as twice the area.
 
-    They are on the side from where the corners run against the clock. np.cross takes three times
-    as long on a hundred of them.
+    Seen from the side of the normal the corners are in counterclockwise order. np.cross takes
+    three times as long on a hundred triangles.
     """
     (ax, ay, az), (bx, by, bz) = (corners[:, k].T - corners[:, 0].T for k in (1, 2))
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
@@ -229,7 +229,7 @@ def face_normals(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 def _quaternion(T_a_b: Transform) -> tuple[float, ...]:
     """Return the unit quaternion x y z w of a transform, w >= 0."""
     (r00, r01, r02, _), (r10, r11, r12, _), (r20, r21, r22, _), _ = T_a_b.tolist()
-    # Each candidate is 4 times one component squared, next to 4 times its products with others.
+    # each candidate is 4 times one component times the quaternion
     if r00 + r11 + r22 > 0.0:
         q = (r21 - r12, r02 - r20, r10 - r01, 1.0 + ((r00 + r11) + r22))
     elif r00 >= r11 and r00 >= r22:
@@ -246,10 +246,10 @@ def _quaternion(T_a_b: Transform) -> tuple[float, ...]:
 
 def _slerp_weight(alpha: float, drop: float) -> float:
     """
-    Return sin(alpha angle) / sin(angle) of the angle whose cosine is 1 + drop, -1 <= drop <= 0.
+    Return sin(alpha angle) / sin(angle) for the angle of cosine 1 + drop, -1 <= drop <= 0.
 
-    A power series in drop. All its terms are positive, so nothing cancels; each is at most half
-    of the one before, so some 50 reach the last bit at a right angle, and a few between poses.
+    A power series in drop. All terms are positive, so nothing cancels; each is at most half of
+    the previous one, so 50 terms reach the last bit at a right angle, and a few between poses.
     """
     alpha_sq = alpha * alpha
     term = total = alpha
@@ -262,6 +262,6 @@ def _slerp_weight(alpha: float, drop: float) -> float:
 
 
 def _cross(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the cross product of two (3,) vectors; np.cross is 20 times slower on so few."""
+    """Return the cross product of two (3,) vectors; np.cross takes 20 times as long."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Scan: one sweep of a sensor, as arrays.
+Scan: the points of one sweep of a sensor, as arrays.
 
-Coordinates stay in the type they came in (float32, or float64 where the cloud has it), because
-the map quantises a point once, in float64; rounding it before would be a second quantisation.
+Coordinates keep the type of the cloud (float32 or float64), because the map quantises a point
+once, in float64; rounding it before would be a second quantisation.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import numpy.typing as npt
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTimes:
     """
-    When the points of a scan were measured.
+    Measurement times of the points of a scan.
 
     Attributes
     ----------
     offsets : (N,) int64
-        Nanoseconds after the stamp of the scan; those of points that are none mean nothing.
+        Nanoseconds after the stamp of the scan; undefined for invalid points.
     first_ns, last_ns : int
-        Times of the first and the last point.
+        Times of the first and of the last point.
 
     """
 
@@ -44,31 +44,31 @@ class Scan:
     Attributes
     ----------
     points : (N, 3) float32 or float64, m
-        In ``frame_id``. May hold nan and inf; whoever uses the points leaves those out. In
-        Fortran order the map takes them without a copy.
+        In ``frame_id``. May contain nan and inf, which consumers leave out. In Fortran order
+        the map takes them without a copy.
     stamp_ns : int
-        Time of the sweep in nanoseconds, of the message's header.
+        Stamp of the message's header, nanoseconds.
     frame_id : str
-        The sensor's coordinate frame.
+        The coordinate frame of the sensor.
     columns : mapping of str to array of length N
-        What else the points carry (intensity, ring, time, ...), one row a point.
+        Further columns of the points (intensity, ring, time, ...).
     T_base_sensor, T_map_sensor : (4, 4) float64, optional
         Pose of the sensor on the robot, and in the map at the stamp; None if unknown. Filters that
         need the robot or the vertical use them.
     times : PointTimes, optional
-        When the points were measured, for deskewing; None: all at the stamp.
+        Measurement times of the points, for deskewing; None: all at the stamp.
     camera : tuple of float
-        Of points of a depth image: width and height of the image, focal lengths and centre
+        For points of a depth image: width and height of the image, focal lengths and centre
         fx, fy, cx, cy, all in pixels.
     free : (K, 3) float, optional
-        Unit vectors along which the sensor found nothing up to its range, as far as it says so.
+        Unit vectors along which the sensor reports no return within its range.
     msg : sensor_msgs/PointCloud2, optional
-        The cloud that it was read from, whose points are these: as many, in this order.
+        The cloud of the scan, if it has the same points in the same order.
 
     Raises
     ------
     ValueError
-        If the points are no array (N, 3) of floating point or a column is not of length N.
+        If the points are not a floating point array (N, 3) or a column is not of length N.
 
     """
 
@@ -93,7 +93,7 @@ class Scan:
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
         if getattr(self.columns, 'num_rows', None) == len(points):
-            return  # of filters: to be measured, each would have to be taken
+            return  # columns of filters are lazy: measuring would compute each
         for name, column in self.columns.items():
             if len(column) != len(points):
                 raise ValueError(
@@ -107,17 +107,17 @@ class Scan:
 
     @property
     def end_ns(self) -> int:
-        """Time of the last point, or the stamp where that is later."""
+        """Time of the last point, or the stamp if that is later."""
         return self.stamp_ns if self.times is None else max(self.stamp_ns, self.times.last_ns)
 
     def select(self, rows: npt.NDArray[Any]) -> Scan:
         """
-        Return the scan with some of its points, their columns with them.
+        Return the scan with selected points and their columns.
 
         Parameters
         ----------
         rows : (N,) bool or (K,) int
-            A mask over the points, or the indices of those wanted in the order wanted.
+            A mask over the points, or indices in the order of the result.
 
         """
         columns = {name: column[rows] for name, column in self.columns.items()}

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Threads: work on the rows of arrays by several threads at once.
+Threads: process the rows of arrays with several threads.
 
-The kernels release Python's lock, so plain threads do. Every row is computed as it would be
-alone, so the result has the same bits for any number of threads.
+The kernels release Python's lock, so plain threads suffice. Every row is computed independently,
+so the result has the same bits for any number of threads. Stands alone: filters, map and models
+share the pool.
 """
 
 from __future__ import annotations
@@ -15,29 +16,29 @@ from functools import cache
 import itertools
 
 PARTS = 4
-"""The rows are divided into so many parts a thread, which whoever is free takes the next of."""
+"""Number of parts a thread into which rows are divided; an idle thread takes the next part."""
 
 
 @cache
 def pool(threads: int) -> ThreadPoolExecutor | None:
-    """Return the threads beside the caller's own, shared by all maps; None for one thread."""
+    """Return the pool of threads beside the caller's own, shared by all; None for one thread."""
     if threads < 2:
         return None
     return ThreadPoolExecutor(threads - 1, thread_name_prefix='surfel_mapper')
 
 
 def split(num_rows: int, parts: int) -> list[slice]:
-    """Return so many slices that are all rows in order, of nearly the same length."""
+    """Return consecutive slices of nearly equal length that cover num_rows rows."""
     bounds = [num_rows * part // parts for part in range(parts + 1)]
     return [slice(first, last) for first, last in itertools.pairwise(bounds)]
 
 
 def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
     """
-    Do the work on all rows, with the help of threads that have nothing else to do.
+    Do the work on all rows, with the help of idle threads of the pool.
 
-    The caller's thread takes parts until none is left, so it never waits for one that is busy
-    with something longer, only for parts that another has begun.
+    The calling thread takes parts until none is left, so it never waits for a thread that is busy
+    with other work, only for parts that another thread has begun.
     """
     helpers = pool(threads)
     if helpers is None:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a Scan may hold, and what it is refused with."""
+"""Scan: accepted content and refused input."""
 
 import numpy as np
 import pytest

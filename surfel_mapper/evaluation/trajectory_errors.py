@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How far estimated poses are from true ones: absolute, relative, and as drift over distance.
+Errors of estimated poses: absolute, relative, and as drift over distance.
 
-The absolute error says how good a map is as a whole, after the best rigid motion of one
-trajectory onto the other; the relative one how good each step is, whatever came before. Both are
-those of evo's ape and rpe.
+The absolute error measures the global consistency of a trajectory, after the best rigid motion
+onto the true one; the relative error measures each step separately. Both equal evo's ape and rpe.
 
 Sources: Umeyama 1991 for the motion; Sturm et al. 2012 (A benchmark for the evaluation of RGB-D
 SLAM systems) for the errors; Geiger et al. 2012 (KITTI) for drift over distance.
@@ -24,13 +23,13 @@ from surfel_mapper.geometry import Transform
 Floats = npt.NDArray[np.float64]
 
 DRIFT_SHARES = (0.125, 0.25, 0.5)
-"""Drift is taken over stretches of these shares of the way."""
+"""Lengths of the segments over which drift is measured, as shares of the path."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseErrors:
     """
-    Errors of some poses.
+    Errors of poses.
 
     Attributes
     ----------
@@ -66,28 +65,28 @@ def compare(
     max_difference_ns: int = 0,
 ) -> dict[str, Any]:
     """
-    Return all errors of a trajectory in numbers, for files and reports.
+    Return all errors of a trajectory as plain numbers, for files and reports.
 
     Parameters
     ----------
     stamp_ns, true_ns : (S,) and (R,) int64
         Times of the poses, ascending.
     T_map_estimated, T_map_true : (S, 4, 4) and (R, 4, 4) float64
-        Poses of one frame, each in a map of its own.
+        Poses of the same frame, each in its own map frame.
     max_difference_ns : int
-        Poses at most so far apart in time are compared.
+        Maximum time difference between compared poses.
 
     Returns
     -------
     dict
-        num_poses; absolute (after the best motion) and relative (from pose to pose), each with
-        rmse, mean, median and max of translation_m and rotation_deg; drift_m_per_100m and
+        num_poses; absolute (after the best rigid motion) and relative (from pose to pose), each
+        with rmse, mean, median and max of translation_m and rotation_deg; drift_m_per_100m and
         drift_deg_per_100m.
 
     Raises
     ------
     ValueError
-        If fewer than two poses belong together.
+        If fewer than two poses have a counterpart.
 
     """
     rows, true_rows = common_stamps(stamp_ns, true_ns, max_difference_ns)
@@ -118,7 +117,7 @@ def absolute_errors(
     T_map_estimated, T_map_true : (S, 4, 4) float64
         Poses of one frame at the same times.
     align : bool
-        First move the estimated ones as a whole to where their positions fit best.
+        Apply the best rigid motion of the estimated positions first.
 
     Raises
     ------
@@ -136,19 +135,19 @@ def relative_errors(
     T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike, *, step: int = 1
 ) -> PoseErrors:
     """
-    Return the error of the motion between every pose and the one so many later.
+    Return the error of the motion between every pose and the pose ``step`` later.
 
     Parameters
     ----------
     T_map_estimated, T_map_true : (S, 4, 4) float64
         Poses of one frame at the same times.
     step : int
-        How many poses later.
+        Number of poses between which a motion is taken.
 
     Raises
     ------
     ValueError
-        If the shapes differ, or there are not more poses than that.
+        If the shapes differ, or there are at most ``step`` poses.
 
     """
     if step < 1:
@@ -160,7 +159,7 @@ def relative_errors(
 
 def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[float, float]:
     """
-    Return by how much the estimate goes astray, over stretches from an eighth to half of the way.
+    Return the drift over segments from an eighth to half of the path.
 
     Parameters
     ----------
@@ -170,7 +169,7 @@ def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[fl
     Returns
     -------
     translation_m, rotation_deg : float
-        Root mean square over all stretches, for each 100 m; nan where the way has no length.
+        Root mean square over all segments, per 100 m; nan if the path has no length.
 
     Raises
     ------
@@ -180,16 +179,16 @@ def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[fl
     """
     estimated, true = _pairs(T_map_estimated, T_map_true, 2)
     steps_m = np.sqrt((np.diff(true[:, :3, 3], axis=0) ** 2).sum(axis=1))
-    way_m = np.concatenate([[0.0], np.cumsum(steps_m)])
-    if not way_m[-1] > 0.0:
+    path_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    if not path_m[-1] > 0.0:
         return float('nan'), float('nan')
     squares = []
     for share in DRIFT_SHARES:
-        last = np.searchsorted(way_m, way_m + share * way_m[-1])
-        first = np.flatnonzero(last < len(way_m))
+        last = np.searchsorted(path_m, path_m + share * path_m[-1])
+        first = np.flatnonzero(last < len(path_m))
         last = last[first]
         errors = _motion_errors(estimated, true, first, last)
-        per_100_m = 100.0 / (way_m[last] - way_m[first])
+        per_100_m = 100.0 / (path_m[last] - path_m[first])
         squares.append(np.square([errors.translation_m, errors.rotation_deg] * per_100_m))
     translation_m, rotation_deg = np.sqrt(np.concatenate(squares, axis=1).mean(axis=1))
     return float(translation_m), float(rotation_deg)
@@ -197,9 +196,9 @@ def drift(T_map_estimated: npt.ArrayLike, T_map_true: npt.ArrayLike) -> tuple[fl
 
 def best_motion(estimated: Floats, true: Floats) -> Transform:
     """
-    Return the rigid transform after which positions (S, 3) are nearest to others, in squares.
+    Return the rigid transform from positions (S, 3) to true positions in the least squares sense.
 
-    Of positions on a line or in a point, one of the transforms that do.
+    For positions on a line or in a point it is one of several.
     """
     middle, target = estimated.mean(axis=0), true.mean(axis=0)
     u, _, vt = np.linalg.svd((true - target).T @ (estimated - middle))
@@ -215,10 +214,10 @@ def common_stamps(
     stamp_ns: npt.NDArray[np.int64], other_ns: npt.NDArray[np.int64], max_difference_ns: int = 0
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """
-    Return the rows of two ascending lists of stamps that belong together.
+    Return the matching rows of two ascending lists of stamps.
 
-    Each stamp of the first goes with the nearest of the second, where that is not farther than
-    ``max_difference_ns`` and no other stamp of the first is nearer to it.
+    A stamp of the first list matches the nearest of the second if their difference is at most
+    ``max_difference_ns`` and no other stamp of the first list is nearer to it.
     """
     if not len(other_ns) or not len(stamp_ns):
         return np.empty(0, np.int64), np.empty(0, np.int64)
@@ -235,7 +234,7 @@ def common_stamps(
 
 
 def _pairs(estimated: npt.ArrayLike, true: npt.ArrayLike, least: int) -> tuple[Floats, Floats]:
-    """Return two lists of poses as arrays, or refuse them."""
+    """Return two lists of poses as arrays; ValueError if they are not usable."""
     first, second = np.asarray(estimated, np.float64), np.asarray(true, np.float64)
     if first.shape != second.shape or first.ndim != 3 or first.shape[1:] != (4, 4):
         raise ValueError(
@@ -256,7 +255,7 @@ def _motion_errors(
 
 
 def _errors(off: Floats) -> PoseErrors:
-    """Return how large transforms (P, 4, 4) are."""
+    """Return the magnitude of transforms (P, 4, 4)."""
     skew = off[:, :3, :3] - off[:, :3, :3].transpose(0, 2, 1)
     sine = np.sqrt((skew**2).sum(axis=(1, 2)) / 8.0)
     cosine = 0.5 * (np.trace(off[:, :3, :3], axis1=1, axis2=2) - 1.0)

@@ -228,7 +228,7 @@ def eigenvectors(matrices, values, smallest, vectors):
         uu, uw = (ux * pux + uy * puy) + uz * puz, (wx * pux + wy * puy) + wz * puz
         ww = (wx * pwx + wy * pwy) + wz * pwz
         half = 0.5 * (uu - ww)
-        scale = max(abs(half), abs(uw))  # the squares of what is tiny vanish
+        scale = max(abs(half), abs(uw))  # the squares of tiny values underflow
         equal = scale == 0.0  # any direction will do
         half, uw = (1.0, 0.0) if equal else (half / scale, uw / scale)
         spread = math.sqrt(half * half + uw * uw)

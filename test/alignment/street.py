@@ -31,7 +31,7 @@ def street_scans(
 
 
 def drifted(poses: Floats, share: float = 0.01, deg_m: float = 0.05) -> Floats:
-    """Return poses as odometry has them that measures ways too long and turns as it goes."""
+    """Return poses with odometry drift: a scale error and a constant turn rate."""
     result = [poses[0]]
     for before, after in pairwise(poses):
         step = np.linalg.inv(before) @ after
@@ -42,7 +42,7 @@ def drifted(poses: Floats, share: float = 0.01, deg_m: float = 0.05) -> Floats:
 
 
 def relative_errors(poses: Floats, true: Floats, apart: int) -> tuple[float, float]:
-    """Return mean errors, m and rad, of the poses of scans in those so many before."""
+    """Return mean errors, m and rad, of the poses relative to the scan ``step`` before."""
     errors = []
     for first in range(len(true) - apart):
         last = first + apart

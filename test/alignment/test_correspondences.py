@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which samples belong together, what their gaps count, and where loops may close."""
+"""Correspondences of samples, weights of their gaps, and loop candidates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def surfels(rng, num=200):
 
 
 def brute_force(source, target, T, limits):
-    """Return the pairs that match is to find, one sample at a time."""
+    """Return the expected pairs, one sample at a time."""
     moved = source.position @ T[:3, :3].T + T[:3, 3]
     pairs = []
     for i, point in enumerate(moved):
@@ -67,7 +67,7 @@ def test_pairs_are_those_that_comparing_all_finds(max_distance_m, max_angle_deg,
 
 @pytest.mark.parametrize('empty', ['source', 'target', 'both'])
 @pytest.mark.parametrize('reciprocal', [False, True])
-def test_nothing_belongs_to_nothing(empty, reciprocal):
+def test_empty_samples_have_no_pairs(empty, reciprocal):
     nothing = Samples(np.empty((0, 3)))
     some = Samples(np.zeros((3, 3)))
     source = some if empty == 'target' else nothing

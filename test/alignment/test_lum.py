@@ -18,7 +18,7 @@ from test.alignment.scan_graphs import chain, make, random_transforms
 
 @pytest.mark.parametrize('angle_rad', [0.5, 1.5, 2.8])
 @pytest.mark.parametrize('seed', range(3))
-def test_it_converges_from_no_pose_at_all_whatever_the_rotations(angle_rad, seed):
+def test_lum_converges_from_the_origin_for_any_rotations(angle_rad, seed):
     rng = np.random.default_rng(seed)
     T = random_transforms(rng, 12, angle_rad)
     lum = make(
@@ -32,7 +32,7 @@ def test_it_converges_from_no_pose_at_all_whatever_the_rotations(angle_rad, seed
         np.testing.assert_allclose(lum.transformation(v), T[v], atol=0.02)
 
 
-def test_one_kilometre_from_the_origin_it_is_as_good_as_at_it():
+def test_accuracy_does_not_fall_one_kilometre_from_the_origin():
     errors = []
     for offset in (0.0, 1000.0):
         rng = np.random.default_rng(5)
@@ -102,7 +102,7 @@ def test_both_directions_count_alike():
     np.testing.assert_allclose(poses[0], poses[1], atol=1e-9)
 
 
-def test_equal_weights_end_where_none_do():
+def test_equal_weights_give_the_result_without_weights():
     rng = np.random.default_rng(9)
     T = random_transforms(rng, 2, 1.0)
     lum = make(rng, T, [(1, 0)], sigma=0.1, max_iterations=50)
@@ -158,7 +158,7 @@ def test_edges_with_and_without_weights_go_together():
         np.testing.assert_allclose(lum.transformation(v), T[v], atol=0.02)
 
 
-def test_points_with_nan_are_passed_over():
+def test_points_with_nan_are_ignored():
     rng = np.random.default_rng(12)
     T = random_transforms(rng, 2, 0.3)
     lum = make(rng, T, [(0, 1)], max_iterations=20)
@@ -196,7 +196,7 @@ def test_clouds_and_poses_are_given_back():
 
     assert lum.add_point_cloud(points) == 0
     assert lum.add_point_cloud(points + 1.0, [1.0, 2.0, 3.0, 0.1, 0.2, 0.3]) == 1
-    points[:] = -1.0  # what was given in is copied
+    points[:] = -1.0  # the input is copied
 
     assert lum.num_vertices == 2
     np.testing.assert_array_equal(lum.point_cloud(0)[0], [0.0, 1.0, 2.0])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LUM: what it refuses, what says nothing, and graphs at the edge of what can be solved."""
+"""LUM: refused input, undetermined edges, and barely solvable graphs."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_bad_input_is_refused_and_changes_nothing(pair, refused, message):
     np.testing.assert_array_equal(pair.pose(1), np.zeros(6))
 
 
-def test_pairs_in_one_point_say_nothing(pair):
+def test_pairs_in_one_point_are_dropped(pair):
     pair.set_correspondences(0, 1, [[0, 0]] * 5)
 
     result = pair.compute()
@@ -71,13 +71,13 @@ def test_pairs_in_one_point_say_nothing(pair):
     assert result.unconnected == (1,)
 
 
-def test_weights_that_are_all_zero_say_nothing(pair):
+def test_edges_of_zero_weights_are_dropped(pair):
     pair.set_correspondences(0, 1, [[0, 0], [1, 1], [2, 2]], np.zeros((3, 3, 3)))
 
     assert pair.compute().dropped == {(0, 1): 'all its weights are zero'}
 
 
-def test_the_steps_of_pcl_know_no_weights(pair):
+def test_the_steps_of_pcl_refuse_weights(pair):
     pair.jacobian = 'pcl'
     pair.set_correspondences(0, 1, [[0, 0]] * 3, [np.eye(3)] * 3)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""LUM against what pcl::registration::LUM computed, and where that fails against the truth."""
+"""LUM against results of pcl::registration::LUM, and against the truth if that fails."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_information_of_edges_is_that_of_pcl(golden, cases, name):
         assert (np.abs(found - expected) / largest).max() < 2e-4
 
 
-def test_what_pcl_warns_of_is_reported(golden, cases):
+def test_warnings_of_pcl_are_reported(golden, cases):
     lum = lum_of(golden, cases, 'few_corrs', 'pcl')
 
     result = lum.compute()
@@ -284,7 +284,7 @@ def test_parts_without_the_reference_are_reported_and_stay(golden, cases):
 
 
 @pytest.mark.parametrize('name', ['collinear_axis', 'near_collinear'])
-def test_a_rotation_that_nothing_is_known_of_stays_and_is_reported(golden, cases, name):
+def test_an_undetermined_rotation_stays_and_is_reported(golden, cases, name):
     lum = lum_of(golden, cases, name, 'exact')
 
     result = lum.compute()

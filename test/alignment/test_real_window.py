@@ -21,7 +21,7 @@ SETTINGS = {'pose.source': 'odometry', 'window.max_scans': 0, 'window.keep_point
 
 @pytest.fixture(scope='module')
 def recorded(data_folder):
-    """Return the scans of the bag, mapped where its odometry has them."""
+    """Return the scans of the bag, mapped at the poses of its odometry."""
     config = Config.from_mapping(SETTINGS)
     mapper = Mapper(config)
     with BagReader(data_folder / 'data' / 'bags' / 'hall_os0_full') as reader:

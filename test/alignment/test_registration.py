@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Registration in rooms whose every surface is known, so that the true pose is as well."""
+"""Registration in rooms of known surfaces and poses."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ CORRIDOR = (
 
 
 def points_on(faces, density, seed, reach_m=math.inf):
-    """Return points on faces with noise, so many a square metre, not far from where TRUE is."""
+    """Return points on faces with noise, density a square metre, near TRUE."""
     rng = np.random.default_rng(seed)
     parts = []
     for corner, first, second in np.array(faces):
@@ -121,7 +121,7 @@ def test_a_heading_that_is_far_off_is_searched_for():
     assert off(found.T_map_sensor)[1] < 0.02
 
 
-def test_a_further_start_is_tried_where_the_first_does_not_fit():
+def test_a_further_start_is_tried_if_the_first_does_not_fit():
     wrong, right = started(0.0, 0.0, 0.0, (0.0, 0.0, 90.0)), started(0.1)
     aligner = registration(search_deg=0.0)
     cells, surfel_map = aligner.cells(scan_of(ROOM)), map_of(ROOM)
@@ -131,7 +131,7 @@ def test_a_further_start_is_tried_where_the_first_does_not_fit():
     assert off(found.T_map_sensor)[0] < 1e-3
 
 
-def test_what_moved_in_the_scan_hardly_disturbs():
+def test_moving_objects_hardly_disturb():
     points = scan_of(ROOM)
     rng = np.random.default_rng(5)
     clutter = rng.uniform([-5.0, -3.0, -1.0], [2.0, 0.0, 1.0], (len(points) // 4, 3))
@@ -141,14 +141,14 @@ def test_what_moved_in_the_scan_hardly_disturbs():
     assert off(found.T_map_sensor)[0] < 0.01
 
 
-def test_along_a_corridor_the_prediction_stays():
+def test_the_prediction_is_kept_along_a_corridor():
     start = started(0.2, 0.1, 0.1, (0.0, 0.0, 1.0))
     points = scan_of(CORRIDOR, reach_m=20.0)
 
     found = align(CORRIDOR, start, 0.3, points=points)
 
     error = found.T_map_sensor[:3, 3] - TRUE[:3, 3]
-    assert error[0] == pytest.approx(0.2, abs=0.02)  # nothing is known of x
+    assert error[0] == pytest.approx(0.2, abs=0.02)  # x is undetermined
     assert abs(error[1:]).max() < 2e-3
     assert len(found.degenerate) == 1
     assert abs(found.degenerate[0, 0]) > 0.99
@@ -183,7 +183,7 @@ def test_a_scan_without_points_fits_nothing():
     assert (found.num_cells, found.support) == (0, 0.0)
 
 
-def test_equal_scans_are_found_at_equal_bits_and_leave_the_map_as_it_is():
+def test_equal_scans_get_bit_identical_poses_and_do_not_change_the_map():
     aligner, surfel_map = registration(), map_of(ROOM)
     digest = surfel_map.digest()
     start = started(0.9, -0.8, 0.3)
@@ -206,7 +206,7 @@ def test_cells_are_means_of_points_within_the_limits_of_range():
     np.testing.assert_allclose(cells, [[1.15, 0.125, 0.15]], atol=4e-6)
 
 
-def test_of_too_many_cells_some_are_taken_evenly():
+def test_too_many_cells_are_subsampled_evenly():
     points = np.column_stack([np.arange(1000.0), np.zeros(1000), np.zeros(1000)]) + 0.1
 
     cells = registration(max_cells=300).cells(points)
@@ -234,7 +234,7 @@ def fits_of(points, place):
     return overlap, np.trace(hessian[:3, :3])
 
 
-def test_a_surfel_of_one_ring_says_nothing_as_its_normal_comes_of_noise():
+def test_a_surfel_of_one_ring_is_ignored_as_its_normal_is_noise():
     # along the ring 0.9 m, along the beam the noise of a range, across both nothing
     rng = np.random.default_rng(4)
     spread, noise = rng.uniform(0.05, 0.95, 200), rng.normal(scale=0.01, size=200)
@@ -243,7 +243,7 @@ def test_a_surfel_of_one_ring_says_nothing_as_its_normal_comes_of_noise():
     assert fits_of(ring, [0.5, 0.5, 0.5]) == (0.0, 0.0)
 
 
-def test_a_surfel_says_less_away_from_its_mean():
+def test_the_weight_of_a_surfel_falls_away_from_its_mean():
     rng = np.random.default_rng(4)
     area = np.column_stack([rng.uniform(0.05, 0.95, (20, 2)), np.full(20, 0.5)])
     area += rng.normal(scale=0.01, size=(20, 3))
@@ -255,7 +255,7 @@ def test_a_surfel_says_less_away_from_its_mean():
 
 
 @pytest.mark.parametrize('points', [np.full((4, 3), 0.3), np.full((9, 3), 0.3)])
-def test_a_surfel_of_few_points_or_of_one_place_says_nothing(points):
+def test_a_surfel_of_few_points_or_of_one_place_is_ignored(points):
     assert fits_of(points, [0.5, 0.5, 0.5]) == (0.0, 0.0)
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tracking through a room, and what is learnt from scan to scan."""
+"""Tracking through a room: predictions, deviations and refusals."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_before_anything_is_known_the_sensor_stays():
     assert tracker.deviation_m == RegistrationConfig().max_deviation_m
 
 
-def test_the_motion_is_taken_to_go_on():
+def test_the_prediction_assumes_constant_velocity():
     tracker = tracker_at(TRUE)
     tracker.advance(TRUE, 0)
     tracker.advance(pose_at(0.5), SECOND // 2)
@@ -53,7 +53,7 @@ def test_the_motion_is_taken_to_go_on():
     np.testing.assert_allclose(tracker.predict(SECOND // 2), pose_at(0.5), atol=1e-12)
 
 
-def test_deviations_from_the_prediction_say_how_far_to_look():
+def test_deviations_set_the_search_distance():
     tracker = tracker_at(np.eye(4))
     tracker.advance(np.eye(4), 0)
     turned = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.1]))
@@ -63,7 +63,7 @@ def test_deviations_from_the_prediction_say_how_far_to_look():
     assert tracker.deviation_m == pytest.approx(2.0 * 20.0 * math.sin(0.05))
 
 
-def test_however_good_predictions_are_noise_is_expected():
+def test_the_expected_deviation_is_at_least_that_of_noise():
     tracker = tracker_at(TRUE)
     for k in range(3):
         tracker.advance(TRUE, k * SECOND)
@@ -112,7 +112,7 @@ def test_a_scan_of_another_place_is_refused_and_the_pose_kept():
         tracker.track(elsewhere, SECOND, map_of(ROOM), np.eye(4))
 
     np.testing.assert_array_equal(tracker.pose, pose_at(0.2))
-    np.testing.assert_allclose(tracker.twist, 0.5 * TWIST, atol=1e-12)  # no longer believed
+    np.testing.assert_allclose(tracker.twist, 0.5 * TWIST, atol=1e-12)  # the velocity is halved
     assert tracker.deviation_m == RegistrationConfig().max_deviation_m
 
 

@@ -82,8 +82,8 @@ def test_true_poses_stay_where_they_are():
 
 
 @pytest.mark.parametrize('step_m', [0.7, 0.9, 1.3])
-def test_in_a_tunnel_the_way_along_it_stays_as_odometry_has_it(step_m):
-    # seen from every place a tunnel looks the same, voxels too: scans would stand one on the other
+def test_odometry_determines_the_translation_along_a_tunnel(step_m):
+    # a tunnel looks the same from every place: without odometry all scans would coincide
     rng = np.random.default_rng(3)
     true = np.tile(np.eye(4), (10, 1, 1))
     true[:, 0, 3] = step_m * np.arange(10)
@@ -98,7 +98,7 @@ def test_in_a_tunnel_the_way_along_it_stays_as_odometry_has_it(step_m):
 
 
 def tunnel(rng):
-    """Return what a lidar sees of a floor, a ceiling and two walls along x, with noise."""
+    """Return a noisy lidar scan of a floor, a ceiling and two walls along x."""
     ahead = Lidar(columns=512).directions().reshape(-1, 3)
     with np.errstate(divide='ignore'):
         ways = [distance / ahead[:, axis] for axis, distance in WALLS]
@@ -179,7 +179,7 @@ def test_scans_that_share_nothing_go_by_odometry_and_are_reported():
         (2, np.full((2, 4, 4), np.nan), 'finite'),
     ],
 )
-def test_what_cannot_be_aligned_is_refused(num_scans, poses, message):
+def test_invalid_scans_and_poses_are_refused(num_scans, poses, message):
     scan = Samples(np.eye(3), np.eye(3), np.ones(3), np.ones(3))
 
     with pytest.raises(AlignmentError, match=message):

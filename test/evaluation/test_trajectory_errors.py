@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Errors of trajectories, against evo 1.38.1 and against what was put in by hand.
+Errors of trajectories, against evo 1.38.1 and against known errors.
 
 The golden numbers are those of evo's APE (after align without scale) and RPE (delta of 1 and of
 5 frames), translation_part and rotation_angle_deg, of the trajectory of ``wandering``.
@@ -169,6 +169,6 @@ def test_a_comparison_of_different_times_is_refused():
         (lambda: drift(line(1), line(1)), '1 poses, expected at least 2'),
     ],
 )
-def test_what_cannot_be_compared_is_refused(call, message):
+def test_incomparable_trajectories_are_refused(call, message):
     with pytest.raises(ValueError, match=message):
         call()

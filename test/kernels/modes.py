@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The two ways to run kernels: compiled, and as the Python they are written in.
+Run kernels compiled and interpreted.
 
 Interpreted, a kernel shows its coverage and checks every index; the kernels that it calls are
 compiled nevertheless. Where a whole program is to be interpreted, it runs in a Python of its own.
@@ -31,14 +31,14 @@ def interpreted(kernel, *arguments):
 
 
 def printed_alike(program):
-    """Return what a program prints; it has to be the same compiled and interpreted."""
+    """Return the output of a program; assert that compiled and interpreted kernels agree."""
     text = printed(program, is_compiled=True)
     assert text == printed(program, is_compiled=False)
     return text
 
 
 def saved_alike(program, folder, **tolerance):
-    """Return the arrays that a program saves to the file it is given, alike in both ways."""
+    """Return the arrays that a program saves to a given file; assert that both modes agree."""
     paths = folder / 'compiled.npz', folder / 'interpreted.npz'
     text = printed(program, paths[0], is_compiled=True)
     assert text == printed(program, paths[1], is_compiled=False)
@@ -49,7 +49,7 @@ def saved_alike(program, folder, **tolerance):
 
 
 def printed(program, *arguments, is_compiled):
-    """Return what a program prints with its kernels compiled or interpreted."""
+    """Return the output of a program with its kernels compiled or interpreted."""
     done = subprocess.run(
         [sys.executable, '-c', QUIET + program, *map(str, arguments)],
         cwd=Path(__file__).parents[2],

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The hash table of a map beside a dict, and what must hold inside of it after every change.
+The hash table of a map compared with a dict, and its invariants after every change.
 
 A small owner of the table stands in for VoxelTable: it makes room by the plainest means. Its
 keys are chosen to collide as well: many of one segment, many of one bucket.
@@ -28,7 +28,7 @@ from test.kernels.modes import both, compiled
 
 
 class Owner:
-    """A table of fixed room for segments, whose directory doubles when asked to."""
+    """A table with a fixed number of segments, whose directory doubles on request."""
 
     def __init__(self, call, num_rows, num_segments):
         self.call = call
@@ -65,7 +65,7 @@ class Owner:
         return row
 
     def check(self):
-        """Check the inside of the table: every entry where its search can find it."""
+        """Check the invariants of the table: a search reaches every entry."""
         depth, num_segments = int(self.state[DEPTH]), int(self.state[SEGMENTS])
         assert len(self.directory) == 2**depth
         buckets = self.buckets.reshape(-1, SEGMENT)
@@ -103,7 +103,7 @@ def colliding_keys(num, rng):
 
 
 @both
-def test_rows_come_and_go_as_in_a_dict(call):
+def test_rows_are_inserted_and_removed_as_in_a_dict(call):
     rng = np.random.default_rng(1)
     many = call is compiled
     owner = Owner(call, 30_000 if many else 900, 256 if many else 8)

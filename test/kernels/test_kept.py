@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Compiled kernels are kept as long as no source changes, and none is used after an update."""
+"""Compiled kernels are cached until a source changes; stale ones are never used."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def package(tmp_path):
 
 
 def run(package, **environment):
-    """Return what the kernel says in a process of its own, how often it was loaded, the log."""
+    """Return result, number of cache loads and log of the kernel, run in a separate process."""
     program = (
         'from surfel_mapper.kernels.caller import twice\n'
         'print(twice(0), sum(twice.stats.cache_hits.values()))'
@@ -63,7 +63,7 @@ def run(package, **environment):
 
 
 @pytest.mark.parametrize('elsewhere', [False, True])
-def test_a_kernel_is_kept_until_one_that_it_calls_changes(package, elsewhere):
+def test_a_kernel_is_cached_until_one_that_it_calls_changes(package, elsewhere):
     environment = {'NUMBA_CACHE_DIR': str(package / 'kept')} if elsewhere else {}
     assert run(package, **environment) == ([2, 0], '')
     assert run(package, **environment) == ([2, 1], '')
@@ -72,7 +72,7 @@ def test_a_kernel_is_kept_until_one_that_it_calls_changes(package, elsewhere):
     assert run(package, **environment) == ([20, 1], '')
 
 
-def test_kernels_are_compiled_where_their_hash_cannot_be_kept(package):
+def test_kernels_are_compiled_if_their_hash_cannot_be_stored(package):
     (package / 'surfel_mapper/kernels/__pycache__/kernels.sha256').mkdir(parents=True)
     answer, log = run(package)
     assert answer == [2, 0]

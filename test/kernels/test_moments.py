@@ -3,7 +3,7 @@
 """
 The kernels that reduce a scan, one by one, against Python integers.
 
-What a whole reduction gives is compared more broadly in test/mapping/test_moments.py.
+Whole reductions are compared in test/mapping/test_moments.py.
 """
 
 import itertools
@@ -173,7 +173,7 @@ def test_every_point_left_out_has_one_cause(call, point, cause):
 
 @both
 @pytest.mark.parametrize('wide', [np.int32, np.int64])
-def test_sums_become_the_integers_they_are(call, wide):
+def test_sums_are_converted_to_integers(call, wide):
     rows = np.array(list(reference.scan_moments(some_points(200), 0.5, None).values()))
     num = len(rows)
     count, total = np.empty(num, np.int32), np.empty((num, 3), wide)
@@ -187,7 +187,7 @@ def test_sums_become_the_integers_they_are(call, wide):
 
 @both
 @pytest.mark.parametrize('origin', [[3.0, -40.0, 2.0], [0.25, 0.25, 0.25], None])
-def test_a_voxel_is_seen_from_the_sensor(call, origin):
+def test_views_point_from_voxels_to_the_sensor(call, origin):
     points = np.random.default_rng(4).uniform(-20.0, 20.0, (CHUNK + 100, 3))
     twin = reference.scan_moments(points, 0.5, origin)
     rows, keys = np.array(list(twin.values())), pack_keys(np.array(list(twin)))

@@ -3,7 +3,7 @@
 """
 Eigenvalues and smallest eigenvectors of 3 by 3 matrices, against numpy.linalg.eigh.
 
-Both solvers are right to some 1e-15 of the largest eigenvalue e2. Eigenvalues are compared to
+Both solvers are accurate to some 1e-15 of the largest eigenvalue e2. Eigenvalues are compared to
 1e-12 e2; a normal moves by the error over the gap e1 - e0 and is compared to 1e-6 rad where
 the gap is above 1e-4 e2. Below, it has to be an eigenvector as good as the eigenvalues are.
 """
@@ -135,20 +135,20 @@ def test_matrices_too_small_for_all_digits_stay_finite(call, tiny):
         (1, 1e-18, 1),
     ],
 )
-def test_diagonal_matrices_are_their_own_answer(call, diagonal):
+def test_diagonal_matrices_are_decomposed_exactly(call, diagonal):
     eigenvalues, normals = decomposed(np.diag(np.array(diagonal, float))[None], call)
     assert np.abs(eigenvalues[0] - np.sort(diagonal)).max() <= 1e-15 * max(diagonal)
     if len(set(diagonal)) == 3 or sorted(diagonal)[0] < sorted(diagonal)[1]:
         axis = int(np.argmin(diagonal))
         assert np.abs(np.abs(normals[0]) - np.eye(3)[axis]).max() <= 1e-15
-    else:  # any direction among the smallest two
+    else:  # any direction in the plane of the two smallest
         assert abs(np.linalg.norm(normals[0]) - 1.0) <= 1e-15
         if diagonal != (2, 2, 2):
             assert normals[0][int(np.argmax(diagonal))] == 0.0
 
 
 @both
-def test_nothing_gives_zeros_and_a_unit_vector(call):
+def test_the_zero_matrix_gives_zeros_and_a_unit_vector(call):
     eigenvalues, normals = decomposed(np.zeros((1, 3, 3)), call)
     assert eigenvalues.tolist() == [[0.0, 0.0, 0.0]]
     assert normals.tolist() == [[0.0, 0.0, 1.0]]
@@ -165,14 +165,14 @@ WHOLE = st.integers(-(2**20), 2**20).map(float)
 
 
 @given(st.tuples(WHOLE, WHOLE, WHOLE).filter(any))
-def test_of_points_on_a_line_two_eigenvalues_are_exactly_0(line):
+def test_two_eigenvalues_of_points_on_a_line_are_exactly_0(line):
     eigenvalues, normals = decomposed(np.outer(line, line)[None])
     assert eigenvalues[0, :2].tolist() == [0.0, 0.0]
     assert abs(normals[0] @ line) <= 1e-15 * np.linalg.norm(line)
 
 
 @given(st.tuples(WHOLE, WHOLE, WHOLE), st.tuples(WHOLE, WHOLE, WHOLE))
-def test_of_points_in_a_plane_the_smallest_eigenvalue_is_0_and_the_normal_across(a, b):
+def test_the_smallest_eigenvalue_of_points_in_a_plane_is_0(a, b):
     normal = np.cross(a, b)
     size = np.linalg.norm(normal)
     if size < 1e-3 * np.linalg.norm(a) * np.linalg.norm(b) or size == 0.0:

@@ -25,7 +25,7 @@ def map_of(scans, voxel_size_m=0.5):
 
 
 def made_up(voxels, counts, places=((0, 0, 0),), voxel_size_m=0.5):
-    """Return moments of so many points in each voxel, spread evenly over some places in it."""
+    """Return moments of count points in each voxel, spread evenly over some places in it."""
     q = np.array(places, np.int64)
     share = np.array(counts, np.int64) // len(q)
     i, j = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What holds for every surfel, and how far rounding may take it, for the tests of Surfel.
+Invariants of every surfel, and bounds of its rounding, for the tests of Surfel.
 
-Tolerances. EPS = 2^-52. One step of float64 may be off by a few EPS of the largest scatter held
-on the way (removing leaves the rounding of what was there), and steps add up as a random walk of
+Tolerances. EPS = 2^-52. One step of float64 may be off by a few EPS of the largest scatter held on
+the way (removing leaves the rounding of the removed points), and steps add up as a random walk of
 half an EPS each: ``rounding(steps)`` = (4 + sqrt(steps) / 2) EPS.
 """
 
@@ -30,7 +30,7 @@ def trace(surfel):
 
 
 def assert_normal(normal, expected, tolerance):
-    """The sign of an eigenvector is free."""
+    """Compare normals up to their sign."""
     assert np.linalg.norm(normal) == pytest.approx(1.0, abs=UNIT)
     np.testing.assert_allclose(
         normal * np.sign(normal @ expected), expected, rtol=0, atol=tolerance
@@ -38,7 +38,7 @@ def assert_normal(normal, expected, tolerance):
 
 
 def assert_promises(surfel):
-    """What holds of every surfel whatsoever."""
+    """Assert the invariants of a surfel."""
     n, values, vectors = surfel.num_points, surfel.eigenvalues(), surfel.eigenvectors()
     assert surfel.empty == (n == 0)
     assert np.isnan(surfel.mean()).all() == (n == 0)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""When voxels were last seen, asked again and again while scans come and go."""
+"""Stamps at which voxels were last seen, while scans enter and leave the window."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def scans(num, num_points, seed):
 
 
 def slow_last_seen_ns(voxel_index, held):
-    """Return the same by looking every voxel up in every scan."""
+    """Return the twin: look every voxel up in every scan."""
     seen = [(scan.stamp_ns, {*map(tuple, scan.moments.voxel_index.tolist())}) for scan in held]
     return [
         max((stamp_ns for stamp_ns, voxels in seen if tuple(index) in voxels), default=-1)
@@ -30,7 +30,7 @@ def slow_last_seen_ns(voxel_index, held):
 
 
 @pytest.mark.parametrize('num_drawn', [0, 1, 300, 10_000])
-def test_the_newest_scan_of_each_voxel_is_told_while_the_window_slides(num_drawn):
+def test_the_newest_scan_of_each_voxel_is_found_while_the_window_slides(num_drawn):
     made, surfel_map = scans(num=12, num_points=400, seed=1)
     ages = Ages()
     for first in range(0, 8, 2):
@@ -38,7 +38,7 @@ def test_the_newest_scan_of_each_voxel_is_told_while_the_window_slides(num_drawn
         drawn = surfel_map.surfels(1, num_drawn + first).voxel_index  # the budget moves too
         found = ages.last_seen_ns(drawn, held)
         assert found.tolist() == slow_last_seen_ns(drawn, held)
-    assert num_drawn == 0 or (found == -1).any()  # of scans that have left
+    assert num_drawn == 0 or (found == -1).any()  # voxels of evicted scans
 
 
 def test_a_scan_that_loses_voxels_has_not_seen_them():

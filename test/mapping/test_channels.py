@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Intensity and colour of a map: summed as integers, gone without a trace, averaged right."""
+"""Intensity and colour of a map: exact sums, exact removal, correct means."""
 
 from __future__ import annotations
 
@@ -82,14 +82,14 @@ def test_the_moments_do_not_depend_on_the_columns():
         np.testing.assert_array_equal(one, two)
 
 
-def test_points_that_do_not_enter_take_their_values_with_them():
+def test_values_of_rejected_points_are_not_summed():
     points = np.array([[0.1, 0.1, 0.1], [np.nan, 0.0, 0.0], [0.2, 0.1, 0.1]])
     surfel_map = SurfelMap(0.5, columns=('intensity',))
     surfel_map.add(points, columns={'intensity': np.array([1.0, 100.0, 3.0])})
     assert surfel_map.surfels().channels['intensity'].tolist() == [2.0]
 
 
-def test_what_is_no_number_counts_as_zero():
+def test_nan_counts_as_zero():
     surfel_map = SurfelMap(0.5, columns=('intensity',))
     surfel_map.add([[0.1, 0.1, 0.1]] * 2, columns={'intensity': np.array([np.nan, 4.0])})
     assert surfel_map.surfels().channels['intensity'].tolist() == [2.0]

@@ -107,7 +107,7 @@ def test_too_many_points_for_a_level_are_refused():
         surfel_map.coarsen(15)
 
 
-def test_a_part_of_a_map_becomes_coarser_alone():
+def test_a_box_of_a_map_is_coarsened_alone():
     surfel_map = map_of(scans_at(0.0))
     low, high = np.array([-4, -4, -2]), np.array([3, 5, 3])
     index = surfel_map.moments().voxel_index
@@ -121,7 +121,7 @@ def test_a_part_of_a_map_becomes_coarser_alone():
     assert coarse == part.coarsen(1)
 
 
-def test_a_copy_is_equal_and_goes_its_own_way():
+def test_a_copy_is_equal_and_independent():
     surfel_map = map_of(scans_at(0.0))
     copy = surfel_map.copy()
     assert copy == surfel_map

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Scans reduced to moments, against exact integers of a slow twin; what is refused; what is left out.
+Scans reduced to moments, against exact integers of a slow twin; refused and left out points.
 
 All comparisons are of integers and exact. Points lie where quantisation could go wrong: on faces
 of voxels, on points of the lattice and the numbers next to them, at -0.0, and far from the origin.
@@ -62,7 +62,7 @@ def test_moments_are_those_of_the_exact_twin(drawn, narrow):
 @pytest.mark.parametrize('dtype', [np.float32, np.float64])
 @pytest.mark.parametrize('offset_m', [0.0, 1e4])
 @pytest.mark.parametrize('size_m', [0.5, 0.2, 1.0 / 3.0])
-def test_posed_points_are_quantised_as_their_places_in_the_map(dtype, offset_m, size_m):
+def test_points_with_a_pose_are_quantised_in_the_map_frame(dtype, offset_m, size_m):
     rng = np.random.default_rng(7)
     points = rng.uniform(-4.0, 4.0, (1500, 3)).astype(dtype)
     pose = random_pose(rng, 3.0)
@@ -85,7 +85,7 @@ def test_any_number_of_points_is_reduced_completely(num):
     assert as_twin(Reducer(0.5).reduce(points)) == scan_moments(points, 0.5)
 
 
-def test_the_order_of_points_is_of_no_account():
+def test_the_order_of_points_does_not_matter():
     rng = np.random.default_rng(1)
     points = rng.normal(scale=2.0, size=(5000, 3)).astype(np.float32)
     reducer = Reducer(0.2)
@@ -114,7 +114,7 @@ def test_moments_do_not_change_when_the_reducer_goes_on():
     assert as_twin(moments) == before
 
 
-def test_each_voxel_stands_once():
+def test_each_voxel_occurs_once():
     points = np.random.default_rng(4).uniform(-30.0, 30.0, (50_000, 3))
     moments = Reducer(0.2).reduce(points)
     assert len(np.unique(moments.key)) == len(moments) == moments.num_voxels
@@ -130,7 +130,7 @@ def test_a_slice_of_wider_rows_is_as_good_as_an_array_of_its_own(columns):
 
 
 @pytest.mark.parametrize('dtype', [np.int16, np.int64, np.uint8, np.float16, '>f4', '>f8'])
-def test_points_of_any_numbers_are_taken_at_their_value(dtype):
+def test_points_of_any_numeric_type_keep_their_value(dtype):
     points = np.arange(30).reshape(10, 3).astype(dtype)
     assert as_twin(Reducer(0.5).reduce(points)) == scan_moments(points.astype(float), 0.5)
 
@@ -250,7 +250,7 @@ def test_points_of_another_shape_are_refused(shape):
 
 
 @pytest.mark.parametrize('dtype', [bool, complex, object, 'U4'])
-def test_points_that_are_no_numbers_are_refused(dtype):
+def test_points_of_other_types_are_refused(dtype):
     with pytest.raises(ValueError, match='points: dtype'):
         Reducer(0.5).reduce(np.zeros((2, 3)).astype(dtype))
 
@@ -261,7 +261,7 @@ def test_no_points_give_no_moments():
         assert (len(moments), moments.num_points) == (0, 0)
 
 
-def test_a_pose_or_origin_that_is_no_pose_or_origin_is_refused():
+def test_an_invalid_pose_or_origin_is_refused():
     points, reducer = np.zeros((1, 3)), Reducer(0.5)
     for pose in (np.eye(3), np.full((4, 4), np.nan), np.diag([1, 1, np.inf, 1])):
         with pytest.raises(ValueError, match='T_map_sensor'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Slab: rows stay and new ones are zero when it grows, also where memory cannot be moved."""
+"""Slab: rows stay and new ones are zero when it grows, also if memory cannot be moved."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def test_a_new_slab_has_the_rows_asked_for_all_zero(width):
 
 
 def grown(slab, expected):
-    """Grow a slab to twice its rows several times and fill what is new; check all of it."""
+    """Double a slab several times, fill new rows, and check all rows."""
     num_rows = len(expected)
     for _ in range(6):
         slab.grow(2 * num_rows)
@@ -41,7 +41,7 @@ def test_growing_keeps_the_rows_and_adds_zeros(width):
     grown(slab, slab.array.copy())
 
 
-def test_a_slab_grows_while_somebody_holds_its_rows():
+def test_a_slab_grows_while_a_view_of_its_rows_exists():
     slab = Slab(64, 16)
     slab.array[:] = 7
     held = slab.array

@@ -68,7 +68,7 @@ def test_any_sequence_of_adding_and_removing_leaves_the_statistics_of_what_is_le
 
 
 @given(st.lists(POINTS, min_size=1, max_size=6))
-def test_ten_kilometres_from_the_origin_not_a_bit_is_lost(batches):
+def test_no_bit_is_lost_ten_kilometres_from_the_origin(batches):
     near, far = Surfel(), Surfel()
     for batch in batches:
         near.add(batch)
@@ -145,7 +145,7 @@ def test_a_square_grid_is_a_plane_of_planarity_one(u, v, normal):
     assert surfel.curvature() == 0.0
 
 
-def test_of_a_normal_the_largest_component_is_positive():
+def test_the_largest_component_of_a_normal_is_positive():
     for axis in np.eye(3):
         for sign in (1, -1):
             tilt = sign * (axis + 0.3 * np.roll(axis, 1) - 0.2 * np.roll(axis, 2))
@@ -223,7 +223,7 @@ def test_removing_down_to_one_point_leaves_no_scatter():
     assert_promises(surfel)
 
 
-def test_removing_what_was_never_added_gives_no_negative_eigenvalue():
+def test_removing_foreign_points_gives_no_negative_eigenvalue():
     surfel = Surfel.from_points(grid([[1, 0, 0], [0, 1, 0]]))
 
     surfel.remove([0.0, 0.0, 9.0])

@@ -46,7 +46,7 @@ class Program:
         self.steps, self.reach = 0, 0.0
 
     def run(self, op):
-        """Run an operation and note how large the rounding may have become."""
+        """Run an operation and update the bound of its rounding."""
         points = self.points(op) if 'array' in op else None
         surfel = self.result(op, points)
         inputs = [op[key] for key in ('reg', 'other', 'a', 'b') if key in op]
@@ -61,7 +61,7 @@ class Program:
         return points[op['index']] if 'index' in op else points[op['start'] : op['stop']]
 
     def result(self, op, points):
-        """Return what the register of an operation holds after it."""
+        """Return the register of an operation after it."""
         surfel = self.registers.get(op['reg'])
         operand = self.registers[op['other']] if 'other' in op else points
         match op['op']:
@@ -120,7 +120,7 @@ def assert_equals_reference(program, register, reference, normal_well_defined):
 
 
 def check_snapshot(program, register, name, description, arrays):
-    """Compare a register with what is stored of it; return whether exact results were."""
+    """Compare a register with its golden values; return whether exact ones exist."""
     surfel = program.registers[register]
     assert surfel.num_points == arrays[f'{name}/num_points']
     assert_promises(surfel)

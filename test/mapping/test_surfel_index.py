@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Queries by place, each against every surfel of the map looked at in turn."""
+"""Spatial queries against a linear search over all surfels."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_best_planar_ranks_those_within_the_radius(index, points, k):
         assert rows.tolist() == expected.tolist() + [-1] * (k - len(expected))
 
 
-def test_in_box_and_in_radius_are_all_that_is_there(index):
+def test_in_box_and_in_radius_find_all_surfels(index):
     position = index.surfels.position
     inside = [i for i, p in enumerate(position) if all(p >= (-1, 0, -2)) and all(p <= (1, 3, 0))]
     assert index.in_box((-1.0, 0.0, -2.0), (1.0, 3.0, 0.0)).tolist() == inside != []
@@ -83,7 +83,7 @@ def test_plane_distance_is_positive_on_the_side_of_the_sensor():
     np.testing.assert_allclose(nearest, [0.1, -0.1, 0.7], atol=lattice_m)
 
 
-def test_a_coarser_level_is_asked_in_its_own_voxels(points):
+def test_a_coarser_level_uses_its_own_voxels(points):
     rng = np.random.default_rng(7)
     fine = SurfelMap(VOXEL_M)
     fine.add(rng.normal(0.0, 2.0, (2000, 3)))
@@ -94,7 +94,7 @@ def test_a_coarser_level_is_asked_in_its_own_voxels(points):
     assert (rows >= 0).sum() > 100
 
 
-def test_an_empty_map_has_no_answers():
+def test_an_empty_map_finds_nothing():
     index = SurfelMap(VOXEL_M).index()
     assert index.at([[0.0, 0.0, 0.0]]).tolist() == [-1]
     assert index.nearest([[0.0, 0.0, 0.0]], 1.0)[0].tolist() == [-1]
@@ -103,13 +103,13 @@ def test_an_empty_map_has_no_answers():
     assert index.in_box((-1, -1, -1), (1, 1, 1)).tolist() == []
 
 
-def test_points_that_are_nowhere_have_no_surfel(index):
+def test_invalid_points_have_no_surfel(index):
     nowhere = [[np.nan, 0.0, 0.0], [0.0, np.inf, 0.0], [0.0, 0.0, 1e30]]
     assert index.at(nowhere).tolist() == [-1, -1, -1]
     assert index.nearest(nowhere, 1.0)[0].tolist() == [-1, -1, -1]
 
 
-def test_wrong_questions_are_refused(index):
+def test_invalid_queries_are_refused(index):
     with pytest.raises(ValueError, match=r'points: shape \(3,\)'):
         index.at([0.0, 0.0, 0.0])
     with pytest.raises(ValueError, match='k: 0'):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Surfel as an object: empty ones, operators, copies, types of points, and what is refused."""
+"""Surfel as an object: empty ones, operators, copies, types of points, refused input."""
 
 import copy
 
@@ -116,7 +116,7 @@ def test_a_position_is_one_point_and_its_scatter_counts_once_others_come():
     np.testing.assert_array_equal(surfel.covariance(), upper + np.triu(upper, 1).T)
 
 
-def test_what_is_returned_may_be_written_to_and_copies_are_independent():
+def test_returned_arrays_are_writeable_and_copies_independent():
     points = np.random.default_rng(1).normal(size=(9, 3))
     surfel, expected = Surfel.from_points(points), Surfel.from_points(points)
     points[:] = np.nan
@@ -159,7 +159,7 @@ def test_points_of_other_types_are_widened(dtype):
         (None, 'dtype object'),
     ],
 )
-def test_what_is_no_point_is_refused_and_changes_nothing(points, named):
+def test_invalid_points_are_refused_and_change_nothing(points, named):
     surfel = Surfel.from_points(np.eye(3))
 
     for change in (surfel.add, surfel.remove, Surfel.from_points):
@@ -180,7 +180,7 @@ def test_what_is_no_point_is_refused_and_changes_nothing(points, named):
         ((np.zeros(3), np.zeros(6), 2**53 + 1), 'num_points: 9007199254740993'),
     ],
 )
-def test_what_are_no_statistics_is_refused(stats, named):
+def test_invalid_statistics_are_refused(stats, named):
     with pytest.raises(ValueError, match=named):
         Surfel.from_stats(*stats)
 
@@ -195,7 +195,7 @@ def test_what_are_no_statistics_is_refused(stats, named):
         ((np.zeros(3), np.full((3, 3), np.nan)), 'scatter: found nan'),
     ],
 )
-def test_what_is_no_position_is_refused(arguments, named):
+def test_invalid_positions_are_refused(arguments, named):
     with pytest.raises(ValueError, match=named):
         Surfel.from_position(*arguments)
 

@@ -103,7 +103,7 @@ def test_a_merge_is_the_map_of_the_union_in_any_order():
         for number in order:
             whole.merge(parts[number])
         assert whole.digest() == expected
-    assert parts[1].digest() == map_of(scans[1:4]).digest()  # what is merged stays as it is
+    assert parts[1].digest() == map_of(scans[1:4]).digest()  # the merged map is unchanged
 
 
 def test_a_map_merged_with_itself_holds_everything_twice():
@@ -222,7 +222,7 @@ def test_no_points_change_nothing():
     assert surfel_map.digest() == before
 
 
-def test_what_surfels_returned_stays_when_the_map_goes_on():
+def test_returned_surfels_do_not_change_with_the_map():
     scans = scans_at(0.0)
     surfel_map = map_of(scans[:3])
     surfels, moments = surfel_map.surfels(), surfel_map.moments()

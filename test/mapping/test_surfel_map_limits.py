@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""SurfelMap: how much it holds, and that what it refuses changes nothing."""
+"""SurfelMap: its limits; refused calls change nothing."""
 
 import math
 from pathlib import Path

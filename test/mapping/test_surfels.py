@@ -183,7 +183,7 @@ def test_normals_are_turned_to_the_side_they_are_seen_from(side, seed):
     assert normal @ (side * turn[2]) > 0.99
 
 
-def test_most_points_decide_from_where_a_voxel_is_seen():
+def test_the_majority_of_points_determines_the_view():
     flat = np.random.default_rng(1).uniform([0.1, 0.1, 0.49], [0.9, 0.9, 0.51], (90, 3))
     surfel_map = map_of(flat[:60], [0.5, 0.5, 9.0])
     below = surfel_map.add(flat[60:], [0.5, 0.5, -9.0])
@@ -206,7 +206,7 @@ def test_without_a_sensor_the_largest_component_of_a_normal_is_positive(seed):
         assert normal[np.argmax(abs(normal))] > 0.0
 
 
-def test_of_equally_large_components_the_first_is_positive():
+def test_the_first_of_equally_large_components_is_positive():
     # the plane x + y = 1: its normal is +-(1, 1, 0); the plane x = y: +-(1, -1, 0)
     middle = [0.25, 0.5, 0.75]
     falling = one_surfel([[a, 1.0 - a, c] for a in middle for c in middle])['normal']

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-SlidingWindow: every limit honoured to the scan, and a map that is the sum of the scans left.
+SlidingWindow: exact limits, and a map that equals the sum of the remaining scans.
 
-What has to be left is found by brute force: the longest end of the sequence that is within all
+The expected scans are found by brute force: the longest end of the sequence that is within all
 limits.
 """
 
@@ -108,7 +108,7 @@ def test_each_limit_is_honoured_to_the_scan(name, keep_points):
     ),
     st.integers(0, 1000),
 )
-def test_of_several_limits_the_first_reached_counts(limits, seed):
+def test_the_first_limit_reached_evicts(limits, seed):
     evictions = check_drive(limits, num=12, seed=seed)
     assert {eviction.limit for eviction in evictions} <= set(limits)
 
@@ -147,7 +147,7 @@ def test_without_limits_every_scan_stays_in_the_map():
         assert window.nbytes == scan.nbytes  # the others are not kept: they never leave
 
 
-def test_without_limits_scans_are_kept_where_their_points_are_wanted():
+def test_without_limits_scans_are_kept_for_their_points():
     window, surfel_map = window_with({}, keep_points=True)
     scans = [scan_at(surfel_map, n, n, [n, 0, 0], keep_points=True) for n in range(5)]
     for scan in scans:
@@ -258,7 +258,7 @@ def test_voxels_that_are_dropped_leave_the_map_and_the_scans(seed, keep_points):
     assert surfel_map.moments().voxel_index[:, 0].min() > 80
 
 
-def test_what_settled_scans_left_is_dropped_too():
+def test_voxels_of_settled_scans_are_dropped_too():
     window, surfel_map = window_with({})
     for number in range(3):
         window.insert(scan_at(surfel_map, number, number, (0.0, 0.0, 0.0)))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Moving scans of a window: exact, whole or not at all, and evicted where they are."""
+"""Moving scans of a window: exact, all or nothing, and exact eviction afterwards."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The sums over the pairs of an edge against numpy, and what they say against the pairs."""
+"""The sums over the pairs of an edge against numpy, and the motions derived from them."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_means_and_second_moments_are_those_of_numpy(kernel, dtype, offset):
 
 
 @pytest.mark.parametrize('kernel', PAIR_MOMENTS + WEIGHTED_MOMENTS)
-def test_no_pairs_sum_up_to_nothing(kernel):
+def test_no_pairs_give_zero_sums(kernel):
     rows = np.empty((0, 2), np.int32)
     weights = [np.empty((0, 3, 3))] if kernel in WEIGHTED_MOMENTS else []
     found = np.full(edges.NUM_WEIGHTED if weights else edges.NUM_MOMENTS, np.nan)
@@ -112,7 +112,7 @@ def test_weighted_motion_is_the_weighted_least_squares_of_the_gaps():
 
 
 @pytest.mark.parametrize('kernel', FIT_RESIDUAL)
-def test_what_a_motion_leaves_is_summed_pair_by_pair(kernel):
+def test_the_residual_of_a_motion_is_summed_pair_by_pair(kernel):
     rng = np.random.default_rng(4)
     source, target, rows = pairs_of(rng)
     source[2] = np.nan

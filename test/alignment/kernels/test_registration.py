@@ -24,7 +24,7 @@ POSE = se3_exp(np.array([3.0, -2.0, 1.0, 0.2, -0.3, 1.5]))[:3].copy()
 
 
 @both
-def test_cells_lie_in_the_voxels_of_their_places(call):
+def test_cells_get_the_key_of_their_voxel(call):
     rng = np.random.default_rng(1)
     cells = rng.uniform(-30.0, 30.0, (200, 3))
     keys = np.empty(200, np.int64)
@@ -36,7 +36,7 @@ def test_cells_lie_in_the_voxels_of_their_places(call):
 
 
 @both
-def test_cells_beyond_the_map_and_those_that_are_nowhere_have_no_voxel(call):
+def test_cells_outside_of_the_grid_or_invalid_have_no_voxel(call):
     cells = np.array([[0.0, 0.0, 0.0], [1e9, 0.0, 0.0], [0.0, -1e9, 0.0], [0.0, 0.0, np.nan]])
     keys = np.empty(4, np.int64)
 
@@ -46,7 +46,7 @@ def test_cells_beyond_the_map_and_those_that_are_nowhere_have_no_voxel(call):
 
 
 @both
-def test_rows_are_numbered_in_the_order_they_are_met(call):
+def test_rows_are_numbered_in_the_order_of_first_use(call):
     found = np.array([7, -1, 3, 7, 5, 3], np.int32)
     number = np.full(9, -1, np.int32)
     number[5] = 0  # known before
@@ -60,7 +60,7 @@ def test_rows_are_numbered_in_the_order_they_are_met(call):
 
 
 def equations(cells, place, planes, width_sq):
-    """Return what sum_equations gives, cell by cell in numpy."""
+    """Return the twin of sum_equations, cell by cell in numpy."""
     hessian, gradient, met, fit = np.zeros((6, 6)), np.zeros(6), 0, 0.0
     for cell, row in zip(cells, place, strict=True):
         if row < 0 or not planes[row, 6] < math.inf:

@@ -22,7 +22,7 @@ NAMES = ['position', 'normal', 'planarity', 'curvature', 'eigenvalues']
 
 
 def row_of(places, voxel=(0, 0, 0), times=1, view=(0, 0, 0)):
-    """Return the row of a voxel with lattice places, each so many times."""
+    """Return the row of a voxel with repeated lattice places."""
     q = [[int(value) for value in place] for place in places]
     row = [0] * ROW
     row[KEY] = int(pack_keys(np.array([voxel]))[0])
@@ -103,7 +103,7 @@ def test_equal_points_spread_by_exactly_0(call, times, place):
 def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times, bits):
     rng = np.random.default_rng(3)
     if times > (1 << 30) >> (2 * (bits - 16)):
-        pytest.skip('a map of this level refuses so many')
+        pytest.skip('a map of this level refuses more points')
     for spread in (1, 3, 100, 32767):
         places = rng.integers(-spread, spread + 1, (3, 3)) << (bits - 16)
         row = row_of(places, times=times)
@@ -139,19 +139,19 @@ def test_means_are_placed_for_voxels_of_any_level(call, bits):
     [
         ((0, 0, 1), (0, 0, 5), False),
         ((0, 0, 1), (0, 0, -5), True),
-        ((0, 0, -1), (3, 2, 0), True),  # seen from the side: as if from nowhere
+        ((0, 0, -1), (3, 2, 0), True),  # seen from the side: as if the sensor were unknown
         ((0, 0, 1), (3, 2, 0), False),
         ((0, 0, -1), (0, 0, 0), True),
         ((0.6, -0.8, 0), (0, 0, 0), True),
         ((0.8, -0.6, 0), (0, 0, 0), False),
         ((-0.5, 0.5, 0.70), (0, 0, 0), False),
         ((0.5, 0.5, -0.70), (0, 0, 0), True),
-        ((-0.5, 0.5, 0.5), (0, 0, 0), True),  # of equal ones the first counts
+        ((-0.5, 0.5, 0.5), (0, 0, 0), True),  # the first of equal ones
         ((0.5, -0.5, -0.5), (0, 0, 0), False),
         ((0.1, -0.5, 0.5), (0, 0, 0), True),
     ],
 )
-def test_normals_that_look_away_are_known(call, normal, view, away):
+def test_normals_turn_towards_the_sensor(call, normal, view, away):
     moments = np.zeros((MOMENTS, CHUNK))
     moments[V : V + 3, 0] = view
     normals = np.zeros((3, CHUNK))

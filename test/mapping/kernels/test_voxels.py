@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The kernels that add moments to a map and take them away, against dicts of Python integers.
+The kernels that add moments to a map and subtract them, against dicts of Python integers.
 
 The table has room for some voxels only, so that adding also stops half-way.
 """
@@ -27,7 +27,9 @@ class Memory:
 
     def __init__(self, call, num_rows):
         self.call = call
-        self.rows = np.full((num_rows, ROW), 99, np.int64)  # what an unused row holds is no matter
+        self.rows = np.full(
+            (num_rows, ROW), 99, np.int64
+        )  # the content of unused rows is irrelevant
         segments = 4
         self.table = (
             np.zeros(1, np.int32),
@@ -40,7 +42,7 @@ class Memory:
         self.state[hashing.SEGMENTS] = 1
 
     def add(self, moments, version, start=0, weight=1):
-        """Return how many rows of the moments are done, and the rows changed."""
+        """Return the number of rows done, and the changed rows."""
         changed = np.full(len(moments[0]), -1, np.int32)
         self.state[hashing.CHANGED] = 0
         done = self.call(
@@ -69,7 +71,7 @@ class Memory:
         return list(map(tuple, unpack_keys(fallen[:num]).tolist()))
 
     def content(self):
-        """Return what the rows in the table hold, as a dict of the twins."""
+        """Return the content of the table as a dict."""
         entries = self.table[1][self.table[1] != 0]
         rows = (entries & 0xFFFFFFFF) - 1
         voxels = map(tuple, unpack_keys(self.rows[rows, KEY]).tolist())
@@ -143,7 +145,7 @@ def test_a_view_of_one_point_counts_for_all_of_them(call):
 
 
 @both
-def test_adding_stops_where_there_is_no_room_and_goes_on_from_there(call):
+def test_adding_stops_without_room_and_resumes(call):
     twin = some_moments(1, num_points=300, spread_m=2.0)
     moments = arrays_of(twin)
     memory = Memory(call, len(twin) - 40)
@@ -164,7 +166,7 @@ def test_adding_stops_where_there_is_no_room_and_goes_on_from_there(call):
 
 
 @both
-def test_adding_stops_where_a_segment_cannot_split(call):
+def test_adding_stops_if_a_segment_cannot_split(call):
     side = range(8)
     twin = {(i, j, k): [1] * 13 for i in side for j in side for k in side}
     memory = Memory(call, 1000)
@@ -218,7 +220,7 @@ def test_voxels_fall_when_they_had_enough_points_and_have_no_more(call, min_poin
 
 
 @both
-def test_voxels_are_found_wherever_they_are(call):
+def test_voxels_are_found_at_any_index(call):
     memory, twin = Memory(call, 1000), some_moments(5, num_points=200)
     memory.add(arrays_of(twin), 1)
     keys = arrays_of(twin)[0]
