@@ -316,7 +316,7 @@ def pose_errors(truth: Path | None, trajectory: ScanTrajectory) -> dict[str, Any
     """Return the errors of the poses for the summary; empty without truth."""
     import numpy as np
 
-    from surfel_mapper.alignment.trajectory_errors import compare
+    from surfel_mapper.evaluation.trajectory_errors import compare
     from surfel_mapper.evaluation.truth import true_poses
 
     if truth is None:
