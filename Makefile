@@ -10,38 +10,45 @@ PYTEST_ARGS ?=
 TEST_PROCESSES ?= 2
 FUZZ_SECONDS ?= 60
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
+BOUNDSCHECKED := $(addprefix test/,kernels mapping filters alignment models sensors tsdf layers \
+	messages simulation viz/kernels)
 
 VENV := .venv
 BIN := $(VENV)/bin
 ifeq ($(and $(ROS_DISTRO),$(shell $(PYTHON) -c 'import rclpy; print("found")' 2>/dev/null)),)
 KIND := pypi
 OTHER := system
-EXTRAS := test,lint,ros
+EXTRAS := test,ros
 else
 KIND := system
 OTHER := pypi
-EXTRAS := test,lint
+EXTRAS := test
 VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
 DOCS_STAMP := $(VENV)/.docs-$(KIND)
+LINT := $(VENV)-lint
+LINT_STAMP := $(LINT)/.ready
 
-.PHONY: demo test boundscheck versions bench soak fuzz lint docs dist settings clean
+.PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist settings clean
 
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
 
-# Nodes are tested one after the other in one process, everything else in the other; see
-# test/conftest.py. TEST_PROCESSES=0 runs all in one.
+# Each process takes the next file of tests when it is done with one, and has a ROS domain of its
+# own; see test/conftest.py. TEST_PROCESSES=0 runs all in this process.
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadgroup --durations=5 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --durations=5 $(PYTEST_ARGS)
 
-# Compiled code reads past the end of an array in silence. Compiled anew with checks it cannot;
-# the cache is thrown away, because cached kernels keep the setting they were compiled with.
-boundscheck: $(STAMP)  ## the tests of the kernels, with every index checked
+# Compiled code reads past the end of an array without an error. Compiled with checks it cannot;
+# the cache is a new one, because cached kernels keep the setting they were compiled with. At the
+# end every kernel has to have been compiled, that is, called by a test.
+boundscheck: $(STAMP)  ## the tests that call kernels, with every index checked
 	cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
-	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" \
-	$(BIN)/python -m pytest -q $(shell find test -path '*kernels*' -name 'test_*.py') $(PYTEST_ARGS)
+	export NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" && \
+	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile \
+		$(BOUNDSCHECKED) $(PYTEST_ARGS) && \
+	$(BIN)/python -m test.kernels.reached "$$cache"
 
 versions:  ## one bag, one digest, on every Python of PYTHONS that is there
 	@for python in $(PYTHONS); do \
@@ -62,11 +69,15 @@ fuzz: $(STAMP)  ## search for inputs that break readers, a minute of each; FUZZ_
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
-lint: $(STAMP)  ## style, format, types, layers
-	$(BIN)/ruff check
-	$(BIN)/ruff format --check
-	$(BIN)/mypy
+lint: $(LINT_STAMP) $(STAMP)  ## style, format, types, layers
+	$(LINT)/bin/ruff check
+	$(LINT)/bin/ruff format --check
+	$(LINT)/bin/mypy
 	$(BIN)/python -m pytest -q test/test_layering.py
+
+format: $(LINT_STAMP)  ## write every file in the one format, imports sorted
+	$(LINT)/bin/ruff check --fix
+	$(LINT)/bin/ruff format
 
 docs: $(DOCS_STAMP)  ## build site/ from docs/ and the docstrings, without a warning, links checked
 	$(BIN)/python -m pytest -q test/docs/test_pages.py
@@ -86,7 +97,7 @@ settings: $(STAMP)  ## write default.yaml and the table of docs/settings.md from
 	$(BIN)/python -m test.settings
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) $(VENV)-versions build install log dist site demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(LINT) $(VENV)-versions build install log dist site demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find surfel_mapper test -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMP): setup.py pyproject.toml
@@ -94,6 +105,11 @@ $(STAMP): setup.py pyproject.toml
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
+	touch $@
+
+$(LINT_STAMP): setup.py setup.cfg
+	$(PYTHON) -m venv $(LINT)
+	$(LINT)/bin/python -m pip install -q --disable-pip-version-check -e '.[lint]'
 	touch $@
 
 $(DOCS_STAMP): $(STAMP)

@@ -69,9 +69,12 @@ TEST = [
     'mcap>=1.1',  # an independent writer of what we read
 ]
 
+# Pinned, so that every machine reaches the same verdict; `make lint` keeps them in an environment
+# of their own, because the types of numpy differ from one version to the next.
 LINT = [
-    'ruff>=0.12',  # style; its rules are in .ruff.toml
-    'mypy>=1.11',  # types; configured in setup.cfg
+    'ruff==0.17.6',  # style and format; its rules are in .ruff.toml
+    'mypy==2.4.1',  # types; configured in setup.cfg
+    'numpy==2.2.6',  # the newest for all of Python 3.10 to 3.13
 ]
 
 FUZZ = [

@@ -1,11 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""
-What the tests share.
-
-The folder of real data, hypothesis without chance or clock, and which tests stay together where
-several processes run them.
-"""
+"""Fixtures and settings of all tests: real data, hypothesis without chance or clock."""
 
 from __future__ import annotations
 
@@ -24,17 +19,6 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile('repeatable')
-
-HERE = Path(__file__).parent
-
-
-@pytest.hookimpl(tryfirst=True)  # before pytest-xdist looks for the marks
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Keep together what shares a node, or hears the nodes of others: all of ROS; else a file."""
-    for item in items:
-        path = item.path.relative_to(HERE)
-        group = path.parts[0] if path.parts[0] == 'ros' else path.as_posix()
-        item.add_marker(pytest.mark.xdist_group(group))
 
 
 @pytest.fixture(scope='session')

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 from contextlib import contextmanager
+import fcntl
 import itertools
 import os
 import socket
@@ -56,6 +57,20 @@ def compiled(domain, tmp_path_factory):
     from test.ros.live import Process
 
     folder = tmp_path_factory.mktemp('compiling')
+    with compiling_alone(folder.parent.parent):
+        compile_kernels(folder, Process)
+
+
+@contextmanager
+def compiling_alone(folder):
+    """Let one process of a test run compile at a time; those after it find the kernels cached."""
+    with open(folder / 'surfel_mapper_compiling.lock', 'w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released when the file is closed
+        yield
+
+
+def compile_kernels(folder, Process):
+    """Run a node with every layer, then one that registers, until they are ready."""
     for settings in (LAYERS, WITHOUT_POSES):
         given = (('-p', f'{name}:={str(value).lower()}') for name, value in settings.items())
         node = Process(['node', '--ros-args', *itertools.chain(*given)], folder)
