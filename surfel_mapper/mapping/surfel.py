@@ -122,7 +122,7 @@ class Surfel:
             If a shape differs, or a number is nan or too large.
 
         """
-        matrix = np.zeros((3, 3))
+        matrix: npt.NDArray[np.float64] = np.zeros((3, 3))
         if scatter is not None:
             matrix = _checked('scatter', scatter, (3, 3), MAX_COORDINATE_M**2)
         return cls.from_stats(_checked('position', position, (3,)), matrix[ROWS, COLUMNS], 1)

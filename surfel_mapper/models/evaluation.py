@@ -88,7 +88,7 @@ def evaluate(model: Model, reference: npt.NDArray[Any], seed: int = 0) -> Evalua
         Of what is drawn from the Gaussians.
 
     """
-    cloud = np.asarray(reference, np.float64).reshape(-1, 3)
+    cloud: npt.NDArray[np.float64] = np.asarray(reference, np.float64).reshape(-1, 3)
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     made = model.resample(seed=seed)
     precise = nearest(made, cloud)

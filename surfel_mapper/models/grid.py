@@ -65,7 +65,7 @@ class Grid:
         per_side = max(round(self.pitch_m / step_m), 1)
         inner = np.argwhere(np.ones((per_side, per_side))) + 0.5
         cells = np.argwhere(self.filled)
-        xy = (cells[:, None] + inner / per_side).reshape(-1, 2)
+        xy: Array = (cells[:, None] + inner / per_side).reshape(-1, 2)
         xy = self.origin + xy * self.pitch_m
         kept: Array = xy[self.contains(xy)]
         return kept

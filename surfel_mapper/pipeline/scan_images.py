@@ -136,6 +136,7 @@ def seen_in(
     pixel = pixels_of(camera, points, image.pixels.shape[:2])
     if not len(pixel) or pixel.max() < 0:
         return None
+    values: npt.NDArray[Any]
     if image.kind == LABEL:
         values, nothing = image.pixels.ravel(), -1
     else:

@@ -56,7 +56,7 @@ def rays_of_beams(
     known = reach > 0.0
     heading = np.divide(level, reach, out=np.zeros_like(level), where=known)
     slope = np.divide(points[..., 2], reach, out=np.zeros_like(reach), where=known)
-    offset = np.ones(len(points), np.complex128)
+    offset: npt.NDArray[np.complex128] = np.ones(len(points), np.complex128)
     for _ in range(ROUNDS):  # columns with gaps have other rows than those without
         across = unit((heading * offset.conj()[:, None]).sum(axis=0))
         offset = unit((heading * across.conj()).sum(axis=1))
@@ -76,4 +76,5 @@ def rays_of_beams(
 def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
     """Return complex numbers of length 1, and 0 where there is none."""
     length = np.abs(numbers)
-    return np.divide(numbers, length, out=np.zeros_like(numbers), where=length > 0.0)
+    result = np.zeros_like(numbers)
+    return np.divide(numbers, length, out=result, where=length > 0.0)

@@ -286,8 +286,8 @@ def framed(
     figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label('planarity')
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(title), 1))
     figure.axes[0].set_title(title, fontsize=min(TITLE_PT, points), x=0.0, ha='left')
-    canvas.draw()  # type: ignore[no-untyped-call]
-    drawn = np.array(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    canvas.draw()
+    drawn = np.array(canvas.buffer_rgba())
     return drawn[..., :3], corners
 
 
