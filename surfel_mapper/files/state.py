@@ -43,9 +43,6 @@ NPY_HEADER_BYTES = 12000
 ENCRYPTED = 1
 """Bit of a zip member's flags."""
 
-npy: Any = np.lib.format
-"""Untyped in numpy 2.2, typed in later ones."""
-
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -108,7 +105,7 @@ def write_archive(
         archive.writestr(zipfile.ZipInfo(MANIFEST), text, compress_type, compresslevel=1)
         for name, array in arrays.items():
             content = io.BytesIO()
-            npy.write_array(content, array, allow_pickle=False)
+            np.lib.format.write_array(content, array, allow_pickle=False)
             info = zipfile.ZipInfo(f'{name}.npy')  # of no date: that would differ every time
             archive.writestr(info, content.getbuffer(), compress_type, compresslevel=1)
         return sum(info.file_size for info in archive.infolist())
@@ -197,9 +194,9 @@ def read_array(
     """Return one array, which has to be of the type and shape that its entry states."""
     content = read_bytes(archive, info)
     stream = io.BytesIO(content[:NPY_HEADER_BYTES])
-    if npy.read_magic(stream) != (1, 0):
+    if np.lib.format.read_magic(stream) != (1, 0):
         raise ValueError(f'{info.filename}: no array as expected')
-    shape, fortran_order, dtype = npy.read_array_header_1_0(stream)
+    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
     if fortran_order or dtype.str != entry['dtype'] or list(shape) != entry['shape']:
         raise ValueError(f'{info.filename}: {dtype.str} {shape}, expected {entry}')
     if not is_array_type(dtype.str):
