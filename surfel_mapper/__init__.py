@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from surfel_mapper.mapping.surfel_map import SurfelMap
     from surfel_mapper.mapping.surfels import Surfels
     from surfel_mapper.mapping.window import SlidingWindow
-    from surfel_mapper.messages.mirror import MapMirror
+    from surfel_mapper.messages.map_cloud import MapMirror
     from surfel_mapper.offline.replay import replay
     from surfel_mapper.pipeline import Mapper
     from surfel_mapper.scan import Scan
@@ -45,7 +45,7 @@ __all__ = [
 
 _HOMES = {
     'Config': 'config',
-    'MapMirror': 'messages.mirror',
+    'MapMirror': 'messages.map_cloud',
     'Mapper': 'pipeline',
     'Scan': 'scan',
     'ScanMoments': 'mapping.moments',

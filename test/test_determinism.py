@@ -20,7 +20,7 @@ import pytest
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.messages.pointcloud2 import from_columns
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 from test import reference
 
 DIGEST = 'e69318006b4cc88421b44993a531f439ca2c576e109dad5844bad84641b92a40'

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Unpacking what bags pack: chunks with zstd, lz4 or bz2, messages and whole files with zstd.
+Bounded decompression: chunks of bags (zstd, lz4, bz2), and messages and files packed with zstd.
 
-All of it goes piece by piece, so that of bytes that end too early everything before the end is
-had, and so that nothing gets larger than it claims to be, nor than its size makes plausible:
-a few kilobytes of zstd unpack to gigabytes if they are made for it. zstd and lz4 are what rosbags
-brings.
+Data is unpacked piece by piece. So a truncated input yields everything before the cut, and no
+output gets larger than it claims to be or than its packed size makes plausible: a few kilobytes
+of zstd can be made to unpack to gigabytes. The modules for zstd and lz4 come with rosbags.
 """
 
 from __future__ import annotations
@@ -21,14 +20,14 @@ from surfel_mapper.errors import BagError, DependencyError
 
 PIECE_BYTES = 1 << 16
 
-MOST_BYTES = 1 << 30
-"""What claims or turns out to be larger is damaged: chunks and messages have some megabytes."""
+MAX_UNPACKED_BYTES = 1 << 30
+"""Limit of an unpacked chunk or message; real ones have some megabytes."""
 
-FREE_BYTES = 1 << 26
-"""So much may come out of whatever is packed: a chunk of images that are black all over."""
+FLOOR_BYTES = 1 << 26
+"""Always allow 64 MiB, whatever the ratio: a chunk of black images packs very small."""
 
 MAX_RATIO = 1000
-"""Beyond that, what is packed gets at most so many times larger."""
+"""Limit of the compression ratio above FLOOR_BYTES."""
 
 ZSTD_HEAD_BYTES = 18
 ZSTD_BLOCK_BYTES = 1 << 17
@@ -37,32 +36,32 @@ ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """How a zstd frame begins; no CDR message does."""
 
 
-def unpacked(packed: bytes, compression: str, most: int) -> bytes:
+def unpacked(packed: bytes, compression: str, size: int) -> bytes:
     """
-    Return packed bytes unpacked, as far as they go and no more than ``most``.
+    Return packed bytes unpacked: ``size`` bytes, or fewer if the input ends or is damaged before.
 
     Raises
     ------
     ValueError
-        If the compression is unknown, or ``most`` beyond all reason.
+        If the compression is unknown, or ``size`` is not plausible for the packed size.
 
     """
-    limit = most_bytes(len(packed))
-    if most > limit:
-        raise ValueError(f'{most} bytes of a chunk, expected at most {limit}')
+    limit = max_unpacked_bytes(len(packed))
+    if size > limit:
+        raise ValueError(f'{size} bytes of a chunk, expected at most {limit}')
     if not compression or compression == 'none':
-        return packed[:most]
+        return packed[:size]
     machine = decompressor(compression)
-    parts, size = [], 0
+    parts, done = [], 0
     for start in range(0, len(packed), PIECE_BYTES):
         piece = packed[start : start + PIECE_BYTES]
         while True:
             try:
-                parts.append(machine.decompress(piece, min(most - size, PIECE_BYTES * 16)))
+                parts.append(machine.decompress(piece, min(size - done, PIECE_BYTES * 16)))
             except Exception:  # each library has errors of its own
-                return b''.join(parts)  # what was whole counts; the caller compares the size
-            size += len(parts[-1])
-            if machine.eof or size >= most:
+                return b''.join(parts)  # the part before the damage; callers compare the size
+            done += len(parts[-1])
+            if machine.eof or done >= size:
                 return b''.join(parts)
             if machine.needs_input:
                 break
@@ -73,27 +72,27 @@ def unpacked(packed: bytes, compression: str, most: int) -> bytes:
 def unpacked_message(packed: bytes | memoryview) -> bytes:
     """Return a message that the recorder packed with zstd."""
     machine = decompressor('zstd')
-    content: bytes = machine.decompress(bytes(packed), most_bytes(len(packed)))
+    content: bytes = machine.decompress(bytes(packed), max_unpacked_bytes(len(packed)))
     if not machine.eof:
-        raise ValueError('a packed message that ends too early, or never')
+        raise ValueError('packed message truncated, or too large')
     return content
 
 
 def unpack_file(path: Path, target: Path) -> bool:
     """
-    Unpack a file that the recorder packed with zstd; return whether it was whole.
+    Unpack a file that the recorder packed with zstd; return whether it was complete.
 
     Raises
     ------
     BagError
-        If it is no such file, damaged before its end, or gets too large for its size.
+        If it is not zstd, damaged before its end, or unpacks to more than is plausible.
 
     """
     with open(path, 'rb') as source, open(target, 'wb') as sink:
-        machine, left = decompressor('zstd'), most_file_bytes(path.stat().st_size)
+        machine, left = decompressor('zstd'), max_unpacked_file_bytes(path.stat().st_size)
         packed = source.read(PIECE_BYTES)
         while packed or not (machine.needs_input or machine.eof):
-            if machine.eof:  # frames one after the other
+            if machine.eof:  # the next frame
                 machine = decompressor('zstd')
             try:
                 piece = machine.decompress(packed, PIECE_BYTES * 16)
@@ -108,51 +107,51 @@ def unpack_file(path: Path, target: Path) -> bool:
         return bool(machine.eof)
 
 
-def most_bytes(packed_size: int) -> int:
-    """Return how large a packed chunk or message may get, in memory."""
-    return min(max(FREE_BYTES, MAX_RATIO * packed_size), MOST_BYTES)
+def max_unpacked_bytes(packed_size: int) -> int:
+    """Return the limit of an unpacked chunk or message, in memory."""
+    return min(max(FLOOR_BYTES, MAX_RATIO * packed_size), MAX_UNPACKED_BYTES)
 
 
-def most_file_bytes(packed_size: int) -> int:
-    """Return how large a packed file may get, on the disk."""
-    return max(FREE_BYTES, MAX_RATIO * packed_size)
+def max_unpacked_file_bytes(packed_size: int) -> int:
+    """Return the limit of an unpacked file, on the disk."""
+    return max(FLOOR_BYTES, MAX_RATIO * packed_size)
 
 
 def bunzip2(packed: bytes) -> bytes:
-    """Return bz2 unpacked, or raise ValueError where it gets too large or ends too early."""
-    machine, limit = bz2.BZ2Decompressor(), most_bytes(len(packed))
+    """Return bz2 unpacked, or raise ValueError if it is truncated or too large."""
+    machine, limit = bz2.BZ2Decompressor(), max_unpacked_bytes(len(packed))
     content = machine.decompress(packed, limit)
     if not machine.eof:
-        raise ValueError(f'a chunk that ends too early, or is larger than {limit} bytes')
+        raise ValueError(f'chunk truncated, or larger than {limit} bytes')
     return content
 
 
 def check_zstd(read: Callable[[int, int], bytes], start: int, size: int) -> None:
     """
-    Refuse a packed chunk that may unpack to more than its size makes plausible.
+    Refuse a zstd chunk that may unpack to more than its packed size makes plausible.
 
-    A frame consists of blocks of 128 KiB at most, and their heads say how many there are; so
-    nothing needs to be unpacked to bound it.
+    A frame consists of blocks of at most 128 KiB, and their headers give an upper bound of the
+    size without unpacking anything.
 
     Parameters
     ----------
     read : callable
-        Gives so many bytes at a place of the file.
+        Called with offset and length, returns bytes of the file.
     start, size : int
-        Where the chunk is.
+        Offset and length of the chunk.
 
     Raises
     ------
     ValueError
-        If it is no zstd, or may get larger than ``most_bytes``.
+        If it may unpack to more than ``max_unpacked_bytes``.
 
     """
-    limit, total, end = most_bytes(size), 0, start + size
+    limit, total, end = max_unpacked_bytes(size), 0, start + size
     at = start
     while at < end:
         head = read(at, ZSTD_HEAD_BYTES)
         if head[:4] != ZSTD_MAGIC:
-            return  # rosbags refuses what follows, or passes over it
+            return  # rosbags refuses or skips the rest
         flags = head[4]
         is_single, has_checksum = flags >> 5 & 1, flags >> 2 & 1
         at += 5 + (not is_single) + (0, 1, 2, 4)[flags & 3] + (is_single, 2, 4, 8)[flags >> 6]
@@ -163,14 +162,14 @@ def check_zstd(read: Callable[[int, int], bytes], start: int, size: int) -> None
             total += length if kind < 2 else ZSTD_BLOCK_BYTES
             at += 3 + (1 if kind == 1 else length)
             if total > limit:
-                raise ValueError(f'a chunk of {size} bytes that may unpack to over {limit}')
+                raise ValueError(f'chunk of {size} bytes that may unpack to over {limit}')
             if at >= end:
                 return
         at += 4 * has_checksum
 
 
 def decompressor(compression: str) -> Any:
-    """Return what has ``decompress``, ``eof``, ``needs_input`` and ``unused_data``."""
+    """Return a decompressor with the interface of bz2.BZ2Decompressor."""
     if compression == 'bz2':
         return bz2.BZ2Decompressor()
     if compression == 'zstd':
@@ -183,7 +182,7 @@ def decompressor(compression: str) -> Any:
 
 
 def import_zstd() -> Any:
-    """Return the module of zstd: of Python's library from 3.14 on, before that a copy of it."""
+    """Return the module for zstd: Python's own from 3.14 on, before that its backport."""
     try:
         if sys.version_info >= (3, 14):
             from compression import zstd

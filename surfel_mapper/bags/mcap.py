@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-An mcap file read from its beginning: for files without an index, or without an end.
+Salvage of mcap files without a complete index.
 
 A file is a magic, records, and the magic again; a record is an opcode, the length of its content
 (uint64) and the content. Messages lie among the records or in chunks, which are records of
-packed records. Of a chunk that is cut off, the messages before the cut are had too.
+packed records. Of a truncated chunk the messages before the cut are read too.
 
 Source: the specification of the format, mcap.dev/spec.
 """
@@ -16,8 +16,8 @@ from collections.abc import Iterator
 import struct
 from zlib import crc32
 
-from surfel_mapper.bags.profiles import profiles_in
-from surfel_mapper.bags.scanning import Chunk, ChunkedFile, Entry, Place
+from surfel_mapper.bags._rosbags import ros2_connection
+from surfel_mapper.bags.salvage import Chunk, FoundMessage, Place, SalvagedChunks
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
 
@@ -26,13 +26,13 @@ MESSAGE_HEAD = struct.Struct('<HIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 
 
-class McapScan(ChunkedFile):
+class SalvagedMcap(SalvagedChunks):
     """The messages of an mcap file, found without its index."""
 
     MAGIC = b'\x89MCAP0\r\n'
 
-    def _scan(self) -> Iterator[Entry]:
-        """Yield the messages up to the end of the data, or to the first record that is broken."""
+    def _scan(self) -> Iterator[FoundMessage]:
+        """Yield the messages up to the end of the data, or to the first damaged record."""
         self._schemas: dict[int, tuple[str, str, str]] = {}
         at = len(self.MAGIC)
         while True:
@@ -56,24 +56,24 @@ class McapScan(ChunkedFile):
             at = end
 
     def _ends(self) -> bool:
-        """Return whether the file ends as it should."""
+        """Return whether the file ends with the magic."""
         return self._at(self.size - len(self.MAGIC), len(self.MAGIC)) == self.MAGIC
 
-    def _in_chunk(self, start: int, size: int, is_whole: bool) -> Iterator[Entry]:
-        """Yield the messages in a chunk of which so many bytes are there."""
+    def _in_chunk(self, start: int, size: int, is_whole: bool) -> Iterator[FoundMessage]:
+        """Yield the messages in a chunk of which ``size`` bytes are in the file."""
         head = self._at(start, min(size, 64))
         _, _, unpacked_size, checksum = CHUNK_HEAD.unpack_from(head)
         compression, after = text(head, CHUNK_HEAD.size)
         (packed_size,) = struct.unpack_from('<Q', head, after)
         if is_whole and after + 8 + packed_size > size:
-            raise ValueError('sizes of a chunk that do not fit')
+            raise ValueError('chunk longer than its record')
         left = min(packed_size, size - after - 8)
         chunk = Chunk(start + after + 8, left, compression, unpacked_size)
         records = self._unpacked(chunk)
         if is_whole and (
             len(records) != unpacked_size or (checksum and crc32(records) != checksum)
         ):
-            raise ValueError('a chunk of another content than it states')
+            raise ValueError('chunk with a wrong checksum or size')
         at = 0
         while at + RECORD.size <= len(records):
             kind, length = RECORD.unpack_from(records, at)
@@ -83,8 +83,10 @@ class McapScan(ChunkedFile):
             yield from self._note(kind, chunk, at, length)
             at += length
 
-    def _note(self, kind: int, chunk: Chunk | None, start: int, size: int) -> Iterator[Entry]:
-        """Take note of one record: yield a message, keep a schema or a channel."""
+    def _note(
+        self, kind: int, chunk: Chunk | None, start: int, size: int
+    ) -> Iterator[FoundMessage]:
+        """Yield the message in a record, or keep its schema or channel."""
         if kind not in (SCHEMA, CHANNEL, MESSAGE):
             return
         wanted = min(size, MESSAGE_HEAD.size) if kind == MESSAGE else size
@@ -98,28 +100,22 @@ class McapScan(ChunkedFile):
             self._note_channel(content)
         else:
             channel, _, record_ns, _ = MESSAGE_HEAD.unpack(content)
-            if channel not in self._found:
-                raise ValueError(f'a message of the unknown channel {channel}')
+            if channel not in self._by_id:
+                raise ValueError(f'message of the unknown channel {channel}')
             place = Place(chunk, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size)
-            yield Entry(record_ns, channel, place)
+            yield FoundMessage(record_ns, channel, place)
 
     def _note_channel(self, content: bytes) -> None:
-        """Keep a channel as rosbags states it."""
-        from rosbags.interfaces import (
-            Connection,
-            ConnectionExtRosbag2,
-            MessageDefinition,
-            MessageDefinitionFormat,
-        )
-
+        """Keep the channel in a record."""
         key, schema = struct.unpack_from('<HH', content)
         topic, at = text(content, 4)
         encoding, at = text(content, at)
         name, kind, definition = self._schemas.get(schema, ('', '', ''))
-        formats = {'ros2msg': MessageDefinitionFormat.MSG, 'ros2idl': MessageDefinitionFormat.IDL}
-        stated = MessageDefinition(formats.get(kind, MessageDefinitionFormat.NONE), definition)
-        ext = ConnectionExtRosbag2(encoding, profiles_in(content[at:].decode(errors='replace')))
-        self._found.setdefault(key, Connection(key, topic, name, stated, '', 0, ext, self))
+        qos = content[at:].decode(errors='replace')
+        connection = ros2_connection(
+            key, topic, name, self, encoding=encoding, qos=qos, definition=(kind, definition)
+        )
+        self._by_id.setdefault(key, connection)
 
 
 def text(content: bytes, at: int) -> tuple[str, int]:
@@ -127,5 +123,5 @@ def text(content: bytes, at: int) -> tuple[str, int]:
     (size,) = struct.unpack_from('<I', content, at)
     end = at + 4 + size
     if end > len(content):
-        raise ValueError('a string longer than its record')
+        raise ValueError('string longer than its record')
     return content[at + 4 : end].decode(), end

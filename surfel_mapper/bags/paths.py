@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which files make up a bag, and what its metadata.yaml states about them.
+The files that make up a bag, and its metadata.yaml.
 
 A rosbag2 recording is a directory of one or more files and a metadata.yaml, which is written last
-and so is missing where the recorder was killed. Files compressed as a whole end in .zstd.
+and so is missing if the recorder was killed. Files compressed as a whole end in .zstd.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ def files_of(path: Path) -> list[Path]:
 
 
 def is_ros1(path: Path) -> bool:
-    """Return whether a path is that of a ROS 1 bag, closed or not."""
+    """Return whether a path is a ROS 1 bag, closed or not, by its name."""
     return path.name.endswith(ROS1_SUFFIXES)
 
 
 def is_storage(path: Path) -> bool:
-    """Return whether a path is that of a file of rosbag2, packed or not."""
+    """Return whether a path is a file of a rosbag2, packed or not, by its name."""
     return unpacked_name(path).endswith(STORAGE_SUFFIXES)
 
 
@@ -65,12 +65,12 @@ def is_packed(path: Path) -> bool:
 
 
 def unpacked_name(path: Path) -> str:
-    """Return the name of a file without what says that it is packed."""
+    """Return the name of a file without the suffix of packed files."""
     return path.name.removesuffix(PACKED_SUFFIX)
 
 
 def stated_counts(path: Path) -> dict[str, int]:
-    """Return how many messages of each topic the metadata.yaml of a directory states."""
+    """Return the number of messages of each topic by the metadata.yaml of a directory."""
     information = metadata(path) if path.is_dir() else None
     if information is None:
         return {}
@@ -84,7 +84,7 @@ def stated_counts(path: Path) -> dict[str, int]:
 
 
 def metadata(directory: Path) -> Mapping[str, Any] | None:
-    """Return the content of metadata.yaml in a directory, or nothing where there is none."""
+    """Return the content of metadata.yaml in a directory, or None if there is no such file."""
     path = directory / METADATA
     if not path.is_file():
         return None
@@ -97,7 +97,7 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
 
 @lru_cache(maxsize=16)
 def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
-    """Return what metadata.yaml says, read once: 10 ms each time that a bag is opened else."""
+    """Return the content of a metadata.yaml, cached: parsing takes 10 ms."""
     information = read_yaml(path)['rosbag2_bagfile_information']
     if not isinstance(information, Mapping):
         raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
@@ -108,8 +108,8 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
     """
     Return the files that metadata.yaml lists.
 
-    Their directory is this one whatever is written there: early versions put the name of the
-    bag before them, a bag may have been renamed since, and no name may lead elsewhere.
+    Only the file names are used, in this directory: early versions put the name of the bag before
+    them, the bag may have been renamed since, and no entry may lead to another directory.
     """
     names = information.get('relative_file_paths')
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
@@ -139,8 +139,8 @@ def loose_files(directory: Path) -> list[Path]:
 
 
 def damaged_metadata(path: Path, error: Exception) -> BagError:
-    """Return the error for a metadata.yaml that does not read."""
+    """Return the error for a metadata.yaml that cannot be read."""
     return BagError(
         f'{path}: not the metadata of a bag: {type(error).__name__}: {error}; '
-        'without this file the .mcap and .db3 files beside it are read as they are'
+        'without this file the .mcap and .db3 files beside it are read directly'
     )

@@ -3,11 +3,11 @@
 """
 Messages from a bag: rosbag2 (mcap, sqlite3, zstd) and ROS 1.
 
-The files of a rosbag2 directory are opened one by one and merged in record time. So a recording
-that was killed before its metadata.yaml was written still reads, and messages do not go missing
-where the descriptions of a topic in metadata.yaml and in the file differ: rosbags 0.11 then
-yields none, in silence. For the same reason all that is read is counted against what the indexes
-state. A file whose end is missing yields what is whole, and a warning says where it ends.
+The files of a rosbag2 directory are opened one by one and merged by record time. So a recording
+that was killed before its metadata.yaml was written can be read, and no message is lost if the
+descriptions of a topic in metadata.yaml and in the file differ: rosbags 0.11 then silently yields
+none. For the same reason the messages read are counted and compared with the index. A truncated
+file yields its whole messages, and a warning states the offset of the cut.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from pathlib import Path
 import tempfile
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
-from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
-from surfel_mapper.bags.scanning import ScannedFile
-from surfel_mapper.bags.storage import (
-    damaged,
-    described,
+from surfel_mapper.bags._rosbags import (
     is_cdr,
-    latches,
-    open_storage,
+    is_latched,
+    jazzy_types,
+    ros1_types,
     Storage,
     type_name,
 )
+from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
+from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
+from surfel_mapper.bags.salvage import SalvagedFile
+from surfel_mapper.bags.storage import damaged, described, open_storage
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, DependencyError
-from surfel_mapper.messages.raw_cloud import parse_cloud
+from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -45,7 +45,7 @@ log = logging.getLogger(__name__)
 
 
 class BagMessage(NamedTuple):
-    """A message as it lies in the bag; ``BagReader.decode`` makes an object of it."""
+    """A serialised message of a bag; ``BagReader.decode`` makes an object of it."""
 
     topic: str
     type: str
@@ -65,11 +65,11 @@ class BagReader:
     Attributes
     ----------
     topics : Topics
-        By name, with the number of messages that the index states.
+        By name, with the number of messages by the index.
     is_ros1 : bool
         Whether messages are serialised as in ROS 1; else they are CDR.
     cuts : list of str
-        Which files end too early, and where; each is warned about once.
+        A sentence for each file that is incomplete, with the offset; each is logged once.
 
     Raises
     ------
@@ -79,7 +79,6 @@ class BagReader:
     """
 
     def __init__(self, path: str | Path) -> None:
-        """Open the bag and read its index."""
         self.path = Path(path)
         self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
@@ -113,8 +112,8 @@ class BagReader:
         return max(s.end_time for _, s in self._storages if s.message_count) - 1
 
     def is_latched(self, name: str) -> bool:
-        """Return whether the publisher of a topic kept messages for those who came later."""
-        return any(latches(c) for c in self._connections() if c.topic == name)
+        """Return whether a topic is latched: late subscribers get its last messages."""
+        return any(is_latched(c) for c in self._connections() if c.topic == name)
 
     def messages(
         self,
@@ -128,15 +127,15 @@ class BagReader:
         Parameters
         ----------
         names : collection of str, optional
-            The topics to read; all without.
+            The topics to read; all if not given.
         start_ns, stop_ns : int, optional
-            Record time of the first message wanted, and of the first not wanted any more.
+            Range of record times: start_ns <= t < stop_ns.
 
         Raises
         ------
         BagError
-            If the bag turns out to be damaged, or yields nothing of a topic that should hold
-            messages. Where it yields fewer than stated, a warning says so.
+            If the bag turns out to be damaged, or yields no message of a topic that has some by
+            the index. If it yields fewer than the index states, a warning is logged.
 
         """
         read: Counter[str] = Counter()
@@ -157,9 +156,9 @@ class BagReader:
         Raises
         ------
         CloudFormatError
-            If it should be a PointCloud2 and is none.
+            If a PointCloud2 cannot be read.
         BagError
-            If it cannot be read as its type.
+            If a message of another type cannot be read.
 
         """
         if message.type == CLOUD:
@@ -176,7 +175,7 @@ class BagReader:
             ) from error
 
     def _open(self, paths: list[Path], files: ExitStack) -> None:
-        """Open the files of the bag; of several the last may hold nothing, as after a crash."""
+        """Open the files of the bag; the last of several may be unreadable, as after a crash."""
         for number, path in enumerate(paths, 1):
             file = self._unpacked(path, files) if is_packed(path) else path
             try:
@@ -184,11 +183,11 @@ class BagReader:
             except BagError as error:
                 if number == 1 or number < len(paths):
                     raise
-                self.cuts.append(f'left out, nothing of it can be read: {error}')
+                self.cuts.append(f'file skipped, it cannot be read: {error}')
                 continue
             files.callback(storage.close)
             self._storages.append((path, storage))
-            if isinstance(storage, ScannedFile) and storage.cut_at is not None:
+            if isinstance(storage, SalvagedFile) and storage.cut_at is not None:
                 self.cuts.append(
                     f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
                     f'{storage.size}; the {storage.message_count} messages found are read'
@@ -196,7 +195,7 @@ class BagReader:
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
                 self.cuts.append(
-                    f'{journal}: holds messages that are not read; merge them with '
+                    f'{journal}: journal with messages that are not read; merge them with '
                     f'`sqlite3 {path} "PRAGMA wal_checkpoint(TRUNCATE)"`'
                 )
 
@@ -215,7 +214,7 @@ class BagReader:
             yield from storage.connections
 
     def _indexed_topics(self) -> list[Topic]:
-        """Return the topics in all files with the counts of index or metadata.yaml."""
+        """Return the topics in all files with the counts of the indexes or metadata.yaml."""
         types: dict[str, set[str]] = {}
         counts: Counter[str] = Counter()
         for connection in self._connections():
@@ -240,7 +239,7 @@ class BagReader:
         wanted = [c for c in storage.connections if is_cdr(c)]
         if names is not None:
             wanted = [c for c in wanted if c.topic in names]
-        if not wanted:  # of an empty list rosbags would make all
+        if not wanted:  # rosbags takes an empty list for all connections
             return
         messages, done = iter(storage.messages(wanted, start_ns, stop_ns)), 0
         while True:
@@ -259,7 +258,7 @@ class BagReader:
             yield BagMessage(connection.topic, type_, record_ns, raw)
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
-        """Compare what was read of every topic with what the index states."""
+        """Compare the number of messages read of each topic with the index."""
         asked = [topic for topic in self.topics if names is None or topic.name in names]
         short = [topic for topic in asked if read[topic.name] < topic.count]
         text = ', '.join(f'{topic.name} {read[topic.name]} of {topic.count}' for topic in short)
@@ -270,18 +269,14 @@ class BagReader:
             log.warning(message)
 
     def _decoder(self, type_: str) -> tuple[Typestore, str]:
-        """Return who decodes a type, and the name it knows it by."""
+        """Return the type store that decodes a type, and its name there."""
         if type_ not in self._decoders:
             self._decoders[type_] = self._new_decoder(type_)
         return self._decoders[type_]
 
     def _new_decoder(self, type_: str) -> tuple[Typestore, str]:
-        """Return a decoder from rosbags' own definitions, or from the bag's for ROS 1."""
-        from rosbags.typesys import get_types_from_msg, get_typestore, Stores
-
+        """Return a decoder from rosbags' own definitions, or for ROS 1 from those in the bag."""
         if not self.is_ros1:
-            return get_typestore(Stores.ROS2_JAZZY), type_
+            return jazzy_types(), type_
         found = next(c for c in self._connections() if type_name(c) == type_)
-        store = get_typestore(Stores.EMPTY)
-        store.register(get_types_from_msg(found.msgdef.data, found.msgtype))
-        return store, found.msgtype
+        return ros1_types(found), found.msgtype

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A ROS 1 bag read from its beginning: for bags whose index was never written, or is cut off.
+Salvage of ROS 1 bags whose index was never written or is cut off.
 
 After a line of text come records: a header of name=value fields with its length, and data with
 its length. Messages lie in chunks, which are records of packed records. A recorder that was
-killed leaves the length of the last chunk zero, so that what the chunk holds follows as if it
-were in the file itself; both are read alike.
+killed leaves the length of the last chunk zero, so that the records of the chunk follow as if
+they were records of the file; both are read alike.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """
@@ -16,7 +16,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 import struct
 
-from surfel_mapper.bags.scanning import Chunk, ChunkedFile, Entry, Place
+from surfel_mapper.bags._rosbags import ros1_connection
+from surfel_mapper.bags.salvage import Chunk, FoundMessage, Place, SalvagedChunks
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
@@ -26,13 +27,13 @@ MOST_HEADER_BYTES = 1 << 20
 Fields = dict[str, bytes]
 
 
-class Ros1Scan(ChunkedFile):
+class SalvagedRos1(SalvagedChunks):
     """The messages of a ROS 1 bag, found without its index."""
 
     MAGIC = b'#ROSBAG V2.0\n'
 
-    def _scan(self) -> Iterator[Entry]:
-        """Yield the messages up to the end of the file, or to the first record that is broken."""
+    def _scan(self) -> Iterator[FoundMessage]:
+        """Yield the messages up to the end of the file, or to the first damaged record."""
         at, has_index = len(self.MAGIC), False
         while at < self.size:
             try:
@@ -53,8 +54,8 @@ class Ros1Scan(ChunkedFile):
         if not has_index:
             self.cut_at = self.size
 
-    def _in_chunk(self, fields: Fields, start: int, size: int) -> Iterator[Entry]:
-        """Yield the messages in a chunk of which so many bytes are there."""
+    def _in_chunk(self, fields: Fields, start: int, size: int) -> Iterator[FoundMessage]:
+        """Yield the messages in a chunk of which ``size`` bytes are in the file."""
         (unpacked_size,) = struct.unpack('<I', fields['size'])
         chunk = Chunk(start, size, fields['compression'].decode(), unpacked_size)
         records, at = self._unpacked(chunk), 0
@@ -69,53 +70,44 @@ class Ros1Scan(ChunkedFile):
             at = inner_start + inner_size
 
     def _record(self, chunk: Chunk | None, at: int) -> tuple[Fields, int, int]:
-        """Return the header of a record, and where its data begins and how long it is."""
+        """Return the header of a record, and offset and length of its data."""
         (length,) = struct.unpack('<I', self._read(Place(chunk, at, 4)))
         if length > MOST_HEADER_BYTES:
-            raise ValueError(f'a header of {length} bytes')
+            raise ValueError(f'header of {length} bytes')
         head = self._read(Place(chunk, at + 4, length + 4))
         (size,) = struct.unpack('<I', head[length:])
         return header_fields(head[:length]), at + 8 + length, size
 
-    def _note(self, fields: Fields, chunk: Chunk | None, start: int, size: int) -> Iterator[Entry]:
-        """Take note of one record: yield a message, keep a connection."""
+    def _note(
+        self, fields: Fields, chunk: Chunk | None, start: int, size: int
+    ) -> Iterator[FoundMessage]:
+        """Yield the message in a record, or keep its connection."""
         kind = fields['op'][0]
         if kind == CONNECTION:
             content = header_fields(self._read(Place(chunk, start, size)))
             self._note_connection(fields, content)
         elif kind == MESSAGE:
             (connection,) = struct.unpack('<I', fields['conn'])
-            if connection not in self._found:
-                raise ValueError(f'a message of the unknown connection {connection}')
+            if connection not in self._by_id:
+                raise ValueError(f'message of the unknown connection {connection}')
             seconds, nanoseconds = struct.unpack('<II', fields['time'])
-            yield Entry(seconds * 10**9 + nanoseconds, connection, Place(chunk, start, size))
+            yield FoundMessage(
+                seconds * 10**9 + nanoseconds, connection, Place(chunk, start, size)
+            )
 
     def _note_connection(self, fields: Fields, content: Fields) -> None:
-        """Keep a connection as rosbags states it."""
-        from rosbags.interfaces import (
-            Connection,
-            ConnectionExtRosbag1,
-            MessageDefinition,
-            MessageDefinitionFormat,
-        )
-
+        """Keep the connection in a record."""
         (key,) = struct.unpack('<I', fields['conn'])
-        package, _, name = content['type'].decode().rpartition('/')
-        definition = content['message_definition'].decode()
-        ext = ConnectionExtRosbag1(None, int(content.get('latching') or 0))
-        self._found.setdefault(
+        connection = ros1_connection(
             key,
-            Connection(
-                key,
-                fields['topic'].decode(),
-                f'{package}/msg/{name}',
-                MessageDefinition(MessageDefinitionFormat.MSG, definition),
-                content['md5sum'].decode(),
-                0,
-                ext,
-                self,
-            ),
+            fields['topic'].decode(),
+            self,
+            type_=content['type'].decode(),
+            md5sum=content['md5sum'].decode(),
+            definition=content['message_definition'].decode(),
+            latching=int(content.get('latching') or 0),
         )
+        self._by_id.setdefault(key, connection)
 
 
 def header_fields(content: bytes) -> Fields:
@@ -126,7 +118,7 @@ def header_fields(content: bytes) -> Fields:
         (length,) = struct.unpack_from('<I', content, at)
         at += 4
         if at + length > len(content):
-            raise ValueError('a field longer than its header')
+            raise ValueError('field longer than its header')
         name, _, value = content[at : at + length].partition(b'=')
         fields[name.decode()] = value
         at += length

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A sqlite3 bag read page by page: for databases whose end is missing.
+Salvage of truncated sqlite3 bags, page by page.
 
 SQLite refuses a file that is shorter than its header states, and its trees lead through pages
-that may be lost while the pages of rows below them are there. So the pages that hold rows are
-read as they lie in the file: rows of four columns (none, integer, integer, blob) are messages,
-rows of texts are the topics. A message larger than a page goes on in a chain of further pages,
-and is whole only if all of these are there.
+that may be lost while the leaves below them are intact. So the leaf pages of tables are read in
+the order of the file: rows of four columns (null, integer, integer, blob) are messages, rows of
+texts are topics. A message larger than a page continues in a chain of overflow pages, and is whole
+only if all of them are in the file.
 
 Source: sqlite.org/fileformat2.html.
 """
@@ -19,23 +19,23 @@ from pathlib import Path
 import struct
 from typing import NamedTuple
 
-from surfel_mapper.bags.profiles import profiles_in
-from surfel_mapper.bags.scanning import Entry, ScannedFile
+from surfel_mapper.bags._rosbags import ros2_connection
+from surfel_mapper.bags.salvage import FoundMessage, SalvagedFile
 
 HEADER_BYTES = 100
-"""In front of the first page's content."""
+"""Size of the file header, at the start of the first page."""
 
 TABLE_LEAF = 13
-"""The first byte of a page that holds rows of a table."""
+"""First byte of a leaf page of a table."""
 
 NULL, BLOB = 0, 12
 
 INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
-"""Bytes of an integer column, by its type; of types 8 and 9 the type is the value."""
+"""Bytes of an integer column by its serial type; 8 and 9 are the values 0 and 1."""
 
 
 class Row(NamedTuple):
-    """A row: the types of its columns, and where its bytes lie."""
+    """A row: the serial types of its columns, and the place of its bytes."""
 
     types: list[int]
     data_at: int
@@ -44,26 +44,26 @@ class Row(NamedTuple):
     local: int
 
 
-class SqliteScan(ScannedFile):
+class SalvagedSqlite(SalvagedFile):
     """The messages of a sqlite3 bag, found without its trees."""
 
     MAGIC = b'SQLite format 3\0'
 
-    def _scan(self) -> Iterator[Entry]:
-        """Yield the messages in all pages that are there."""
+    def _scan(self) -> Iterator[FoundMessage]:
+        """Yield the messages in all pages of the file."""
         header = self._at(0, HEADER_BYTES)
         self._page_size, num_pages = pages(header)
         self._usable = self._page_size - header[20]
         self._num_pages = self.size // self._page_size
         if num_pages > self._num_pages or self.size % self._page_size:
             self.cut_at = self._num_pages * self._page_size
-        messages: list[Entry] = []
+        messages: list[FoundMessage] = []
         for page in range(self._num_pages):
             messages += self._in_page(page)
-        yield from (entry for entry in messages if entry.connection in self._found)
+        yield from (entry for entry in messages if entry.connection in self._by_id)
 
-    def _in_page(self, page: int) -> Iterator[Entry]:
-        """Yield the messages in a page, if it is one of rows; keep its topics."""
+    def _in_page(self, page: int) -> Iterator[FoundMessage]:
+        """Yield the messages in a page, if it is a leaf; keep its topics."""
         content = self._at(page * self._page_size, self._page_size)
         start = HEADER_BYTES if page == 0 else 0
         if content[start] != TABLE_LEAF:
@@ -77,7 +77,7 @@ class SqliteScan(ScannedFile):
             except (struct.error, ValueError, IndexError):
                 self.cut_at = min(self.cut_at or self.size, page * self._page_size + at)
 
-    def _row(self, content: bytes, page: int, at: int) -> Iterator[Entry]:
+    def _row(self, content: bytes, page: int, at: int) -> Iterator[FoundMessage]:
         """Yield the message in a cell, or keep the topic in it."""
         row, rowid = self._parsed(content, at)
         if is_message(row.types):
@@ -87,7 +87,7 @@ class SqliteScan(ScannedFile):
             skipped = row.data_at + topic_size + INTEGERS[row.types[2]] - row.payload
             place = (page * self._page_size + row.payload, row.local, row.size, skipped)
             self._check_chain(place)
-            yield Entry(record_ns, topic, place)
+            yield FoundMessage(record_ns, topic, place)
         elif is_topic(row.types) and row.local == row.size:
             self._note_topic(rowid, row, content)
 
@@ -98,7 +98,7 @@ class SqliteScan(ScannedFile):
         local = self._local_bytes(size)
         header_size, types_at = varint(content, at)
         if at + local > len(content) or header_size > local:
-            raise ValueError('a row longer than its page')
+            raise ValueError('row longer than its page')
         types = []
         while types_at < at + header_size:
             kind, types_at = varint(content, types_at)
@@ -106,7 +106,7 @@ class SqliteScan(ScannedFile):
         return Row(types, at + header_size, at, size, local), rowid
 
     def _local_bytes(self, size: int) -> int:
-        """Return how much of a row is in its page, the rest being in the chain."""
+        """Return the bytes of a row that lie in its page; the rest is in overflow pages."""
         if size <= self._usable - 35:
             return size
         least = (self._usable - 12) * 32 // 255 - 23
@@ -114,14 +114,7 @@ class SqliteScan(ScannedFile):
         return local if local <= self._usable - 35 else least
 
     def _note_topic(self, rowid: int, row: Row, content: bytes) -> None:
-        """Keep a topic as rosbags states it; other tables of texts have no topic's name."""
-        from rosbags.interfaces import (
-            Connection,
-            ConnectionExtRosbag2,
-            MessageDefinition,
-            MessageDefinitionFormat,
-        )
-
+        """Keep the topic in a row; rows of other tables have no topic name and are skipped."""
         at, texts = row.data_at, []
         for kind in row.types[1:]:
             length = (kind - 13) // 2
@@ -129,17 +122,18 @@ class SqliteScan(ScannedFile):
             at += length
         topic, type_, encoding, *further = texts
         if topic.startswith('/') and '/' in type_:
-            nothing = MessageDefinition(MessageDefinitionFormat.NONE, '')
-            ext = ConnectionExtRosbag2(encoding, profiles_in(' '.join(further[:1])))
-            self._found[rowid] = Connection(rowid, topic, type_, nothing, '', 0, ext, self)
+            qos = ' '.join(further[:1])
+            self._by_id[rowid] = ros2_connection(
+                rowid, topic, type_, self, encoding=encoding, qos=qos
+            )
 
     def _check_chain(self, place: tuple[int, int, int, int]) -> None:
-        """Refuse a message whose chain of pages leads out of the file."""
+        """Raise ValueError if an overflow page of a message is not in the file."""
         for _ in self._chain(place):
             pass
 
     def _chain(self, place: tuple[int, int, int, int]) -> Iterator[int]:
-        """Yield the offsets of the further pages of a row."""
+        """Yield the offsets of the overflow pages of a row."""
         start, local, size, _ = place
         link = start + local
         for _ in range(-(-(size - local) // (self._usable - 4))):
@@ -158,7 +152,7 @@ class SqliteScan(ScannedFile):
 
 
 def pages(header: bytes) -> tuple[int, int]:
-    """Return the size and the number of the pages that the first bytes of a file state."""
+    """Return the size and the number of pages that the file header states."""
     stated, num_pages = struct.unpack_from('>H10xI', header, 16)
     size = 65536 if stated == 1 else stated
     if size < 512 or size & (size - 1):
@@ -167,14 +161,14 @@ def pages(header: bytes) -> tuple[int, int]:
 
 
 def is_short(path: Path) -> bool:
-    """Return whether a database is shorter than it states; SQLite reads some of these."""
+    """Return whether a database is shorter than its header states; SQLite opens some of these."""
     with open(path, 'rb') as file:
         size, num_pages = pages(file.read(HEADER_BYTES))
     return path.stat().st_size < size * num_pages
 
 
 def is_message(types: list[int]) -> bool:
-    """Return whether columns are number, topic, time and content of a message."""
+    """Return whether the columns are number, topic, time and content of a message."""
     if len(types) != 4 or types[0] != NULL:
         return False
     is_blob = types[3] >= BLOB and types[3] % 2 == 0
@@ -182,7 +176,7 @@ def is_message(types: list[int]) -> bool:
 
 
 def is_topic(types: list[int]) -> bool:
-    """Return whether columns are number, name, type, encoding, and perhaps more texts."""
+    """Return whether the columns are number, name, type, encoding, and perhaps more texts."""
     return len(types) >= 4 and types[0] == NULL and all(t > BLOB and t % 2 for t in types[1:])
 
 

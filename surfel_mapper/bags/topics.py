@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The topics of a bag, and choosing among them.
+The topics of a bag, and the choice among them.
 
-A topic that was not named is guessed only where there is no other: a map made of the wrong one
-of two lidars looks right.
+A topic that was not named is chosen only if it is the only one of its type: a map from the wrong
+one of two lidars looks right.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ POSE = 'geometry_msgs/msg/PoseStamped'
 TF = 'tf2_msgs/msg/TFMessage'
 
 SAME_AS = {'tf/msg/tfMessage': TF}
-"""What early ROS 1 called a type of the same content."""
+"""Names of types in early ROS 1, and the type with the same content."""
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """A topic of a bag, and how many messages of which type its index states."""
+    """A topic of a bag, with type and number of messages by the index."""
 
     name: str
     type: str
@@ -36,23 +36,26 @@ class Topic:
 
 
 class Topics(list[Topic]):
-    """The topics of one bag."""
+    """The topics of the bag at a path, which errors name."""
 
     def __init__(self, path: Path, topics: Collection[Topic]) -> None:
-        """Hold the topics of the bag at a path, which errors name."""
         super().__init__(topics)
         self.path = path
 
     def num_messages(self, names: Collection[str]) -> int:
-        """Return how many messages some topics have by the index."""
+        """Return the number of messages of the named topics by the index."""
         return sum(topic.count for topic in self if topic.name in names)
 
     def of_type(self, *types: str) -> list[str]:
-        """Return the names of the topics of a type, or of one of some."""
+        """Return the names of the topics of any of the types."""
         return [topic.name for topic in self if topic.type in types]
 
     def choose_image(self, name: str | None = None) -> str:
-        """Return the topic of images to read, as choose does; packed ones if named, or alone."""
+        """
+        Return the topic of images to read, chosen as in choose.
+
+        Compressed images are chosen if they are named, or if there are no others.
+        """
         packed = () if name is None and self.of_type(IMAGE) else (PACKED_IMAGE,)
         return self.choose(IMAGE, name, or_else=packed)
 
@@ -74,9 +77,9 @@ class Topics(list[Topic]):
         name : str, optional
             What the user asked for.
         default : str, optional
-            Taken where nothing was asked for and the bag has it.
+            Taken if ``name`` is not given and the bag has it.
         or_else : tuple of str
-            Types that will do as well.
+            Further types that are accepted.
 
         Raises
         ------

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Write rosbag2 directories, as mcap or sqlite3, through rosbags.
+Writing rosbag2 directories, as mcap or sqlite3, through rosbags.
 
-A bag appears under its name once it is whole. Until then it grows in a hidden directory beside
-it, which is removed if anything fails; a bag that is overwritten stays until then too. rosbags
-writes the storage file under the name of its directory, so the hidden one holds a directory of
-the final name.
+A bag appears under its name once it is complete. Until then it grows in a hidden directory beside
+it, which is removed if anything fails; a bag to be overwritten stays until then too. rosbags
+names the storage file after its directory, so the hidden directory contains one of the final name.
 """
 
 from __future__ import annotations
@@ -20,43 +19,41 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from surfel_mapper.bags.profiles import latched_profile
+from surfel_mapper.bags._rosbags import jazzy_types, latched_profile, new_writer
+from surfel_mapper.bags.paths import METADATA
 from surfel_mapper.errors import BagError
 from surfel_mapper.messages.pointcloud2 import CloudBytes
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 STORAGES = ('mcap', 'sqlite3')
 
-METADATA = 'metadata.yaml'
-"""The file that makes a directory a bag."""
-
 
 class BagWriter:
     """
-    A bag being written, to be used in a with-block: whole at its end, or not there.
+    Context manager that writes a bag: complete at the end of the block, or absent after an error.
 
     Parameters
     ----------
     path : str or Path
-        Directory of the bag; missing parents are made.
+        Directory of the bag; missing parents are created.
     storage : str
         mcap or sqlite3.
     overwrite : bool
-        Whether a bag, or an empty directory, of that name gives way.
+        Whether to replace a bag, or an empty directory, of that name.
 
     Attributes
     ----------
     directory : Path
-        Inside the with-block: where the bag is being written. Files put there go with it.
+        Inside the block: the hidden directory. Files created there become part of the bag.
 
     Raises
     ------
     BagError
-        If the storage is unknown, or something is there that may not be overwritten; later, if
-        it cannot be written.
+        If the storage is unknown, or the path exists and may not be overwritten; later, if the
+        bag cannot be written.
 
     """
 
@@ -74,18 +71,14 @@ class BagWriter:
 
     def __enter__(self) -> BagWriter:
         """Begin the bag in a hidden directory beside its path."""
-        from rosbags.rosbag2 import StoragePlugin, Writer
-        from rosbags.typesys import get_typestore, Stores
-
-        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self._store = jazzy_types()
         with self._refusing():
             self._missing = [p for p in self.path.parents if not p.exists()]
             self.path.parent.mkdir(parents=True, exist_ok=True)
             prefix = f'.{self.path.name}.'
             self._hidden = Path(tempfile.mkdtemp(prefix=prefix, dir=self.path.parent))
             self.directory = self._hidden / self.path.name
-            plugin = StoragePlugin[self.storage.upper()]
-            self._writer = Writer(self.directory, version=9, storage_plugin=plugin)
+            self._writer = new_writer(self.directory, self.storage)
             try:
                 self._writer.open()
             except BaseException:
@@ -94,7 +87,7 @@ class BagWriter:
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Give the bag its name, or remove what there is of it after an error."""
+        """Give the bag its name, or remove the incomplete bag after an error."""
         try:
             if kind is not None:
                 self._writer.abort()
@@ -110,7 +103,7 @@ class BagWriter:
                 self._remove_parents()
 
     def _remove_parents(self) -> None:
-        """Remove the parents that were made for the bag, as far as nothing else is in them."""
+        """Remove the parents that were created for the bag and are empty."""
         for directory in self._missing:
             with suppress(OSError):
                 directory.rmdir()
@@ -125,18 +118,18 @@ class BagWriter:
         latched: bool = False,
     ) -> None:
         """
-        Append a message; the first of a topic adds the topic.
+        Append a message; the first message of a topic adds the topic.
 
         Parameters
         ----------
         topic, type_ : str
             A type of ROS 2 Jazzy, such as sensor_msgs/msg/PointCloud2.
         record_ns : int
-            When it is recorded; messages are expected in this order.
+            Record time; messages are expected in this order.
         raw : bytes
             The message as CDR.
         latched : bool
-            Whether late subscribers still get the last message: transient local.
+            Whether late subscribers get the last message: durability transient local.
 
         """
         with self._refusing():
@@ -179,13 +172,15 @@ class BagWriter:
     def write_transform(
         self, topic: str, record_ns: int, pose: StampedPose, *, latched: bool = False
     ) -> None:
-        """Append a tf2_msgs/TFMessage of one transform; latched for static ones."""
+        """Append a tf2_msgs/TFMessage with one transform; latched for static ones."""
         transform = self._new(
             'geometry_msgs/msg/TransformStamped',
             self._header(pose.stamp_ns, pose.parent),
             pose.child,
             self._new(
-                'geometry_msgs/msg/Transform', self._vector(pose.xyz), self._turn(pose.q_xyzw)
+                'geometry_msgs/msg/Transform',
+                self._vector(pose.xyz),
+                self._quaternion(pose.q_xyzw),
             ),
         )
         message = self._new('tf2_msgs/msg/TFMessage', [transform])
@@ -196,21 +191,21 @@ class BagWriter:
     ) -> None:
         """Append a nav_msgs/Odometry; the twist in the child's frame, m/s and then rad/s."""
         unknown = np.zeros(36)
-        place = self._new('geometry_msgs/msg/Point', *map(float, pose.xyz))
-        where = self._new('geometry_msgs/msg/Pose', place, self._turn(pose.q_xyzw))
+        position = self._new('geometry_msgs/msg/Point', *map(float, pose.xyz))
+        pose_msg = self._new('geometry_msgs/msg/Pose', position, self._quaternion(pose.q_xyzw))
         v = tuple(twist)
-        motion = self._new('geometry_msgs/msg/Twist', self._vector(v[:3]), self._vector(v[3:]))
+        twist_msg = self._new('geometry_msgs/msg/Twist', self._vector(v[:3]), self._vector(v[3:]))
         message = self._new(
             'nav_msgs/msg/Odometry',
             self._header(pose.stamp_ns, pose.parent),
             pose.child,
-            self._new('geometry_msgs/msg/PoseWithCovariance', where, unknown),
-            self._new('geometry_msgs/msg/TwistWithCovariance', motion, unknown),
+            self._new('geometry_msgs/msg/PoseWithCovariance', pose_msg, unknown),
+            self._new('geometry_msgs/msg/TwistWithCovariance', twist_msg, unknown),
         )
         self._write_message(topic, record_ns, message)
 
     def _take_name(self) -> None:
-        """Put the bag under its name; what had the name comes back if that fails."""
+        """Rename the hidden directory to the path; restore the former content if that fails."""
         replaced = self._hidden / 'replaced'
         if self.path.exists():
             self.path.rename(replaced)
@@ -238,7 +233,7 @@ class BagWriter:
         """Return a geometry_msgs/Vector3."""
         return self._new('geometry_msgs/msg/Vector3', *map(float, xyz))
 
-    def _turn(self, q_xyzw: Iterable[float]) -> Any:
+    def _quaternion(self, q_xyzw: Iterable[float]) -> Any:
         """Return a geometry_msgs/Quaternion."""
         return self._new('geometry_msgs/msg/Quaternion', *map(float, q_xyzw))
 
@@ -247,7 +242,7 @@ class BagWriter:
         return self._store.types[type_](*values)
 
     def _check_free(self) -> None:
-        """Refuse to write over anything that may not go."""
+        """Raise BagError if the path exists and may not be replaced."""
         if not self.path.exists() and not self.path.is_symlink():
             return
         if not self.overwrite:
@@ -255,7 +250,7 @@ class BagWriter:
         if self.path.is_symlink() or not self.path.is_dir():
             raise BagError(f'{self.path}: not a directory, so not a bag to overwrite')
         if not (self.path / METADATA).exists() and any(self.path.iterdir()):
-            raise BagError(f'{self.path}: holds files but no {METADATA}: no bag to overwrite')
+            raise BagError(f'{self.path}: has files but no {METADATA}, so not a bag to overwrite')
 
     @contextmanager
     def _refusing(self) -> Iterator[None]:

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Files of maps, scans, models and trajectories, each written whole or not at all."""
+"""Files of maps, scans, models and trajectories, each written atomically."""

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A whole map with its window in one file, exact: what is loaded has the digest of what was saved.
+Saving and loading a map with its window, exactly: the digests before and after are equal.
 
-The integers of every voxel are stored, and for each scan of the window its moments, stamp, pose
-and, where kept, points; so a map that is loaded goes on as if it had never stopped. Nothing in a
-file is believed: voxels have to be sorted and their numbers possible, and the digest has to
-come out right.
+The file has the integers of every voxel, and for each scan of the window its moments, stamp, pose
+and, if kept, points; so a loaded map continues as if it had never stopped. Files are not trusted:
+voxels and counts are checked, and the digest is compared.
 """
 
 from __future__ import annotations
@@ -43,13 +42,13 @@ def save_map(
     Parameters
     ----------
     path : str or Path
-        The file, by custom with the extension npz; written whole or not at all.
+        The file, usually with the extension npz; written atomically.
     surfel_map : SurfelMap
         The map.
     window : iterable of WindowedScan
-        The scans that can still leave it, oldest first: its SlidingWindow.
+        The scans that can be evicted, oldest first: its SlidingWindow.
     compress : bool
-        Pack: 1.7 times smaller, 4 times slower.
+        Compress: 1.7 times smaller, 4 times slower.
 
     Raises
     ------
@@ -90,12 +89,12 @@ def load_map(
     path : str or Path
         A file that save_map wrote.
     voxel_size_m : float, optional
-        The voxel size that the map has to have.
+        The voxel size that is required.
 
     Returns
     -------
     SurfelMap
-        Its digest equals that of the map saved.
+        Its digest equals that of the saved map.
     list of WindowedScan
         For SlidingWindow.restore.
 
@@ -108,7 +107,7 @@ def load_map(
     """
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
-        raise FileFormatError(f'{path}: holds {attributes.get("kind")!r}, expected a {KIND}')
+        raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     found_m: Any = attributes.get('voxel_size_m')
     if voxel_size_m is not None and found_m != voxel_size_m:
         raise FileFormatError(
@@ -123,7 +122,7 @@ def load_map(
         held = SurfelMap(found_m, columns=surfel_map.columns, level=surfel_map.level)
         for scan in scans:
             held.insert(scan.moments)
-        surfel_map.copy().subtract(held)  # so that every scan can leave
+        surfel_map.copy().subtract(held)  # checks that every scan can be evicted
     except (MapError, ValueError, TypeError, LookupError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
     digest = surfel_map.digest()
@@ -163,21 +162,21 @@ def checked_moments(
     parts: dict[str, npt.NDArray[Any]], surfel_map: SurfelMap, prefix: str
 ) -> ScanMoments:
     """
-    Return moments from a file, which have to be possible: the kernels rely on it.
+    Return moments from a file after checking that they are possible, as the kernels require.
 
     Parameters
     ----------
     parts : dict of str to array
         The arrays of ScanMoments by name.
     surfel_map : SurfelMap
-        The map that they are for.
+        The map into which they will be inserted.
     prefix : str
-        What errors call them.
+        Name of the moments in errors.
 
     Raises
     ------
     ValueError
-        If shapes or types are wrong, a voxel stands twice or its numbers cannot be.
+        If shapes or types are wrong, a voxel occurs twice, or its counts and sums are impossible.
 
     """
     key, count = parts['key'], parts['count']
@@ -189,7 +188,7 @@ def checked_moments(
     if any(parts[name].dtype != np.int64 for name in ('key', 'product', 'channels')):
         raise ValueError(f'{prefix}: keys, products or channels are not int64')
     if len(np.unique(key)) < len(key) or (key < 0).any():
-        raise ValueError(f'{prefix}: a voxel stands twice, or is none')
+        raise ValueError(f'{prefix}: a voxel occurs twice, or is out of range')
     most = np.abs(parts['total']).max(axis=1, initial=0) / (HALF << surfel_map.level)
     if (count < 1).any() or (count > MAX_MAP_COUNT).any() or (most > count).any():
         raise ValueError(f'{prefix}: impossible numbers of points')

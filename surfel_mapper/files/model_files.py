@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models in files: JSON with everything, Parquet with a row a primitive, OBJ with triangles.
+Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ and DXF.
 
-JSON is for people and scripts, Parquet for tables of many clouds, OBJ for CAD and viewers: each
-plane and surface is an object of its own there, and Gaussians are left out. DXF is in dxf.py.
+OBJ is for viewers, DXF for CAD; each plane and surface is an object of its own there, without
+Gaussians. DXF is that of AutoCAD 2000 and later, in metres, with outlines as closed polylines and
+faces as meshes. ezdxf writes it, because readers expect tables and headers beside the entities
+that are easily wrong when written by hand.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+import io
 import itertools
 import json
 from pathlib import Path
@@ -18,8 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import DependencyError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.dxf import write_dxf
 from surfel_mapper.files.parquet import import_pyarrow
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
@@ -40,13 +43,13 @@ def write_models(
     Parameters
     ----------
     directory : Path
-        Where to.
+        Directory of the files.
     model : MultiModel
-        What to write.
+        The models.
     formats : sequence of str
-        As what.
+        Any of json, obj, parquet, dxf.
     versions : mapping of int to int, optional
-        Of primitives that live, by id; in JSON and Parquet.
+        Versions of the primitives, by id; written to JSON and Parquet.
 
     Raises
     ------
@@ -75,10 +78,10 @@ def write_json(
     """
     Write models as JSON, lengths in m.
 
-    A patch: id, num_points, mean, R_patch_map (rows x, y, normal), rms_m, normal and offset_m of
-    its plane, and outline, a list of rings. A surface besides: pitch_m, origin, degrees and
-    control of its spline. A Gaussian: id, num_points, mean, covariance. Each has its version
-    besides, where versions are given.
+    A plane or surface: id, num_points, mean, R_patch_map (rows x, y, normal), rms_m, normal and
+    offset_m of its plane, and outline, a list of rings. A surface also: pitch_m, origin, degrees
+    and control of its spline. A Gaussian: id, num_points, mean, covariance. Each also has its
+    version, if versions are given.
 
     Raises
     ------
@@ -105,7 +108,7 @@ def write_json(
 
 
 def patch_content(patch: Plane) -> dict[str, Any]:
-    """Return a patch as plain values."""
+    """Return a plane or surface as JSON values."""
     return {
         'id': patch.id,
         'num_points': patch.num_points,
@@ -120,7 +123,7 @@ def patch_content(patch: Plane) -> dict[str, Any]:
 
 
 def surface_content(surface: Surface) -> dict[str, Any]:
-    """Return a surface as plain values."""
+    """Return a surface as JSON values."""
     spline = surface.spline
     return {
         **patch_content(surface),
@@ -133,7 +136,7 @@ def surface_content(surface: Surface) -> dict[str, Any]:
 
 
 def gaussian_content(gaussians: Gaussians) -> list[dict[str, Any]]:
-    """Return Gaussians as plain values."""
+    """Return Gaussians as JSON values."""
     return [
         {
             'id': int(gaussians.id[k]),
@@ -147,7 +150,7 @@ def gaussian_content(gaussians: Gaussians) -> list[dict[str, Any]]:
 
 def columns(model: MultiModel) -> dict[str, npt.NDArray[Any]]:
     """
-    Return a row a primitive: planes, surfaces, Gaussians.
+    Return columns with one row per primitive: planes, surfaces, Gaussians.
 
     id, kind, num_points, mean_x to mean_z, cov_xx to cov_zz, and for planes and surfaces the
     normal, offset_m, rms_m and area_m2; nan for Gaussians.
@@ -176,14 +179,14 @@ def columns(model: MultiModel) -> dict[str, npt.NDArray[Any]]:
 
 
 PARTS_OF_AREA = 8
-"""Areas are sums of squares of this part of a cell."""
+"""Resolution of areas: squares per edge of a cell."""
 
 
 def write_parquet(
     path: str | Path, model: MultiModel, versions: Mapping[int, int] | None = None
 ) -> None:
     """
-    Write a row a primitive as Parquet; see columns; and ``version``, where versions are given.
+    Write one row per primitive as Parquet (see columns), with ``version`` if versions are given.
 
     Raises
     ------
@@ -203,7 +206,7 @@ def write_parquet(
 
 def write_obj(path: str | Path, model: MultiModel) -> None:
     """
-    Write planes and surfaces as triangles, an OBJ object each, named by kind and id.
+    Write planes and surfaces as triangles, one OBJ object each, named by kind and id.
 
     Raises
     ------
@@ -221,3 +224,55 @@ def write_obj(path: str | Path, model: MultiModel) -> None:
             np.savetxt(file, shape.vertices, 'v %.6f %.6f %.6f')
             np.savetxt(file, shape.faces + begin, 'f %d %d %d')
             begin += len(shape.vertices)
+
+
+LAYERS = {
+    'plane_outlines': 1,
+    'planes': 8,
+    'surface_outlines': 5,
+    'surfaces': 8,
+}
+"""Layers and their AutoCAD colours: red, grey, blue, grey."""
+
+
+def write_dxf(path: str | Path, model: MultiModel) -> None:
+    """
+    Write planes and surfaces, each kind on two layers: outlines, and faces.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written.
+    DependencyError
+        If ezdxf is not installed.
+
+    """
+    ezdxf = import_ezdxf()
+    drawing = ezdxf.new('R2000', units=ezdxf.units.M)
+    for layer, color in LAYERS.items():
+        drawing.layers.add(layer, color=color)
+    space = drawing.modelspace()
+    for patch in model.patches:
+        shape = shape_of(patch)
+        kind = 'surface' if shape.is_curved else 'plane'
+        for ring in shape.rings:
+            attributes = {'layer': f'{kind}_outlines'}
+            space.add_polyline3d(ring.tolist(), close=True, dxfattribs=attributes)
+        with space.add_mesh(dxfattribs={'layer': f'{kind}s'}).edit_data() as mesh:
+            mesh.vertices, mesh.faces = shape.vertices.tolist(), shape.faces.tolist()
+    text = io.StringIO()
+    drawing.write(text)
+    with replace_file(path) as file:
+        file.write(text.getvalue().encode())
+
+
+def import_ezdxf() -> Any:
+    """Return ezdxf."""
+    try:
+        import ezdxf
+    except ImportError as error:
+        raise DependencyError(
+            f'ezdxf cannot be loaded ({error}). It writes DXF; install it with '
+            "`pip install 'surfel_mapper[formats]'` or `pip install ezdxf`"
+        ) from error
+    return ezdxf

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps as Parquet, one row a surfel: what it is, and the integers that it is made of.
+Maps as Parquet, one row per voxel: derived quantities and exact moments.
 
-Every voxel has a row, however few its points, sorted by voxel: its index i j k, what SurfelMap
-derives (x y z nx ny nz planarity curvature), and the exact moments as int64 (num_points, sum_*,
-sum_**, view_*). From the moments the map is built again with the same digest, which stands in
-the file and is checked, so a file that was changed is refused. Tools that know nothing of this
-package read the columns by name.
+Every voxel has a row, sorted by voxel: its index i j k, the quantities that SurfelMap derives
+(x y z nx ny nz planarity curvature), and the exact moments as int64 (num_points, sum_*, sum_**,
+view_*). The map is rebuilt from the moments with the same digest, which is in the file and
+compared, so a changed file is refused. Other tools read the columns by name.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 KIND, VERSION = 'surfel_mapper surfels', 1
 
 METADATA = b'surfel_mapper'
-"""Where in the file the attributes are, as JSON."""
+"""Key of the attributes, as JSON, in the metadata of the schema."""
 
 INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
@@ -43,7 +42,7 @@ Columns = dict[str, npt.NDArray[Any]]
 
 def write_map(path: str | Path, surfel_map: SurfelMap) -> str:
     """
-    Write a map as Parquet, whole or not at all; return its digest.
+    Write a map as Parquet, atomically; return its digest.
 
     Parameters
     ----------
@@ -71,14 +70,14 @@ def write_map(path: str | Path, surfel_map: SurfelMap) -> str:
 
 def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMap:
     """
-    Return the map in a Parquet file, exactly as it was written.
+    Return the map in a Parquet file, exactly as written.
 
     Parameters
     ----------
     path : str or Path
         A file that write_map wrote.
     voxel_size_m : float, optional
-        The voxel size that the map has to have.
+        The voxel size that is required.
 
     Raises
     ------
@@ -116,7 +115,7 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
 
 
 def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, Any]:
-    """Return what a file says of its map; the digest only where wanted."""
+    """Return the attributes of a map for a file; the digest is optional."""
     return {
         'kind': KIND,
         'version': VERSION,
@@ -128,7 +127,7 @@ def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, An
 
 
 def map_columns(surfel_map: SurfelMap, *, derived: bool = True) -> Columns:
-    """Return every column of the file, sorted by voxel; those derived only where wanted."""
+    """Return the columns of the file, sorted by voxel; the derived ones are optional."""
     moments = surfel_map.moments()
     columns: Columns = {
         **named(INDEX, moments.voxel_index),
@@ -143,7 +142,7 @@ def map_columns(surfel_map: SurfelMap, *, derived: bool = True) -> Columns:
 
 
 def derived_columns(surfel_map: SurfelMap) -> Columns:
-    """Return what a map derives from its moments, sorted by voxel."""
+    """Return the quantities derived from the moments of a map, sorted by voxel."""
     surfels = surfel_map.surfels()
     surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
     return {
@@ -160,19 +159,19 @@ def named(names: tuple[str, ...], table: npt.NDArray[Any]) -> Columns:
 
 
 def channel_columns(surfel_map: SurfelMap) -> tuple[str, ...]:
-    """Return what the sums of intensity and colour are called."""
+    """Return the names of the columns of the sums of intensity and colour."""
     return tuple(f'sum_{name}' for name in channel_names(surfel_map.columns))
 
 
 def moment_names(surfel_map: SurfelMap) -> tuple[str, ...]:
-    """Return the columns from which a map is built."""
+    """Return the names of the columns from which a map is rebuilt."""
     return (*INDEX, 'num_points', *SUMS, *PRODUCTS, *VIEWS, *channel_columns(surfel_map))
 
 
 def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[str, Any]:
-    """Return what a file says of its map."""
+    """Return the attributes of the map in a file."""
     if METADATA not in metadata:
-        raise FileFormatError(f'{path}: no map of surfel_mapper, but another Parquet file')
+        raise FileFormatError(f'{path}: a Parquet file, but not a map of surfel_mapper')
     attributes: dict[str, Any] = json.loads(metadata[METADATA])
     found = (attributes['kind'], attributes['version'])
     if found != (KIND, VERSION):
@@ -186,7 +185,7 @@ def read_attributes(path: str | Path, metadata: Mapping[bytes, bytes]) -> dict[s
 def map_of(
     attributes: Mapping[str, Any], voxel_size_m: float | None, path: str | Path
 ) -> SurfelMap:
-    """Return an empty map as the attributes state it."""
+    """Return an empty map with the attributes of a file."""
     found_m = attributes['voxel_size_m']
     if voxel_size_m is not None and found_m != voxel_size_m:
         raise FileFormatError(
@@ -196,7 +195,7 @@ def map_of(
 
 
 def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
-    """Return a column of whole numbers, refusing anything else."""
+    """Return an integer column; raise ValueError if it has another type or nulls."""
     column = table.column(name)
     if column.null_count or str(column.type) not in ('int64', 'int32'):
         raise ValueError(f'column {name}: {column.type} with {column.null_count} missing')

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Parts of a map as Parquet: those of one shard, and the tiles of a map that no process holds whole.
+Parts of a map as Parquet: shards, and the tiles of a map larger than the memory.
 
-A tile is a square of 256 voxels a side in i and j, with everything above and below: 128 m at
-0.5 m. Its file is one that write_map writes, so read_map reads it, and all tiles together are a
-dataset partitioned by tile: ``tile_i=3/tile_j=-2/surfels.parquet``. Within it a row group holds
-32 voxels in i. Side by side the tiles of one tile_i are then sorted by voxel 32 voxels at a time,
-and that is how the digest of the whole map is taken with little memory.
+A tile is a column of 256 x 256 voxels in i and j: 128 m at 0.5 m. Its file has the format of
+write_map, so read_map reads it, and all tiles together are a dataset partitioned by tile:
+``tile_i=3/tile_j=-2/surfels.parquet``. A row group has 32 voxels in i, so the tiles of one tile_i
+can be merged in the order of voxels 32 voxels at a time, which is how the digest of the whole map
+is computed with little memory.
 
-The file of a shard has a row group for every tile that it touches, of the moments alone.
+The file of a shard has a row group for every tile that it touches, with the moments only.
 """
 
 from __future__ import annotations
@@ -58,11 +58,11 @@ FILE = 'surfels.parquet'
 TILE_PATH = re.compile(r'tile_i=(-?\d+)/tile_j=(-?\d+)/' + re.escape(FILE))
 
 ROWS_READ = 1 << 18
-"""So many rows are read at a time where a file is cut into tiles, or a digest taken."""
+"""Number of rows read at a time to split a file into tiles, or to compute a digest."""
 
 
 KIND = ('voxel_size_m', 'level', 'columns')
-"""What maps that add up have in common."""
+"""Attributes that must be equal in maps that are merged."""
 
 
 class Tile(NamedTuple):
@@ -73,12 +73,12 @@ class Tile(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Where its file is in a dataset."""
+        """Path of its file in a dataset."""
         return Path(f'tile_i={self.i}', f'tile_j={self.j}', FILE)
 
 
 class Part(NamedTuple):
-    """A row group of a file: a tile, or what a shard has of it."""
+    """Row groups of a file: a tile, or the part of it in a shard."""
 
     path: str
     groups: tuple[int, ...]
@@ -96,13 +96,13 @@ def tiles_in(directory: str | Path) -> dict[Tile, Path]:
 
 
 def write_shard(path: str | Path, surfel_map: SurfelMap) -> dict[Tile, Part]:
-    """Write a map with a row group for every tile, whole or not at all; return where each is."""
+    """Write a map with a row group for every tile, atomically; return the part of each tile."""
     columns = map_columns(surfel_map, derived=False)
     tile = np.stack([columns['i'], columns['j']], axis=1) >> TILE_BITS
     order = np.lexsort((tile[:, 1], tile[:, 0]))
     bounds = np.flatnonzero(np.diff(tile[order], axis=0, prepend=tile[order[:1]] - 1).any(axis=1))
     rows = np.split(order, bounds[1:]) if len(order) else []
-    # to be read once, and thrown away: without a digest, packed quickly, not forced to the disk
+    # a temporary file, read once: without a digest, with fast compression and no fsync
     with replace_file(path, lasting=False) as file:
         _write(file, attributes_of(surfel_map, digest=False), columns, rows, 'lz4')
     return {
@@ -112,7 +112,7 @@ def write_shard(path: str | Path, surfel_map: SurfelMap) -> dict[Tile, Part]:
 
 
 def write_tile(path: str | Path, surfel_map: SurfelMap) -> None:
-    """Write the map of one tile, whole or not at all; the directories are made."""
+    """Write the map of one tile, atomically; missing directories are created."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     columns = map_columns(surfel_map)
     block = columns['i'] >> BLOCK_BITS
@@ -128,7 +128,7 @@ def read_part(part: Part) -> SurfelMap:
     Raises
     ------
     FileFormatError
-        If they cannot be read, or are not what was written.
+        If they cannot be read or are damaged.
 
     """
     with _opened(part.path) as (content, attributes):
@@ -148,7 +148,7 @@ def tile_part(path: str | Path) -> Part:
 
 
 def split_map(path: str | Path) -> Iterator[SurfelMap]:
-    """Yield the map in a Parquet file piece by piece, so that it need not fit into memory."""
+    """Yield the map in a Parquet file in parts, so that it need not fit into memory."""
     with _opened(path) as (content, attributes):
         names = moment_names(map_of(attributes, None, path))
         for batch in content.iter_batches(ROWS_READ, columns=list(names)):
@@ -158,19 +158,19 @@ def split_map(path: str | Path) -> Iterator[SurfelMap]:
 
 
 def kind_of(path: str | Path) -> dict[str, Any]:
-    """Return what maps that add up have in common; see KIND."""
+    """Return the attributes that must be equal in maps that are merged; see KIND."""
     with _opened(path) as (_, attributes):
         return {name: attributes[name] for name in KIND}
 
 
 def dataset_digest(directory: str | Path) -> str:
     """
-    Return the digest of the map in a dataset; the map is never in memory as a whole.
+    Return the digest of the map in a dataset, without loading the whole map.
 
     Raises
     ------
     FileFormatError
-        If a file cannot be read, or the files are not of one map.
+        If a file cannot be read, or the files belong to different maps.
 
     """
     tiles = tiles_in(directory)
@@ -204,10 +204,9 @@ def dataset_digest(directory: str | Path) -> str:
 
 def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArray[np.int64]]:
     """
-    Yield columns of tiles that lie side by side, sorted by voxel; without names, the keys.
+    Yield columns of the tiles of one tile_i, sorted by voxel; without names, the keys.
 
-    Each tile is sorted, and all of them have their places in j in order, so that of several
-    tiles only i is to be looked at.
+    Each tile is sorted and the tiles are in the order of j, so a stable sort by i merges them.
     """
     footers = {}
     blocks: dict[int, list[tuple[Path, int]]] = {}
@@ -230,7 +229,7 @@ def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArr
 def _batches(
     blocks: Mapping[int, list[tuple[Path, int]]], footers: Mapping[Path, Any]
 ) -> Iterator[dict[Path, list[int]]]:
-    """Yield row groups by file, whole blocks in order, of ROWS_READ rows or little more."""
+    """Yield row groups by file, complete blocks in order, of about ROWS_READ rows."""
     batch: dict[Path, list[int]] = {}
     num_rows = 0
     for block in sorted(blocks):
@@ -260,7 +259,7 @@ def _write(
     groups: Sequence[npt.NDArray[np.int64]],
     compression: str,
 ) -> None:
-    """Write a file with row groups of the given rows."""
+    """Write a file with a row group for each array of rows."""
     arrow, parquet = import_pyarrow()
     table = arrow.table(columns)
     schema = table.schema.with_metadata({METADATA: json.dumps(attributes)})
@@ -272,16 +271,16 @@ def _write(
 
 
 def _starts(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    """Return the rows where a value differs from the one before, the first included."""
+    """Return the first row and the rows whose value differs from the one before."""
     return np.flatnonzero(np.diff(values, prepend=values[:1] - 1))
 
 
 @contextmanager
 def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[str, Any]]]:
     """
-    Open a file that we wrote; whatever goes wrong while it is open names it.
+    Open a file of this package; errors in the block become FileFormatErrors that name it.
 
-    Give its ``metadata`` as the footer where it is known, which takes a quarter of the time.
+    Passing the footer, if known, takes a quarter of the time.
     """
     arrow, parquet = import_pyarrow()
     try:
@@ -294,4 +293,4 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except (arrow.ArrowException, ValueError, LookupError, TypeError, AttributeError) as error:
-        raise FileFormatError(f'{path}: damaged, or not what was written: {error}') from error
+        raise FileFormatError(f'{path}: damaged, or of another program: {error}') from error

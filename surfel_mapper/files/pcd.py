@@ -1,13 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfels and points as PCD, for PCL and what is built on it.
+Surfels and points as PCD, for PCL and tools built on it.
 
-Written binary with the columns of ~/normals, among them normal_x normal_y normal_z curvature, the
-names of PCL's PointNormal. All are float32, as PCL's point types are: a field x of doubles it
-leaves out in silence. That rounds by 0.5 mm at 10 km from the origin; PLY and Parquet keep
-doubles. Read in every encoding: ascii, binary, and binary_compressed, where each column is packed
-with LZF, which the extra ``formats`` brings.
+Files are written binary with the columns of ~/normals, including normal_x normal_y normal_z
+curvature, the names of PCL's PointNormal. All are float32, as in PCL's point types: PCL silently
+drops a field x of doubles. That rounds by 0.5 mm at 10 km from the origin; PLY and Parquet keep
+doubles. All encodings are read: ascii, binary, and binary_compressed, whose columns are packed
+with LZF, which the extra ``formats`` installs.
+
+The format is a text header and a table, so numpy alone reads and writes it: a library (pypcd4,
+Open3D) would be one more dependency for 200 lines, and neither refuses truncated files. The tests
+compare with pypcd4.
 """
 
 from __future__ import annotations
@@ -32,22 +36,22 @@ if TYPE_CHECKING:
 KINDS = {'f': 'F', 'i': 'I', 'u': 'U'}
 
 SIZES = {'F': (4, 8), 'I': (1, 2, 4, 8), 'U': (1, 2, 4, 8)}
-"""Bytes that a number of each type may have."""
+"""Valid sizes of each type, bytes."""
 
 MAX_HEADER_BYTES = 65536
 
 MAX_COUNT = 4096
-"""Numbers of one field in a point; feature histograms have some hundreds."""
+"""Limit of the count of a field; feature histograms have some hundreds."""
 
 MAX_RATIO = 100
-"""LZF packs at most 88 times; what claims more is not unpacked."""
+"""Limit of the compression ratio; LZF reaches at most 88."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class Header:
-    """What the text before the points states."""
+class PcdHeader:
+    """Layout, number and encoding of the points, by the text header of a file."""
 
     layout: np.dtype[Any]
     num_points: int
@@ -56,7 +60,7 @@ class Header:
 
 def write_surfels(path: str | Path, surfels: Surfels) -> None:
     """
-    Write surfels as a binary PCD, whole or not at all.
+    Write surfels as a binary PCD, atomically.
 
     Raises
     ------
@@ -69,14 +73,14 @@ def write_surfels(path: str | Path, surfels: Surfels) -> None:
 
 def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
     """
-    Write columns of equal length K as a binary PCD, whole or not at all.
+    Write columns of equal length K as a binary PCD, atomically.
 
     Parameters
     ----------
     path : str or Path
         The file; see replace_file.
     columns : mapping of str to (K,) array
-        At least one, of integers, float32 or float64.
+        At least one column of integers, float32 or float64.
 
     Raises
     ------
@@ -105,14 +109,14 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
 
 def read_points(path: str | Path) -> Columns:
     """
-    Return the fields of the points of a PCD file, each (K,), or (K, C) where its count is C.
+    Return the fields of the points of a PCD file, each (K,), or (K, C) if its count is C > 1.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is no PCD, is truncated or damaged.
+        If the file cannot be read, is not a PCD, is truncated or damaged.
     DependencyError
-        If it is binary_compressed and no module lzf is installed.
+        If it is binary_compressed and the module lzf is not installed.
 
     """
     try:
@@ -130,13 +134,13 @@ def read_points(path: str | Path) -> Columns:
     return {name: np.ascontiguousarray(table[name]) for name in header.layout.names or ()}
 
 
-def read_header(path: str | Path, file: BinaryIO) -> Header:
-    """Return what the header states; leave the file at the first point."""
+def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
+    """Return the parsed header; the file is then at the first point."""
     words: dict[str, list[str]] = {}
     while 'DATA' not in words:
         line = file.readline(MAX_HEADER_BYTES)
         if not line or file.tell() > MAX_HEADER_BYTES:
-            raise FileFormatError(f'{path}: no header of a PCD file')
+            raise FileFormatError(f'{path}: not a PCD file, its header is missing')
         keyword, *values = line.decode('ascii', 'replace').partition('#')[0].split() or ['']
         words[keyword] = values
     try:
@@ -153,17 +157,17 @@ def read_header(path: str | Path, file: BinaryIO) -> Header:
         if not fields:
             raise ValueError('no fields')
     except (LookupError, ValueError) as error:
-        raise FileFormatError(f'{path}: a PCD header that does not fit: {error}') from error
+        raise FileFormatError(f'{path}: inconsistent PCD header: {error}') from error
     if num_points < 0 or encoding not in ('ascii', 'binary', 'binary_compressed'):
         raise FileFormatError(
             f'{path}: {num_points} points, DATA {encoding}, expected ascii, binary or '
             'binary_compressed'
         )
-    return Header(layout, num_points, encoding)
+    return PcdHeader(layout, num_points, encoding)
 
 
 def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[Any, ...]:
-    """Return a field as numpy states it; padding, which is called _, gets a name of its own."""
+    """Return a field for np.dtype; padding, named _, gets a unique name."""
     if size not in SIZES[kind] or not 1 <= count <= MAX_COUNT:
         raise ValueError(f'field {name} of type {kind}, size {size}, count {count}')
     unique = f'_{place}' if name == '_' else name
@@ -171,7 +175,9 @@ def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[A
     return (unique, code) if count == 1 else (unique, code, (count,))
 
 
-def binary_table(path: str | Path, header: Header, file: BinaryIO, left: int) -> npt.NDArray[Any]:
+def binary_table(
+    path: str | Path, header: PcdHeader, file: BinaryIO, left: int
+) -> npt.NDArray[Any]:
     """Return the points of an uncompressed file."""
     size = header.num_points * header.layout.itemsize
     if size > left:
@@ -182,8 +188,8 @@ def binary_table(path: str | Path, header: Header, file: BinaryIO, left: int) ->
     return np.frombuffer(file.read(size), header.layout)
 
 
-def compressed_table(path: str | Path, header: Header, file: BinaryIO) -> npt.NDArray[Any]:
-    """Return the points of a compressed file, in which every field lies on its own."""
+def compressed_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:
+    """Return the points of a compressed file, which is stored field by field."""
     try:
         import lzf
     except ImportError as error:
@@ -206,7 +212,7 @@ def compressed_table(path: str | Path, header: Header, file: BinaryIO) -> npt.ND
     except ValueError as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
     if content is None or len(content) != size:
-        raise FileFormatError(f'{path}: damaged: its points do not unpack')
+        raise FileFormatError(f'{path}: damaged: its points cannot be unpacked')
     table = np.empty(header.num_points, header.layout)
     at = 0
     for name in header.layout.names or ():
@@ -216,7 +222,7 @@ def compressed_table(path: str | Path, header: Header, file: BinaryIO) -> npt.ND
     return table
 
 
-def ascii_table(path: str | Path, header: Header, file: BinaryIO) -> npt.NDArray[Any]:
+def ascii_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:
     """Return the points of a text file."""
     numbers = header.layout.itemsize and sum(
         int(np.prod(header.layout[name].shape)) for name in header.layout.names or ()

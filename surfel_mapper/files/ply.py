@@ -3,14 +3,15 @@
 """
 Surfels and points as PLY, for CloudCompare and MeshLab.
 
-Written binary, little endian, one row a surfel: x y z nx ny nz planarity curvature num_points.
-Positions are doubles: float32 rounds by 0.5 mm at 10 km from the origin and by 0.25 m at the
-northings of UTM, where the map itself still knows 8 micrometres; programs that draw in float32
-shift such coordinates on import. All else is float32, which holds a normal to 1e-5 deg, and
-uint32 for the counts.
+Files are binary and little endian, one vertex per surfel: x y z nx ny nz planarity curvature
+num_points. Positions are doubles: float32 rounds by 0.5 mm at 10 km from the origin and by 0.25 m
+at the northings of UTM, where the map still resolves 8 micrometres; programs that draw in float32
+shift such coordinates on import. The other properties are float32, exact to 1e-5 deg for normals,
+and uint32 for counts.
 
-The format is a text header and a table, so numpy alone reads and writes it. (plyfile, the usual
-library, is under the GPL, which this package is not; the tests read the files with it.)
+The format is a text header and a table, so numpy alone reads and writes it. It is our own code
+because plyfile, the usual library, is under the GPL, which this package is not; the tests compare
+with it.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ TYPES = {
     'float32': 'f4',
     'float64': 'f8',
 }
-"""Numpy's name of every scalar type of PLY; it has an old and a new name for each."""
+"""NumPy dtypes of the scalar types of PLY, each of which has an old and a new name."""
 
 NAMES = {np.dtype(TYPES[name]): name for name in list(TYPES)[:8]}
 
@@ -59,7 +60,7 @@ MAX_HEADER_BYTES = 65536
 
 def write_surfels(path: str | Path, surfels: Surfels) -> None:
     """
-    Write surfels as a binary PLY, whole or not at all.
+    Write surfels as a binary PLY, atomically.
 
     Raises
     ------
@@ -79,7 +80,7 @@ def write_surfels(path: str | Path, surfels: Surfels) -> None:
 
 
 def channel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
-    """Return the mean intensity, float32, and colour, a byte a channel, where there are any."""
+    """Return the mean intensity (float32) and colour (uint8), if the surfels have them."""
     columns: dict[str, npt.NDArray[Any]] = {}
     for name, values in surfels.channels.items():
         is_colour = name != 'intensity'
@@ -89,14 +90,14 @@ def channel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
 
 def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:
     """
-    Write columns of equal length K as the vertices of a binary PLY, whole or not at all.
+    Write columns of equal length K as the vertices of a binary PLY, atomically.
 
     Parameters
     ----------
     path : str or Path
         The file; see replace_file.
     columns : mapping of str to (K,) array
-        At least one, of integers of up to 32 bits, float32 or float64.
+        At least one column of integers of up to 32 bits, float32 or float64.
 
     Raises
     ------
@@ -116,7 +117,7 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
 
 def write_mesh(path: str | Path, mesh: Mesh) -> None:
     """
-    Write a mesh as a binary PLY, with the colours of the vertices where there are any.
+    Write a mesh as a binary PLY, with the colours of the vertices if it has any.
 
     Raises
     ------
@@ -162,13 +163,13 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     Parameters
     ----------
     path : str or Path
-        A PLY file, binary or ascii. Its first element has to be the vertices, and these have to
-        be plain numbers; elements after them (faces) are not read.
+        A PLY file, binary or ascii. Its first element must be the vertices, with scalar
+        properties; later elements (faces) are not read.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is no PLY, is of another structure or truncated.
+        If the file cannot be read, is not a PLY, has another structure or is truncated.
 
     """
     try:
@@ -207,7 +208,7 @@ def text_columns(
         table = np.array([float(word) for word in words]).reshape(count, len(names))
     except ValueError as error:
         raise FileFormatError(f'{path}: {error}') from error
-    with np.errstate(invalid='ignore'):  # what is no whole number of its type becomes any
+    with np.errstate(invalid='ignore'):  # numbers out of the range of an integer type
         return {name: table[:, at].astype(layout[name]) for at, name in enumerate(names)}
 
 
@@ -215,12 +216,12 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
     """
     Return the number and layout of the vertices, and whether they are text.
 
-    The file is left at the first of them.
+    The file is then at the first vertex.
     """
     header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
     lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
     if not found or not lines or lines[0] != ['ply']:
-        raise FileFormatError(f'{path}: no header of a PLY file')
+        raise FileFormatError(f'{path}: not a PLY file, its header is missing')
     file.seek(len(header))
     file.readline()
     lines = [line for line in lines[1:] if line and line[0] not in ('comment', 'obj_info')]
@@ -232,7 +233,7 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
         number = int(count)
     except (ValueError, KeyError) as error:
         raise FileFormatError(
-            f'{path}: not a PLY whose first element has plain numbers alone'
+            f'{path}: not a PLY whose first element has scalar properties only'
         ) from error
     if version != '1.0' or element != 'vertex' or number < 0 or not properties:
         raise FileFormatError(

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Scans that lie in files of their own: PLY, PCD, and the raw float32 of KITTI and nuScenes.
+Folders of scans, one file each: PLY, PCD, and the raw float32 of KITTI and nuScenes.
 
-A file knows neither its time nor its frame; who reads a folder of them says both.
+Such files state neither time nor frame; the caller supplies both.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from surfel_mapper.files.atomic import by_number
 SUFFIXES = ('.ply', '.pcd', '.bin')
 
 RAW_COLUMNS = {'.bin': 4, '.pcd.bin': 5}
-"""Float32 numbers a point: KITTI x y z intensity, nuScenes x y z intensity ring."""
+"""Float32 numbers per point: KITTI x y z intensity, nuScenes x y z intensity ring."""
 
 EXTRA = ('intensity', 'ring')
 
 ALIASES = {'scalar_intensity': 'intensity', 'scalar_Intensity': 'intensity'}
-"""What CloudCompare calls columns."""
+"""Names of columns in files of CloudCompare, and ours."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -40,7 +40,7 @@ def scan_files(directory: Path) -> list[Path]:
 
 def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
     """
-    Return the points (N, 3) of a file of one scan, m, and what else they carry.
+    Return the points (N, 3), m, of a scan in a file, and its other columns.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
 
 
 def read_raw(path: Path) -> tuple[npt.NDArray[Any], Columns]:
-    """Return points and columns of a file of bare float32."""
+    """Return points and columns of a file of raw float32."""
     width = RAW_COLUMNS['.pcd.bin' if path.name.endswith('.pcd.bin') else '.bin']
     try:
         size = os.stat(path).st_size

@@ -1,15 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Named arrays and attributes in one file that is whole or refused: how maps are saved.
+Named arrays and attributes in one checked file: the format of saved maps.
 
-The file is an npz archive, so numpy reads the arrays without this package, with a member
-``manifest.json`` beside them: name and version of the format, attributes, type and shape of every
-array, and the SHA-256 of all of that and of the arrays' bytes. Nothing is pickled.
+The file is an npz archive, so numpy reads the arrays without this package. Its member
+``manifest.json`` has name and version of the format, attributes, type and shape of every array,
+and the SHA-256 of all of that and of the arrays' bytes. Nothing is pickled.
 
-Reading believes no size: all members together may claim at most MAX_RATIO times the file (zlib
-packs up to 1000 times), and no array is made larger than the bytes of its member. So memory is
-bounded by the file; what would pack better than that is written unpacked.
+Sizes in a file are not trusted: all members together may claim at most MAX_RATIO times the size of
+the file (zlib reaches 1000), and no array is larger than its member. So memory is bounded by the
+file; content that would compress better is written uncompressed.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MAX_RATIO = 100
 CHUNK_BYTES = 1 << 20
 
 NPY_HEADER_BYTES = 12000
-"""What numpy writes before the numbers of an array is shorter."""
+"""Upper bound of the header that numpy writes before an array."""
 
 ENCRYPTED = 1
 """Bit of a zip member's flags."""
@@ -50,7 +50,7 @@ def save_state(
     path: str | Path, arrays: Arrays, attributes: Mapping[str, Any], *, compress: bool = False
 ) -> None:
     """
-    Write arrays and attributes to a file, whole or not at all.
+    Write arrays and attributes to a file, atomically.
 
     Parameters
     ----------
@@ -59,9 +59,9 @@ def save_state(
     arrays : mapping of str to array
         Names of letters, digits, ``_``, ``-`` and ``.``; arrays of numbers, booleans or strings.
     attributes : mapping of str
-        What JSON holds; tuples come back as lists.
+        JSON values; tuples come back as lists.
     compress : bool
-        Pack with zlib: a map gets 1.7 times smaller and takes 4 times as long.
+        Compress with zlib: a map gets 1.7 times smaller and takes 4 times as long.
 
     Raises
     ------
@@ -99,20 +99,20 @@ def save_state(
 def write_archive(
     file: BinaryIO, manifest: Mapping[str, Any], arrays: Arrays, compress_type: int
 ) -> int:
-    """Write manifest and arrays as a zip archive; return the size of its members unpacked."""
+    """Write manifest and arrays as a zip archive; return the uncompressed size of its members."""
     with zipfile.ZipFile(file, 'w') as archive:
         text = json.dumps(manifest, indent=1, allow_nan=False)
         archive.writestr(zipfile.ZipInfo(MANIFEST), text, compress_type, compresslevel=1)
         for name, array in arrays.items():
             content = io.BytesIO()
             np.lib.format.write_array(content, array, allow_pickle=False)
-            info = zipfile.ZipInfo(f'{name}.npy')  # of no date: that would differ every time
+            info = zipfile.ZipInfo(f'{name}.npy')  # without a date, so that bytes are equal
             archive.writestr(info, content.getbuffer(), compress_type, compresslevel=1)
         return sum(info.file_size for info in archive.infolist())
 
 
 def content_sha256(manifest: Mapping[str, Any], arrays: Iterable[npt.NDArray[Any]]) -> str:
-    """Return the hash over a manifest, but for its hash, and the bytes of its arrays in order."""
+    """Return the hash of a manifest, without its own hash, and of its arrays in order."""
     rest = {key: value for key, value in manifest.items() if key != 'sha256'}
     content = hashlib.sha256(json.dumps(rest, sort_keys=True, allow_nan=False).encode())
     for array in arrays:
@@ -124,12 +124,12 @@ def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
     """
     Return the arrays and the attributes of a file that save_state wrote.
 
-    Memory is at most MAX_RATIO times the size of the file, whatever it claims.
+    Memory is at most MAX_RATIO times the size of the file.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, is of another format or version, or is not what was written.
+        If the file cannot be read, is of another format or version, or is damaged.
 
     """
     try:
@@ -150,7 +150,7 @@ def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
 def read_archive(
     path: str | Path, archive: zipfile.ZipFile, file_size: int
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
-    """Return arrays and attributes; whatever does not fit together raises some error."""
+    """Return arrays and attributes; raise any exception if the content is inconsistent."""
     members = {info.filename: info for info in archive.infolist()}
     if MANIFEST not in members:
         raise FileFormatError(f'{path}: no {MANIFEST} inside, expected a state of surfel_mapper')
@@ -182,7 +182,7 @@ def read_archive(
 
 
 def check_packing(info: zipfile.ZipInfo) -> None:
-    """Refuse a member packed in a way that save_state never uses."""
+    """Raise ValueError if a member is encrypted or compressed with another method than zlib."""
     plain = info.compress_type in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
     if not plain or info.flag_bits & ENCRYPTED:
         raise ValueError(f'{info.filename}: encrypted, or packing {info.compress_type}')
@@ -191,7 +191,7 @@ def check_packing(info: zipfile.ZipInfo) -> None:
 def read_array(
     archive: zipfile.ZipFile, info: zipfile.ZipInfo, entry: Mapping[str, Any]
 ) -> npt.NDArray[Any]:
-    """Return one array, which has to be of the type and shape that its entry states."""
+    """Return one array; raise ValueError if type or shape differ from its entry."""
     content = read_bytes(archive, info)
     stream = io.BytesIO(content[:NPY_HEADER_BYTES])
     if np.lib.format.read_magic(stream) != (1, 0):
@@ -206,9 +206,9 @@ def read_array(
 
 def read_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
     """
-    Return a member unpacked, as many bytes as it claims.
+    Return an unpacked member of exactly the size that it claims.
 
-    Asked for all at once, zipfile unpacks up to 2 GiB before it cuts to the size claimed.
+    Read in pieces: a single read unpacks up to 2 GiB before zipfile cuts to the claimed size.
     """
     content = bytearray(info.file_size)
     unfilled = memoryview(content)
@@ -222,10 +222,10 @@ def read_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
 
 
 def is_array_name(name: str) -> bool:
-    """Return whether an array may have this name: the member of the archive is called so."""
+    """Return whether a name is valid for an array, and so for a member of the archive."""
     return re.fullmatch(r'[A-Za-z0-9_.-]+', name) is not None
 
 
 def is_array_type(dtype: str) -> bool:
-    """Return whether arrays of this type are stored: plain bytes, nothing that needs pickling."""
+    """Return whether arrays of this type are stored: those that need no pickling."""
     return re.fullmatch(r'[<>|][biufcSU][1-9][0-9]*', dtype) is not None

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Trajectories as text: TUM, KITTI and CSV read, TUM written.
+Trajectories as text: reading TUM, KITTI and CSV, writing TUM.
 
-Stamps are decimal text to nanoseconds and back without a float between, because a float64 has
-only 240 ns at the seconds of this century; coordinates are written with the digits that give the
-same float64 back. Nothing is put in order or filled in: a pose of the wrong time maps a scan to
-the wrong place.
+Stamps are converted between decimal text and nanoseconds without a float, because the resolution
+of a float64 is only 240 ns for seconds since 1970; coordinates are written with the digits that
+restore the same float64. Poses are neither sorted nor interpolated here: a pose of the wrong time
+maps a scan to the wrong place.
 """
 
 from __future__ import annotations
@@ -40,14 +40,14 @@ POSE_COLUMNS = (
     ('qz', 'q_z', 'q_rs_z', 'orientation_z'),
     ('qw', 'q_w', 'q_rs_w', 'orientation_w'),
 )
-"""What the seven numbers of a pose are called in CSV files (those with RS are EuRoC's)."""
+"""Names of the seven numbers of a pose in CSV files (those with RS are EuRoC's)."""
 
 STAMP_COLUMNS = ('stamp', 'timestamp', 'time', 't')
 
 UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 MOST_SECONDS = 10**11
-"""A larger stamp without a unit is not in seconds: these are 3000 years."""
+"""Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,7 +80,7 @@ def write_tum(
     T_fixed_sensor: npt.ArrayLike,
 ) -> None:
     """
-    Write poses as TUM text, a line ``stamp_s x y z qx qy qz qw`` each; whole or not at all.
+    Write poses as TUM text, one line ``stamp_s x y z qx qy qz qw`` each, atomically.
 
     Parameters
     ----------
@@ -112,15 +112,15 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     Parameters
     ----------
     path : str or Path
-        The file. KITTI poses take their stamps from a times.txt beside it, where there is one.
+        The file. KITTI poses take their stamps from a times.txt beside it, if there is one.
     format_ : str, optional
-        tum, kitti or csv; without it told by the first line: 8 numbers, 12 numbers, or commas.
+        tum, kitti or csv; by default told from the first line: 8 numbers, 12 numbers, or commas.
 
     Raises
     ------
     FileFormatError
-        If the file cannot be read, holds no poses, or a line is no pose of the format, or its
-        stamp is not after that of the line before.
+        If the file cannot be read, has no poses, a line is not a pose of the format, or stamps do
+        not increase.
 
     """
     lines = numbered_lines(path)
@@ -146,7 +146,7 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
 
 
 def numbered_lines(path: str | Path) -> list[tuple[str, str]]:
-    """Return the lines that say something, each with where it is; a commented header is one."""
+    """Return file:line and text of all lines but comments; a commented CSV header is kept."""
     try:
         text = Path(path).read_text(encoding='utf-8-sig')
     except OSError as error:
@@ -158,7 +158,7 @@ def numbered_lines(path: str | Path) -> list[tuple[str, str]]:
 
 
 def is_comment(line: str) -> bool:
-    """Return whether a line is a comment, and not the header of a CSV with # before it."""
+    """Return whether a line is a comment, and not a commented CSV header."""
     return line.startswith(('#', '%')) and ',' not in line
 
 
@@ -179,7 +179,7 @@ def guessed(path: str | Path, line: str) -> str:
 def tum_rows(
     path: str | Path, lines: list[tuple[str, str]]
 ) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield where it is, stamp and numbers of every pose of a TUM file."""
+    """Yield file:line, stamp and numbers of every pose of a TUM file."""
     for where, line in lines:
         columns = line.split()
         if len(columns) != 8:
@@ -190,7 +190,7 @@ def tum_rows(
 def csv_rows(
     path: str | Path, lines: list[tuple[str, str]]
 ) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield where it is, stamp and numbers of every pose of a CSV file with a header."""
+    """Yield file:line, stamp and numbers of every pose of a CSV file with a header."""
     header = [column_name(text) for text in lines[0][1].lstrip('# ').split(',')]
     names = [name for name, _ in header]
     stamps = [place for place, name in enumerate(names) if name in STAMP_COLUMNS]
@@ -237,7 +237,7 @@ def kitti_poses(path: str | Path, lines: list[tuple[str, str]]) -> Trajectory:
 
 
 def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
-    """Return whether a (3, 3) matrix is a rotation, to the few digits that such files have."""
+    """Return whether a (3, 3) matrix is a rotation, to the few digits of such files."""
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 2.0:
         return False
     skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
@@ -245,7 +245,7 @@ def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
-    """Return the stamps in a times.txt, which has to have as many lines as there are poses."""
+    """Return the stamps in a times.txt, which must have one line per pose."""
     if not path.is_file():
         return None
     stamps = [nanoseconds(line, where) for where, line in numbered_lines(path)]
@@ -257,7 +257,7 @@ def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
 
 
 def check_pose(where: str, values: list[float]) -> None:
-    """Refuse seven numbers that are no pose."""
+    """Raise FileFormatError if seven numbers are not a pose."""
     try:
         pose_matrix(values[:3], values[3:])
     except ValueError as error:
@@ -276,7 +276,7 @@ def floats(texts: Sequence[str], where: str) -> list[float]:
 
 
 def nanoseconds(text: str, where: str, unit: str = '') -> int:
-    """Return a time as the nearest whole nanoseconds."""
+    """Return a time rounded to nanoseconds."""
     try:
         number = Decimal(text.strip())
     except InvalidOperation as error:

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A whole TSDF in one file: what is loaded goes on as if it had never stopped.
+Saving and loading a TSDF: a loaded map continues as if it had never stopped.
 
-Blocks are written in the order of their index, so that equal maps give equal bytes. Nothing in a
-file is believed: blocks have to be there once each, distances within the truncation, weights not
-negative.
+Blocks are written in the order of their index, so that equal maps give equal bytes. Files are not
+trusted: blocks must be unique, distances within the truncation, weights not negative.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ SHAPE = (
     'semantics',
     'votes_per_voxel',
 )
-"""What a configuration has to share with a file."""
+"""Settings that must be equal in a configuration and a file."""
 
 ARRAYS = {
     'index': np.int64,
@@ -50,11 +49,11 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
     Parameters
     ----------
     path : str or Path
-        The file, by custom with the extension npz; written whole or not at all.
+        The file, usually with the extension npz; written atomically.
     blocks : BlockMap
         The map.
     compress : bool
-        Pack: smaller, and slower.
+        Compress: smaller and slower.
 
     Raises
     ------
@@ -72,14 +71,14 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
 
 def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     """
-    Return a TSDF as it was saved.
+    Return a saved TSDF.
 
     Parameters
     ----------
     path : str or Path
         A file that save_tsdf wrote.
     config : TsdfConfig
-        How the map goes on; what shapes its arrays has to be that of the file.
+        Settings of the loaded map; those that shape its arrays (SHAPE) must equal the file's.
 
     Raises
     ------
@@ -92,7 +91,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
     """
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
-        raise FileFormatError(f'{path}: holds {attributes.get("kind")!r}, expected a {KIND}')
+        raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     for name in SHAPE:
         found, wanted = attributes.get(name), getattr(config, name)
         if found != wanted:
@@ -114,7 +113,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
 
 
 def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
-    """Return the content of a file, which has to be possible; otherwise raise ValueError."""
+    """Return the content of a file; raise ValueError if it is impossible."""
     count = len(arrays['index'])
     for name, dtype in ARRAYS.items():
         array, channel = arrays[name], getattr(blocks, name, None)
@@ -125,7 +124,7 @@ def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
             raise ValueError(f'{name}: {array.dtype} {array.shape}, expected {shape}')
     keys = block_keys(arrays['index'])
     if (keys < 0).any() or len(np.unique(keys)) < count:
-        raise ValueError('a block stands twice, or is none')
+        raise ValueError('a block occurs twice, or is out of range')
     distance, weight = arrays['field'][:, 0], arrays['field'][:, 1]
     limit = np.float32(blocks.config.truncation_m * (1.0 + 1e-6))
     if not (np.abs(distance) <= limit).all():

@@ -1,16 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Images that a transport has packed: sensor_msgs/CompressedImage as ROS's image_transport writes it.
+Decoding sensor_msgs/CompressedImage as ROS's image_transport writes it.
 
-The transport ``compressed`` holds a JPEG or a PNG; ``compressedDepth`` twelve bytes, of which two
-numbers matter, and a PNG of 16 bits: millimetres, or for depth in metres its inverse in even
-steps. An image is unpacked where its pixels are wanted and is a sensor_msgs/Image from there on;
-one that is none already is handed through. What a JPEG loses does not matter to colours, but
-would make labels and depths that nobody measured.
+The transport ``compressed`` holds a JPEG or a PNG; ``compressedDepth`` a header of twelve bytes
+and a PNG of 16 bits: millimetres, or for depth in metres the quantised inverse depth. The result
+has the attributes of a sensor_msgs/Image; an Image is returned unchanged. JPEG is accepted for
+colours only: its losses would change labels and depths.
 
-Only the decoders of JPEG and PNG are let near the bytes, and none for more pixels than a camera
-has, so that a few bytes cannot ask for all memory.
+Only the decoders of JPEG and PNG are enabled, and the size in the header is checked before
+decoding, so that a few bytes cannot allocate all memory.
 """
 
 from __future__ import annotations
@@ -27,16 +26,16 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 
 TRANSPORTS = ('compressed', 'compressedDepth')
-"""What the last part of the name of a topic of packed images is."""
+"""Last part of the name of a topic of compressed images."""
 
 DEPTH_HEADER = np.dtype([('format', '<i4'), ('quantum', '<f4', 2)])
-"""What comes before the PNG of compressedDepth: the two numbers make metres of its steps."""
+"""Header of compressedDepth: the two numbers convert quantised inverse depth to metres."""
 
 MAX_PIXELS = 1 << 26
-"""An image of more is refused: 8192 x 8192."""
+"""Larger images are refused: 8192 x 8192 pixels."""
 
 ENCODINGS = {'L': 'mono8', 'RGB': 'rgb8', 'I;16': '16UC1', 'I;16B': '16UC1', 'I': '16UC1'}
-"""What Pillow calls the pixels of a file, and their encoding in a message."""
+"""Pillow's mode of an image, and the encoding of a message."""
 
 DAMAGED = (
     OSError,
@@ -48,36 +47,36 @@ DAMAGED = (
     struct.error,
     zlib.error,
 )
-"""What Pillow raises for bytes that are no image, or stop being one."""
+"""Exceptions that Pillow raises for damaged images."""
 
 
 def is_packed(topic: str) -> bool:
-    """Return whether a topic is, by its name, one of packed images."""
+    """Return whether a topic has compressed images, by its name."""
     return topic.rpartition('/')[2] in TRANSPORTS
 
 
 def base_topic(topic: str) -> str:
-    """Return the topic of the images that a topic has packed; of others their own."""
+    """Return the topic of the raw images of a compressed topic; other names unchanged."""
     return topic.rpartition('/')[0] if is_packed(topic) else topic
 
 
 def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
     """
-    Return a sensor_msgs/Image, or what looks like one, of an image that may be packed.
+    Return an image that may be compressed with the attributes of a sensor_msgs/Image.
 
     Parameters
     ----------
     msg : sensor_msgs/Image or sensor_msgs/CompressedImage
-        Of any library.
+        From rclpy or rosbags.
     topic : str
-        For errors.
+        Named in errors.
     exact : bool
-        Whether the values matter one by one, so that a JPEG will not do.
+        Whether to refuse JPEG, which changes values.
 
     Raises
     ------
     CloudFormatError
-        If its bytes are no image of the format that it states.
+        If the bytes are not an image of the stated format.
 
     """
     if not hasattr(msg, 'format'):
@@ -105,7 +104,7 @@ def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
 
 
 def depth_of(data: bytes, encoding: str, packing: str, topic: str) -> tuple[str, npt.NDArray[Any]]:
-    """Return encoding and pixels of what compressedDepth has packed."""
+    """Return encoding and pixels of a compressedDepth image."""
     if packing.endswith('rvl') or encoding not in ('16UC1', '32FC1'):
         raise CloudFormatError(
             f'{topic}: format {encoding}; {packing}, expected a png of 16UC1 or 32FC1; set '
@@ -138,6 +137,6 @@ def pixels_of(data: bytes, topic: str, formats: tuple[str, ...]) -> tuple[str, n
             pixels = np.asarray(shown)
     except (*DAMAGED, Image.DecompressionBombError) as error:
         expected = ' or '.join(formats)
-        raise CloudFormatError(f'{topic}: no {expected} that can be read: {error}') from error
+        raise CloudFormatError(f'{topic}: not a readable {expected}: {error}') from error
     encoding = ENCODINGS[shown.mode]
     return encoding, np.ascontiguousarray(pixels, '<u2' if encoding == '16UC1' else 'u1')

@@ -1,26 +1,40 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Exact moments as fields of a cloud, and back.
+Exact moments as fields of a cloud, and MapMirror: a client's exact copy of the map of a node.
 
-A PointField holds no 64-bit integer. So each integer is a field of two uint32, the low half
+A PointField has no 64-bit integer. So each integer is a field of two uint32, the low half
 first: its bytes in little-endian order. The number of points is ``num_points``, the voxel three
-int32, and what the map sums of its channels follows under their names.
+int32; the sums of the map's channels follow under their names.
+
+``~/changed`` states the present moments of all voxels that a scan changed, not the difference, so
+a message applied twice, or after a newer full map, does no harm. ``~/normals`` regularly states
+the full map: it starts a copy, and mends one that has missed a change. Both carry the moments if
+``publish.moments`` is set.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from itertools import dropwhile
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_columns import surfel_columns
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.appended import appended
-from surfel_mapper.messages.pointcloud2 import CloudBytes, from_columns, UINT32
+from surfel_mapper.messages.pointcloud2 import (
+    append_fields,
+    CloudBytes,
+    from_columns,
+    to_scan,
+    UINT32,
+)
 
 VOXEL = ('voxel_x', 'voxel_y', 'voxel_z')
 
@@ -44,16 +58,16 @@ def moment_cloud(
     surfels: Surfels, moments: ScanMoments, removed: npt.NDArray[np.int32]
 ) -> CloudBytes:
     """
-    Return the cloud of ~/normals and ~/changed where moments are asked for.
+    Return the cloud of ~/normals and ~/changed with moments (publish.moments).
 
     Parameters
     ----------
     surfels : Surfels
-        Of every voxel once.
+        One for each voxel.
     moments : ScanMoments
         Of the same voxels, sorted by voxel, as SurfelMap.moments returns them.
     removed : (E, 3) int32
-        Voxels that hold nothing any more; a row of 0 points each, nan and 0 throughout.
+        Voxels that are empty now; each becomes a row with 0 points, all else nan or 0.
 
     """
     order = np.argsort(pack_keys(surfels.voxel_index))
@@ -68,7 +82,7 @@ def moment_cloud(
     sums = np.zeros((len(index), len(names)), np.int64)
     np.concatenate(arrays, axis=1, out=sums[: len(moments)])
     fields = [(name, UINT32, 2) for name in names]
-    return appended(from_columns(columns), halves(sums), fields)
+    return append_fields(from_columns(columns), halves(sums), fields)
 
 
 def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...]) -> ScanMoments:
@@ -78,11 +92,11 @@ def moments_in(columns: Columns, voxel_size_m: float, channels: tuple[str, ...])
     Parameters
     ----------
     columns : dict of str to array
-        Of a decoded cloud, x, y and z among them.
+        Columns of a decoded cloud, with x, y and z.
     voxel_size_m : float
         Of the map.
     channels : tuple of str
-        What else the map sums: intensity; red, green, blue.
+        Further channels that the map sums: intensity; red, green, blue.
 
     Raises
     ------
@@ -120,14 +134,14 @@ def check_size(
     rows: npt.NDArray[np.bool_],
     voxel_size_m: float,
 ) -> None:
-    """Refuse surfels that do not lie in their voxels."""
+    """Raise CloudFormatError if surfels do not lie in their voxels."""
     position = np.stack([columns[name] for name in 'xyz'], axis=1)[rows].astype(np.float64)
     offset = np.abs(position - (index[rows] + 0.5) * voxel_size_m)
     slack = 1e-6 * (np.abs(position) + voxel_size_m)  # positions are float32
     if (offset > 0.5 * voxel_size_m + slack).any():
         raise CloudFormatError(
-            f'surfels that lie outside of their voxels of {voxel_size_m:g} m; has the map of the '
-            'node another map.voxel_size_m?'
+            f'surfels outside of their voxels of {voxel_size_m:g} m; does the node have another '
+            'map.voxel_size_m?'
         )
 
 
@@ -142,6 +156,90 @@ def whole(pairs: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 
 def extended(values: npt.NDArray[Any], number: int) -> npt.NDArray[Any]:
-    """Return a column with so many more rows: nan where it has such, else 0."""
+    """Return a column with ``number`` further rows: nan for floats, 0 for integers."""
     filling = np.nan if values.dtype.kind == 'f' else 0
     return np.concatenate([values, np.full(number, filling, values.dtype)])
+
+
+MAX_RECENT = 100
+"""Number of changes kept in case an older full map arrives after them: 5 s at 20 Hz."""
+
+
+RESET_NS = 10**9
+"""A stamp that is older by more than this means that time was set back; less, another sensor."""
+
+
+class MapMirror:
+    """
+    A copy of a map that follows another.
+
+    Parameters
+    ----------
+    voxel_size_m : float
+        ``map.voxel_size_m`` of the node.
+    columns : tuple of str
+        ``map.columns`` of the node: ``intensity``, ``rgb``.
+
+    Attributes
+    ----------
+    map : SurfelMap
+        The copy, to be read only.
+    stamp_ns : int
+        Stamp of the newest scan in it; 0 at first.
+    is_complete : bool
+        Whether a full map has come; until then the copy has only the changes since the start.
+
+    """
+
+    def __init__(self, voxel_size_m: float, columns: tuple[str, ...] = ()) -> None:
+        self.map = SurfelMap(voxel_size_m, columns=columns)
+        self.stamp_ns = 0
+        self.is_complete = False
+        self._channels = channel_names(columns)
+        self._recent: deque[tuple[int, ScanMoments]] = deque(maxlen=MAX_RECENT)
+
+    def replace(self, msg: Any) -> None:
+        """
+        Take the full map of a message on ~/normals; changes since then are applied to it.
+
+        Parameters
+        ----------
+        msg : sensor_msgs/PointCloud2
+            From rclpy or rosbags.
+
+        Raises
+        ------
+        CloudFormatError
+            If it has no moments, or those of other voxels; the copy is unchanged then.
+
+        """
+        stamp_ns, moments = self._read(msg)
+        self.map.clear()
+        self.map.insert(moments)
+        self.stamp_ns = stamp_ns
+        for changed_ns, changed in dropwhile(lambda change: change[0] < stamp_ns, self._recent):
+            self._put(changed)
+            self.stamp_ns = changed_ns
+        self.is_complete = True
+
+    def change(self, msg: Any) -> None:
+        """Apply a message on ~/changed; see replace."""
+        stamp_ns, moments = self._read(msg)
+        if stamp_ns < self.stamp_ns - RESET_NS:
+            self._recent.clear()
+        self._recent.append((stamp_ns, moments))
+        self._put(moments)
+        self.stamp_ns = stamp_ns
+
+    def _read(self, msg: Any) -> tuple[int, ScanMoments]:
+        """Return the stamp and the moments in a message."""
+        scan = to_scan(msg)
+        if not len(scan):
+            return scan.stamp_ns, self.map.moments(np.empty((0, 3), np.int32))
+        columns = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
+        return scan.stamp_ns, moments_in(columns, self.map.voxel_size_m, self._channels)
+
+    def _put(self, moments: ScanMoments) -> None:
+        """Replace the moments of voxels in the copy."""
+        self.map.remove(self.map.moments(moments.voxel_index))
+        self.map.insert(moments.select(moments.count > 0))

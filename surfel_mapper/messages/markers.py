@@ -1,187 +1,162 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfels as markers: coloured discs, and normals as lines.
+visualization_msgs/Marker, MarkerArray and polygons, serialised from arrays.
 
-Six corners make a disc of four triangles, 12 vertices of 40 bytes: 20,000 discs are 10 MB, of
-which the middleware makes two copies more. (A colour a triangle would save a quarter, but not
-every viewer takes that.) All discs are one marker and all lines another, so that each message
-replaces what was drawn before: surfels that have left the map are gone from the picture too.
+A marker of a surfel map has hundreds of thousands of vertices, so the message object is never
+built: its bytes are, which rclpy publishes as they are. surfel_markers.py and model_messages.py
+fill the markers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.mapping.ages import Ages
-from surfel_mapper.messages.cdr import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
-from surfel_mapper.messages.kernels.discs import draw_discs, draw_normals
+from surfel_mapper.messages.cdr import MessageWriter, write_header
 
-if TYPE_CHECKING:
-    from surfel_mapper.mapping.surfels import Surfels
-    from surfel_mapper.mapping.window import WindowedScan
+LINE_LIST = 5
+TEXT_VIEW_FACING = 9
+TRIANGLE_LIST = 11
+ADD = 0
+DELETE = 2
+DELETE_ALL = 3
 
-SEGMENTS = 6
-
-ANGLES = np.arange(SEGMENTS) * (2.0 * math.pi / SEGMENTS)
-
-CIRCLE = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
-"""The corners of a disc."""
-
-PALETTE = np.array(
-    [
-        (0.303, 0.035, 0.482),
-        (0.204, 0.259, 0.679),
-        (0.076, 0.457, 0.652),
-        (0.112, 0.606, 0.652),
-        (0.146, 0.758, 0.613),
-        (0.541, 0.873, 0.429),
-        (0.964, 0.918, 0.304),
-    ]
-)
-"""
-Colours of 0 to 1 at equal distances, red green blue: violet, blue, green, yellow.
-
-Lightness rises evenly from 0.34 to 0.92 while the hue turns from 305 to 105 deg in Oklab, each
-as colourful as the screen allows: the order can be seen in grey, and by the colour-blind.
-"""
-
-SHADES = 256
-
-TABLE = np.stack(
-    [
-        np.interp(np.linspace(0, 1, SHADES), np.linspace(0, 1, len(PALETTE)), channel)
-        for channel in (*PALETTE.T, np.ones(len(PALETTE)))
-    ],
-    axis=1,
-).astype(np.float32)
-"""The palette in fine steps, with opacity."""
-
-NORMAL_COLOR = (0.9, 0.9, 0.9, 0.8)
+IDENTITY = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
-def surfel_markers(
-    surfels: Surfels,
-    voxel_size_m: float,
-    colors: npt.NDArray[np.float32],
-    *,
-    stamp_ns: int,
-    frame_id: str,
-) -> list[Marker]:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Marker:
     """
-    Return two markers that draw surfels: their discs, and their normals as lines.
+    A visualization_msgs/Marker; its further members are zero or empty in the message.
 
-    Parameters
+    Attributes
     ----------
-    surfels : Surfels
-        Those without a normal are left out.
-    voxel_size_m : float
-        Bounds the radius of a disc at half the diagonal of a voxel's face.
-    colors : (K, 4) float32
-        Red, green, blue and opacity of each surfel in [0, 1]; see shades and normal_colors.
-    stamp_ns, frame_id : int, str
-        Of the map.
+    ns, id : str, int
+        Identity of the marker: the next one of the same namespace and id replaces it.
+    type, action : int
+        TRIANGLE_LIST, LINE_LIST or TEXT_VIEW_FACING; ADD, DELETE or DELETE_ALL.
+    frame_id, stamp_ns : str, int
+        Coordinate frame of the points, and time in nanoseconds.
+    pose : 7 floats
+        Of the points in the frame: x y z in m, then qx qy qz qw.
+    scale : 3 floats
+        A factor for triangles; for lines the first is their width, for text the last its height,
+        in m.
+    color : 4 floats
+        Red, green, blue, opacity in [0, 1]; used if the points have no colours of their own.
+    points : (P, 3) float64, m
+        Corners of triangles, or ends of lines.
+    colors : (P, 4) float32
+        One for each point, or empty.
+    text : str
+        Of a TEXT_VIEW_FACING.
 
-    Returns
-    -------
-    list of Marker
-        ``discs`` and ``normals``, which replace those sent before; where nothing is to be drawn,
-        they delete them.
-
-    """
-    rows = np.flatnonzero(np.isfinite(surfels.normal[:, 0]))  # nan in all of it, or in none
-    drawn = (surfels.position, surfels.normal)
-    discs = np.empty((len(rows) * 3 * (SEGMENTS - 2), 3))
-    disc_colors = np.empty((len(discs), 4), np.float32)
-    radius = disc_radius(surfels.eigenvalues[rows], voxel_size_m)
-    draw_discs(drawn, rows, radius, colors[rows], CIRCLE, discs, disc_colors)
-    lines = np.empty((2 * len(rows), 3))
-    draw_normals(drawn, rows, 0.5 * voxel_size_m, lines)
-    action = ADD if len(rows) else DELETE
-    return [
-        Marker(
-            ns='discs',
-            id=0,
-            type=TRIANGLE_LIST,
-            action=action,
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
-            points=discs,
-            colors=disc_colors,
-        ),
-        Marker(
-            ns='normals',
-            id=0,
-            type=LINE_LIST,
-            action=action,
-            frame_id=frame_id,
-            stamp_ns=stamp_ns,
-            scale=(0.02 * voxel_size_m, 0.0, 0.0),
-            color=NORMAL_COLOR,
-            points=lines,
-        ),
-    ]
-
-
-def disc_radius(
-    eigenvalues: npt.NDArray[np.float64], voxel_size_m: float
-) -> npt.NDArray[np.float64]:
-    """
-    Return the radius of the disc that stands for each surfel, (K,) m.
-
-    The variance along the side of a square patch is side^2 / 12; half of the side, so that the
-    discs of a plane touch, is sqrt(3 e2) for the larger variance in the patch.
-    """
-    radius: npt.NDArray[np.float64] = np.sqrt(3.0 * np.maximum(eigenvalues[:, 2], 0.0))
-    return np.minimum(radius, math.sqrt(0.5) * voxel_size_m, out=radius)
-
-
-def shades(values: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Return the colours of values in [0, 1], (K, 4): dark to bright; nan counts as 0."""
-    steps = np.rint(np.nan_to_num(np.clip(values, 0.0, 1.0)) * (SHADES - 1))
-    return np.asarray(TABLE[steps.astype(np.uint8)])
-
-
-def disc_colors(
-    kind: str,
-    surfels: Surfels,
-    scans: Iterable[WindowedScan] = (),
-    ages: Ages | None = None,
-) -> npt.NDArray[np.float32]:
-    """
-    Return the colours of surfels, (K, 4).
-
-    Parameters
-    ----------
-    kind : str
-        planarity, normal or age: the newest of the scans that saw the voxel, from dark for the
-        oldest scan to bright for the newest.
-    surfels : Surfels
-        K of them.
-    scans : iterable of WindowedScan
-        Those of the window.
-    ages : Ages, optional
-        The one of the last drawing, which makes the next faster.
+    Raises
+    ------
+    ValueError
+        If the points or the colours are of another shape.
 
     """
-    if kind == 'normal':
-        return normal_colors(surfels.normal)
-    if kind == 'planarity':
-        return shades(surfels.planarity)
-    held = list(scans)
-    stamps = [scan.stamp_ns for scan in held] or [0]
-    span_ns = max(max(stamps) - min(stamps), 1)
-    last_ns = (ages or Ages()).last_seen_ns(surfels.voxel_index, held)
-    return shades((last_ns - min(stamps)) / span_ns)
+
+    ns: str
+    id: int
+    type: int
+    action: int
+    frame_id: str
+    stamp_ns: int
+    pose: Sequence[float] = IDENTITY
+    scale: Sequence[float] = (1.0, 1.0, 1.0)
+    color: Sequence[float] = (1.0, 1.0, 1.0, 1.0)
+    points: npt.NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 3)))
+    colors: npt.NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 4), np.float32))
+    text: str = ''
+
+    def __post_init__(self) -> None:
+        """Check the shapes."""
+        if self.points.ndim != 2 or self.points.shape[1] != 3:
+            raise ValueError(f'points: shape {self.points.shape}, expected (P, 3)')
+        if self.colors.shape not in ((0, 4), (len(self.points), 4)):
+            raise ValueError(
+                f'colors: shape {self.colors.shape}, expected (0, 4) or ({len(self.points)}, 4)'
+            )
 
 
-def normal_colors(normal: npt.NDArray[np.float64]) -> npt.NDArray[np.float32]:
-    """Return the colours of normals, (K, 4): red, green, blue are x, y, z from -1 to 1."""
-    colors = np.ones((len(normal), 4), np.float32)
-    colors[:, :3] = 0.5 * normal + 0.5
-    return colors
+def marker_array(markers: Sequence[Marker]) -> bytes:
+    """
+    Return the serialised visualization_msgs/MarkerArray of some markers.
+
+    Raises
+    ------
+    struct.error
+        If a stamp (from the year 2038 on) or an id does not fit into 32 bits.
+
+    """
+    writer = MessageWriter()
+    writer.numbers('I', len(markers))
+    for marker in markers:
+        write_marker(writer, marker)
+    return writer.join()
+
+
+def marker_bytes(marker: Marker) -> bytes:
+    """Return the serialised visualization_msgs/Marker; raises as marker_array does."""
+    writer = MessageWriter()
+    write_marker(writer, marker)
+    return writer.join()
+
+
+def polygon_instance(
+    ring: npt.NDArray[np.float64], number: int, *, stamp_ns: int, frame_id: str
+) -> bytes:
+    """Return the serialised geometry_msgs/PolygonInstanceStamped of a ring (M, 3), m."""
+    writer = MessageWriter()
+    write_header(writer, stamp_ns, frame_id)
+    writer.sequence(ring, '<f4')
+    writer.numbers('q', number)
+    return writer.join()
+
+
+def write_marker(writer: MessageWriter, marker: Marker) -> None:
+    """Write the members of a visualization_msgs/Marker of Jazzy, in its order."""
+    write_header(writer, marker.stamp_ns, marker.frame_id)
+    writer.string(marker.ns)
+    writer.numbers('i', marker.id, marker.type, marker.action)
+    writer.numbers('d', *marker.pose, *marker.scale)
+    writer.numbers('f', *marker.color)
+    writer.numbers('I', 0, 0)  # lifetime: stays until replaced
+    writer.numbers('B', 0)  # frame_locked
+    writer.sequence(marker.points, '<f8')
+    writer.sequence(marker.colors, '<f4')
+    writer.append(NO_TEXTURE, 4)
+    writer.string(marker.text)
+    writer.append(NO_MESH, 4)
+
+
+def no_texture() -> bytes:
+    """Return the members of a marker from texture_resource to uv_coordinates, all empty."""
+    writer = MessageWriter()
+    writer.string('')  # texture_resource
+    writer.numbers('I', 0, 0)  # texture.header.stamp
+    writer.string('')  # texture.header.frame_id
+    writer.string('')  # texture.format
+    writer.numbers('I', 0)  # texture.data
+    writer.numbers('I', 0)  # uv_coordinates
+    return writer.content()
+
+
+def no_mesh() -> bytes:
+    """Return the members of a marker from mesh_resource on, all empty."""
+    writer = MessageWriter()
+    writer.string('')  # mesh_resource
+    writer.string('')  # mesh_file.filename
+    writer.numbers('I', 0)  # mesh_file.data
+    writer.numbers('B', 0)  # mesh_use_embedded_materials
+    return writer.content()
+
+
+NO_TEXTURE, NO_MESH = no_texture(), no_mesh()
+"""Members that are the same in every marker; numbers in them are at multiples of 4."""

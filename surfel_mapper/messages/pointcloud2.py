@@ -1,43 +1,51 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The bytes of sensor_msgs/PointCloud2: messages to scans, columns to messages.
+sensor_msgs/PointCloud2: messages and serialised bytes to scans, columns to messages.
 
-A message is read by the names of its attributes only, so one decoder serves rclpy and bags, and
-nothing of ROS is imported. Sizes and fields are checked before a byte is read; every check is
-made on Python integers, which do not overflow. Columns are strided views into the message, which
-costs nothing for those that nobody reads; they are read-only, since the message is not ours.
+A message is read by the names of its attributes, so one decoder serves rclpy and bags, and ROS is
+not imported. Sizes and fields are checked before a byte is read, with Python integers, which do
+not overflow. Columns are strided, read-only views into the message, so unused ones cost nothing.
 
-Coordinates are gathered into one array that keeps each of x, y and z together, as the kernels of
-the map want them (Fortran order): 0.2 ms for 131072 points, aligned or not, of 22 to 48 bytes. As
-one (N, 3) view, whose inner loop is three numbers long, they take 1.0 ms.
+Coordinates are gathered into one array in Fortran order, as the kernels of the map need them:
+0.2 ms for 131072 points, aligned or not, of 22 to 48 bytes. As an (N, 3) view, whose inner loop is
+three numbers long, they take 1.0 ms.
+
+``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 import math
+import struct
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.messages.pose_messages import frame_name
+from surfel_mapper.messages.cdr import (
+    checked_stamp_ns,
+    frame_name,
+    Header,
+    MessageReader,
+    read_header,
+)
 from surfel_mapper.scan import Scan
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', UINT32: 'u4', FLOAT32: 'f4', FLOAT64: 'f8'}
-"""Numpy's name of every datatype that a PointField may have."""
+"""NumPy dtypes of the datatypes of a PointField."""
 
 DATATYPES = {np.dtype(name): datatype for datatype, name in DTYPES.items()}
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """What a PointField says: where in a point a column is, and of which type."""
+    """A sensor_msgs/PointField: place and type of a column in a point."""
 
     name: str
     offset: int
@@ -47,7 +55,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CloudBytes:
-    """All of a PointCloud2 but its header; the attributes are those of the message."""
+    """A PointCloud2 without its header; the attributes are those of the message."""
 
     height: int
     width: int
@@ -66,23 +74,23 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     Parameters
     ----------
     msg : sensor_msgs/PointCloud2
-        Of rclpy or rosbags, or anything with the same attributes; ``data`` may be any buffer.
+        From rclpy or rosbags, or any object with these attributes; ``data`` may be any buffer.
     topic : str
-        Where the message came from; errors begin with it.
+        Topic of the message; errors begin with it.
 
     Returns
     -------
     Scan
-        ``points`` is float32 if x, y and z are, else float64. ``columns`` holds every other
-        field in the type it has, (N,) or (N, count), read-only and mostly views into the message.
-        Fields without a name are padding and left out; of fields that share a name the first is
-        taken. A cloud of no points gives an empty scan without columns, whatever its fields.
+        ``points`` is float32 if x, y and z are, else float64. ``columns`` has every other field
+        in its own type, (N,) or (N, count), read-only and mostly views into the message. Fields
+        without a name are padding and left out; of fields with the same name the first is taken.
+        A cloud without points gives an empty scan without columns.
 
     Raises
     ------
     CloudFormatError
-        If sizes, fields and data do not fit together, x, y or z is missing, or the stamp is no
-        time.
+        If sizes, fields and data do not fit together, x, y or z is missing, or the stamp is
+        invalid.
 
     """
     stamp_ns = checked_stamp_ns(msg.header.stamp, topic)
@@ -106,19 +114,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     )
 
 
-def checked_stamp_ns(stamp: Any, topic: str) -> int:
-    """Return a builtin_interfaces/Time in nanoseconds, or refuse one that is no time."""
-    sec, nanosec = int(stamp.sec), int(stamp.nanosec)
-    if sec < 0 or not 0 <= nanosec < 10**9:
-        raise CloudFormatError(
-            f'{topic}: stamp of {sec} s and {nanosec} ns, '
-            'expected no negative time and less than 1000000000 ns'
-        )
-    return sec * 10**9 + nanosec
-
-
 def bytes_of(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
-    """Return what a message holds as data, or refuse what is no buffer of bytes."""
+    """Return the data of a message as uint8; raise CloudFormatError if it is not a buffer."""
     try:
         return np.frombuffer(msg.data, np.uint8)
     except (TypeError, ValueError, BufferError) as error:
@@ -128,7 +125,7 @@ def bytes_of(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
 
 
 def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
-    """Return the bytes of a message, or refuse sizes that do not agree."""
+    """Return the data of a message; raise CloudFormatError if sizes do not agree."""
     data = bytes_of(msg, topic)
     height, width, point_step = int(msg.height), int(msg.width), int(msg.point_step)
     row_step = int(msg.row_step)
@@ -149,9 +146,9 @@ def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
 
 def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
     """
-    Return the fields of a message by name, or refuse those that no point can hold.
+    Return the fields of a message by name; raise CloudFormatError if they do not fit a point.
 
-    A count of 0 is taken as 1: that is what messages of old drivers and bags mean by it.
+    A count of 0 is read as 1, as old drivers and bags write it.
     """
     fields: dict[str, Field] = {}
     for found in msg.fields:
@@ -174,7 +171,7 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
 
 
 def checked_coordinate(fields: Mapping[str, Field], name: str, topic: str) -> Field:
-    """Return the field x, y or z, or refuse a cloud that has none or of another type."""
+    """Return the field x, y or z; raise CloudFormatError if it is missing or not a float."""
     if name not in fields:
         names = ', '.join(fields) or 'none'
         raise CloudFormatError(
@@ -191,7 +188,7 @@ def checked_coordinate(fields: Mapping[str, Field], name: str, topic: str) -> Fi
 
 @dataclass(frozen=True, slots=True)
 class Points:
-    """The data of a checked message: one axis over all points, or two where rows are padded."""
+    """The data of a checked message: one axis over all points, or two if rows are padded."""
 
     data: npt.NDArray[np.uint8]
     shape: tuple[int, ...]
@@ -208,7 +205,7 @@ class Points:
         return cls(data, (height, width), (int(msg.row_step), point_step), order)
 
     def view(self, offset: int, dtype: npt.DTypeLike, count: int = 1) -> npt.NDArray[Any]:
-        """Return the items at an offset in every point, with an axis of their own if many."""
+        """Return a view of the items at an offset in every point, (..., count) if count > 1."""
         dtype = np.dtype(dtype)
         shape, strides = self.shape, self.strides
         if count > 1:
@@ -227,7 +224,7 @@ def column(points: Points, field: Field) -> npt.NDArray[Any]:
 
 
 def coordinates(points: Points, xyz: list[Field]) -> npt.NDArray[Any]:
-    """Return three fields as an (N, 3) array of its own, column by column, in native order."""
+    """Return three fields as a new (N, 3) array in Fortran order and native byte order."""
     views = [points.view(f.offset, points.order + DTYPES[f.datatype]) for f in xyz]
     dtype = np.result_type(*views).newbyteorder('=')
     packed: npt.NDArray[Any] = np.empty((math.prod(points.shape), 3), dtype, order='F')
@@ -243,13 +240,13 @@ def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
     Parameters
     ----------
     columns : mapping of str to (K,) or (K, C) array
-        Of any type that a PointField may have; C becomes the field's count. Every field starts
-        at a multiple of the size of its type, so that decoders read aligned numbers.
+        Of any type of a PointField; C becomes the count of the field. Every field starts at a
+        multiple of the size of its type, so that decoders read aligned numbers.
 
     Raises
     ------
     ValueError
-        If there is no column, or one has no name, no rows like the others, or another type.
+        If there are no columns, or one has no name, another number of rows, or another type.
 
     """
     arrays = {name: np.asarray(values) for name, values in columns.items()}
@@ -266,7 +263,7 @@ def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
             )
     formats = [(values.dtype.newbyteorder('<'), values.shape[1:]) for values in arrays.values()]
     layout = np.dtype({'names': [*arrays], 'formats': formats}, align=True)
-    points = np.zeros(shapes[0][0], layout)  # zeros, so that padding is the same every time
+    points = np.zeros(shapes[0][0], layout)  # zeros, so that the padding is deterministic
     for name, values in arrays.items():
         points[name] = values
     return CloudBytes(
@@ -287,3 +284,123 @@ def field_of(name: str, layout: np.dtype[Any]) -> Field:
     dtype, offset = layout.fields[name][:2]
     count = dtype.shape[0] if dtype.shape else 1
     return Field(name, offset, DATATYPES[dtype.base.newbyteorder('=')], count)
+
+
+SMALLEST_FIELD_BYTES = 13
+"""Smallest size of a field, to check their number before the loop."""
+
+
+@dataclass(frozen=True, slots=True)
+class RawCloud:
+    """A sensor_msgs/PointCloud2; data is a read-only (row_step * height,) uint8 view."""
+
+    header: Header
+    height: int
+    width: int
+    fields: list[Field]
+    is_bigendian: bool
+    point_step: int
+    row_step: int
+    data: npt.NDArray[np.uint8]
+    is_dense: bool
+
+
+def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'points') -> RawCloud:
+    """
+    Return the PointCloud2 in serialised bytes, without copying its data.
+
+    Parameters
+    ----------
+    raw : bytes or memoryview
+        The message: CDR in either byte order, or as ROS 1 writes it.
+    ros1 : bool
+        Whether ROS 1 wrote it.
+    topic : str
+        Named in errors.
+
+    Raises
+    ------
+    CloudFormatError
+        If the bytes are truncated, or are not such a message.
+
+    """
+    try:
+        return read_cloud(MessageReader(raw, ros1=ros1))
+    except (struct.error, UnicodeDecodeError, ValueError) as error:
+        raise CloudFormatError(
+            f'{topic}: {len(raw)} bytes that are not a whole PointCloud2: {error}'
+        ) from error
+
+
+def read_cloud(reader: MessageReader) -> RawCloud:
+    """Return the PointCloud2 at a reader; the arguments are read in the order of the message."""
+    header = read_header(reader)
+    height, width = reader.number('I'), reader.number('I')
+    num_fields = reader.number('I')
+    if num_fields * SMALLEST_FIELD_BYTES > reader.remaining:
+        raise ValueError(f'{num_fields} fields announced, {reader.remaining} bytes left')
+    return RawCloud(
+        header=header,
+        height=height,
+        width=width,
+        fields=[read_field(reader) for _ in range(num_fields)],
+        is_bigendian=bool(reader.number('B')),
+        point_step=reader.number('I'),
+        row_step=reader.number('I'),
+        data=np.frombuffer(reader.sequence(), np.uint8),
+        is_dense=bool(reader.number('B')),
+    )
+
+
+def read_field(reader: MessageReader) -> Field:
+    """Return the PointField at a reader."""
+    return Field(reader.string(), reader.number('I'), reader.number('B'), reader.number('I'))
+
+
+WORD_BYTES = 4
+
+
+def append_fields(
+    msg: Any, words: npt.NDArray[np.uint32], fields: Sequence[tuple[str, int, int]]
+) -> CloudBytes:
+    """
+    Return a cloud with appended fields of four-byte numbers; the other bytes are unchanged.
+
+    Parameters
+    ----------
+    msg : sensor_msgs/PointCloud2
+        Or any object with its attributes; a message that could be decoded.
+    words : (N, W) uint32
+        The appended numbers of each point, in native byte order.
+    fields : sequence of (str, int, int)
+        Name, datatype and count of each appended field.
+
+    Two passes over the bytes for any number of fields: 1.4 ms for 131072 points of 32 bytes.
+
+    """
+    height, width, step = int(msg.height), int(msg.width), int(msg.point_step)
+    data = np.frombuffer(msg.data, np.uint8)
+    points = np.ndarray((height, width), f'V{step}', data, 0, (int(msg.row_step), step))
+    offset = -(-step // WORD_BYTES) * WORD_BYTES
+    added = f'V{words.shape[1] * WORD_BYTES}'
+    layout = np.dtype(
+        {'names': ['point', 'added'], 'formats': [f'V{step}', added], 'offsets': [0, offset]}
+    )
+    cloud = np.zeros((height, width), layout)
+    cloud['point'] = points
+    ordered = np.ascontiguousarray(words, '>u4' if msg.is_bigendian else '<u4')
+    cloud['added'] = ordered.view(added).reshape(height, width)
+    placed = []
+    for name, datatype, count in fields:
+        placed.append(Field(name, offset, datatype, count))
+        offset += count * WORD_BYTES
+    return CloudBytes(
+        height=height,
+        width=width,
+        fields=(*msg.fields, *placed),
+        is_bigendian=bool(msg.is_bigendian),
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * width,
+        data=cloud.reshape(-1).view(np.uint8),
+        is_dense=bool(msg.is_dense),
+    )

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The cloud that came in, with what the map says of each of its points.
+The input cloud with the surfel of each of its points.
 
-Points are copied as they are, whatever fields they have, and get further fields behind: normal,
-planarity and number of points of the surfel that they are part of. Normals are in the frame of
-the cloud, as everything else in it.
+Points are copied with all their fields; appended are normal, planarity and number of points of the
+surfel in whose voxel the point lies. Normals are in the frame of the cloud.
 """
 
 from __future__ import annotations
@@ -22,20 +21,25 @@ from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.appended import appended
 from surfel_mapper.messages.kernels.attach import attach_surfels
-from surfel_mapper.messages.pointcloud2 import CloudBytes, FLOAT32, from_columns, UINT32
+from surfel_mapper.messages.pointcloud2 import (
+    append_fields,
+    CloudBytes,
+    FLOAT32,
+    from_columns,
+    UINT32,
+)
 from surfel_mapper.scan import Scan
 
 ADDED = ('normal_x', 'normal_y', 'normal_z', 'planarity', 'num_points')
-"""The further fields, four bytes each; uint32 the last, float32 the others."""
+"""The appended fields, four bytes each; the last is uint32, the others are float32."""
 
 
 def scan_with_normals(
     scan: Scan, T_map_sensor: Transform, surfel_map: SurfelMap, min_points: int
 ) -> CloudBytes:
     """
-    Return the cloud of a scan with what a map says of each point.
+    Return the cloud of a scan with the surfel of each point.
 
     Parameters
     ----------
@@ -61,7 +65,7 @@ def surfels_of_points(
     scan: Scan, T_map_sensor: Transform, surfels: Surfels, voxel_size_m: float
 ) -> npt.NDArray[np.float32]:
     """
-    Return what the surfel of each point of a scan says.
+    Return normal, planarity and number of points of the surfel of each point.
 
     Parameters
     ----------
@@ -70,7 +74,7 @@ def surfels_of_points(
     T_map_sensor : (4, 4) float64
         Its pose.
     surfels : Surfels
-        In the fixed frame, those in which points may lie.
+        The surfels in which points may lie, in the fixed frame.
     voxel_size_m : float
         Edge of a voxel.
 
@@ -78,7 +82,7 @@ def surfels_of_points(
     -------
     (N, 5) float32
         Normal x y z in the sensor frame, planarity, and the number of points, which is a uint32
-        of the same bytes. nan and 0 where there is no surfel.
+        of the same bytes. nan and 0 for points without a surfel.
 
     """
     keys = pack_keys(surfels.voxel_index)
@@ -97,26 +101,26 @@ def surfels_of_points(
 
 def extended_cloud(msg: Any, added: npt.NDArray[np.float32]) -> CloudBytes:
     """
-    Return a cloud with the fields of ``ADDED`` behind those that it has.
+    Return a cloud with the fields of ``ADDED`` appended.
 
     Parameters
     ----------
     msg : sensor_msgs/PointCloud2
-        One that could be decoded. A field of the same name as a new one stays, and the new one
-        is called ``surfel_`` and its name.
+        A message that could be decoded. If it has a field of the same name as a new one, the new
+        one is called ``surfel_`` and its name.
     added : (N, 5) float32
-        From surfels_of_points, one row a point.
+        From surfels_of_points, one row per point.
 
     """
     taken = {field.name for field in msg.fields}
     types = [FLOAT32] * (len(ADDED) - 1) + [UINT32]
     names = [f'surfel_{name}' if name in taken else name for name in ADDED]
     fields = [(name, type_, 1) for name, type_ in zip(names, types, strict=True)]
-    return replace(appended(msg, added.view(np.uint32), fields), is_dense=False)
+    return replace(append_fields(msg, added.view(np.uint32), fields), is_dense=False)
 
 
 def cloud_of_scan(scan: Scan, added: npt.NDArray[np.float32]) -> CloudBytes:
-    """Return the same for a scan that was no cloud but a depth image."""
+    """Return the same for a scan that came from a depth image, so has no message."""
     columns = {**dict(zip('xyz', scan.points.T, strict=True)), **scan.columns}
     columns.update(zip(ADDED[:-1], added.T[:-1], strict=True))
     return from_columns({**columns, ADDED[-1]: added.view(np.uint32)[:, -1]})

@@ -24,7 +24,7 @@ from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
 

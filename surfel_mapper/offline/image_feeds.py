@@ -14,13 +14,13 @@ from typing import Any
 
 from surfel_mapper.bags.reader import BagMessage, BagReader
 from surfel_mapper.errors import BagError, CloudFormatError
-from surfel_mapper.messages.depth_image import (
+from surfel_mapper.messages.images import (
     camera_info_topic,
     CameraImage,
     depth_scan,
     DepthImages,
+    SceneImages,
 )
-from surfel_mapper.messages.scene_image import SceneImages
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 

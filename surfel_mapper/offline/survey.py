@@ -20,8 +20,8 @@ from surfel_mapper.bags.topics import CLOUD, Topic
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.geometry import pose_matrix, q_xyzw
-from surfel_mapper.messages.pose_messages import frame_name, stamp_ns, StampedPose
-from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.messages.cdr import frame_name, stamp_ns
+from surfel_mapper.messages.poses import raw_poses, StampedPose
 from surfel_mapper.offline.pose_sources import static_topics, TYPES
 from surfel_mapper.poses import TransformBuffer
 

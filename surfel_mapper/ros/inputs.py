@@ -27,17 +27,16 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, DependencyError, PoseError
 from surfel_mapper.messages.compressed_image import is_packed
-from surfel_mapper.messages.depth_image import (
+from surfel_mapper.messages.images import (
     camera_info_topic,
     CameraImage,
     depth_scan,
     DepthImages,
+    SceneImages,
     warm_up,
 )
-from surfel_mapper.messages.pose_messages import ODOMETRY, POSE, TF
-from surfel_mapper.messages.raw_cloud import parse_cloud
-from surfel_mapper.messages.raw_pose import raw_poses
-from surfel_mapper.messages.scene_image import SceneImages
+from surfel_mapper.messages.pointcloud2 import parse_cloud
+from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.scan import Scan

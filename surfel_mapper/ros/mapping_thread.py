@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.drops import REMEDIES
 from surfel_mapper.pipeline.scan_images import MAX_IMAGES

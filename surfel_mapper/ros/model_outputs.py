@@ -24,9 +24,12 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
-from surfel_mapper.messages.cdr import marker_array, polygon_instance
-from surfel_mapper.messages.model_cloud import primitive_columns, surfel_primitive_columns
-from surfel_mapper.messages.model_markers import model_markers
+from surfel_mapper.messages.markers import marker_array, polygon_instance
+from surfel_mapper.messages.model_messages import (
+    model_markers,
+    primitive_columns,
+    surfel_primitive_columns,
+)
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.models.filling import joined
 from surfel_mapper.models.live import LiveModels

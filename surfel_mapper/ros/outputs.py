@@ -33,11 +33,11 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.mapping.window import WindowedScan
-from surfel_mapper.messages.cdr import marker_array
 from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
-from surfel_mapper.messages.markers import disc_colors, surfel_markers
+from surfel_mapper.messages.markers import marker_array
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.messages.scan_normals import scan_with_normals
+from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.pipeline import Alignment, Mapper, Update
 from surfel_mapper.ros.base_node import LATCHED, result_of, steady_timer
 from surfel_mapper.ros.changes import ChangeTracker, MapChange

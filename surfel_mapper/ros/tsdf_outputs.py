@@ -10,8 +10,8 @@ from rclpy.timer import Timer
 from visualization_msgs.msg import Marker
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.messages.cdr import marker_bytes
-from surfel_mapper.messages.mesh_marker import mesh_marker
+from surfel_mapper.messages.markers import marker_bytes
+from surfel_mapper.messages.surfel_markers import mesh_marker
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.tsdf_layer import TsdfLayer
 from surfel_mapper.ros.base_node import LATCHED, steady_timer

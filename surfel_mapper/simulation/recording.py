@@ -23,7 +23,7 @@ import numpy as np
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.messages.pointcloud2 import CloudBytes, Field
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation.drive import Drive, Simulation
 from surfel_mapper.simulation.lidar import Lidar

@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.messages.model_markers import GREY, most_points, primitive_colors
+from surfel_mapper.messages.model_messages import GREY, most_points, primitive_colors
 from surfel_mapper.models.multi_model import Gaussians, MultiModel
 from surfel_mapper.models.shapes import CORNERS, ellipsoid_corners, FACES, PatchShape
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh

@@ -18,8 +18,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.model_cloud import quaternions
-from surfel_mapper.messages.model_markers import GREY, primitive_colors
+from surfel_mapper.messages.model_messages import GREY, primitive_colors, quaternions
 from surfel_mapper.models.shapes import ellipsoid_frames, Shapes
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.mesh import vertex_normals

@@ -11,7 +11,7 @@ from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.errors import BagError
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 
 POSE = StampedPose('odom', 'base_link', 5_000_000_007, (1.0, 2.0, 3.0), (0.0, 0.6, 0.0, 0.8))
 CLOUD = from_columns({name: np.arange(3.0, dtype=np.float32) + i for i, name in enumerate('xyz')})
@@ -109,7 +109,7 @@ def test_what_is_no_bag_is_never_overwritten(tmp_path):
     file.write_text('a file')
     write_some(tmp_path / 'bag')
     link.symlink_to(tmp_path / 'bag')
-    for path, says in ((home, 'no bag to overwrite'), (file, 'not a dir'), (link, 'not a dir')):
+    for path, says in ((home, 'not a bag to overwrite'), (file, 'not a dir'), (link, 'not a dir')):
         with pytest.raises(BagError, match=says):
             BagWriter(path, overwrite=True)
     assert (home / 'thesis.tex').read_text() == 'years of work'

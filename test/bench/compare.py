@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.raw_cloud import RawCloud
+from surfel_mapper.messages.pointcloud2 import RawCloud
 from surfel_mapper.simulation.recording import POINT
 from test.bench.machine import one_core
 from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW

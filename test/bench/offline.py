@@ -27,7 +27,7 @@ from surfel_mapper.bags.topics import CLOUD
 from surfel_mapper.config import load_config
 from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.bag_recording import feed as replay_bag
 from surfel_mapper.offline.pose_sources import pose_topics
 from surfel_mapper.offline.replay import ALL_SCANS

@@ -17,8 +17,7 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_cloud import RawCloud
+from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 
 STAGES = ('decode', 'reduce', 'insert', 'evict', 'normals')
 

@@ -25,14 +25,16 @@ from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.messages.cdr import marker_array
-from surfel_mapper.messages.map_cloud import moment_cloud
-from surfel_mapper.messages.markers import disc_colors, surfel_markers
-from surfel_mapper.messages.mirror import MapMirror
-from surfel_mapper.messages.model_cloud import primitive_columns, surfel_primitive_columns
-from surfel_mapper.messages.model_markers import model_markers
+from surfel_mapper.messages.map_cloud import MapMirror, moment_cloud
+from surfel_mapper.messages.markers import marker_array
+from surfel_mapper.messages.model_messages import (
+    model_markers,
+    primitive_columns,
+    surfel_primitive_columns,
+)
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.messages.scan_normals import scan_with_normals
+from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.models.live import LiveModels
 from surfel_mapper.models.shapes import Shapes
 from surfel_mapper.pipeline import Mapper, Update

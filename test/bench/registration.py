@@ -31,7 +31,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.evaluation.trajectory_errors import absolute_errors, drift, relative_errors
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import Scan

@@ -21,7 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.messages.raw_cloud import Header, RawCloud, Stamp
+from surfel_mapper.messages.cdr import Header, Stamp
+from surfel_mapper.messages.pointcloud2 import RawCloud
 from surfel_mapper.scan import Scan
 from surfel_mapper.simulation import Lidar, Simulation, World
 from surfel_mapper.simulation.recording import cloud_bytes, SENSOR

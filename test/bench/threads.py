@@ -20,8 +20,7 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_cloud import RawCloud
+from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from surfel_mapper.threads import pool

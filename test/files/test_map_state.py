@@ -88,7 +88,7 @@ def test_another_voxel_size_is_refused(tmp_path):
 
 def test_a_file_of_another_kind_is_refused(tmp_path):
     save_state(tmp_path / 'map.npz', {}, {'kind': 'mesh'})
-    with pytest.raises(FileFormatError, match="holds 'mesh', expected a surfel map"):
+    with pytest.raises(FileFormatError, match="contains 'mesh', expected a surfel map"):
         load_map(tmp_path / 'map.npz')
 
 

@@ -106,7 +106,7 @@ def test_a_file_that_was_changed_is_refused(tmp_path, change):
 def test_another_parquet_file_is_refused(tmp_path):
     pq.write_table(pa.table({'x': [1.0]}), tmp_path / 'map.parquet')
 
-    with pytest.raises(FileFormatError, match='no map of surfel_mapper, but another Parquet'):
+    with pytest.raises(FileFormatError, match='but not a map of surfel_mapper'):
         read_map(tmp_path / 'map.parquet')
 
 

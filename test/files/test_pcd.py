@@ -104,10 +104,10 @@ HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOI
 @pytest.mark.parametrize(
     ('content', 'says'),
     [
-        ('', 'no header of a PCD file'),
-        ('ply\n', 'no header of a PCD file'),
-        ('x' * 10**6, 'no header of a PCD file'),
-        ('DATA binary\n', 'header that does not fit'),
+        ('', 'not a PCD file'),
+        ('ply\n', 'not a PCD file'),
+        ('x' * 10**6, 'not a PCD file'),
+        ('DATA binary\n', 'inconsistent PCD header'),
         (HEADER + 'DATA binary\n1234567', '7 bytes after the header, expected 8'),
         (HEADER + 'DATA ascii\n1\n', '1 numbers, expected 2'),
         (HEADER + 'DATA ascii\n1 a\n', 'could not convert'),
@@ -116,11 +116,11 @@ HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOI
         (HEADER + 'DATA binary_compressed\n\x02\0\0\0\x08\0\0\0ab', 'damaged'),
         (HEADER + 'DATA binary_compressed\n\x02\0\0\0\x08\0\0\1ab', 'expected 8'),
         (HEADER.replace('SIZE 4', 'SIZE 3') + 'DATA binary\n', 'field x of type F, size 3'),
-        (HEADER.replace('TYPE F', 'TYPE Q') + 'DATA binary\n', 'header that does not fit'),
+        (HEADER.replace('TYPE F', 'TYPE Q') + 'DATA binary\n', 'inconsistent PCD header'),
         (HEADER.replace('COUNT 1', 'COUNT 0') + 'DATA binary\n', 'count 0'),
         (HEADER.replace('POINTS 2', 'POINTS -2') + 'DATA binary\n', '-2 points'),
         (HEADER.replace('POINTS 2', f'POINTS {10**30}') + 'DATA binary\n', 'expected 4000000'),
-        (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'header that does not fit'),
+        (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'inconsistent PCD header'),
     ],
 )
 def test_what_is_no_whole_pcd_is_refused(tmp_path, content, says):

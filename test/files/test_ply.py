@@ -102,9 +102,9 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
 @pytest.mark.parametrize(
     ('content', 'expected'),
     [
-        ('', 'no header of a PLY file'),
-        ('solid stl\nend_header\n', 'no header'),
-        (HEADER + 'element vertex 1\nproperty float x\n', 'no header'),
+        ('', 'not a PLY file'),
+        ('solid stl\nend_header\n', 'not a PLY file'),
+        (HEADER + 'element vertex 1\nproperty float x\n', 'not a PLY file'),
         (HEADER + 'end_header\n', 'not a PLY whose'),
         (HEADER + 'element vertex 1\nend_header\n', 'of 0 properties'),
         (HEADER + 'element vertex 1\nproperty half x\nend_header\n', 'not a PLY whose'),

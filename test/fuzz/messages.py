@@ -12,9 +12,8 @@ import numpy as np
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, SurfelMapperError
 from surfel_mapper.messages.compressed_image import unpacked
-from surfel_mapper.messages.depth_image import camera_in, CameraImage, depth_scan
-from surfel_mapper.messages.pointcloud2 import Field, to_scan
-from surfel_mapper.messages.raw_cloud import parse_cloud
+from surfel_mapper.messages.images import camera_in, CameraImage, depth_scan
+from surfel_mapper.messages.pointcloud2 import Field, parse_cloud, to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.fuzz.source import Source

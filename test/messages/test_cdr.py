@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from surfel_mapper.messages.cdr import (
+from surfel_mapper.messages.markers import (
     ADD,
     DELETE,
     DELETE_ALL,

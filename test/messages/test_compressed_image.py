@@ -13,10 +13,9 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.compressed_image import is_packed, unpacked
-from surfel_mapper.messages.depth_image import camera_info_topic, CameraImage, depth_scan
-from surfel_mapper.messages.scene_image import SceneImages
+from surfel_mapper.messages.images import camera_info_topic, CameraImage, depth_scan, SceneImages
 from surfel_mapper.sensors.depth import depth_points
-from test.messages.test_depth_image import CAMERA, DEPTH_MM, image
+from test.messages.test_images import CAMERA, DEPTH_MM, image
 
 TOPIC = '/camera/image/compressed'
 ROW, COLUMN = np.indices((48, 64))
@@ -73,7 +72,7 @@ def test_labels_of_a_png_are_whole(dtype):
 
 
 def test_labels_of_a_jpeg_are_refused():
-    with pytest.raises(CloudFormatError, match=f'^{TOPIC}: no PNG that can be read'):
+    with pytest.raises(CloudFormatError, match=f'^{TOPIC}: not a readable PNG'):
         scene('label', packed(SMOOTH[..., 0].copy(), 'mono8; jpeg compressed', 'JPEG'))
 
 
@@ -126,7 +125,7 @@ def test_damaged_bytes_are_refused_wherever_they_end_or_change(kind):
     whole = message.data
     for length in range(0, len(whole) - 20, max(len(whole) // 40, 1)):
         message.data = whole[:length]
-        with pytest.raises(CloudFormatError, match='that can be read'):
+        with pytest.raises(CloudFormatError, match='not a readable'):
             unpacked(message, TOPIC, exact=False)
     rng = np.random.default_rng(2)
     refused = 0
@@ -149,13 +148,13 @@ def test_an_image_of_more_pixels_than_a_camera_has_is_refused_before_it_is_unpac
     message.data = (
         message.data[:12] + header + zlib.crc32(header).to_bytes(4, 'big') + message.data[33:]
     )
-    with pytest.raises(CloudFormatError, match='that can be read: '):
+    with pytest.raises(CloudFormatError, match='not a readable PNG: '):
         unpacked(message, TOPIC, exact=True)
 
 
 def test_other_formats_are_not_tried():
     message = packed(SMOOTH, 'bmp', 'BMP')
-    with pytest.raises(CloudFormatError, match='no PNG or JPEG that can be read'):
+    with pytest.raises(CloudFormatError, match='not a readable PNG or JPEG'):
         unpacked(message, TOPIC, exact=False)
 
 

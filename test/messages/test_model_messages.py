@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.cdr import (
+from surfel_mapper.messages.markers import (
     ADD,
     DELETE_ALL,
     LINE_LIST,
@@ -20,21 +20,19 @@ from surfel_mapper.messages.cdr import (
     TEXT_VIEW_FACING,
     TRIANGLE_LIST,
 )
-from surfel_mapper.messages.model_cloud import (
+from surfel_mapper.messages.model_messages import (
     GAUSSIAN,
-    NONE,
-    PLANE,
-    primitive_columns,
-    SURFACE,
-    surfel_primitive_columns,
-)
-from surfel_mapper.messages.model_markers import (
     GREY,
     MAX_GAUSSIANS,
     model_markers,
     most_points,
+    NONE,
     OPACITY,
+    PLANE,
     primitive_colors,
+    primitive_columns,
+    SURFACE,
+    surfel_primitive_columns,
 )
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.models import fit

@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper import Config, Mapper
 from surfel_mapper.errors import BagError
-from surfel_mapper.messages.depth_image import CameraImage, depth_scan
+from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
 from surfel_mapper.sensors.depth import PinholeCamera

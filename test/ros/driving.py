@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.pipeline import Mapper
 from test.ros.live import cloud, odometry, RELIABLE, room, START_NS
 

@@ -17,8 +17,14 @@ from surfel_mapper import Mapper, Scan, SurfelMap
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.mapping.moments import pack_keys
-from surfel_mapper.messages.map_cloud import halves, moment_cloud, voxel_columns, whole
-from surfel_mapper.messages.mirror import MapMirror, MAX_RECENT
+from surfel_mapper.messages.map_cloud import (
+    halves,
+    MapMirror,
+    MAX_RECENT,
+    moment_cloud,
+    voxel_columns,
+    whole,
+)
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.ros.changes import ChangeTracker

@@ -20,9 +20,9 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 
 from surfel_mapper import Mapper
 from surfel_mapper.config import Config
-from surfel_mapper.messages.depth_image import CameraImage, depth_scan
+from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.ros.context import FASTDDS_VARIABLES
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.sensors.depth import PinholeCamera

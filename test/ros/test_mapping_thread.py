@@ -12,7 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from surfel_mapper.config import Config
-from surfel_mapper.messages.pose_messages import poses_in, StampedPose
+from surfel_mapper.messages.poses import poses_in, StampedPose
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.mapping_thread import MappingThread, MAX_POSES
 from test.ros.live import cloud, odometry, room, START_NS

@@ -23,7 +23,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from surfel_mapper import Mapper
 from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.models.multi_model import Surface
 from test.ros.live import cloud, LATCHED, NODE, odometry, RELIABLE, RVIZ, START_NS
 

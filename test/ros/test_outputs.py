@@ -20,9 +20,9 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper import MapMirror
 from surfel_mapper.mapping.moments import pack_keys
-from surfel_mapper.messages.markers import normal_colors, SEGMENTS, shades
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
+from surfel_mapper.messages.surfel_markers import normal_colors, SEGMENTS, shades
 from test.messages.test_scan_normals import cloud as odd_cloud
 from test.ros.driving import arguments, drive, mapped, PERIOD_NS, send
 from test.ros.live import cloud, LATCHED, RVIZ, START_NS

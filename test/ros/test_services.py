@@ -49,7 +49,7 @@ def feed(peer, num_scans):
 def send_more(peer, twin, first, num_scans):
     """Send further scans to the node and to the twin."""
     from surfel_mapper.messages.pointcloud2 import to_scan
-    from surfel_mapper.messages.pose_messages import poses_in
+    from surfel_mapper.messages.poses import poses_in
 
     for points, pose in drive(first + num_scans)[first:]:
         send(peer, [(points, pose)])

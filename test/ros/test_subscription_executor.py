@@ -67,8 +67,8 @@ def test_malformed_messages_are_counted_and_valid_ones_mapped(start, peer):
         'messages_ignored.bad_pose': 3,
     }
     peer.diagnosis(expected)
-    assert 'bytes that are no whole PointCloud2' in node.output
-    assert '60 bytes that are no message of odometry' in node.output
+    assert 'bytes that are not a whole PointCloud2' in node.output
+    assert '60 bytes that are not a message of odometry' in node.output
 
 
 class Bench:

@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.memory import keep_freed_memory
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_cloud import RawCloud
+from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 from surfel_mapper.pipeline import Mapper
 from test.bench.machine import resident_bytes
 from test.bench.options import Options

@@ -27,8 +27,7 @@ from scipy.spatial.transform import Rotation
 from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.messages.pointcloud2 import to_scan
-from surfel_mapper.messages.raw_cloud import RawCloud
+from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
 from surfel_mapper.ros.context import enlarge_shared_memory
 from test.bench.live_publisher import ros_cloud
 from test.bench.options import Options

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.messages.model_markers import GREY, primitive_colors
+from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models import fit
 from surfel_mapper.models.filling import areas
 from surfel_mapper.models.shapes import shape_of

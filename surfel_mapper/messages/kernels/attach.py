@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""For each point of a scan, what the surfel of its voxel says."""
+"""Look up the surfel of each point of a scan; apart from the kernels that draw markers."""
 
 import math
 
@@ -14,7 +14,7 @@ from surfel_mapper.kernels.quantisation import quantise
 @njit(cache=True, nogil=True)
 def attach_surfels(xyz, quantisation, surfels, keys, table, floats, counts):
     """
-    Write normal, planarity and number of points of the surfel that each point lies in.
+    Write normal, planarity and number of points of the surfel in whose voxel each point lies.
 
     xyz           (3, N) float32 or float64, m, sensor frame
     quantisation  pose (3, 4), scale and range_sq (2,) as ``reduce_points`` takes them

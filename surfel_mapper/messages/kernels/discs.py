@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Surfels as triangles and lines: the vertices of markers, written once where they are to be.
+Vertices of surfel markers: discs as triangles, normals as lines.
 
-A disc is a regular polygon cut into a fan of triangles. Its corners are computed once each, in
-registers; as array operations every one of them goes through memory five times, which for 20,000
-discs takes three times as long.
+A disc is a regular polygon cut into a fan of triangles. Each corner is computed once, in
+registers; array operations move each through memory five times, which for 20,000 discs takes
+three times as long.
 """
 
 import math
@@ -17,14 +17,14 @@ import numpy as np
 @njit(cache=True, nogil=True)
 def draw_discs(surfels, rows, radius, shades, circle, points, colors):
     """
-    Write the triangles of discs, counter-clockwise seen from where the normals point.
+    Write the triangles of discs, counter-clockwise as seen from the side of the normal.
 
     surfels  position (M, 3) and normal (M, 3), float64
-    rows     (K,) int64, which of them
+    rows     (K,) int64, rows of the surfels to draw
     radius   (K,) float64, m
     shades   (K, 4) float32, red green blue opacity
     circle   (S, 2) float64, cosine and sine of the corners
-    points   (K (S - 2) 3, 3) float64, out: three corners a triangle, disc by disc
+    points   (K (S - 2) 3, 3) float64, out: three corners per triangle, disc by disc
     colors   (K (S - 2) 3, 4) float32, out
 
     The frame of a disc is that of Duff et al. 2017, Building an Orthonormal Basis, Revisited: no
@@ -58,10 +58,11 @@ def draw_discs(surfels, rows, radius, shades, circle, points, colors):
 @njit(cache=True, nogil=True)
 def draw_normals(surfels, rows, length, points):
     """
-    Write the normals as lines of a length.
+    Write the normals as line segments.
 
     surfels  position (M, 3) and normal (M, 3), float64
-    rows     (K,) int64, which of them
+    rows     (K,) int64, rows of the surfels to draw
+    length   float64, m
     points   (2 K, 3) float64, out: from and to
     """
     position, normal = surfels

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A file of a bag read record by record from its beginning, without the index at its end.
+Salvage: read a file of a bag record by record from its beginning, without the index at its end.
 
-rosbags needs that index, which is missing where the recorder was killed, the disk was full or a
-copy broke off. A scan finds every message that is whole, in memory of some 200 bytes for each,
-sorts them by record time as an index does, and says at which byte the file ends too early.
+rosbags needs that index, which is missing if the recorder was killed, the disk was full or a copy
+was interrupted. Salvage finds every whole message, in about 200 bytes of memory each, sorts them
+by record time as an index does, and states at which byte the file ends too early. It is our own
+code because the libraries refuse such files and the repair tools need a second copy on the disk.
 """
 
 from __future__ import annotations
@@ -22,11 +23,11 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 KEPT_CHUNKS = 4
-"""Chunks overlap in time a little, so the last few stay unpacked."""
+"""Number of chunks kept unpacked: neighbouring chunks overlap in time."""
 
 
-class Entry(NamedTuple):
-    """A message: when it was recorded, of which connection, and where its bytes are."""
+class FoundMessage(NamedTuple):
+    """An entry of the rebuilt index: record time, connection and place of a message."""
 
     record_ns: int
     connection: int
@@ -34,7 +35,7 @@ class Entry(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Where packed records lie in a file, and how they are packed."""
+    """Place, compression and size of the packed records of a chunk."""
 
     start: int
     size: int
@@ -43,16 +44,16 @@ class Chunk(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Where the bytes of a message are: in a chunk, or in the file itself."""
+    """Place of the bytes of a message: in a chunk, or if that is None in the file."""
 
     chunk: Chunk | None
     start: int
     size: int
 
 
-class ScannedFile(ABC):
+class SalvagedFile(ABC):
     """
-    What rosbags' readers have, of a file without an index.
+    A file read without its index, with the interface of rosbags' readers (see Storage).
 
     Parameters
     ----------
@@ -62,7 +63,7 @@ class ScannedFile(ABC):
     Attributes
     ----------
     cut_at : int, optional
-        Offset of the first record that is not whole; None where the file ends as it should.
+        Offset of the first record that is not whole; None if the file is complete.
     connections : list of Connection
         With the number of messages found.
     start_time, end_time : int
@@ -71,25 +72,24 @@ class ScannedFile(ABC):
     """
 
     MAGIC: ClassVar[bytes]
-    """How such a file begins."""
+    """First bytes of such a file."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file once and take note of its messages."""
         self.path = path
         self.size = path.stat().st_size
         self.cut_at: int | None = None
-        self._found: dict[int, Connection] = {}
+        self._by_id: dict[int, Connection] = {}
         self._file = open(path, 'rb')  # noqa: SIM115 - closed by close
         try:
-            self._entries = sorted(self._scan(), key=lambda entry: entry.record_ns)
+            self._index = sorted(self._scan(), key=lambda found: found.record_ns)
         except BaseException:
             self._file.close()
             raise
-        counts = Counter(entry.connection for entry in self._entries)
-        self.connections = [c._replace(msgcount=counts[c.id]) for c in self._found.values()]
-        self.message_count = len(self._entries)
-        self.start_time = self._entries[0].record_ns if self._entries else 2**63 - 1
-        self.end_time = self._entries[-1].record_ns + 1 if self._entries else 0
+        counts = Counter(found.connection for found in self._index)
+        self.connections = [c._replace(msgcount=counts[c.id]) for c in self._by_id.values()]
+        self.message_count = len(self._index)
+        self.start_time = self._index[0].record_ns if self._index else 2**63 - 1
+        self.end_time = self._index[-1].record_ns + 1 if self._index else 0
 
     def messages(
         self,
@@ -99,21 +99,21 @@ class ScannedFile(ABC):
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield connection, record time and bytes of messages, in order of record time."""
         wanted = {connection.id: connection for connection in connections}
-        for entry in self._entries:
-            before = start is not None and entry.record_ns < start
-            if before or entry.connection not in wanted:
+        for found in self._index:
+            before = start is not None and found.record_ns < start
+            if before or found.connection not in wanted:
                 continue
-            if stop is not None and entry.record_ns >= stop:
+            if stop is not None and found.record_ns >= stop:
                 return
-            yield wanted[entry.connection], entry.record_ns, self._read(entry.place)
+            yield wanted[found.connection], found.record_ns, self._read(found.place)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
     @abstractmethod
-    def _scan(self) -> Iterator[Entry]:
-        """Yield the messages in the order of the file; note connections, and where it is cut."""
+    def _scan(self) -> Iterator[FoundMessage]:
+        """Yield the messages in the order of the file; fill ``_by_id`` and ``cut_at``."""
 
     @abstractmethod
     def _read(self, place: Any) -> bytes:
@@ -125,11 +125,10 @@ class ScannedFile(ABC):
         return self._file.read(size)
 
 
-class ChunkedFile(ScannedFile):
+class SalvagedChunks(SalvagedFile):
     """A file whose records may lie in packed chunks."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file once and take note of its messages."""
         self._chunks: OrderedDict[Chunk, bytes] = OrderedDict()
         super().__init__(path)
 
@@ -140,7 +139,7 @@ class ChunkedFile(ScannedFile):
         return self._unpacked(place.chunk)[place.start : place.start + place.size]
 
     def _unpacked(self, chunk: Chunk) -> bytes:
-        """Return the records of a chunk, as many as there are."""
+        """Return the records of a chunk, up to the cut if the file ends in it."""
         if chunk in self._chunks:
             self._chunks.move_to_end(chunk)
         else:

@@ -18,7 +18,7 @@ import pytest
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.errors import BagError
-from surfel_mapper.messages.pose_messages import StampedPose
+from surfel_mapper.messages.poses import StampedPose
 from test.bags.recorded import (
     cut,
     drive,
@@ -172,7 +172,7 @@ def test_messages_still_in_the_journal_are_said(tmp_path):
         shutil.copytree(path, tmp_path / 'killed')
 
     with BagReader(tmp_path / 'killed' / 'drive.db3') as reader:
-        assert 'drive.db3-wal: holds messages that are not read; merge them' in reader.cuts[0]
+        assert 'drive.db3-wal: journal with messages that are not read' in reader.cuts[0]
 
 
 def write_mcap(path, entries, **options):

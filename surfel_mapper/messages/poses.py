@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Poses from messages: odometry, stamped poses and transforms.
+
+``poses_in`` reads message objects of rclpy or rosbags by the names of their attributes.
+``raw_poses`` reads the same from serialised bytes, which node and replay use: only the part up to
+the pose is parsed, in 20 us, where rclpy takes 0.3 ms to build an odometry message with its two
+covariances, at 100 Hz more than mapping takes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+import struct
+from typing import Any, NamedTuple
+
+from surfel_mapper.errors import PoseError
+from surfel_mapper.messages.cdr import frame_name, MessageReader, read_header, stamp_ns
+
+ODOMETRY, POSE, TF = 'odometry', 'pose', 'tf'
+
+
+class StampedPose(NamedTuple):
+    """The pose of a child frame in its parent at one time, as ``Mapper.add_pose`` takes it."""
+
+    parent: str
+    child: str
+    stamp_ns: int
+    xyz: Iterable[float]
+    q_xyzw: Iterable[float]
+
+
+def poses_in(kind: str, msg: Any, base: str) -> Iterator[StampedPose]:
+    """
+    Yield the poses in a message.
+
+    Parameters
+    ----------
+    kind : str
+        odometry (nav_msgs/Odometry), pose (geometry_msgs/PoseStamped) or tf (tf2_msgs/TFMessage).
+    msg : message
+        From rclpy or rosbags.
+    base : str
+        Child frame of a stamped pose; the other messages state theirs.
+
+    """
+    if kind == TF:
+        for stamped in msg.transforms:
+            transform = stamped.transform
+            child = stamped.child_frame_id
+            yield stamped_pose(stamped.header, child, transform.translation, transform.rotation)
+    elif kind == ODOMETRY:
+        pose = msg.pose.pose
+        yield stamped_pose(msg.header, msg.child_frame_id, pose.position, pose.orientation)
+    else:
+        yield stamped_pose(msg.header, base, msg.pose.position, msg.pose.orientation)
+
+
+def stamped_pose(header: Any, child: str, position: Any, orientation: Any) -> StampedPose:
+    """Return a pose from the parts of a message."""
+    return StampedPose(
+        parent=frame_name(header.frame_id),
+        child=frame_name(child),
+        stamp_ns=stamp_ns(header),
+        xyz=(position.x, position.y, position.z),
+        q_xyzw=(orientation.x, orientation.y, orientation.z, orientation.w),
+    )
+
+
+SMALLEST_TRANSFORM_BYTES = 72
+"""Smallest size of a transform, to check their number before the loop."""
+
+
+def raw_poses(
+    kind: str, raw: bytes | memoryview, base: str, topic: str, *, ros1: bool = False
+) -> list[StampedPose]:
+    """
+    Return the poses in a serialised message.
+
+    Parameters
+    ----------
+    kind, base : str
+        As ``poses_in`` takes them.
+    raw : bytes or memoryview
+        The message: CDR in either byte order, or as ROS 1 writes it.
+    topic : str
+        Named in errors.
+    ros1 : bool
+        Whether ROS 1 wrote it.
+
+    Raises
+    ------
+    PoseError
+        If the bytes are truncated, or are not such a message.
+
+    """
+    try:
+        return list(read_poses(kind, MessageReader(raw, ros1=ros1), base))
+    except (struct.error, ValueError) as error:
+        raise PoseError(
+            f'{topic}: {len(raw)} bytes that are not a message of {kind}: {error}'
+        ) from error
+
+
+def read_poses(kind: str, reader: MessageReader, base: str) -> Iterator[StampedPose]:
+    """Yield the poses of the message at a reader."""
+    number = 1
+    if kind == TF:
+        number = reader.number('I')
+        if number * SMALLEST_TRANSFORM_BYTES > reader.remaining:
+            raise ValueError(f'{number} transforms announced, {reader.remaining} bytes left')
+    for _ in range(number):
+        header = read_header(reader)
+        child = reader.string() if kind in (TF, ODOMETRY) else base
+        xyz, q_xyzw = reader.floats(3), reader.floats(4)
+        yield StampedPose(
+            frame_name(header.frame_id), frame_name(child), stamp_ns(header), xyz, q_xyzw
+        )
