@@ -24,7 +24,9 @@ REQUIRED = [
     'numpy>=1.26',  # arrays; 1.26 is what the messages of ROS from apt are compiled for
     'scipy>=1.11',  # rotations and spatial search beyond the kernels
     'numba>=0.61',  # compiles the kernels; 0.61 is the first for Python 3.13
-    'rosbags>=0.11.7',  # bags of ROS 1 and 2 without ROS; brings lz4 and backports.zstd
+    # bags of ROS 1 and 2 without ROS; brings lz4 and backports.zstd. Bounded above, because
+    # bags/_rosbags.py fills tables of its readers that are no public interface
+    'rosbags>=0.11.7,<0.12',
     'PyYAML>=6.0',  # settings
     'tqdm>=4.66',  # progress on a terminal
     'matplotlib>=3.6',  # map.png

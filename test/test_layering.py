@@ -175,7 +175,7 @@ ALLOWED = (
     ('tsdf/kernels/lookup.py', 'numba.njit'),
     ('config/stages.py', 'surfel_mapper.config._fields.setting'),
     ('mapping/surfel_map.py', 'surfel_mapper.mapping.surfels'),
-    ('bags/reader.py', 'rosbags.highlevel.AnyReader'),
+    ('bags/_rosbags.py', 'rosbags.highlevel.AnyReader'),
     ('cli/main.py', 'surfel_mapper.__version__'),
     ('ros/node.py', 'surfel_mapper.pipeline.Mapper'),
 )

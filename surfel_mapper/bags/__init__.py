@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Reading, salvaging and writing of bags; the only place that imports rosbags."""
+"""Reading, salvaging and writing of bags."""

@@ -23,9 +23,10 @@ from surfel_mapper.bags.topics import SAME_AS
 from surfel_mapper.errors import DependencyError
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection, Qos
+    from rosbags.interfaces import Connection as Connection
+    from rosbags.interfaces import Qos
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys.store import Typestore
+    from rosbags.typesys.store import Typestore as Typestore
 
 TRANSIENT_LOCAL = re.compile(r'durability:\s*(1|transient_local)\b', re.IGNORECASE)
 """Durability of a latched topic in the YAML of a bag: a number or a name, by its version."""

@@ -38,8 +38,7 @@ from surfel_mapper.errors import BagError, DependencyError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
-    from rosbags.typesys.store import Typestore
+    from surfel_mapper.bags._rosbags import Connection, Typestore
 
 log = logging.getLogger(__name__)
 

@@ -20,7 +20,7 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 from surfel_mapper.bags.compression import unpacked
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+    from surfel_mapper.bags._rosbags import Connection
 
 KEPT_CHUNKS = 4
 """Number of chunks kept unpacked: neighbouring chunks overlap in time."""

@@ -26,7 +26,7 @@ from surfel_mapper.messages.pointcloud2 import CloudBytes
 from surfel_mapper.messages.poses import StampedPose
 
 if TYPE_CHECKING:
-    from rosbags.interfaces import Connection
+    from surfel_mapper.bags._rosbags import Connection
 
 STORAGES = ('mcap', 'sqlite3')
 
