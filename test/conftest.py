@@ -21,6 +21,21 @@ settings.register_profile(
 settings.load_profile('repeatable')
 
 
+DATA_PARTS = ('data', 'golden')
+
+
+def pytest_configure() -> None:
+    """End the run with one message if the folder of real data is not as CONTRIBUTING.md says."""
+    folder = os.environ.get('SURFEL_MAPPER_TEST_DATA')
+    missing = [part for part in DATA_PARTS if folder and not (Path(folder) / part).is_dir()]
+    if missing:
+        pytest.exit(
+            f'SURFEL_MAPPER_TEST_DATA={folder}: no folder {" and no ".join(missing)}, expected '
+            'data/ and golden/ as CONTRIBUTING.md describes; unset it to skip tests of real data',
+            returncode=pytest.ExitCode.USAGE_ERROR,
+        )
+
+
 @pytest.fixture(scope='session')
 def data_folder() -> Path:
     """Return the folder with data/ (real scans and bags) and golden/ (reference values)."""
