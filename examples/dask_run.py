@@ -17,8 +17,8 @@ import argparse
 from pathlib import Path
 
 from surfel_mapper import load_config
-from surfel_mapper.cluster.engines import engine
-from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.cluster.executors import open_executor
+from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.cluster.shards import cut
 from surfel_mapper.offline.request import Request
 
@@ -37,8 +37,8 @@ def main() -> None:
 
     config = load_config(args.config)
     shards = [shard for bag in args.bags for shard in cut(Request(path=bag), config, args.shard)]
-    with engine(args.workers, args.scheduler) as running:
-        mapped = map_bags(shards, running, args.output)
+    with open_executor(args.workers, args.scheduler) as executor:
+        mapped = map_bags(shards, executor, args.output)
     tiled = mapped.map
     print(
         f'{len(shards)} shards, {tiled.points} points, {tiled.surfels} surfels '

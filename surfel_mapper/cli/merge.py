@@ -45,13 +45,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Merge and report."""
-    from surfel_mapper.cluster.engines import engine
-    from surfel_mapper.cluster.running import merge_maps
+    from surfel_mapper.cluster.executors import open_executor
+    from surfel_mapper.cluster.tiles import merge_maps
     from surfel_mapper.files.atomic import write_json
 
     began = time.perf_counter()
-    with engine(args.workers, args.scheduler) as running:
-        tiled = merge_maps(args.maps, running, args.output, args.min_points)
+    with open_executor(args.workers, args.scheduler) as executor:
+        tiled = merge_maps(args.maps, executor, args.output, args.min_points)
     summary = {
         'maps': [str(path) for path in args.maps],
         'points': tiled.points,

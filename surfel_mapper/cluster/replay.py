@@ -15,11 +15,11 @@ from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cluster.engines import begin_workers, engine, never
+from surfel_mapper.cluster.executors import never, open_executor, start_forkserver
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
-    from surfel_mapper.cluster.running import Mapped
+    from surfel_mapper.cluster.map_reduce import MapReduceResult
     from surfel_mapper.config import Config
 
 
@@ -30,7 +30,7 @@ class ShelfResult:
 
     Attributes
     ----------
-    mapped : Mapped
+    mapped : MapReduceResult
         The map in tiles, and the results of the shards.
     summary : dict of str
         The content of summary.json.
@@ -39,7 +39,7 @@ class ShelfResult:
 
     """
 
-    mapped: Mapped
+    mapped: MapReduceResult
     summary: dict[str, Any]
     written: list[Path]
 
@@ -94,8 +94,8 @@ def replay_bags(
     """
     began = time.perf_counter()
     if workers is not None and scheduler is None:
-        begin_workers()  # they load their modules while this process loads its own
-    from surfel_mapper.cluster.running import map_bags
+        start_forkserver()  # they load their modules while this process loads its own
+    from surfel_mapper.cluster.map_reduce import map_bags
     from surfel_mapper.cluster.shards import cut, shard_length_s
 
     lengths_s, cuts = surveyed(requests, config)
@@ -107,12 +107,12 @@ def replay_bags(
             done_s += amount
             progress(round(done_s), round(recorded_s))
 
-    with engine(workers, scheduler) as running:
-        num_workers = running.num_workers
+    with open_executor(workers, scheduler) as executor:
+        num_workers = executor.num_workers
         shard_s = shard_length_s(recorded_s, num_workers)
         shards = [shard for request in requests for shard in cut(request, config, shard_s)]
-        mapped = map_bags(shards, running, output, on_done, stopped)
-        num_workers = running.num_workers
+        mapped = map_bags(shards, executor, output, on_done, stopped)
+        num_workers = executor.num_workers
     summary = {
         'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
         'bags': [str(request.path) for request in requests],
@@ -153,7 +153,7 @@ def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], 
     return lengths_s, cuts
 
 
-def write_overview(output: Path, summary: dict[str, Any], mapped: Mapped) -> list[Path]:
+def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResult) -> list[Path]:
     """Write picture, report and summary of a map in tiles; return all that was written."""
     from surfel_mapper.files.atomic import write_json
     from surfel_mapper.offline.summary import rounded

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Shards: bags cut by record time, each mapped on its own as if all before it had been seen.
+Map: shards, which are bags cut by record time, each mapped on its own as a part of the whole.
 
-A worker reads a shard from a while before it on, so that poses and stamps are known when it
-begins; what it needs to know there is hashed at both ends (ShardMapper.outlook). Where the end
-of one shard and the beginning of the next disagree, the next is mapped again from earlier on.
+A worker starts to read some time before its shard (the lead), so that poses and stamps are known
+when the shard begins. The state that decides about later scans is hashed at both ends
+(ShardMapper.outlook). If the end of one shard and the start of the next disagree, the next is
+mapped again with a longer lead.
 """
 
 from __future__ import annotations
@@ -33,18 +34,18 @@ from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
 
 SHORTEST_S, LONGEST_S = 5.0, 60.0
-"""Bounds of the length of a shard: what comes before each is read twice, what it maps is held."""
+"""Bounds of the length of a shard, s: its lead is read twice, its map is held in memory."""
 
 SLACK = 0.02
-"""Shards may be longer by this share of their length, rather than be one more."""
+"""Share by which shards may be longer, to avoid one more short shard."""
 
 LEAD_S = 1.0
-"""A worker begins to read so long before the oldest pose that it may need, at first."""
+"""First lead: time before the oldest pose that a worker may need, s."""
 
-LONGER = 8.0
-"""By so much that time grows where it was too short."""
+LEAD_GROWTH = 8.0
+"""Factor by which a lead grows if it was too short."""
 
-PLACES = 100
+POSITIONS = 100
 """Positions of the sensor that are kept of a shard, for the picture."""
 
 
@@ -56,14 +57,14 @@ class Shard:
     Attributes
     ----------
     request : Request
-        The recording, with absolute paths, and what of it is mapped by all shards together.
+        The recording, with absolute paths, and the part that all shards map together.
     config : Config
         The settings.
     start_ns, stop_ns : int, optional
-        Record time of its first message, and of the first that is not in it; None at the ends
-        of what is mapped.
+        Record time of its first message, and of the first one after it; None at the ends of the
+        part that is mapped.
     lead_s : float
-        How long before its start to begin.
+        Time before its start at which reading begins, s.
 
     """
 
@@ -75,31 +76,31 @@ class Shard:
 
     @property
     def is_whole(self) -> bool:
-        """Whether it is all that is to be mapped of its recording."""
+        """Whether it is the whole part of its recording."""
         return self.start_ns is None and self.stop_ns is None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShardResult:
     """
-    What became of a shard.
+    Result of a shard.
 
     Attributes
     ----------
     parts : dict of Tile to Part
-        Where its map is, by tile.
+        Files of its map, by tile.
     before, after : str, optional
         Outlook at its start and at its stop; None at the ends of the bag.
     counts : dict
         ``Counters.summary`` of this part alone.
     resets : int
-        How often time was set back, in what came before it too.
+        Times that the clock was set back, in its lead too.
     recorded_s, seconds, core_s : float
-        Time from its start to its stop, time that it took, and that of the processor.
-    places : (P, 3) float64, m
-        Where the sensor was.
+        Time from its start to its stop, wall time of mapping it, and processor time.
+    positions : (P, 3) float64, m
+        Some positions of the sensor in the map frame.
     peak_bytes : int
-        The most memory that the process had until then.
+        The most memory of the process until its end.
 
     """
 
@@ -111,13 +112,13 @@ class ShardResult:
     recorded_s: float
     seconds: float
     core_s: float
-    places: npt.NDArray[np.float64]
+    positions: npt.NDArray[np.float64]
     peak_bytes: int
 
 
 def shard_length_s(recorded_s: float, num_workers: int) -> float:
     """
-    Return how long shards should be: as many for one worker as for any other, and few.
+    Return the length of shards, s: few shards, and equally many for every worker.
 
     Three shards for two workers would leave one of them idle for a third of the time.
     """
@@ -132,19 +133,19 @@ def cut(request: Request, config: Config, shard_s: float) -> list[Shard]:
     Parameters
     ----------
     request : Request
-        What is mapped.
+        The recording and its part.
     config : Config
-        The settings; all scans stay in the map, whatever they say of a window. Where they make
-        a scan depend on all before it, the recording is one shard, and so is a folder of scans.
+        The settings; all scans stay in the map, their window is ignored. If they make a scan
+        depend on all before it, the recording is one shard, and so is a folder of scans.
     shard_s : float
-        How long a shard should be.
+        Length of a shard, s.
 
     Raises
     ------
     BagError, FileFormatError
-        If the recording cannot be read or lacks what is asked of it.
+        If the recording cannot be read or lacks a topic or poses.
     ConfigError
-        If the settings ask for something that shards cannot do.
+        If the settings need a single process.
 
     """
     if config.map.mode != 'live' or config.map.load:
@@ -173,7 +174,7 @@ def absolute(request: Request) -> Request:
 
 
 def may_be_cut(recording: BagRecording) -> bool:
-    """Return whether a scan depends on its surroundings alone, not even on its number."""
+    """Return whether a scan depends on neighbouring messages alone, and not on its number."""
     path = recording.poses.path
     by_number = recording.span.every > 1 or (path is not None and not path.has_stamps)
     return is_divisible(recording.config) and not by_number
@@ -193,14 +194,14 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
     """
     began, began_core = time.perf_counter(), time.process_time()
     keep_freed_memory()
-    entry = Entry()
+    start = ShardStart()
     with open_recording(shard.request, shard.config) as recording:
         mapper = ShardMapper(recording.config)
         recorded_s = recording.recorded_s
         if shard.is_whole:
-            places = [update.T_map_sensor[:3, 3] for update in recording.replay(mapper)]
+            positions = [update.T_map_sensor[:3, 3] for update in recording.replay(mapper)]
         elif isinstance(recording, BagRecording):
-            entry, places = map_middle(recording, mapper, shard)
+            start, positions = map_middle(recording, mapper, shard)
             first_ns, last_ns = recording.bounds_ns
             start_ns = first_ns if shard.start_ns is None else shard.start_ns
             recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
@@ -209,61 +210,61 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
     parts = write_shard(path, mapper.map)
     return ShardResult(
         parts=parts,
-        before=entry.outlook,
+        before=start.outlook,
         after=None if shard.stop_ns is None else mapper.outlook(),
-        counts=difference(mapper.counters.summary(), entry.counts),
+        counts=difference(mapper.counters.summary(), start.counts),
         resets=mapper.counters.resets,
         recorded_s=recorded_s,
         seconds=time.perf_counter() - began,
         core_s=time.process_time() - began_core,
-        places=np.array(places).reshape(-1, 3)[:: max(len(places) // PLACES, 1)],
+        positions=np.array(positions).reshape(-1, 3)[:: max(len(positions) // POSITIONS, 1)],
         peak_bytes=peak_bytes(),
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """What a mapper knew, and had counted, when its shard began."""
+class ShardStart:
+    """Outlook and counts of a mapper at the start of its shard."""
 
     outlook: str | None = None
     counts: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, mapper: ShardMapper) -> Entry:
-        """Return that of a mapper now."""
+    def of(cls, mapper: ShardMapper) -> ShardStart:
+        """Return those of a mapper at present."""
         return cls(mapper.outlook(), mapper.counters.summary())
 
 
 def map_middle(
     recording: BagRecording, mapper: ShardMapper, shard: Shard
-) -> tuple[Entry, list[npt.NDArray[np.float64]]]:
-    """Map a shard after its lead-in; return what was known at its start, and the positions."""
+) -> tuple[ShardStart, list[npt.NDArray[np.float64]]]:
+    """Map a shard after its lead; return the state at its start, and the positions."""
     reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     if recording.config.input.kind == 'depth':
         raise BagError(f'{reader.path}: depth images are mapped by one process alone')
-    entry, places = Entry(), []
+    start, positions = ShardStart(), []
     mapper.passes_over = shard.start_ns is not None
     for topic, place in poses.mounts.items():
         base = mapper.config.frames.base
         mapper.add_pose(base, topic, 0, place[:3], place[3:], static=True)
     for message in messages_of(recording, shard):
         if mapper.passes_over and message.record_ns >= (shard.start_ns or 0):
-            entry = Entry.of(mapper)
+            start = ShardStart.of(mapper)
             mapper.passes_over = False
         if message.topic not in clouds:
             add_poses(reader, mapper, message, poses)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
-        places += [update.T_map_sensor[:3, 3] for update in mapper.insert_ready()]
-    if mapper.passes_over:  # nothing was recorded since
-        entry = Entry.of(mapper)
+        positions += [update.T_map_sensor[:3, 3] for update in mapper.insert_ready()]
+    if mapper.passes_over:  # no message was recorded since
+        start = ShardStart.of(mapper)
     if shard.stop_ns is None:
         mapper.finish()
-    return entry, places
+    return start, positions
 
 
 def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
-    """Yield static transforms from before a shard, then all of it from its lead-in on."""
+    """Yield static transforms from before a shard, then its messages from its lead on."""
     reader, poses, span = recording.reader, recording.poses, recording.span
     first_ns = span.poses_start_ns
     if shard.start_ns is not None:
@@ -278,7 +279,7 @@ def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:
 
 
 def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
-    """Return counts less those before; times of stages are all from now."""
+    """Return counts less those before; times of stages stay as they are."""
     left: dict[str, Any] = {}
     for name, value in now.items():
         if name == 'milliseconds':
@@ -291,10 +292,10 @@ def difference(now: dict[str, Any], before: dict[str, Any]) -> dict[str, Any]:
 
 
 def peak_bytes() -> int:
-    """Return the most memory that this process has had since its program began."""
+    """Return the peak memory of this process since its program began, bytes."""
     status = Path('/proc/self/status')
     for line in status.read_text().splitlines() if status.exists() else []:
         if line.startswith('VmHWM:'):
             return int(line.split()[1]) * 1024
-    # elsewhere; on Linux this counts what the parent had, too
+    # without /proc; on Linux this would include the memory of the parent
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -24,8 +24,8 @@ import sys
 import tempfile
 from time import perf_counter, process_time, time
 
-from surfel_mapper.cluster.engines import Engine, engine
-from surfel_mapper.cluster.running import map_bags, Mapped
+from surfel_mapper.cluster.executors import Executor, open_executor
+from surfel_mapper.cluster.map_reduce import map_bags, MapReduceResult
 from surfel_mapper.cluster.shards import cut, peak_bytes, shard_length_s
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -55,8 +55,9 @@ BUDGET_RATIO = 1.6
 STARTS = {
     'one process': 'from surfel_mapper.pipeline import Mapper\nMapper().warm_up()\nsay()',
     'two workers': (
-        'from surfel_mapper.cluster.engines import begin_workers, engine\nbegin_workers()\n'
-        'from surfel_mapper.cluster import running\nwith engine(workers=2):\n    say()'
+        'from surfel_mapper.cluster.executors import open_executor, start_forkserver\n'
+        'start_forkserver()\n'
+        'from surfel_mapper.cluster import map_reduce\nwith open_executor(workers=2):\n    say()'
     ),
 }
 """Programs that say when they are ready to map."""
@@ -83,7 +84,7 @@ def speed_rows(bag: Path) -> list[Row]:
         found[name] = way()
         seconds.setdefault(name, []).append(perf_counter() - start)
 
-    with engine(workers=2) as two:
+    with open_executor(workers=2) as two:
         by(two, requests[:1])  # pyarrow and the file are loaded
         for _ in range(RUNS):
             timed('two workers', lambda: by(two, requests))
@@ -141,22 +142,22 @@ def in_one_process(requests: list[Request]) -> tuple[str, float, float]:
     return total.digest(), recorded_s, process_time() - start
 
 
-def by(running: Engine, requests: list[Request]) -> tuple[str, float, float]:
+def by(executor: Executor, requests: list[Request]) -> tuple[str, float, float]:
     """Map drives with workers; return digest, seconds recorded and seconds of processors."""
     lengths = []
     for request in requests:
         with open_recording(request, CONFIG) as recording:
             lengths.append(recording.recorded_s)
-    mapped = tiled(running, requests, shard_length_s(sum(lengths), running.num_workers))
+    mapped = tiled(executor, requests, shard_length_s(sum(lengths), executor.num_workers))
     core_s = sum(result.core_s for result in mapped.results) + mapped.map.core_s
     return mapped.map.digest, sum(lengths), core_s
 
 
-def tiled(running: Engine, requests: list[Request], shard_s: float) -> Mapped:
+def tiled(executor: Executor, requests: list[Request], shard_s: float) -> MapReduceResult:
     """Map drives into tiles that are thrown away."""
     shards = [shard for request in requests for shard in cut(request, CONFIG, shard_s)]
     with tempfile.TemporaryDirectory() as directory:
-        return map_bags(shards, running, Path(directory))
+        return map_bags(shards, executor, Path(directory))
 
 
 def memory_rows(bag: Path) -> list[Row]:
@@ -169,8 +170,8 @@ def memory_rows(bag: Path) -> list[Row]:
         context = multiprocessing.get_context('spawn')
         with ProcessPoolExecutor(1, mp_context=context) as alone:
             digest, peak = alone.submit(peak_of_one, requests).result()
-        with engine(workers=2) as running:
-            mapped = tiled(running, requests, 0.25 * whole_s * 1.001)
+        with open_executor(workers=2) as executor:
+            mapped = tiled(executor, requests, 0.25 * whole_s * 1.001)
         check_equal({digest, mapped.map.digest})
         common = {'what': 'memory', 'recorded_s': share * whole_s, 'voxels': mapped.map.voxels}
         rows.append({**common, 'who': 'one process', 'peak_MB': peak / 1e6})

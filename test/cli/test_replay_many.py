@@ -8,8 +8,8 @@ import signal
 import pytest
 
 from surfel_mapper.cli.main import main
-from surfel_mapper.cluster import shard_run, shards
-from surfel_mapper.cluster.engines import InProcess
+from surfel_mapper.cluster import map_reduce, shards
+from surfel_mapper.cluster.executors import SerialExecutor
 from surfel_mapper.cluster.shards import map_shard
 from surfel_mapper.files.parquet import read_map
 from surfel_mapper.files.parquet_tiles import dataset_digest
@@ -72,7 +72,7 @@ def test_ctrl_c_leaves_the_map_of_the_shards_that_are_done(
         signal.raise_signal(signal.SIGINT)
         return map_shard(*args)
 
-    monkeypatch.setattr(shard_run, 'map_shard', pressing)
+    monkeypatch.setattr(map_reduce, 'map_shard', pressing)
     assert main(['replay', *bags, '--output', str(tmp_path), '--json', *TF]) == 130
 
     assert {path.name for path in tmp_path.iterdir()} == FILES
@@ -91,7 +91,7 @@ def test_ctrl_c_before_a_shard_is_done_that_counts_leaves_the_earlier_map(
         signal.raise_signal(signal.SIGINT)
         yield len(items) - 1, function(items[-1])
 
-    monkeypatch.setattr(InProcess, 'run', pressing)
+    monkeypatch.setattr(SerialExecutor, 'run', pressing)
     monkeypatch.setattr(shards, 'LONGEST_S', 3.0)
     assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 130
 
@@ -197,9 +197,9 @@ def test_a_number_of_workers_that_is_none_is_refused(bags, number):
 
 def test_a_scheduler_that_does_not_answer_is_refused(bags, tmp_path, capsys, monkeypatch):
     pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
-    from surfel_mapper.cluster import engines
+    from surfel_mapper.cluster import executors
 
-    monkeypatch.setattr(engines, 'CONNECT_S', 1)
+    monkeypatch.setattr(executors, 'CONNECT_S', 1)
     arguments = ['replay', bags[0], '--scheduler', 'tcp://127.0.0.1:1', '--output', str(tmp_path)]
     assert main([*arguments, *TF]) == 1
     assert 'no Dask scheduler answers' in capsys.readouterr().err

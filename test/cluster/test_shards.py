@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.cluster.engines import InProcess, never
-from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.cluster.executors import never, SerialExecutor
+from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.cluster.shards import (
     difference,
     LONGEST_S,
@@ -30,7 +30,7 @@ def test_shards_make_the_map_and_the_counts_of_one_go(tmp_path, name):
     expected = in_one_go(bag, config)
     shards = shards_of(bag, config, 0.9)
 
-    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+    mapped = map_bags(shards, SerialExecutor(), tmp_path / 'out')
 
     assert mapped.map.digest == expected.map.digest()
     assert mapped.map.digest == dataset_digest(tmp_path / 'out' / 'map')
@@ -70,7 +70,7 @@ def test_a_lead_in_that_is_too_short_is_noticed_and_mended(tmp_path):
     expected = in_one_go(bag, config)
     short = [replace(shard, lead_s=0.01) for shard in shards_of(bag, config, 1.0)]
 
-    mapped = map_bags(short, InProcess(), tmp_path / 'out')
+    mapped = map_bags(short, SerialExecutor(), tmp_path / 'out')
 
     assert mapped.repeated > 0
     assert mapped.map.digest == expected.map.digest()
@@ -94,7 +94,7 @@ def test_bags_of_nearly_the_same_length_are_not_cut_for_what_they_differ(tmp_pat
 
 def test_the_usual_lead_in_is_long_enough(tmp_path):
     bag, config = written(tmp_path, 'plain')
-    assert map_bags(shards_of(bag, config, 0.5), InProcess(), tmp_path / 'out').repeated == 0
+    assert map_bags(shards_of(bag, config, 0.5), SerialExecutor(), tmp_path / 'out').repeated == 0
 
 
 @pytest.mark.parametrize('every', [1, 3])
@@ -104,7 +104,7 @@ def test_a_part_of_a_bag_is_mapped_alike(tmp_path, every):
     expected = in_one_go(bag, config, **part)
 
     shards = shards_of(bag, config, 0.7, **part)
-    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+    mapped = map_bags(shards, SerialExecutor(), tmp_path / 'out')
 
     assert len(shards) == (5 if every == 1 else 1)
     assert mapped.map.digest == expected.map.digest()
@@ -126,14 +126,14 @@ def test_poses_of_a_file_are_known_in_the_middle_too(tmp_path, has_stamps):
     expected = in_one_go(bag, config, **part)
 
     shards = shards_of(bag, config, 1.0, **part)
-    mapped = map_bags(shards, InProcess(), tmp_path / 'out')
+    mapped = map_bags(shards, SerialExecutor(), tmp_path / 'out')
 
     assert len(shards) == (6 if has_stamps else 1)
     assert mapped.map.digest == expected.map.digest()
     assert mapped.counts()['scans']['mapped'] == 60
 
 
-class LastFirst(InProcess):
+class LastFirst(SerialExecutor):
     """Runs the tasks in the opposite order, as may happen among several workers."""
 
     def run(self, function, items, stopped=never):
@@ -152,7 +152,7 @@ def test_what_is_mapped_when_it_is_stopped_is_the_map(tmp_path):
     expected = in_one_go(bag, config, duration_s=RECORDED_S / 6 * 2 - 1e-6)
 
     shards = shards_of(bag, config, 1.0)
-    mapped = map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(2))
+    mapped = map_bags(shards, SerialExecutor(), tmp_path / 'out', stopped=after(2))
 
     assert mapped.interrupted
     assert len(mapped.results) == 2
@@ -179,9 +179,9 @@ def test_shards_that_nothing_leads_to_are_left_out_when_it_is_stopped(tmp_path):
 def test_shards_that_do_not_fit_are_left_out_when_it_is_stopped(tmp_path):
     bag, config = written(tmp_path, 'late poses')
     short = [replace(shard, lead_s=0.01) for shard in shards_of(bag, config, 1.0)]
-    expected = map_bags(short[:1], InProcess(), tmp_path / 'first')
+    expected = map_bags(short[:1], SerialExecutor(), tmp_path / 'first')
 
-    mapped = map_bags(short, InProcess(), tmp_path / 'out', stopped=after(3))
+    mapped = map_bags(short, SerialExecutor(), tmp_path / 'out', stopped=after(3))
 
     assert mapped.interrupted
     assert len(mapped.results) == 1
@@ -192,13 +192,13 @@ def test_a_bag_in_which_time_is_set_back_is_left_out_when_it_is_stopped(tmp_path
     bag, config = written(tmp_path, 'time set back')
     shards = shards_of(bag, config, 1.0)
     with pytest.raises(MapError, match='no scan was mapped'):
-        map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(6))
+        map_bags(shards, SerialExecutor(), tmp_path / 'out', stopped=after(6))
 
 
 def test_when_it_is_stopped_at_the_end_nothing_is_missing(tmp_path):
     bag, config = written(tmp_path, 'plain')
     shards = shards_of(bag, config, 3.0)
-    assert not map_bags(shards, InProcess(), tmp_path / 'out', stopped=after(2)).interrupted
+    assert not map_bags(shards, SerialExecutor(), tmp_path / 'out', stopped=after(2)).interrupted
 
 
 def test_several_bags_make_the_sum_of_their_maps(tmp_path):
@@ -209,24 +209,24 @@ def test_several_bags_make_the_sum_of_their_maps(tmp_path):
 
     shards = [*shards_of(first, config, 2.0), *shards_of(second, config, 2.0)]
 
-    assert map_bags(shards, InProcess(), tmp_path / 'out').map.digest == expected.digest()
+    assert map_bags(shards, SerialExecutor(), tmp_path / 'out').map.digest == expected.digest()
 
 
 def test_an_earlier_map_is_replaced_and_nothing_is_left_beside_it(tmp_path):
     bag, config = written(tmp_path, 'plain')
     for shard_s in (1.0, 3.0):
-        mapped = map_bags(shards_of(bag, config, shard_s), InProcess(), tmp_path / 'out')
+        mapped = map_bags(shards_of(bag, config, shard_s), SerialExecutor(), tmp_path / 'out')
     assert [path.name for path in (tmp_path / 'out').iterdir()] == ['map']
     assert dataset_digest(tmp_path / 'out' / 'map') == mapped.map.digest
 
 
 def test_a_failure_leaves_an_earlier_map_whole(tmp_path):
     bag, config = written(tmp_path, 'plain')
-    before = map_bags(shards_of(bag, config, 3.0), InProcess(), tmp_path / 'out').map.digest
+    before = map_bags(shards_of(bag, config, 3.0), SerialExecutor(), tmp_path / 'out').map.digest
     nowhere = config.replace({'frames.fixed': 'nowhere'})
 
     with pytest.raises(MapError, match='no scan was mapped'):
-        map_bags(shards_of(bag, nowhere, 3.0), InProcess(), tmp_path / 'out')
+        map_bags(shards_of(bag, nowhere, 3.0), SerialExecutor(), tmp_path / 'out')
 
     assert dataset_digest(tmp_path / 'out' / 'map') == before
     assert [path.name for path in (tmp_path / 'out').iterdir()] == ['map']
@@ -243,12 +243,15 @@ def test_progress_adds_up_to_the_recording_and_the_tiles(tmp_path):
     told = []
 
     mapped = map_bags(
-        shards_of(bag, config, 1.0), InProcess(), tmp_path / 'out', lambda *done: told.append(done)
+        shards_of(bag, config, 1.0),
+        SerialExecutor(),
+        tmp_path / 'out',
+        lambda *done: told.append(done),
     )
 
     assert sum(s for kind, s in told if kind == 'map') == pytest.approx(RECORDED_S, abs=0.01)
     assert sum(n for kind, n in told if kind == 'merge') == mapped.map.tiles
-    assert len(mapped.places) >= 60
+    assert len(mapped.positions) >= 60
     assert len(mapped.map.sample) == mapped.map.surfels
 
 

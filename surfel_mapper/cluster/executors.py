@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Who does the work: this process, local workers, or those of a Dask scheduler anywhere.
+Executors of tasks: this process, local workers, or the workers of a Dask scheduler.
 
-A task is a function of this package and its arguments; what it makes goes to files, what it
-returns is small. So a task that a lost worker was at is simply done again by another, by Dask
-itself, and several attempts leave the same files.
+A task is a function of this package and its arguments; it writes its result to files and returns
+little. So Dask gives the task of a lost worker to another one, and several attempts leave the
+same files.
 """
 
 from __future__ import annotations
@@ -27,35 +27,36 @@ Item = TypeVar('Item')
 Result = TypeVar('Result')
 
 CONNECT_S = 20
-"""A scheduler has to answer within this time."""
+"""Time in which a scheduler has to answer, s."""
 
 LOSSES = 5
-"""A task at which so many workers died is given up."""
+"""A task is given up after this many workers died at it."""
 
 POLL_S = 0.02
-"""So often it is looked whether a task is done, or no more is wanted."""
+"""Period of checking for finished tasks and for a stop, s."""
 
-PRELOADED = ['surfel_mapper.cluster.preload', 'distributed']
-"""What local workers are forked with; each of them would load it for 2 s otherwise."""
+PRELOADED = ['surfel_mapper.cluster._forkserver_preload', 'distributed']
+"""Modules of the fork server; loading them would take each local worker 2 s."""
 
 WORKER_ENVIRONMENT = {'MALLOC_ARENA_MAX': '1', 'OMP_NUM_THREADS': '1', 'MKL_NUM_THREADS': '1'}
 """
-Tasks run beside the main thread of a worker, where freed memory goes back to the system at once
-unless there is a single arena: every cloud would be paged in anew, which doubles the time.
+Environment of workers, with a single malloc arena. Tasks run beside the main thread of a worker;
+with several arenas freed memory returns to the system at once, and paging it in again for every
+cloud doubles the time.
 """
 
 
 def never() -> bool:
-    """Return that all is wanted."""
+    """Return False: not stopped."""
     return False
 
 
-class Engine(Protocol):
+class Executor(Protocol):
     """Runs tasks."""
 
     @property
     def num_workers(self) -> int:
-        """How many tasks run at a time."""
+        """Number of tasks that run at a time."""
 
     def run(
         self,
@@ -64,14 +65,14 @@ class Engine(Protocol):
         stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
         """
-        Yield the number of each item and what the function returns, as they get done.
+        Yield the number and the result of each item, as they get done.
 
-        Once it is stopped, only what is under way gets done.
+        After a stop, only the tasks that have begun get done.
         """
 
 
-class InProcess:
-    """Runs one task after the other, here."""
+class SerialExecutor:
+    """Runs one task after the other, in this process."""
 
     num_workers = 1
 
@@ -81,31 +82,30 @@ class InProcess:
         items: Sequence[Item],
         stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
-        """Yield the number of each item and what the function returns, until it is stopped."""
+        """Yield the number and the result of each item, until it is stopped."""
         for number, item in enumerate(items):
             if stopped():
                 return
             yield number, function(item)
 
 
-class OnDask:
+class DaskExecutor:
     """
     Runs tasks on the workers of a Dask client.
 
     Parameters
     ----------
     client : distributed.Client
-        Whose workers are to be used.
+        Its workers run the tasks.
 
     """
 
     def __init__(self, client: Any) -> None:
-        """Take a client."""
         self._client = client
 
     @property
     def num_workers(self) -> int:
-        """How many workers there are now."""
+        """Number of workers at present."""
         return max(len(self._client.scheduler_info(n_workers=-1)['workers']), 1)
 
     def run(
@@ -115,15 +115,15 @@ class OnDask:
         stopped: Callable[[], bool] = never,
     ) -> Iterator[tuple[int, Result]]:
         """
-        Yield the number of each item and what the function returns, as they get done.
+        Yield the number and the result of each item, as they get done.
 
-        Once it is stopped, only what is under way gets done: of what is not done yet, as many as
-        there are workers, since tasks are begun in their order.
+        After a stop, only the tasks that have begun get done: as many as there are workers, since
+        tasks begin in their order.
 
         Raises
         ------
         ClusterError
-            If workers died at a task again and again, or the scheduler is gone.
+            If several workers died at a task, or the scheduler is gone.
 
         """
         from distributed import as_completed, CancelledError, KilledWorker
@@ -155,12 +155,12 @@ class OnDask:
             self._client.cancel(list(numbers))
 
 
-def begin_workers() -> str:
+def start_forkserver() -> str:
     """
-    Begin to load what local workers need; return by which method they are to be started.
+    Start loading the modules of local workers; return the method by which to start these.
 
-    That goes on in a process of its own, from which workers are forked when it is done. It ends
-    with this process, and until then lost workers are replaced at once.
+    A process of its own, the fork server, loads them, and workers are forked from it. It ends
+    with this process; until then lost workers are replaced at once.
     """
     if 'forkserver' not in multiprocessing.get_all_start_methods():
         return 'spawn'
@@ -173,7 +173,7 @@ def begin_workers() -> str:
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set variables of the environment for the processes that are started meanwhile."""
+    """Set environment variables in a block, for the processes that are started there."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -188,9 +188,9 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def on_interrupt(handler: Callable[[int, Any], object] | signal.Handlers) -> Iterator[None]:
-    """Have Ctrl-C do something else in a block, and in what is started there."""
+    """Temporarily replace the SIGINT handler, for started processes too."""
     if threading.current_thread() is not threading.main_thread():
-        yield  # others are not interrupted
+        yield  # signals interrupt the main thread only
         return
     before = signal.signal(signal.SIGINT, handler)
     try:
@@ -201,7 +201,7 @@ def on_interrupt(handler: Callable[[int, Any], object] | signal.Handlers) -> Ite
 
 @contextmanager
 def interrupt_held() -> Iterator[None]:
-    """Hold Ctrl-C back until the end of a block: Dask cannot end a cluster that half began."""
+    """Delay Ctrl-C until the end of a block: Dask cannot end a cluster that is half started."""
     pressed: list[int] = []
     with on_interrupt(lambda number, _: pressed.append(number)):
         yield
@@ -210,16 +210,16 @@ def interrupt_held() -> Iterator[None]:
 
 
 @contextmanager
-def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator[Engine]:
+def open_executor(workers: int | None = None, scheduler: str | None = None) -> Iterator[Executor]:
     """
-    Give whatever runs tasks, and close it at the end.
+    Open an executor for a with-block.
 
     Parameters
     ----------
     workers : int, optional
-        So many processes on this machine.
+        Number of processes on this machine; without workers and scheduler, this process.
     scheduler : str, optional
-        Address of a Dask scheduler, tcp://host:8786, whose workers can read and write the same
+        Address of a Dask scheduler, tcp://host:8786; its workers have to read and write the same
         paths as this process.
 
     Raises
@@ -231,9 +231,9 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
 
     """
     if workers is None and scheduler is None:
-        yield InProcess()
+        yield SerialExecutor()
         return
-    method = begin_workers() if scheduler is None else 'spawn'
+    method = start_forkserver() if scheduler is None else 'spawn'
     try:
         import dask
         from distributed import Client, LocalCluster
@@ -252,17 +252,17 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
     }
     with dask.config.set(settings):
         if scheduler is None:
-            with ExitStack() as begun:
+            with ExitStack() as started:
                 with interrupt_held():
-                    cluster = begun.enter_context(
+                    cluster = started.enter_context(
                         LocalCluster(
                             n_workers=workers,
                             threads_per_worker=1,
                             dashboard_address='127.0.0.1:0',
                         )
                     )
-                    client = begun.enter_context(Client(cluster))
-                yield OnDask(client)
+                    client = started.enter_context(Client(cluster))
+                yield DaskExecutor(client)
             return
         try:
             client = Client(scheduler, timeout=CONNECT_S)
@@ -271,4 +271,4 @@ def engine(workers: int | None = None, scheduler: str | None = None) -> Iterator
         with client:
             if not client.scheduler_info(n_workers=-1)['workers']:
                 raise ClusterError(f'{scheduler}: no workers; start some with `dask worker`')
-            yield OnDask(client)
+            yield DaskExecutor(client)

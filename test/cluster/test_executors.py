@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
-from surfel_mapper.cluster import engines
-from surfel_mapper.cluster.engines import engine, InProcess
-from surfel_mapper.cluster.running import map_bags
+from surfel_mapper.cluster import executors
+from surfel_mapper.cluster.executors import open_executor, SerialExecutor
+from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.errors import ClusterError
 from test.cluster.bags import in_one_go, shards_of, written
 
@@ -40,9 +40,9 @@ def what_is_there():
     )
 
 
-def kill_one(running):
+def kill_one(executor):
     """Kill a worker that is at a task, and return its process."""
-    client = running._client
+    client = executor._client
     pids = client.run(os.getpid)
     busy = [address for address, tasks in client.processing().items() if tasks]
     victim = pids[busy[0] if busy else next(iter(pids))]
@@ -52,8 +52,8 @@ def kill_one(running):
 
 @pytest.fixture(scope='module')
 def two_workers():
-    with engine(workers=2) as running:
-        yield running
+    with open_executor(workers=2) as executor:
+        yield executor
 
 
 @pytest.fixture(scope='module')
@@ -63,8 +63,8 @@ def case(tmp_path_factory):
 
 
 def test_every_task_is_answered_under_its_number(two_workers):
-    for running in (two_workers, InProcess()):
-        answers = dict(running.run(squared, range(7)))
+    for executor in (two_workers, SerialExecutor()):
+        answers = dict(executor.run(squared, range(7)))
         assert answers == {number: number * number for number in range(7)}
     assert two_workers.num_workers == 2
 
@@ -84,7 +84,7 @@ def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
 
     monkeypatch.setattr(distributed, 'LocalCluster', Interrupted)
     before = signal.getsignal(signal.SIGINT)
-    with pytest.raises(KeyboardInterrupt), engine(workers=1):
+    with pytest.raises(KeyboardInterrupt), open_executor(workers=1):
         pytest.fail('it has begun')
     assert made[0].status is distributed.Status.closed
     assert signal.getsignal(signal.SIGINT) is before
@@ -93,8 +93,8 @@ def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
 FORKSERVER = """
 from multiprocessing import forkserver
 from pathlib import Path
-from surfel_mapper.cluster.engines import begin_workers
-assert begin_workers() == 'forkserver'
+from surfel_mapper.cluster.executors import start_forkserver
+assert start_forkserver() == 'forkserver'
 words = Path(f'/proc/{forkserver._forkserver._forkserver_pid}/status').read_text().split()
 print(words[words.index('SigIgn:') + 1])
 """
@@ -111,7 +111,7 @@ def test_what_workers_are_forked_from_ignores_ctrl_c_from_its_first_moment():
 def test_the_environment_is_left_as_it_was(monkeypatch):
     monkeypatch.setenv('SURFEL_MAPPER_A', 'old')
     monkeypatch.delenv('SURFEL_MAPPER_B', raising=False)
-    with engines.environment({'SURFEL_MAPPER_A': 'new', 'SURFEL_MAPPER_B': 'new'}):
+    with executors.environment({'SURFEL_MAPPER_A': 'new', 'SURFEL_MAPPER_B': 'new'}):
         assert os.environ['SURFEL_MAPPER_A'] == os.environ['SURFEL_MAPPER_B'] == 'new'
     assert os.environ['SURFEL_MAPPER_A'] == 'old'
     assert 'SURFEL_MAPPER_B' not in os.environ
@@ -148,9 +148,9 @@ def test_an_error_of_a_task_comes_back_as_it_is(two_workers):
 
 
 def test_a_task_that_kills_its_workers_is_given_up(monkeypatch):
-    monkeypatch.setattr(engines, 'LOSSES', 0)
-    with engine(workers=1) as running, pytest.raises(ClusterError, match='workers died'):
-        list(running.run(die, [1]))
+    monkeypatch.setattr(executors, 'LOSSES', 0)
+    with open_executor(workers=1) as executor, pytest.raises(ClusterError, match='workers died'):
+        list(executor.run(die, [1]))
 
 
 def test_a_scheduler_elsewhere_is_used(case, tmp_path):
@@ -159,22 +159,22 @@ def test_a_scheduler_elsewhere_is_used(case, tmp_path):
         distributed.LocalCluster(
             n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0'
         ) as cluster,
-        engine(scheduler=cluster.scheduler_address) as running,
+        open_executor(scheduler=cluster.scheduler_address) as executor,
     ):
-        assert map_bags(shards, running, tmp_path).map.digest == digest
+        assert map_bags(shards, executor, tmp_path).map.digest == digest
 
 
 def test_a_scheduler_without_workers_is_refused():
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address='127.0.0.1:0') as cluster,
         pytest.raises(ClusterError, match='no workers'),
-        engine(scheduler=cluster.scheduler_address),
+        open_executor(scheduler=cluster.scheduler_address),
     ):
         pass
 
 
 @pytest.mark.parametrize('address', ['tcp://127.0.0.1:1', 'nonsense://x'])
 def test_a_scheduler_that_does_not_answer_is_refused_by_name(monkeypatch, address):
-    monkeypatch.setattr(engines, 'CONNECT_S', 1)
-    with pytest.raises(ClusterError, match=address), engine(scheduler=address):
+    monkeypatch.setattr(executors, 'CONNECT_S', 1)
+    with pytest.raises(ClusterError, match=address), open_executor(scheduler=address):
         pass
