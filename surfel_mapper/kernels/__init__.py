@@ -74,19 +74,24 @@ def _discard_stale(directory: Path, digest: bytes) -> None:
         _log.warning('%s: kernels may be compiled at every start: %s', stamp, error)
 
 
-try:
-    _caches = [_cache_of(each.parent) for each in _PACKAGE.glob('**/kernels/__init__.py')]
-except RuntimeError:
-    _directory = tempfile.mkdtemp(prefix='surfel_mapper-kernels-')
-    atexit.register(shutil.rmtree, _directory, ignore_errors=True)
-    _numba.config.CACHE_DIR = _directory  # type: ignore[attr-defined]
-    _log.warning(
-        'no writable cache directory for compiled kernels, so every start takes half a minute: '
-        'set NUMBA_CACHE_DIR to a writable directory'
-    )
-else:
-    if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
-        _sources = sorted(_PACKAGE.glob('**/kernels/*.py'))
-        _digest = hashlib.sha256(b''.join(each.read_bytes() for each in _sources)).digest()
-        for _cache in _caches:
-            _discard_stale(_cache, _digest)
+def _prepare_cache() -> None:
+    """Discard stale kernels; if there is no writable cache, use a temporary directory."""
+    try:
+        caches = [_cache_of(each.parent) for each in _PACKAGE.glob('**/kernels/__init__.py')]
+    except RuntimeError:
+        directory = tempfile.mkdtemp(prefix='surfel_mapper-kernels-')
+        atexit.register(shutil.rmtree, directory, ignore_errors=True)
+        _numba.config.CACHE_DIR = directory  # type: ignore[attr-defined]
+        _log.warning(
+            'no writable cache directory for compiled kernels, so every start takes half a '
+            'minute: set NUMBA_CACHE_DIR to a writable directory'
+        )
+        return
+    sources = sorted(_PACKAGE.glob('**/kernels/*.py'))
+    digest = hashlib.sha256(b''.join(each.read_bytes() for each in sources)).digest()
+    for cache in caches:
+        _discard_stale(cache, digest)
+
+
+if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    _prepare_cache()
