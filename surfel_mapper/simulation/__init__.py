@@ -5,10 +5,10 @@ A lidar driving through an analytic world: scans, poses and bags with known trut
 
     simulation = Simulation(World.street(seed=1, length_m=50.0), Lidar(), num_scans=10)
     simulation.scans()                          the scans, with the true surface of every point
-    simulation.drive.T_odom_sensor(stamp_ns)    where the sensor was
+    simulation.drive.T_odom_sensor(stamp_ns)    true pose of the sensor
     simulation.world.normal_at(positions)       true normals; the world's frame is odom
-    record(simulation, 'street')                all of it as a bag
-    load_simulation('street')                   the simulation of a bag, with its truth
+    record(simulation, 'street')                write it as a bag
+    load_simulation('street')                   the simulation that a bag was recorded from
 """
 
 from surfel_mapper.simulation.drive import Drive, Simulation

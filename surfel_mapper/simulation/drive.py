@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Drive: where the vehicle is at any time; Simulation: the scans that its lidar takes.
+Drive: the pose of the vehicle at any time; Simulation: the scans of its lidar.
 
-The odom frame is the world's frame. The course is a sum of sines of the distance driven, so that
-the pose at any stamp is known exactly and a standing vehicle does not rock. A pose is position
-and quaternion first and a matrix second: whoever reads it from a message gets the same bits.
+The odom frame is the frame of the world. The course is a sum of sines of the distance driven, so
+the pose at any stamp is known exactly and a standing vehicle does not rock. Matrices of poses are
+computed from position and quaternion, so that readers of a message get the same bits.
 """
 
 from __future__ import annotations
@@ -32,23 +32,23 @@ from surfel_mapper.simulation.lidar import Lidar
 from surfel_mapper.simulation.world import World
 
 START_NS = 1_700_000_000_000_000_000
-"""Stamp of the first scan unless told otherwise."""
+"""Default stamp of the first scan, ns."""
 
 TWIST_STEP_NS = 1_000_000
-"""The twist is the motion from so long before a stamp to so long after it."""
+"""Half the interval over which the twist is computed, ns."""
 
 WEAVE_M = ((1.0, 70.0), (0.5, 31.0))
-"""Amplitude and length of the curves to the side, m; together up to 11 deg off the road."""
+"""Amplitude and wavelength of the lateral curves, m; the heading deviates by up to 11 deg."""
 
 BUMPS_M = ((0.02, 9.0), (0.01, 3.7))
-"""Amplitude and length of the unevenness of the road, m."""
+"""Amplitude and wavelength of the unevenness of the road, m."""
 
 ROLL_DEG, PITCH_DEG = (0.9, 17.0), (0.6, 13.0)
-"""Amplitude, deg, and length, m, of the rocking about x and y."""
+"""Amplitude, deg, and wavelength, m, of roll and pitch."""
 
 
 def base_to_sensor() -> tuple[float, ...]:
-    """Return the mounting of the lidar, x y z qx qy qz qw: on the roof, slightly askew."""
+    """Return the default pose of the lidar on the vehicle, x y z qx qy qz qw: slightly tilted."""
     turn = np.deg2rad([0.0, 0.0, 0.0, 0.7, -1.1, 2.3])
     return (0.85, 0.04, 1.9, *(float(v) for v in q_xyzw(se3_exp(turn))))
 
@@ -56,23 +56,23 @@ def base_to_sensor() -> tuple[float, ...]:
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
     """
-    The course of a vehicle along a street, and where its lidar is mounted.
+    The course of a vehicle along a street, and the mounting of its lidar.
 
     Attributes
     ----------
     start : (7,) float
-        Pose x y z (m) qx qy qz qw in odom from which it drives ahead, World.start.
+        Start pose x y z (m) qx qy qz qw in odom, usually World.start.
     speed_m_s : float
-        Along the road; the way along the curves is up to 2 % longer.
+        Speed along the road; the path along the curves is up to 2 % longer.
     start_ns : int
-        Stamp at the start; before it the vehicle comes from behind.
+        Stamp at the start pose; at earlier stamps the vehicle is behind it.
     base_to_sensor : (7,) float
         Pose of the lidar on the vehicle, as in the setting frames.base_to_sensor.
 
     Raises
     ------
     ConfigError
-        If a value is out of bounds or no pose.
+        If a value is out of bounds or not a pose.
 
     """
 
@@ -136,11 +136,11 @@ class Simulation:
     world : World
     lidar : Lidar
     drive : Drive
-        Without one, a drive from the world's start.
+        By default a drive from the start of the world.
     num_scans : int
     rolling : bool
-        Whether each column is seen from where the lidar is at its time; else a whole scan is
-        seen from where the lidar is at its stamp.
+        Whether each column is measured from the pose of the lidar at its time; otherwise a whole
+        scan is measured from the pose at its stamp.
 
     Raises
     ------
@@ -151,23 +151,23 @@ class Simulation:
 
     world: World
     lidar: Lidar = field(default_factory=Lidar)
-    drive: Drive = None  # type: ignore[assignment]  # filled in when made
+    drive: Drive = None  # type: ignore[assignment]  # set in __post_init__
     num_scans: int = field(default=100, kw_only=True)
     rolling: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        """Fill in the drive and check the number of scans."""
+        """Set the default drive and check the number of scans."""
         if self.drive is None:
             object.__setattr__(self, 'drive', Drive(start=self.world.start))
         if self.num_scans < 1:
             raise ConfigError(f'scans: {self.num_scans}, expected one or more')
 
     def stamp_ns(self, number: int) -> int:
-        """Return the stamp of a scan, which is when its turn begins."""
+        """Return the stamp of a scan, the beginning of its turn, ns."""
         return self.drive.start_ns + round(number * 1e9 / self.lidar.rate_hz)
 
     def scan(self, number: int, frame_id: str = 'lidar') -> Scan:
-        """Return a scan, the same whatever was simulated before; see Lidar.scan."""
+        """Return a scan; it does not depend on other calls. See Lidar.scan."""
         stamp_ns = self.stamp_ns(number)
         if self.rolling:
             delays = np.rint(self.lidar.column_times() * 1e9).astype(np.int64).tolist()
@@ -185,7 +185,7 @@ class Simulation:
 
 
 def _sines(along: float, waves: tuple[tuple[float, float], ...]) -> tuple[float, float]:
-    """Return the sum of sines at a distance, and its slope."""
+    """Return the sum of sines at a distance and its slope."""
     value = slope = 0.0
     for amplitude, length in waves:
         turn = 2.0 * math.pi / length

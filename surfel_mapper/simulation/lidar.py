@@ -3,10 +3,10 @@
 """
 Lidar: a spinning lidar of many beams in an analytic world.
 
-A scan is organised: one point for every beam and column, beam by beam, and nan where nothing was
-hit, so that row and column of a point are its beam and azimuth. Points are float32 in the frame
+A scan is organised: one point for every beam and column, beam by beam, nan for rays without a
+return, so that row and column of a point are its beam and azimuth. Points are float32 in the frame
 of the sensor, as drivers send them: at 64 to 128 m that rounds by up to 3.8 micrometres an axis,
-as much as the quantisation of the map at 0.5 m voxels does.
+as much as the quantisation of the map with 0.5 m voxels.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ class Lidar:
     elevation_deg : (2,) float
         Elevation of the lowest and the highest beam.
     rate_hz : float
-        Turns a second.
+        Revolutions a second.
     range_noise_m : float
         Standard deviation of the range.
     min_range_m, max_range_m : float
-        Nearer and farther surfaces return nothing; noise comes on top.
+        Nearer and farther surfaces have no return; noise is added afterwards.
     seed : int
-        Of the noise, together with the number of the scan.
+        Seed of the noise, together with the number of the scan.
 
     Raises
     ------
@@ -93,7 +93,7 @@ class Lidar:
         return unit
 
     def column_times(self) -> FloatArray:
-        """Return when each column is measured, (columns,), s since the turn began."""
+        """Return the time of each column since the start of the turn, (columns,) s."""
         return np.arange(self.columns) / (self.columns * self.rate_hz)
 
     def scan(
@@ -106,30 +106,30 @@ class Lidar:
         number: int = 0,
     ) -> Scan:
         """
-        Return what the lidar measures in one turn.
+        Return the measurements of one turn.
 
         Parameters
         ----------
         world : World
-            What it stands in.
+            The world around the lidar.
         T_world_sensor : (4, 4) or (columns, 4, 4) float64
-            Where the sensor is: one pose for all points, or one for each column.
+            Pose of the sensor: one for all points, or one for each column.
         stamp_ns, frame_id
-            Of the scan.
+            Stamp and frame of the scan.
         number : int
-            Of the scan: its noise is drawn for this number, whatever was simulated before.
+            Number of the scan, which seeds its noise together with ``seed``.
 
         Returns
         -------
         Scan
-            beams * columns points, beam by beam, nan where nothing was hit. Columns: intensity
-            float32 in [0, 255]; ring uint16; time float32, s after the stamp, and 0 throughout
-            where one pose holds for all points; surface int64, the true surface, -1 for none.
+            beams * columns points, beam by beam, nan for rays without a return. Columns: intensity
+            float32 in [0, 255]; ring uint16; time float32, s after the stamp, or 0 with a single
+            pose; surface int64, the true surface, -1 for none.
 
         Raises
         ------
         ValueError
-            If the poses are of another shape.
+            If the poses have another shape.
 
         """
         T = np.asarray(T_world_sensor, dtype=np.float64)

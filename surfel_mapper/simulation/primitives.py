@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Primitive: one analytic thing of a simulated world, in terms a person writes down.
+Primitive: an analytic surface or solid of a simulated world.
 
-The pose is kept as position and quaternion, not as a matrix, so that a world read back from its
-file casts the same rays to the last bit.
+The pose is stored as position and quaternion, not as a matrix, so that a world loaded from its
+file gives the same ray casts to the last bit.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ KINDS = {
     'tube': (TUBE, ('radius', 'length')),
     'sphere': (SPHERE, ('radius',)),
 }
-"""Every kind with its number in the kernels and what its sizes are."""
+"""Number of each kind in the kernels, and the names of its sizes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,24 +40,24 @@ class Primitive:
     ----------
     kind : str
         rectangle: bounded plane z = 0, outward is +z. box: solid. cylinder: about z, with caps;
-        tube: the same without them. sphere: solid.
+        tube: without caps. sphere: solid.
     size_m : tuple of float, m
-        rectangle: whole extent in x and y. box: in x, y and z. cylinder and tube: radius and
-        length. sphere: radius.
+        rectangle: full extent in x and y. box: full extent in x, y and z. cylinder and
+        tube: radius and length. sphere: radius.
     xyz : (3,) float, m
-        Where its centre is in the world.
+        Position of its centre in the world.
     q_xyzw : (4,) float
-        How its axes are turned in the world.
+        Rotation of its axes in the world.
     reflectivity : float
-        In [0, 1]: scales the intensity that a lidar sees.
+        In [0, 1]; scales the intensity measured by a lidar.
     label : str
-        What it stands for: ground, building, car, ...
+        Name of the object: ground, building, car, ...
 
     Raises
     ------
     ValueError
-        If the kind is unknown, sizes are not as many as the kind has or not positive and finite,
-        the pose is none, or the reflectivity is out of bounds.
+        If the kind is unknown, the number of sizes is wrong, a size is not positive and finite,
+        the pose is invalid, or the reflectivity is out of bounds.
 
     """
 
@@ -69,7 +69,7 @@ class Primitive:
     label: str = ''
 
     def __post_init__(self) -> None:
-        """Check everything; sequences of numbers become tuples of float."""
+        """Check every value; convert sequences of numbers to tuples of float."""
         if self.kind not in KINDS:
             raise ValueError(f'kind: {self.kind!r}, expected one of {", ".join(KINDS)}')
         for name in ('size_m', 'xyz', 'q_xyzw'):
@@ -91,7 +91,7 @@ class Primitive:
 
     @property
     def half_m(self) -> tuple[float, float, float]:
-        """Half the extent along its own axes, m; 0 across a rectangle."""
+        """Half the extent along its own axes, m; 0 along z for a rectangle."""
         first = self.size_m[0]
         if self.kind == 'sphere':
             return first, first, first
@@ -107,17 +107,17 @@ class Primitive:
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> Primitive:
         """
-        Return the primitive that to_mapping described.
+        Return the primitive that to_mapping returned.
 
         Raises
         ------
         FileFormatError
-            If an attribute is unknown or missing, or a value is refused.
+            If an attribute is unknown or missing, or a value is invalid.
 
         """
         unknown = set(mapping) - {field.name for field in fields(cls)}
         if unknown:
-            raise FileFormatError(f'{", ".join(sorted(unknown))}: no attribute of a primitive')
+            raise FileFormatError(f'{", ".join(sorted(unknown))}: not an attribute of a primitive')
         try:
             return cls(**mapping)
         except (TypeError, ValueError) as error:

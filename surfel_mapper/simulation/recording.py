@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Record a simulation as a bag, with all that is needed to know its truth beside the messages.
+Record a simulation as a bag with its ground truth.
 
-The bag holds /points (PointCloud2 in the frame lidar), /odom and /tf (odom to base_link, one of
-each at every scan's stamp), and /tf_static (base_link to lidar). Poses are recorded at their
-stamp and a cloud when its turn is over, as a driver would. The directory also holds world.json
-and simulation.json, from which load_simulation makes the same simulation again.
+The bag holds /points (PointCloud2 in the frame lidar), /odom and /tf (odom to base_link, every
+10 ms and at every stamp of a scan), and /tf_static (base_link to lidar). Poses are recorded at
+their stamp and a cloud after its turn, as by a driver. The directory also holds world.json and
+simulation.json, from which load_simulation restores the simulation.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ ODOM, BASE, SENSOR = 'odom', 'base_link', 'lidar'
 """Names of the frames."""
 
 ODOMETRY_STEP_NS = 10_000_000
-"""A pose is recorded every so often, and at every scan's stamp."""
+"""Period of the recorded poses; further ones are at the stamps of scans."""
 
 DRIVER_DELAY_NS = 2_000_000
-"""From the end of a turn to the recording of its cloud."""
+"""Delay from the end of a turn to the recording of its cloud."""
 
 WORLD_FILE, SIMULATION_FILE = 'world.json', 'simulation.json'
 
@@ -48,7 +48,7 @@ POINT = np.dtype(
         'itemsize': 32,
     }
 )
-"""A point as drivers lay it out, with padding."""
+"""Layout of a point, with padding as drivers have it."""
 
 FIELDS = (
     Field('x', 0, 7, 1),
@@ -74,20 +74,20 @@ def record(
     Parameters
     ----------
     simulation : Simulation
-        What to write.
+        The simulation.
     path : str or Path
         Directory of the bag.
     storage : str
         mcap or sqlite3.
     overwrite : bool
-        Whether a bag of that name gives way.
+        Whether an existing bag is replaced.
     on_scan : callable, optional
-        Called with each scan once it is written.
+        Called with each scan after it is written.
 
     Raises
     ------
     BagError
-        If something is at the path that may not be overwritten, or writing fails.
+        If the path exists and may not be overwritten, or writing fails.
 
     """
     with BagWriter(path, storage, overwrite=overwrite) as bag:
@@ -172,17 +172,17 @@ def _write_description(simulation: Simulation, directory: Path) -> None:
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:
-    """Return the values with lists, which JSON makes of tuples, turned back."""
+    """Return the values with lists converted to tuples; JSON has no tuples."""
     return {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
 
 
 def _turn_ns(simulation: Simulation) -> int:
-    """Return how long a turn of the lidar takes."""
+    """Return the duration of a turn of the lidar, ns."""
     return round(1e9 / simulation.lidar.rate_hz)
 
 
 def _pose_times(simulation: Simulation) -> Iterator[tuple[int, int]]:
-    """Yield when poses are recorded, each once, until the last turn is over; and -1."""
+    """Yield the stamp of each recorded pose until the end of the last turn, and -1."""
     start = simulation.drive.start_ns
     scans = [simulation.stamp_ns(number) for number in range(simulation.num_scans)]
     end = scans[-1] + _turn_ns(simulation)
@@ -192,7 +192,7 @@ def _pose_times(simulation: Simulation) -> Iterator[tuple[int, int]]:
 
 
 def _scan_times(simulation: Simulation) -> Iterator[tuple[int, int]]:
-    """Yield when clouds are recorded, and the number of the scan."""
+    """Yield the time at which each cloud is recorded, and the number of its scan."""
     delay = _turn_ns(simulation) + DRIVER_DELAY_NS
     for number in range(simulation.num_scans):
         yield simulation.stamp_ns(number) + delay, number

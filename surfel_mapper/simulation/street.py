@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A street canyon out of primitives: road, pavements, houses, parked cars, trees, lamps, bins.
+A street canyon of primitives: road, pavements, houses, parked cars, trees, lamps, bins.
 
-In the frame of the street x runs along the road, y to the left and z up from the road. The frame
-is turned and tilted in the world, and nearly everything in it a little more, so that no plane
-lies along the voxel grid, where errors of rounding would hide. Solids reach into the ground and
-into what they stand on, so that no gap shows.
+In the frame of the street x runs along the road, y to the left and z up from the road. The street
+is rotated in the world, and nearly every object in the street, so that no plane is parallel to the
+voxel grid, which would hide rounding errors. Solids reach into the ground and into the objects
+below them, so that there are no gaps.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from surfel_mapper.geometry import compose, pose_matrix, q_xyzw, se3_exp
 from surfel_mapper.simulation.primitives import Primitive
 
 STREET_XYZ = (3.7, -12.4, 1.3)
-"""Where the street begins in the world, m."""
+"""Start of the street in the world, m."""
 
 STREET_TURN_DEG = (2.6, -1.9, 27.0)
-"""How the street is turned in the world, rotation vector."""
+"""Rotation vector of the street in the world, deg."""
 
 BEYOND_M = 60.0
-"""The street goes on so far before the start and after the end of a drive."""
+"""Length of the street before the start and after the end of a drive."""
 
 GROUND_WIDTH_M = 90.0
 PAVEMENT_Y_M = (5.8, 8.8)
@@ -36,7 +36,7 @@ PAVEMENT_HEIGHT_M = 0.13
 
 
 def street_pose() -> list[float]:
-    """Return where the street begins and how it is turned, x y z in m, qx qy qz qw."""
+    """Return the pose of the street in the world, x y z in m, qx qy qz qw."""
     turn = np.deg2rad([0.0, 0.0, 0.0, *STREET_TURN_DEG])
     return [*STREET_XYZ, *(float(v) for v in q_xyzw(se3_exp(turn)))]
 
@@ -68,7 +68,7 @@ def street_primitives(seed: int, length_m: float) -> list[Primitive]:
 
 
 class Street:
-    """Makes the rows of things along one street, in the order the random numbers are drawn."""
+    """Generates the rows of objects along one street, in the order of its random numbers."""
 
     def __init__(self, rng: np.random.Generator, length_m: float) -> None:
         self._rng = rng
@@ -77,7 +77,7 @@ class Street:
         self._T_world_street = pose_matrix(pose[:3], pose[3:])
 
     def ends(self) -> Iterator[Primitive]:
-        """Yield the ground and a house across either end."""
+        """Yield the ground and a house across each end."""
         size = (self._length_m + 2.0 * BEYOND_M + 40.0, GROUND_WIDTH_M)
         middle = (self._length_m / 2.0, 0.0, 0.0)
         yield self._place('rectangle', size, middle, label='ground', reflectivity=0.25)
@@ -86,7 +86,7 @@ class Street:
             yield self._place('box', (8.0, 40.0, 24.0), (x, 0.0, 2.0), turn, label='building')
 
     def pavement(self, side: int) -> Iterator[Primitive]:
-        """Yield slabs beside the road."""
+        """Yield the slabs of a pavement."""
         near, far = PAVEMENT_Y_M
         slab = 24.0
         for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, slab):
@@ -96,7 +96,7 @@ class Street:
             yield self._place('box', size, centre, turn, label='pavement', reflectivity=0.4)
 
     def houses(self, side: int) -> Iterator[Primitive]:
-        """Yield a row of houses, some apart, some with a bay window or a sign."""
+        """Yield a row of houses, some with a gap, a bay window or a sign."""
         rng, x = self._rng, -BEYOND_M
         while x < self._length_m + BEYOND_M:
             width, height = rng.uniform(8.0, 16.0), rng.uniform(6.0, 15.0)
@@ -117,7 +117,7 @@ class Street:
             x += width + (rng.uniform(3.0, 8.0) if rng.random() < 0.2 else -0.2)
 
     def cars(self, side: int) -> Iterator[Primitive]:
-        """Yield parked cars: a body and a cabin each, leaning and turned alike."""
+        """Yield parked cars: a body and a cabin with the same rotation."""
         for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, 7.0):
             if self._rng.random() < 0.4:
                 continue
@@ -159,7 +159,7 @@ class Street:
         yield self._place('tube', (0.32, 1.6), (x, y, 0.3), turn, label='bin', reflectivity=0.6)
 
     def _about(self, value: float, spread: float) -> float:
-        """Return a random number within a spread of a value."""
+        """Return a uniform random number in value +- spread."""
         return float(self._rng.uniform(value - spread, value + spread))
 
     def _place(
@@ -170,7 +170,7 @@ class Street:
         turn_deg: tuple[float, ...] = (0.0, 0.0, 0.0),
         **look: Any,
     ) -> Primitive:
-        """Return a primitive placed in the street by centre and rotation vector."""
+        """Return a primitive from its centre and rotation vector in the street."""
         turn = se3_exp(np.deg2rad([0.0, 0.0, 0.0, *turn_deg]))
         T_world_primitive = compose(self._T_world_street, pose_matrix(xyz, q_xyzw(turn)))
         return Primitive(

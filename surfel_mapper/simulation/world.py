@@ -1,10 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-World: analytic primitives that rays can be cast against, and the truth about their surfaces.
+World: analytic primitives for ray casting, with the true surface and normal at any position.
 
 A surface is a number: a plane, the side of a cylinder, a sphere. The six faces of a box are six
-surfaces, so that points of one plane can be told from points of one thing.
+surfaces, which distinguishes points on one plane from points on one object.
+
+Primitives are the leaves of a tree of axis-parallel bounding boxes in depth-first order: after an
+entered node comes the next one, after a missed node the end of its branch. Nodes are split at the
+median of the centres along the longest side, which keeps the tree balanced for any world.
 """
 
 from __future__ import annotations
@@ -25,22 +29,22 @@ from surfel_mapper.simulation.primitives import KINDS, Primitive
 from surfel_mapper.simulation.street import street_pose, street_primitives
 
 MARGIN = 1e-9
-"""Boxes are wider by this share of the largest coordinate: rounding never hides a surface."""
+"""Margin of boxes relative to the largest coordinate, so that rounding never hides a surface."""
 
 
 @dataclass(frozen=True, slots=True)
 class BoxTree:
     """
-    The nodes in depth-first order.
+    A tree of bounding boxes: its nodes in depth-first order.
 
     Attributes
     ----------
     box : (M, 6) float64, m
         Lowest x y z, highest x y z.
     next : (M,) int64
-        The node after this one's whole branch.
+        Number of the first node after the branch of each node.
     primitive : (M,) int64
-        The primitive of a leaf, -1 elsewhere.
+        Primitive of a leaf, -1 for inner nodes.
 
     """
 
@@ -52,7 +56,7 @@ class BoxTree:
 def bounding_boxes(
     pose: npt.NDArray[np.float64], half: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
-    """Return (P, 6) float64 boxes about primitives from (P, 3, 4) poses and (P, 3) half sizes."""
+    """Return the (P, 6) boxes, m, of primitives with (P, 3, 4) poses and (P, 3) half sizes."""
     centre = pose[:, :, 3]
     reach = (np.abs(pose[:, :, :3]) * half[:, None, :]).sum(axis=2)
     reach += MARGIN * np.abs(centre).max(axis=1, initial=1.0, keepdims=True) + MARGIN * reach
@@ -60,7 +64,7 @@ def bounding_boxes(
 
 
 def build_tree(boxes: npt.NDArray[np.float64]) -> BoxTree:
-    """Return the tree over (P, 6) bounding boxes; without boxes it has no node."""
+    """Return the tree over (P, 6) bounding boxes; it has no nodes without boxes."""
     num_nodes = max(2 * len(boxes) - 1, 0)
     tree = BoxTree(
         np.empty((num_nodes, 6)),
@@ -75,7 +79,7 @@ def build_tree(boxes: npt.NDArray[np.float64]) -> BoxTree:
 def _fill(
     tree: BoxTree, boxes: npt.NDArray[np.float64], members: npt.NDArray[np.int64], node: int
 ) -> int:
-    """Write the branch of some primitives from a node on; return the node after it."""
+    """Write the branch of members at a node; return the first node after it."""
     inside = boxes[members]
     tree.box[node, :3] = inside[:, :3].min(axis=0)
     tree.box[node, 3:] = inside[:, 3:].max(axis=0)
@@ -95,7 +99,7 @@ FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
 
 FORMAT = 'surfel_mapper world 1'
-"""First entry of a world's file."""
+"""Value of the key format in the file of a world."""
 
 
 class World:
@@ -105,14 +109,14 @@ class World:
     Parameters
     ----------
     primitives : sequence of Primitive
-        Solids may overlap; surfaces inside other solids are there all the same.
+        Solids may overlap; surfaces inside of other solids remain.
     start : (7,) float
-        Pose x y z (m) qx qy qz qw from which drives begin: on the ground, x ahead, z up.
+        Start pose of drives, x y z (m) qx qy qz qw: on the ground, x ahead, z up.
 
     Raises
     ------
     ValueError
-        If the start is no pose.
+        If the start is not a pose.
 
     """
 
@@ -136,14 +140,14 @@ class World:
     @classmethod
     def street(cls, *, seed: int = 0, length_m: float = 200.0) -> World:
         """
-        Return a street canyon, tilted and turned off the grid; the same for the same arguments.
+        Return a street canyon, rotated against the voxel grid; deterministic.
 
         Parameters
         ----------
         seed : int
-            Where things stand and how they are turned.
+            Seed of the positions and rotations of objects.
         length_m : float
-            How far a drive can go; the street goes on beyond both ends.
+            Longest drive; the street continues beyond both ends.
 
         Raises
         ------
@@ -157,31 +161,31 @@ class World:
         self, origins: npt.ArrayLike, directions: npt.ArrayLike, max_range_m: float = np.inf
     ) -> tuple[FloatArray, IntArray, FloatArray]:
         """
-        Return what rays hit first.
+        Return the first surface on each ray.
 
         Parameters
         ----------
         origins : (N, 3) or (3,) float64, m
-            In the world.
+            In the world frame.
         directions : (N, 3) float64
             Unit vectors in the world.
         max_range_m : float
-            Nothing farther is hit.
+            Farther surfaces are ignored.
 
         Returns
         -------
         range_m : (N,) float64
-            Distance, inf where nothing is hit.
+            Distance, inf for no hit.
         surface : (N,) int64
-            The surface, -1 where nothing is hit.
+            The surface, -1 for no hit.
         normal : (N, 3) float64
-            Its outward normal there, nan where nothing is hit. From inside a solid, and from
-            behind a rectangle, it points along the ray.
+            Outward normal at the hit, nan for no hit. From inside of a solid, and from behind a
+            rectangle, it points along the ray.
 
         Raises
         ------
         ValueError
-            If shapes do not fit, a direction is no unit vector, or an origin is not finite.
+            If shapes do not match, a direction is not a unit vector, or an origin is not finite.
 
         """
         start = _rows(origins, 'origins')
@@ -206,16 +210,16 @@ class World:
         Parameters
         ----------
         positions : (N, 3) float64, m
-            In the world, on either side of the surface or on it.
+            In the world frame, on either side of the surface or on it.
 
         Returns
         -------
         surface : (N,) int64
-            -1 for positions that are not finite, and in an empty world.
+            -1 for non-finite positions and in an empty world.
         distance_m : (N,) float64
-            How far it is, inf where there is none.
+            Distance to the surface, inf for none.
         normal : (N, 3) float64
-            Its outward unit normal there, nan where there is none.
+            Outward unit normal of the surface, nan for none.
 
         """
         places = _rows(positions, 'positions')
@@ -233,7 +237,7 @@ class World:
         return np.where(surface < 0, -1, surface // surfaces.FACES)
 
     def is_plane(self, surface: IntArray) -> npt.NDArray[np.bool_]:
-        """Return whether each surface is flat: rectangles, faces of boxes, caps; not -1."""
+        """Return whether each surface is flat: rectangles, faces of boxes, caps; False for -1."""
         kind = np.append(self._kind, -1)[self.primitive_of(surface)]
         cap = (kind == surfaces.CYLINDER) & (surface % surfaces.FACES > 0)
         plane: npt.NDArray[np.bool_] = np.isin(kind, (surfaces.RECTANGLE, surfaces.BOX)) | cap
@@ -251,12 +255,12 @@ class World:
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, Any]) -> World:
         """
-        Return the world that to_mapping described.
+        Return the world that to_mapping returned.
 
         Raises
         ------
         FileFormatError
-            If it is no such description, or a value in it is refused.
+            If the mapping does not describe a world, or a value is invalid.
 
         """
         found = mapping.get('format') if isinstance(mapping, Mapping) else type(mapping).__name__
@@ -277,12 +281,12 @@ class World:
     @classmethod
     def load(cls, path: str | Path) -> World:
         """
-        Read the world of a file that save wrote.
+        Read a world from a file written by save.
 
         Raises
         ------
         FileFormatError
-            If the file cannot be read or holds no world.
+            If the file cannot be read or does not hold a world.
 
         """
         try:

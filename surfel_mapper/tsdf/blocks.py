@@ -1,14 +1,29 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-BlockMap: the voxels of a TSDF in cubes of M x M x M, found by hash.
+Storage of a distance field: a hash table of blocks of M x M x M voxels.
 
-Blocks stand in the rows of arrays, see blocks.py, which a hash table knows. A row is reused
-when its block has left; one that is not in use is zero but for its head.
+Block (a, b, c) spans from (a, b, c) * M * voxel_size_m to the next. Voxel (i, j, k) of it has the
+number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
+((a, b, c) * M + (i, j, k) + 0.5) * voxel_size_m. Row r of every array belongs to one block:
 
-``version`` counts the changes of the map; whoever follows them keeps the version that he has seen
-and asks ``changed_since`` for the rows. A block changed after the last ``clear_updated`` is
-flagged updated, and stays when the window moves on.
+    head    (R, 4) int64       key, version, stamp of the last change; see kernels/blocks.py
+    field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
+                               it; weight, 0 for a voxel that was never observed
+    color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
+    votes   (R, V, N) float32  for labels, see kernels/channels.py; V depends on the semantics
+    stamps  (R, 2, N) int64    first and last stamp, ns; 0 for a voxel that was never observed
+
+color, votes and stamps have no rows unless the configuration asks for them. All arrays are slabs
+that grow in place: a view is valid until blocks are added and must not be kept. The row of a
+removed block is reused; free rows are zero except for their head.
+
+``version`` counts the changes of the map. To follow them, keep the last version seen and ask
+``changed_since`` for the rows. Blocks changed after the last ``clear_updated`` are flagged as
+updated and are not evicted.
+
+One module: the arrays, their content outside of a map (Blocks) and the map over them share the
+layout above.
 """
 
 from __future__ import annotations
@@ -41,16 +56,16 @@ Float32 = npt.NDArray[np.float32]
 @dataclass(frozen=True, kw_only=True)
 class Blocks:
     """
-    Content of some blocks, taken out of a map or about to be put into one.
+    Content of blocks outside of a map: copied, removed, or to be inserted.
 
     Attributes
     ----------
     index : (K, 3) int64
-        Which blocks.
+        Block index along x, y, z.
     stamp_ns : (K,) int64
-        Stamp of the last change of each.
+        Stamp of the last change of each block, ns.
     field, color, votes, stamps
-        As in BlockMap, one row a block.
+        As in the module docstring, one row a block.
 
     """
 
@@ -62,12 +77,12 @@ class Blocks:
     stamps: Int64
 
     def __len__(self) -> int:
-        """Return how many blocks."""
+        """Return the number of blocks."""
         return len(self.index)
 
 
-def some(array: npt.NDArray[Any], rows: Int64) -> Any:
-    """Return a copy of some rows, or of none where the channel is not kept."""
+def copied_rows(array: npt.NDArray[Any], rows: Int64) -> Any:
+    """Return a copy of rows; an empty array if the channel is not kept."""
     return array[rows] if len(array) else array.copy()
 
 
@@ -81,29 +96,28 @@ def block_keys(index: npt.NDArray[Any]) -> Int64:
 
 
 def block_index(keys: Int64) -> Int64:
-    """Return the blocks that keys stand for, (..., 3) int64."""
+    """Return the (..., 3) int64 indices of blocks from their keys."""
     shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
     index: Int64 = (keys[..., None] >> shifts & INDEX_MASK) - INDEX_OFFSET
     return index
 
 
 FIRST_ROWS = 128
-"""Rows to begin with; any slab of so many is whole pages."""
+"""Initial number of rows; a slab of 128 rows fills whole pages for any row width."""
 
 
 class BlockArrays:
     """
-    A row for each block, in as many arrays as the configuration asks for.
+    One row a block in each array that the configuration asks for.
 
     Parameters
     ----------
     config : TsdfConfig
-        Voxels per side, and what a voxel keeps.
+        Voxels per side and channels of a voxel.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        """Make rows that are not in use."""
         self.config = config
         voxels = self.voxels_per_block
         widths = {  # in int64
@@ -118,17 +132,17 @@ class BlockArrays:
 
     @property
     def voxels_per_block(self) -> int:
-        """N, the number of voxels in a block."""
+        """Number of voxels in a block, N."""
         return self.config.voxels_per_side**3
 
     @property
     def head(self) -> Int64:
-        """Key, version and stamp of each row, (R, 4); only until the map grows."""
+        """Key, version and stamp of each row, (R, 4); valid until the map grows."""
         return self._slabs['head'].array[:, :HEAD]
 
     @property
     def field(self) -> Float32:
-        """Distance and weight, (R, 2, N); only until the map grows."""
+        """Distance and weight, (R, 2, N); valid until the map grows."""
         return self._floats('field', 2)
 
     @property
@@ -138,7 +152,7 @@ class BlockArrays:
 
     @property
     def weight(self) -> Float32:
-        """Weights, (R, N), 0 where never observed, a view of field."""
+        """Weights, (R, N), 0 for voxels never observed; a view of field."""
         return self.field[:, 1]
 
     @property
@@ -165,39 +179,39 @@ class BlockArrays:
         return flat.reshape(-1, width, self.voxels_per_block)
 
     def _copied(self, rows: Int64) -> dict[str, npt.NDArray[Any]]:
-        """Return a copy of what some rows hold beside their head, by name."""
+        """Return copies of the channels of rows, without their heads, by name."""
         names = ('field', 'color', 'votes', 'stamps')
-        return {name: some(getattr(self, name), rows) for name in names}
+        return {name: copied_rows(getattr(self, name), rows) for name in names}
 
     def _write(self, rows: Int64, blocks: Blocks) -> None:
-        """Put the content of blocks into rows, but for their head."""
+        """Write the channels of blocks into rows; heads stay."""
         for name in self._slabs.keys() - {'head'}:
             getattr(self, name)[rows] = getattr(blocks, name)
 
     def _wipe(self, rows: Int64) -> None:
-        """Make rows zero, but for their head."""
+        """Set the channels of rows to zero; heads stay."""
         for name, slab in self._slabs.items():
             if name != 'head':
                 slab.array[rows] = 0
 
     def _grow(self) -> None:
-        """Make room for twice as many rows."""
+        """Double the number of rows."""
         num_rows = len(self.head)
-        for slab in reversed(self._slabs.values()):  # the head, which says how many, last
+        for slab in reversed(self._slabs.values()):  # the head last: it counts the rows
             if len(slab.array) < 2 * num_rows:
                 slab.grow(2 * num_rows)
 
 
 MAX_DEPTH = 24
-"""The directory of the hash table has at most 2^24 entries."""
+"""Largest depth of the hash table's directory: 2^24 entries, more than 64 million blocks."""
 
 UPPER = np.array([(n & 1, n >> 1 & 1, n >> 2) for n in range(8)])
-"""The block itself and the seven beside and above it that hold the far corners of its cubes."""
+"""Offsets of a block and of the seven that hold the upper corners of its marching cubes."""
 
 
 class BlockMap(BlockArrays):
     """
-    Blocks of voxels with distance, weight and what else the configuration asks for.
+    A map of blocks: find, place, touch, evict, copy and insert.
 
     Parameters
     ----------
@@ -207,14 +221,13 @@ class BlockMap(BlockArrays):
     Attributes
     ----------
     config : TsdfConfig
-        As given.
+        The settings.
     version : int
         Number of changes so far.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        """Make an empty map."""
         super().__init__(config)
         self.version = 0
         self._settled = 0
@@ -223,17 +236,17 @@ class BlockMap(BlockArrays):
 
     @property
     def num_blocks(self) -> int:
-        """Blocks in the map."""
+        """Number of blocks in the map."""
         return self._hash.num_keys
 
     @property
     def nbytes(self) -> int:
-        """Bytes in use for blocks and their hash table."""
+        """Bytes used by blocks and their hash table."""
         return self._hash.rows_used * self._row_bytes + self._hash.nbytes
 
     @property
     def lookup(self) -> tuple[Any, ...]:
-        """What kernels find blocks with: head, table, state; only until the map grows."""
+        """Arrays by which kernels find blocks: head, table, state; valid until the map grows."""
         return self.head, self._hash.arrays, self._state
 
     def rows(self) -> Int64:
@@ -245,11 +258,11 @@ class BlockMap(BlockArrays):
         return np.flatnonzero(self._used_head()[:, VERSION] > version)
 
     def index(self, rows: Int64) -> Int64:
-        """Return which blocks stand in rows, (K, 3) int64."""
+        """Return the block indices of rows, (K, 3) int64."""
         return block_index(self.head[rows, KEY])
 
     def find(self, index: npt.ArrayLike) -> Int64:
-        """Return the rows of blocks given by (..., 3) index, -1 where the map has none."""
+        """Return the rows of blocks by (..., 3) index, -1 for blocks not in the map."""
         keys = block_keys(np.asarray(index))
         rows = np.empty(keys.size, np.int64)
         find_blocks(keys.ravel(), self.head, self._hash.arrays, self._state, rows)
@@ -261,12 +274,12 @@ class BlockMap(BlockArrays):
 
     def place(self, index: npt.ArrayLike) -> Int64:
         """
-        Return the rows of blocks, adding empty ones where the map has none.
+        Return the rows of blocks, adding those that are missing.
 
         Parameters
         ----------
         index : (K, 3) int
-            Which blocks.
+            Block indices.
 
         Returns
         -------
@@ -276,7 +289,7 @@ class BlockMap(BlockArrays):
         Raises
         ------
         MapLimitError
-            If an index is beyond 20 bits, or there is no memory; the map holds what it held.
+            If an index is beyond 20 bits, or memory is short; the map is unchanged.
 
         """
         keys = block_keys(np.asarray(index))
@@ -289,7 +302,7 @@ class BlockMap(BlockArrays):
         return self.place_keys(keys)
 
     def place_keys(self, keys: Int64) -> Int64:
-        """Return the rows of blocks given by their keys, as place does."""
+        """Return the rows of blocks by key; otherwise as place."""
         limit = self.config.max_blocks or np.iinfo(np.int64).max
         rows = np.full(len(keys), -1, np.int64)
         done = 0
@@ -304,20 +317,20 @@ class BlockMap(BlockArrays):
         return rows
 
     def touch(self, rows: Int64, stamp_ns: int) -> None:
-        """Mark blocks as changed by a measurement at a stamp; a change of the map."""
+        """Mark blocks as changed at a stamp; increments the version."""
         self.version += 1
         self.head[rows, VERSION] = self.version
         self.head[rows, STAMP] = stamp_ns
 
     def drop_new(self, rows: Int64) -> int:
-        """Remove those of some blocks that were placed and never changed; return how many."""
+        """Remove the blocks among rows that were placed but never touched; return their number."""
         rows = rows[rows >= 0]
         rows = rows[self.head[rows, VERSION] == NEW]
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return len(rows)
 
     def clear_updated(self) -> None:
-        """Take the flag of all blocks: what changed so far has been seen by whoever needs it."""
+        """Clear the updated flag of all blocks."""
         self._settled = self.version
 
     def updated(self) -> Int64:
@@ -326,20 +339,20 @@ class BlockMap(BlockArrays):
 
     def evict(self, position: npt.ArrayLike, stamp_ns: int) -> Blocks:
         """
-        Remove the blocks that the window leaves behind, and hand them back.
+        Remove the blocks outside of the window and return their content.
 
         Parameters
         ----------
         position : (3,) float
-            The middle of the window in the map frame, m.
+            Centre of the window in the map frame, m.
         stamp_ns : int
-            The time now.
+            Current time, ns.
 
         Returns
         -------
         Blocks
-            Those of which the centre is farther than max_radius_m or whose last change is older
-            than max_age_s, and that are not flagged updated.
+            Blocks whose centre is farther than max_radius_m or whose last change is older than
+            max_age_s, except those flagged as updated.
 
         """
         config, rows = self.config, self.rows()
@@ -353,26 +366,26 @@ class BlockMap(BlockArrays):
         return self.remove(rows[leaves])
 
     def remove(self, rows: Int64) -> Blocks:
-        """Remove blocks and return what they held."""
+        """Remove blocks and return their content."""
         removed = self.copied(rows)
         self._wipe(rows)
         remove_blocks(rows, self.head, self._hash.arrays, self._state)
         return removed
 
     def copied(self, rows: Int64) -> Blocks:
-        """Return a copy of what blocks hold."""
+        """Return a copy of the content of blocks."""
         return Blocks(
             index=self.index(rows), stamp_ns=self.head[rows, STAMP], **self._copied(rows)
         )
 
     def insert(self, blocks: Blocks) -> None:
         """
-        Put blocks into the map, in place of what it held there; a change of the map.
+        Write blocks into the map, replacing those of the same index; increments the version.
 
         Raises
         ------
         MapLimitError
-            If they do not fit; the map holds what it held.
+            If they exceed max_blocks; the map is unchanged.
 
         """
         rows = self.place(blocks.index)
@@ -389,7 +402,7 @@ class BlockMap(BlockArrays):
         return self.head[: self._hash.rows_used]
 
     def _make_room(self) -> None:
-        """Enlarge what kept place_blocks from placing a block."""
+        """Enlarge the rows or the hash table, whichever is full."""
         if self._hash.lacks_row(len(self.head)):
             self._grow()
         else:

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The lidar that a scan came from, as its points show it.
+Fit the projection model of a lidar to the points of a scan.
 
-With a ring number a point each beam gets the elevation that its points have; without one the
-beams are taken to be evenly spaced between the lowest and the highest point. There are as many
-columns as the fullest beam has points.
+With ring numbers each beam gets the median elevation of its points; without them the beams are
+evenly spaced between the lowest and the highest point. The number of columns is the number of
+points of the fullest beam.
 """
 
 from __future__ import annotations
@@ -19,15 +19,16 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.sensors import LidarModel
 
 USUAL_ROWS = 64
-"""Beams where nothing tells how many there are."""
+"""Number of beams assumed without ring numbers and settings."""
 
 MAX_COLUMNS = 4096
+"""Limit of the fitted columns: no lidar has more, merged clouds of several sensors seem to."""
 
 SMALLEST_STEP_DEG = 0.01
-"""Rings nearer than this are one beam: no lidar has them, some number their columns."""
+"""Rings nearer than this are one beam: some drivers number their columns as rings."""
 
 NEAR_M = 0.1
-"""Points nearer than this say nothing about an angle; many a driver has zeros for no return."""
+"""Nearer points are ignored: many drivers send zeros for missing returns."""
 
 
 def fitted_lidar(
@@ -40,23 +41,23 @@ def fitted_lidar(
     max_range_m: float,
 ) -> LidarModel:
     """
-    Return a lidar that looks all around and has measured these points.
+    Return the model of the lidar, with a full circle, that measured these points.
 
     Parameters
     ----------
     points : (N, 3) float
-        In its frame, m; nan where there was no return.
+        In the frame of the sensor, m; nan for no return.
     ring : (N,) int, optional
-        Number of the beam of each point.
+        Beam number of each point.
     rows, columns : int
-        Beams and steps of azimuth; 0: as the points show.
+        Beams and azimuth steps; 0 means fitted.
     min_range_m, max_range_m : float
         As in LidarModel.
 
     Raises
     ------
     CloudFormatError
-        If the points show no two beams.
+        If the elevations of the points do not span two beams.
 
     """
     ranges = np.linalg.norm(points, axis=1)

@@ -3,9 +3,9 @@
 """
 Integrator: fuses range images into a block map.
 
-One step is: choose the blocks, place those that are missing, fuse each by itself, and take away
-those placed in vain. Threads share the blocks; what they write does not depend on how many there
-are. See tsdf/kernels/integration.py for what happens in a block.
+One step selects the blocks, adds those that are missing, fuses each block independently, and
+removes added blocks that no measurement touched. Blocks are divided among threads; the result has
+the same bits for any number of threads. See tsdf/kernels/integration.py for the work in a block.
 """
 
 from __future__ import annotations
@@ -42,22 +42,22 @@ NO_MASK = np.empty((0, 0), np.uint8)
 @dataclass(frozen=True, kw_only=True)
 class Integrated:
     """
-    What became of a range image.
+    Counts of one integrated range image.
 
     Attributes
     ----------
     num_blocks : int
-        Blocks that it concerned.
+        Blocks selected.
     num_updated : int
-        Those of which a voxel was observed.
+        Blocks in which at least one voxel was observed.
     num_added : int
-        Those of these that the map did not have before.
+        Updated blocks that are new in the map.
     num_refused : int
-        Blocks that the budget had no room for.
+        Blocks not added because of max_blocks.
     num_voxels : int
         Voxels observed.
     num_labels_lost : int
-        Labels for which a voxel had no slot left.
+        Label observations dropped because a voxel had no free slot.
 
     """
 
@@ -71,7 +71,7 @@ class Integrated:
 
 class Integrator:
     """
-    Fuses range images into a map.
+    Fuses range images into a block map.
 
     Parameters
     ----------
@@ -81,7 +81,7 @@ class Integrator:
     """
 
     def __init__(self, blocks: BlockMap) -> None:
-        """Prepare for the settings of a map; warn of those that leave holes."""
+        """Prepare for the settings of the map; warn if they leave holes."""
         self.blocks = blocks
         config = blocks.config
         if config.truncation_m < 2.0 * config.voxel_size_m:
@@ -114,26 +114,26 @@ class Integrator:
         Parameters
         ----------
         image : RangeImage
-            What was measured.
+            The measurement.
         T_map_sensor : (4, 4) float64
-            From where.
+            Pose of the sensor in the map frame.
         stamp_ns : int
-            When.
+            Stamp of the measurement, ns.
         allocate_blocks : bool
-            Whether blocks are added; without, only those there are changed.
+            Whether missing blocks are added; otherwise only existing ones change.
 
         Returns
         -------
         Integrated
-            What became of it.
+            Counts of blocks and voxels.
 
         Raises
         ------
         PoseError
             If the pose is not a finite rigid transform.
         MapLimitError
-            If the range or the place is beyond what the map can index, or there is no memory; the
-            map is unchanged.
+            If the range or the position exceeds the index range of the map, or memory is short;
+            the map is unchanged.
 
         """
         T = checked_pose(T_map_sensor)
@@ -164,7 +164,7 @@ class Integrator:
     def _fuse(
         self, image: RangeImage, T_map_sensor: Float64, stamp_ns: int, index: Int64, rows: Int64
     ) -> tuple[Int64, int]:
-        """Fuse an image into blocks; return the voxels observed in each, and labels lost."""
+        """Fuse an image into blocks; return the voxels observed in each, and lost labels."""
         config, sensor = self.blocks.config, image.sensor
         R_sensor_map = T_map_sensor[:3, :3].T
         corner = index * config.block_size_m + 0.5 * config.voxel_size_m
@@ -190,20 +190,20 @@ class Integrator:
         return observed, fuse(parts[0]) + sum(one.result() for one in lost)
 
     def _warn_of_radius(self, sensor: Sensor) -> None:
-        """Say once if blocks will come and go with every scan."""
+        """Warn once if the window is smaller than the reach of the sensor."""
         config = self.blocks.config
         needed_m = sensor.max_range_m + math.sqrt(0.75) * config.block_size_m
         if 0.0 < config.max_radius_m < needed_m and not self._has_warned:
             self._has_warned = True
             logger.warning(
-                'layers.tsdf.max_radius_m: %g m is less than the range of the sensor and the half '
-                'diagonal of a block, %.4g m; blocks beyond it are made anew with every scan',
+                'layers.tsdf.max_radius_m: %g m is less than the range of the sensor plus half '
+                'the diagonal of a block, %.4g m; blocks beyond it come and go with every scan',
                 config.max_radius_m,
                 needed_m,
             )
 
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
-        """Return ranges, colours, labels and mask; without rows what there is not."""
+        """Return ranges, cosines, colours, labels and mask; missing ones have no rows."""
         mask = image.mask
         if len(self._masked_labels) and image.label is not None:
             masked = np.isin(image.label, self._masked_labels).astype(np.uint8)
@@ -219,7 +219,7 @@ class Integrator:
         )
 
     def _channels(self, stamp_ns: int) -> tuple[Any, ...]:
-        """Return what the kernel takes of channels beside distance and weight."""
+        """Return the channels beside distance and weight in the form that the kernel takes."""
         config, blocks = self.blocks.config, self.blocks
         return (
             blocks.color,
@@ -233,11 +233,11 @@ class Integrator:
 
 
 POWERS = {'constant': 0, 'inverse_square': 1, 'ray_density': 1, 'ray_density_inv_sq': 2}
-"""Weights fall by depth to the power of minus twice this."""
+"""Exponent p of each weight mode: weights are proportional to depth^(-2 p)."""
 
 
 def settings(config: TsdfConfig, image: RangeImage) -> Float32:
-    """Return the numbers that the kernel takes, in its order."""
+    """Return the settings of an integration, in the order of kernels/lookup.py."""
     sensor, is_lidar = image.sensor, isinstance(image.sensor, LidarModel)
     found = np.zeros(kernels.NUM_SETTINGS, np.float32)
     found[kernels.TAU] = config.truncation_m
@@ -264,7 +264,7 @@ def checked_pose(T_map_sensor: Float64) -> Float64:
         raise PoseError(f'pose of the sensor: {T.tolist()}, expected finite (4, 4)')
     R = T[:3, :3]
     if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0.0:
-        raise PoseError(f'pose of the sensor: {R.tolist()} is no rotation')
+        raise PoseError(f'pose of the sensor: {R.tolist()} is not a rotation')
     if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
         raise PoseError(f'pose of the sensor: last row {T[3].tolist()}, expected 0 0 0 1')
     return T

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Mesher: the surface of a block map as triangles, made anew where blocks have changed.
+Mesher: the surface of a block map as triangles, updated for changed blocks.
 
-The cubes of marching cubes have voxel centres as corners, so those at the upper faces of a block
-reach into the blocks above it, and a change of a block concerns the seven below as well. A vertex
-is known by the edge it is on: the voxel where the edge begins, and its axis. Vertices of one edge
-are one, within a block and between blocks.
+The cubes of marching cubes have voxel centres as corners, so cubes at the upper faces of a block
+reach into the blocks above it, and a change of a block affects the seven blocks below as well. A
+vertex is identified by its edge: the voxel at the edge's start, and the axis. Vertices on the same
+edge are welded, within a block and between blocks.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Mesh:
     vertices : (V, 3) float64
         m.
     triangles : (F, 3) int32
-        Vertices of each, counter-clockwise as seen from free space.
+        Vertex numbers of each, counter-clockwise as seen from free space.
     colors : (V, 3) uint8
-        Red, green, blue; no rows where the map keeps no colour.
+        Red, green, blue; no rows if the map keeps no colour.
 
     """
 
@@ -61,12 +61,12 @@ EMPTY = Mesh(
 @dataclass(frozen=True, kw_only=True)
 class BlockMesh(Mesh):
     """
-    The triangles of the cubes that begin in one block.
+    The triangles of the cubes whose first corner lies in one block.
 
     Attributes
     ----------
     edges : (V, 4) int32
-        Voxel where the edge of each vertex begins, and its axis.
+        Voxel at the start of the edge of each vertex, and the axis of the edge.
 
     """
 
@@ -75,29 +75,29 @@ class BlockMesh(Mesh):
 
 class Mesher:
     """
-    Follows a block map.
+    Keeps the mesh of a block map up to date.
 
     Parameters
     ----------
     blocks : BlockMap
-        What is meshed.
+        The map.
 
     """
 
     def __init__(self, blocks: BlockMap) -> None:
-        """Begin with no triangles; the first update makes those of all blocks."""
+        """Start without triangles; the first update meshes all blocks."""
         self._blocks = blocks
         self._version = -1
         self._meshes: dict[int, BlockMesh] = {}
 
     def update(self) -> int:
         """
-        Make the triangles of changed blocks anew, and drop those of blocks that are gone.
+        Mesh the changed blocks again and drop the triangles of removed blocks.
 
         Returns
         -------
         int
-            How many blocks were looked at.
+            Number of blocks meshed.
 
         """
         blocks = self._blocks
@@ -116,7 +116,7 @@ class Mesher:
         return len(rows)
 
     def mesh(self) -> Mesh:
-        """Return the triangles of all blocks, with one vertex an edge."""
+        """Return the triangles of all blocks with welded vertices."""
         meshes = list(self._meshes.values())
         if not meshes:
             return EMPTY
@@ -142,13 +142,13 @@ class Mesher:
         )
 
     def block_mesh(self, index: npt.ArrayLike) -> Mesh:
-        """Return the triangles of the cubes that begin in one block, given by (3,) index."""
+        """Return the triangles of one block, by (3,) index."""
         (row,) = self._blocks.find(np.asarray(index)[None])
         found = self._meshes.get(int(self._blocks.head[row, KEY])) if row >= 0 else None
         return EMPTY if found is None else found
 
     def _marched(self, rows: Int64) -> list[BlockMesh]:
-        """Return the meshes of blocks."""
+        """Run marching cubes over blocks and return their meshes."""
         blocks, config = self._blocks, self._blocks.config
         side = config.voxels_per_side
         limits = config.mesh_min_weight, config.mesh_max_step_m
@@ -185,7 +185,7 @@ class Mesher:
         ]
 
     def _colors(self, edges: Int64, place: Float64) -> UInt8:
-        """Return the colours at places of edges, between those of the voxels at their ends."""
+        """Return colours interpolated between the voxels at the ends of edges."""
         if not self._blocks.config.color:
             return np.empty((0, 3), np.uint8)
         ends = np.repeat(edges[:, None, :3], 2, axis=1)

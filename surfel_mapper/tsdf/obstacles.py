@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What is free and how far the next obstacle is: slices at a height, and distances in a box.
+Free space and obstacles for planners: slices at a height, and Euclidean distances in a box.
 
-The signed distances of the field are along rays and end at the truncation; a robot that plans
-its way needs the Euclidean distance to the nearest obstacle from anywhere. It is made on request
-from the occupied voxels by the exact transform of scipy (Maurer, Qi and Raghavan 2003).
+The signed distances of the field are measured along rays and end at the truncation; a planner
+needs the Euclidean distance to the nearest obstacle at any position. It is computed on request
+from the occupied voxels by scipy's exact transform (Maurer, Qi and Raghavan 2003).
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.queries import OCCUPIED, states, UNKNOWN
 
 MAX_VOXELS = 1 << 27
-"""Of a box: its distances take 0.5 GB, and making them four times as much."""
+"""Limit of the voxels in a box: their distances take 0.5 GB, computing them four times that."""
 
 COSTS = np.array([UNSEEN, 0, OBSTACLE], np.int8)
-"""Of unknown, free and occupied voxels in an occupancy grid."""
+"""Occupancy grid values of unknown, free and occupied voxels."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,9 +39,9 @@ class DistanceField:
     voxel_size_m : float
         Edge of a voxel.
     origin : (3,) float64, m
-        Outer corner of the first voxel.
+        Lower corner of the first voxel, map frame.
     distance_m : (nx, ny, nz) float32
-        Between the centres of voxels; 0 where one is occupied, inf where none in the box is.
+        Between voxel centres; 0 for occupied voxels, inf if the box has none.
     known : (nx, ny, nz) bool
         Whether a voxel was observed.
 
@@ -54,12 +54,12 @@ class DistanceField:
 
     def at_height(self, height_m: float) -> npt.NDArray[np.float32]:
         """
-        Return the distances of the layer at a height, (nx, ny).
+        Return the distances of the voxel layer at a height, (nx, ny).
 
         Raises
         ------
         ValueError
-            If the box does not reach there.
+            If the height is outside of the box.
 
         """
         layer = int(np.floor((height_m - self.origin[2]) / self.voxel_size_m))
@@ -73,12 +73,12 @@ class DistanceField:
 
 def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
     """
-    Return what is free and what is not at a height, over all blocks there.
+    Return the occupancy grid of all blocks at a height.
 
     Raises
     ------
     MapLimitError
-        If the blocks are too far apart for one grid.
+        If the blocks span more than MAX_VOXELS.
 
     """
     size_m = blocks.config.voxel_size_m
@@ -100,21 +100,22 @@ def distance_field(
     high_m: npt.ArrayLike | None = None,
 ) -> DistanceField:
     """
-    Return how far it is to the nearest occupied voxel.
+    Return the distance to the nearest occupied voxel in a box.
 
     Parameters
     ----------
     blocks : BlockMap
         The field.
     low_m, high_m : (3,) float, optional
-        Corners of the box; without them it holds all blocks. Obstacles outside do not count.
+        Corners of the box, map frame, m; by default it spans all blocks. Obstacles outside of
+        the box do not count.
 
     Raises
     ------
     ValueError
-        If the box is none.
+        If a corner is not (3,) or low is not below high.
     MapLimitError
-        If it has too many voxels.
+        If the box has more than MAX_VOXELS.
 
     """
     size_m = blocks.config.voxel_size_m
@@ -141,7 +142,7 @@ def distance_field(
 def extent(
     blocks: BlockMap, index: npt.NDArray[np.int64]
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Return the first voxel of some blocks along each axis, and the first behind them."""
+    """Return the bounds of blocks in voxels: the first of each axis, and the last plus one."""
     if not len(index):
         return np.zeros(3, np.int64), np.zeros(3, np.int64)
     side = blocks.config.voxels_per_side
@@ -151,7 +152,7 @@ def extent(
 def box_states(
     blocks: BlockMap, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.uint8]:
-    """Return the states of the voxels from low up to but without high, (nx, ny, nz)."""
+    """Return the states of the voxels in [low, high), (nx, ny, nz)."""
     shape = tuple((high - low).tolist())
     num = int(np.prod(shape, dtype=object))
     if num > MAX_VOXELS:

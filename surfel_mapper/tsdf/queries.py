@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the field says at points: how far the surface is, which way, and whether a place is free.
+Queries of the field at points: distance, gradient, occupancy, labels.
 
-Distances are those along the rays that were measured, cut at the truncation. Along other ways
-they are too large, by 1 / cos of the angle at which a ray meets the surface; the surface itself is
-where it is.
+Distances are measured along rays and truncated. They exceed the Euclidean distance by 1 / cos of
+the angle of incidence; the zero level, the surface, is not affected.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ class Sampled:
     Attributes
     ----------
     distance : (P,) float32
-        Signed distance, m, positive in front of a surface; nan where it is not known.
+        Signed distance, m, positive in front of a surface; nan if unknown.
     gradient : (P, 3) float32
-        Where it grows, and how fast, in metres a metre; nan likewise.
+        Gradient of the distance, no unit, map frame; nan if unknown.
 
     """
 
@@ -53,7 +52,7 @@ def sample(blocks: BlockMap, points: npt.ArrayLike, *, min_weight: float = 0.0) 
     points : (P, 3) float
         In the map frame, m.
     min_weight : float
-        Voxels that weigh less count as not observed.
+        Voxels of smaller weight count as not observed.
 
     Raises
     ------
@@ -88,7 +87,7 @@ def states(
     occupied_up_to_m: float | None = None,
 ) -> npt.NDArray[np.uint8]:
     """
-    Return whether the voxels that points lie in are UNKNOWN, FREE or OCCUPIED.
+    Return the state of the voxel at each point: UNKNOWN, FREE or OCCUPIED.
 
     Parameters
     ----------
@@ -97,10 +96,10 @@ def states(
     points : (P, 3) float
         In the map frame, m.
     min_weight : float
-        Voxels that weigh less count as not observed.
+        Voxels of smaller weight count as not observed.
     occupied_up_to_m : float, optional
-        Voxels of this distance or less are occupied, those behind a surface with them; half a
-        voxel where not given.
+        Voxels of this signed distance or less are occupied, including those behind a surface;
+        half a voxel by default.
 
     Raises
     ------
@@ -128,7 +127,7 @@ def states(
 
 
 def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], int]:
-    """Return points in voxels, and how many bits number the voxels along a block's edge."""
+    """Return points in units of voxels, and the bits of a voxel index within a block."""
     places = np.asarray(points, np.float64)
     if places.ndim != 2 or places.shape[1] != 3:
         raise ValueError(f'points: {places.shape}, expected (P, 3)')
@@ -141,7 +140,7 @@ Float32 = npt.NDArray[np.float32]
 
 def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.int32], Float32]:
     """
-    Return the labels of the voxels that points lie in, and their weights.
+    Return the label of the voxel at each point, and its weight.
 
     Parameters
     ----------
@@ -153,7 +152,7 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     Returns
     -------
     (P,) int32 and (P,) float32
-        As ``labels_of`` has them; -1 and 0 where the map has no voxel.
+        As ``labels_of``; -1 and 0 for points outside of the map.
 
     Raises
     ------
@@ -165,12 +164,12 @@ def labels_at(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.i
     if config.semantics == 'none':
         raise ValueError("semantics: 'none', expected a map that keeps labels")
     places, bits = in_voxels(blocks, points)
-    near = np.abs(places).max(axis=1) < 1e12  # false for nan; farther there are no blocks
+    near = np.abs(places).max(axis=1) < 1e12  # false for nan and for indices beyond int64
     voxel = np.floor(np.where(near[:, None], places, 0.0)).astype(np.int64)
     rows = np.where(near, blocks.find(voxel >> bits), -1)
     x, y, z = (voxel & ((1 << bits) - 1)).T
     votes = blocks.votes[rows, :, x + ((y + (z << bits)) << bits)]
-    votes[rows < 0] = 0.0  # as in a voxel that was never labelled
+    votes[rows < 0] = 0.0  # as in a voxel without labels
     return labels_of(config.semantics, votes.T, min_weight=config.min_label_weight)
 
 
@@ -183,18 +182,18 @@ def labels_of(
     Parameters
     ----------
     semantics : str
-        As in the configuration.
+        As in the setting layers.tsdf.semantics.
     votes : (V, ...) float32
-        Of voxels, see tsdf/kernels/channels.py.
+        Votes of voxels, see tsdf/kernels/channels.py.
     min_weight : float
-        first_k: a label counts if it weighs more.
+        first_k: labels of at most this weight are ignored.
 
     Returns
     -------
     (...) int32
-        -1 where there is none; on a tie the smaller one, of the first k that seen first.
+        -1 for none; on a tie the smaller label, with first_k the one seen first.
     (...) float32
-        How often it was seen (majority, binary), its weight (first_k), or its lead (single).
+        Number of observations (majority, binary), weight (first_k) or lead (single).
 
     """
     if semantics in ('majority', 'binary'):
@@ -210,14 +209,14 @@ def labels_of(
 
 def log_odds(votes: Float32, confidence: float) -> Float32:
     """
-    Return the log-likelihoods of labels but for a constant, from counts, (V, ...).
+    Return the log-likelihoods of labels, up to a constant, from counts, (V, ...).
 
     Parameters
     ----------
     votes : (V, ...) float32
-        Counts of the majority.
+        Counts kept with semantics ``majority``.
     confidence : float
-        How likely a label seen is right, in (0, 1); each of the others has the rest.
+        Probability that an observed label is correct, in (0, 1).
 
     """
     if not 0.0 < confidence < 1.0:

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-RangeImage: what one scan or depth image measured, pixel by pixel of its sensor.
+RangeImage: the measurements of one scan or depth image in the pixels of its sensor.
 
-The images of a lidar that looks all around repeat the first column after the last, so that
-nothing that reads them has to know of the seam. See tsdf/kernels/range_image.py for
-what a pixel holds.
+Images of a full-circle lidar repeat the first column after the last, so that readers need no
+special case for the seam. See tsdf/kernels/range_image.py for the values of a pixel.
 """
 
 from __future__ import annotations
@@ -23,38 +22,37 @@ from surfel_mapper.tsdf.sensors import CameraModel, Sensor
 Float32 = npt.NDArray[np.float32]
 
 MAX_LABEL = (1 << 24) - 1
-"""Labels are kept as float32, which holds whole numbers up to here."""
-
+"""Largest label: labels are stored as float32, exact up to 2^24."""
 
 LEAST_COSINE = float(kernels.LEAST_COSINE)
 
 CLEARING_M = 2e3
-"""A pixel that clears holds a range so far beyond max_range_m: more than any truncation."""
+"""A clearing pixel holds max_range_m plus this, which is more than any truncation."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RangeImage:
     """
-    Ranges, and colours, labels and a mask where there are any, in the pixels of a sensor.
+    Ranges in the pixels of a sensor, with optional colours, labels, mask and cosines.
 
     Attributes
     ----------
     sensor : CameraModel or LidarModel
-        Of which the pixels are.
+        The sensor model that defines the pixels.
     range_m : (rows, columns or one more) float32
-        Length of each ray; 0: unknown; more than max_range_m: nothing up to there.
+        Length of each ray, m; 0 means unknown, more than max_range_m free up to there.
     largest_m : float
-        The largest range, at most max_range_m; 0 where there is none.
+        The largest range, at most max_range_m; 0 for an image without ranges.
     num_used : int
-        Pixels or points that say something.
+        Number of pixels or points used.
     color : (rows, columns or one more, 3 or 4) uint8, optional
-        Red, green, blue; where the fourth is 0 the colour is not known.
+        Red, green, blue; a fourth channel of 0 means unknown.
     label : (rows, columns or one more) int32, optional
-        -1: unknown.
+        -1 means unknown.
     mask : (rows, columns or one more) uint8, optional
-        1 where something moves or must not leave a surface.
+        1 for pixels that only free space, for example of moving objects.
     cosine : (rows, columns or one more) float32, optional
-        Cosine of the angle between each ray and the normal of the surface that it meets.
+        Cosine of the angle of incidence of each ray.
 
     """
 
@@ -75,16 +73,16 @@ class RangeImage:
         mask: npt.ArrayLike | None = None,
     ) -> RangeImage:
         """
-        Return this range image with images of the same size beside it.
+        Return a copy with a colour image, labels or a mask of the same size.
 
         Parameters
         ----------
         color : (rows, columns, 3 or 4) uint8, optional
-            Red, green, blue; where the fourth is 0 the colour is not known.
+            Red, green, blue; a fourth channel of 0 means unknown.
         label : (rows, columns) int, optional
             From -1, for unknown, to 2^24 - 1.
         mask : (rows, columns) bool or int, optional
-            Not 0 where something moves: it frees space and leaves no surface.
+            Non-zero pixels only free space and leave no surface.
 
         Raises
         ------
@@ -112,7 +110,7 @@ class RangeImage:
         return replace(self, **more)
 
     def with_cosines(self, reach_m: float) -> RangeImage:
-        """Return this range image with cosines, from slopes between points so far apart, m."""
+        """Return a copy with cosines, from slopes between points about reach_m apart."""
         cosine = np.empty_like(self.range_m)
         sensor = self.sensor
         kernels.cosines(
@@ -147,19 +145,20 @@ def from_depth(
     Parameters
     ----------
     sensor : CameraModel
-        Which took it.
+        Model of the camera.
     depth : (rows, columns) float32, float64 or uint16
-        Along z; in metres if float, 0, negative and nan: unknown, inf: nothing up to max_range_m;
-        in millimetres if uint16, 0: unknown.
+        Depth along z. Floats are in m; 0, negative and nan mean unknown, inf free up to
+        max_range_m. uint16 is in mm; 0 means unknown.
     scale : float, optional
-        Metres of one unit, where it is not those.
+        Metres of one unit, if different from the above.
     unknown : float, optional
-        A further value that says nothing: 65535 with some cameras.
+        A further value that means unknown: 65535 with some cameras.
 
     Raises
     ------
     CloudFormatError
-        If the size is not that of the sensor, the type is another or scale is not positive.
+        If the size differs from the sensor model, the type is not supported, or scale is not
+        positive.
 
     """
     if depth.shape != (sensor.rows, sensor.columns):
@@ -192,23 +191,23 @@ def from_points(
     labels: npt.NDArray[Any] | None = None,
 ) -> RangeImage:
     """
-    Return the range image of a cloud in any order: in every pixel the nearest of its points.
+    Return the range image of points in any order; each pixel takes its nearest point.
 
     Parameters
     ----------
     sensor : CameraModel or LidarModel
-        Which measured them.
+        Model of the sensor.
     points : (N, 3) float32 or float64
-        In its frame, m; those not finite or out of view are left out.
+        In the frame of the sensor, m; points not finite or out of view are left out.
     colors : (N, 3 or 4) uint8, optional
-        Red, green, blue of each point; where the fourth is 0 its colour is not known.
+        Red, green, blue of each point; a fourth channel of 0 means unknown.
     labels : (N,) int, optional
         Label of each point, -1 for unknown.
 
     Raises
     ------
     CloudFormatError
-        If shapes or types are others.
+        If a shape or type is not as above.
 
     """
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype not in (np.float32, np.float64):
@@ -230,19 +229,19 @@ def from_points(
 
 def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
     """
-    Return the range image of an organised cloud: its ranges as they are, in the sensor's pixels.
+    Return the range image of ranges that are already in the pixels of the sensor.
 
     Parameters
     ----------
     sensor : CameraModel or LidarModel
-        Which measured them, rows from the highest beam to the lowest.
+        Model of the sensor, rows from the highest beam to the lowest.
     range_m : (rows, columns) float
-        Length of each ray; 0, negative and nan: unknown; inf: nothing up to max_range_m.
+        Length of each ray, m; 0, negative and nan mean unknown, inf free up to max_range_m.
 
     Raises
     ------
     CloudFormatError
-        If the size is not that of the sensor.
+        If the size differs from the sensor model.
 
     """
     if range_m.shape != (sensor.rows, sensor.columns) or range_m.dtype.kind != 'f':
@@ -261,7 +260,7 @@ def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
 
 
 def limits(sensor: Sensor) -> Float32:
-    """Return smallest and largest range, and the value of a pixel that clears, m."""
+    """Return the smallest and largest range, and the value of a clearing pixel, m, (3,)."""
     farthest = sensor.max_range_m
     return np.array([sensor.min_range_m, farthest, farthest + CLEARING_M], np.float32)
 
@@ -273,9 +272,9 @@ def taken(
     source: npt.NDArray[np.int32],
     missing: int,
 ) -> npt.NDArray[Any]:
-    """Return the values of the points that pixels are from, as an image."""
+    """Return an image of point values: of the point that each pixel took its range from."""
     if values.shape != shape:
-        raise CloudFormatError(f'{name}: {values.shape}, expected {shape} as there are points')
+        raise CloudFormatError(f'{name}: {values.shape}, expected {shape} one for each point')
     if not len(values):
         return np.full(source.shape + shape[1:], missing, values.dtype)
     image = values[source]
@@ -284,5 +283,5 @@ def taken(
 
 
 def repeated(image: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return an image with its first column once more after the last."""
+    """Return an image with its first column repeated after the last."""
     return np.concatenate([image, image[:, :1]], axis=1)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which blocks a range image concerns: those that its rays touch, or all within its view.
+Selection of the blocks that a range image updates: touched by its rays, or in its field of view.
 
-The first costs as much as there are rays, the second as much as there is room in view. Where both
-find a block they lead to the same voxels, as a block is fused by itself.
+The cost of the first grows with the number of rays, of the second with the volume in view. Blocks
+are fused independently, so a block that both select gets the same values.
 """
 
 from __future__ import annotations
@@ -23,16 +23,15 @@ Float64 = npt.NDArray[np.float64]
 NO_COSINE = np.empty((0, 0), np.float32)
 
 MAX_SIDE = 2048
-"""Blocks along the edge of the cube that rays stay in: 1 GiB of bits."""
-
+"""Largest side of the cube about the sensor, blocks: 1 GiB of bits."""
 
 SPACING_VOXELS = 0.7
-"""Rays through the band are at most so far apart; half as much where that is the power of two."""
+"""Largest spacing of the rays walked through the band, voxels; the smallest is half of it."""
 
 
 class BlockSelection:
     """
-    Chooses blocks; keeps the memory that it needs for it.
+    Selects blocks; keeps its working memory between calls.
 
     Parameters
     ----------
@@ -42,13 +41,12 @@ class BlockSelection:
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        """Begin without memory."""
         self._config = config
         self._marks = np.zeros(0, np.int64)
 
     def blocks(self, image: RangeImage, T_map_sensor: Float64) -> Int64:
         """
-        Return the blocks that a range image concerns, (K, 3) int64, ascending.
+        Return the blocks that a range image updates, (K, 3) int64, ascending.
 
         Raises
         ------
@@ -87,20 +85,20 @@ class BlockSelection:
 
 
 def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:
-    """Return how far behind the farthest surface voxels may change, along a ray."""
+    """Return the distance behind a surface up to which voxels change, along the ray, m."""
     longer = 1.0 if image.cosine is None else 1.0 / LEAST_COSINE
     return config.reach_behind_m * longer
 
 
 def half_side(config: TsdfConfig, image: RangeImage) -> int:
-    """Return how many blocks from the sensor's the farthest one is; 0 if nothing is measured."""
+    """Return the reach of an image in blocks; 0 for an image without ranges."""
     if image.largest_m == 0.0:
         return 0
     return int((image.largest_m + reach_behind_m(config, image)) / config.block_size_m) + 2
 
 
 def reach(config: TsdfConfig, image: RangeImage) -> Float64:
-    """Return what rays reach, as tsdf/kernels/block_marks.py has it."""
+    """Return the reach of rays, (NUM_REACH,), in the order of tsdf/kernels/block_marks.py."""
     sensor = image.sensor
     free = [config.block_size_m / 8.0 / pitch for pitch in sensor.pitch_rad]
     band = [SPACING_VOXELS * config.voxel_size_m / pitch for pitch in sensor.pitch_rad]
@@ -109,13 +107,13 @@ def reach(config: TsdfConfig, image: RangeImage) -> Float64:
 
 
 def in_view(config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: int) -> Int64:
-    """Return the blocks that may lie in the view of the sensor, up to its largest range."""
+    """Return the blocks that intersect the field of view up to the largest range, (K, 3)."""
     size_m, sensor = config.block_size_m, image.sensor
     radius_m = np.sqrt(0.75) * size_m
     middle = np.floor(T_map_sensor[:3, 3] / size_m).astype(np.int64)
     along = np.arange(-half, half + 1)
     found = []
-    for layer in along:  # by layers: the whole cube may be large
+    for layer in along:  # by layers, because the whole cube may be large
         grid = np.meshgrid([layer], along, along, indexing='ij')
         index = middle + np.stack(grid, axis=-1).reshape(-1, 3)
         centres = ((index + 0.5) * size_m - T_map_sensor[:3, 3]) @ T_map_sensor[:3, :3]

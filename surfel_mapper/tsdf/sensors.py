@@ -28,13 +28,14 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.kernels.projection import CAMERA, LIDAR, LIDAR_TABLE
 
 Check = tuple[str, bool, str]
-"""A property, whether it is as it has to be, and how that is."""
+"""Name of a property, whether it is valid, and the values expected."""
 
 MAX_PIXELS = 1 << 26
+"""Limit of rows * columns: a range image of 256 MB."""
 
 
 class Ranging(Protocol):
-    """What every sensor has."""
+    """Properties that all sensor models have."""
 
     @property
     def rows(self) -> int:
@@ -46,15 +47,15 @@ class Ranging(Protocol):
 
     @property
     def min_range_m(self) -> float:
-        """What is nearer is ignored."""
+        """Nearer returns are ignored, m."""
 
     @property
     def max_range_m(self) -> float:
-        """What is farther says that there is nothing up to here."""
+        """Farther returns only free the space up to here, m."""
 
 
 def refuse_unless(sensor: object, checks: Iterable[Check]) -> None:
-    """Raise ConfigError for the first property that does not hold."""
+    """Raise ConfigError for the first property that is not valid."""
     for name, holds, expected in checks:
         if not holds:
             kind = type(sensor).__name__
@@ -62,7 +63,7 @@ def refuse_unless(sensor: object, checks: Iterable[Check]) -> None:
 
 
 def range_checks(sensor: Ranging) -> list[Check]:
-    """Return the checks of what all sensors have."""
+    """Return the checks of the properties that all sensor models have."""
     return [
         ('rows', sensor.rows >= 1, 'at least 1'),
         ('columns', sensor.columns >= 1, 'at least 1'),
@@ -83,7 +84,7 @@ Float64 = npt.NDArray[np.float64]
 @dataclass(frozen=True, kw_only=True)
 class CameraModel:
     """
-    A pinhole camera that measures depth.
+    Projection model of a pinhole depth camera.
 
     Attributes
     ----------
@@ -92,7 +93,7 @@ class CameraModel:
     fx, fy, cx, cy : float
         Intrinsics, pixels.
     min_range_m, max_range_m : float
-        What is nearer is ignored; what is farther says that there is nothing up to max_range_m.
+        Nearer returns are ignored; farther ones only free the space up to max_range_m.
 
     Raises
     ------
@@ -144,24 +145,24 @@ class CameraModel:
 
     @cached_property
     def parameters(self) -> Float32:
-        """What the kernels need to project, see kernels/projection.py."""
+        """Parameters of the projection, see kernels/projection.py."""
         return np.array(
             [self.fx, self.fy, self.cx, self.cy, self.columns, self.rows, 0.0, 0.0], np.float32
         )
 
     @cached_property
     def elevations(self) -> Float32:
-        """Nothing: rows of a camera are not at one elevation."""
+        """Empty: the rows of a camera are not at one elevation."""
         return np.zeros(0, np.float32)
 
     @property
     def projection(self) -> tuple[Any, ...]:
-        """What the kernels take: kind, parameters, elevations."""
+        """Kind, parameters and elevations, the form that kernels take."""
         return self.kind, self.parameters, self.elevations
 
     @property
     def density(self) -> float:
-        """Rays that a face of 1 m^2 at depth 1 m meets."""
+        """Number of rays through a face of 1 m^2 at depth 1 m."""
         return self.fx * self.fy
 
     @property
@@ -170,7 +171,7 @@ class CameraModel:
         return 1.0 / self.fy, 1.0 / self.fx
 
     def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
-        """Return which balls about (K, 3) centres in its frame reach into its view."""
+        """Return which balls about (K, 3) centres, sensor frame, m, touch the field of view."""
         corners = [(0.0, 0.0), (self.columns, 0.0), (self.columns, self.rows), (0.0, self.rows)]
         rays = np.array(
             [((u - self.cx) / self.fx, (v - self.cy) / self.fy, 1.0) for u, v in corners]
@@ -185,26 +186,26 @@ class CameraModel:
 @dataclass(frozen=True, kw_only=True)
 class LidarModel:
     """
-    A spinning lidar.
+    Projection model of a spinning lidar.
 
     Attributes
     ----------
     rows : int
-        Beams; as many as beam_elevations_deg where those are given.
+        Number of beams; the length of beam_elevations_deg if that is given.
     columns : int
         Steps of azimuth.
     vertical_fov_deg : float
         Angle between the highest and the lowest beam.
     vertical_fov_top_deg : float
-        Elevation of the highest beam; nan: half of vertical_fov_deg.
+        Elevation of the highest beam; nan means half of vertical_fov_deg.
     horizontal_fov_deg : float
-        360 for all around, otherwise the angle between the first and the last column.
+        360 for a full circle, otherwise the angle between the first and the last column.
     first_azimuth_deg : float
-        Azimuth of column 0, counted from x to y; nan: half of horizontal_fov_deg.
+        Azimuth of column 0, from x towards y; nan means half of horizontal_fov_deg.
     beam_elevations_deg : tuple of float
-        Elevation of each beam from the highest to the lowest, where they are not evenly spaced.
+        Elevation of each beam, descending; empty for evenly spaced beams.
     min_range_m, max_range_m : float
-        What is nearer is ignored; what is farther says that there is nothing up to max_range_m.
+        Nearer returns are ignored; farther ones only free the space up to max_range_m.
 
     Raises
     ------
@@ -224,7 +225,7 @@ class LidarModel:
     max_range_m: float = 100.0
 
     def __post_init__(self) -> None:
-        """Check every value; missing angles follow from the others."""
+        """Check every value; derive missing angles from the others."""
         beams = tuple(float(value) for value in self.beam_elevations_deg)
         object.__setattr__(self, 'beam_elevations_deg', beams)
         if beams:
@@ -259,9 +260,9 @@ class LidarModel:
         **properties: Any,
     ) -> LidarModel:
         """
-        Return a lidar of which the angles between neighbouring rays are known.
+        Return the model of a lidar from the angles between neighbouring rays.
 
-        Beams span one gap less than they are: 30 deg in steps of 2 deg are 16 beams.
+        H beams span H - 1 gaps: 30 deg in steps of 2 deg are 16 beams.
 
         Raises
         ------
@@ -283,18 +284,18 @@ class LidarModel:
 
     @property
     def wraps(self) -> bool:
-        """Whether the first column follows the last."""
+        """Whether the last column is the neighbour of the first."""
         reach = self.horizontal_fov_deg * self.columns / (self.columns - 1)
         return reach > 360.0 - 1e-6
 
     @property
     def kind(self) -> int:
-        """How the kernels project, see kernels/projection.py."""
+        """Kind of projection, see kernels/projection.py."""
         return LIDAR_TABLE if self.beam_elevations_deg else LIDAR
 
     @cached_property
     def azimuths_rad(self) -> Float64:
-        """Azimuth of each column."""
+        """Azimuth of each column, (columns,)."""
         steps = np.arange(self.columns, dtype=np.float64) * self._column_rad
         return math.radians(self.first_azimuth_deg) - steps
 
@@ -306,7 +307,7 @@ class LidarModel:
 
     @cached_property
     def elevations_rad(self) -> Float64:
-        """Elevation of each row, from the highest to the lowest."""
+        """Elevation of each row, descending, (rows,)."""
         if self.beam_elevations_deg:
             return np.deg2rad(self.beam_elevations_deg)
         top = self.vertical_fov_top_deg
@@ -314,7 +315,7 @@ class LidarModel:
 
     @cached_property
     def elevations(self) -> Float32:
-        """Elevation of each row, rad."""
+        """Elevation of each row as float32 for kernels, rad."""
         return self.elevations_rad.astype(np.float32)
 
     @cached_property
@@ -329,7 +330,7 @@ class LidarModel:
 
     @cached_property
     def parameters(self) -> Float32:
-        """What the kernels need to project, see kernels/projection.py."""
+        """Parameters of the projection, see kernels/projection.py."""
         row_rad = math.radians(self.vertical_fov_deg) / (self.rows - 1)
         top_rad, first_rad = self.elevations_rad[0], math.radians(self.first_azimuth_deg)
         turn, lowest = 2.0 * math.pi / self._column_rad, 0.0 if self.wraps else -0.5
@@ -338,12 +339,12 @@ class LidarModel:
 
     @property
     def projection(self) -> tuple[Any, ...]:
-        """What the kernels take: kind, parameters, elevations."""
+        """Kind, parameters and elevations, the form that kernels take."""
         return self.kind, self.parameters, self.elevations
 
     @property
     def density(self) -> float:
-        """Rays that a face of 1 m^2 at range 1 m meets, as virtual focal lengths have it."""
+        """Number of rays through a face of 1 m^2 at range 1 m, from virtual focal lengths."""
         across = self.columns * 90.0 / self.horizontal_fov_deg / 2.0
         return across * self.rows * 90.0 / self.vertical_fov_deg / 2.0
 
@@ -353,7 +354,7 @@ class LidarModel:
         return float(-np.diff(self.elevations_rad).min()), self._column_rad
 
     def sees(self, centres: Float64, inflation_m: float) -> npt.NDArray[np.bool_]:
-        """Return which balls about (K, 3) centres in its frame reach into its view."""
+        """Return which balls about (K, 3) centres, sensor frame, m, touch the field of view."""
         distance = np.linalg.norm(centres, axis=1)
         ball = np.arcsin(np.minimum(inflation_m / np.maximum(distance, inflation_m), 1.0))
         half_top, half_bottom = -np.diff(self.elevations_rad)[[0, -1]] / 2.0
@@ -365,3 +366,4 @@ class LidarModel:
 
 
 Sensor = CameraModel | LidarModel
+"""Either sensor model."""

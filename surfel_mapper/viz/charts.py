@@ -1,126 +1,147 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Plots as SVG, written by hand: lines over time, histograms, and bars with a name.
+Plots of the report as SVG: lines over time, histograms, and bars with names.
 
-An SVG of a few kilobytes whose text is text and whose colours are those of the page around it;
-matplotlib would write some 50 kB, with every letter as a path. Whatever text comes in is escaped.
+matplotlib draws them. Text stays text, and the colours are CSS variables of the page
+(page/report.css), so that plots follow its light or dark style: each element is drawn in a
+placeholder colour, which is replaced in the SVG. A plot takes 2 to 20 kB.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from html import escape
+import io
 import itertools
-import math
+import re
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
 Array = npt.NDArray[np.float64]
 
 WIDTH, HEIGHT = 520, 220
-LEFT, RIGHT, TOP, BOTTOM = 56, 12, 12, 40
-"""Margins around the plotted area, in the units of the picture."""
+"""Size of a plot in the units of its viewBox, px when not scaled."""
+
+ROW_HEIGHT = 24
+"""Height of a named bar, px."""
 
 POINTS = 400
-"""A line has no more points than this; of more, the median of each stretch is drawn."""
+"""Most points of a line; longer lines are reduced to the median of each stretch."""
 
-COLOURS = 8
-"""The page gives so many colours for lines, --line-0 and so on."""
+NUM_BINS = 36
+
+FAINT, RULE, BAR = '#fe0001', '#fe0002', '#fe0003'
+"""Placeholder colours of text, grid lines and bars."""
+
+LINES = tuple(f'#fe001{number}' for number in range(8))
+"""Placeholder colours of lines."""
+
+VARIABLES = {
+    FAINT: 'var(--faint)',
+    RULE: 'var(--rule)',
+    BAR: 'var(--bar)',
+    **{color: f'var(--line-{number})' for number, color in enumerate(LINES)},
+}
+"""CSS variable of each placeholder colour."""
+
+STYLE: dict[Any, Any] = {
+    'axes.edgecolor': RULE,
+    'axes.labelcolor': FAINT,
+    'axes.spines.left': False,
+    'axes.spines.right': False,
+    'axes.spines.top': False,
+    'font.family': ['sans-serif'],
+    'font.size': 10.0,
+    'grid.color': RULE,
+    'legend.frameon': False,
+    'legend.handlelength': 1.0,
+    'svg.fonttype': 'none',
+    'text.color': FAINT,
+    'text.parse_math': False,  # names come from bags and may hold dollar signs
+    'xtick.color': FAINT,
+    'xtick.major.size': 0.0,
+    'ytick.color': FAINT,
+    'ytick.major.size': 0.0,
+}
+
+UNWANTED = (r'<style.*?</style>', r'(?<=<g) id="[^"]*"', r'font-family: [^;]*; ')
+"""Parts of matplotlib's SVG: a style for the whole page, ids that repeat, and fonts."""
 
 NO_DATA = '<p class="none">none</p>'
 
 
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """From values to places in the picture, along one axis."""
-
-    low: float
-    high: float
-    first: float
-    last: float
-
-    def __call__(self, value: float) -> float:
-        """Return the place of a value."""
-        share = (value - self.low) / (self.high - self.low)
-        return self.first + share * (self.last - self.first)
-
-
 def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> str:
     """
-    Return a plot of lines over a common x, from y = 0 on.
+    Return a plot of lines over a common x; the y axis begins at 0.
 
     Parameters
     ----------
     x : (N,) float64
         Ascending.
     series : mapping of str to (N,) float64
-        A line each, by its name; nan leaves a gap.
+        Values of each line by its name; nan leaves a gap.
     x_label, y_label : str
-        What the axes show.
+        Labels of the axes.
 
     """
     drawn = {name: thinned(x, y) for name, y in series.items() if np.isfinite(y).any()}
     if not drawn:
         return NO_DATA
     top = max(highest(y[np.isfinite(y)]) for _, y in drawn.values())
-    across = Scale(float(x[0]), float(x[-1]) if x[-1] > x[0] else x[0] + 1.0, *_horizontal())
-    up = Scale(0.0, top * 1.05 or 1.0, *_vertical())
-    parts = [_axes(across, up, x_label, y_label)]
-    for number, (name, (places, values)) in enumerate(drawn.items()):
-        path, pen = [], 'M'
-        for place, value in zip(places, values, strict=True):
-            if math.isfinite(value):
-                path.append(f'{pen}{across(place):.1f} {up(min(value, up.high)):.1f}')
-                pen = 'L'
-            else:
-                pen = 'M'
-        colour = f'var(--line-{number % COLOURS})'
-        parts.append(f'<path class="line" d="{"".join(path)}" stroke="{colour}"/>')
-        parts.append(_legend(name, number, colour))
-    return _picture(parts, x_label, y_label)
+    with _axes(HEIGHT) as (figure, axes):
+        for number, (name, (places, values)) in enumerate(drawn.items()):
+            color = LINES[number % len(LINES)]
+            axes.plot(places, values, color=color, linewidth=1.6, label=_visible(name))
+        axes.set(ylim=(0.0, top * 1.2 or 1.0), xlabel=x_label, ylabel=y_label)
+        if x[-1] > x[0]:
+            axes.set_xlim(x[0], x[-1])
+        _label_numbers(axes)
+        axes.legend(loc='upper left', ncols=5, columnspacing=1.2)
+        return _svg(figure, f'{y_label} by {x_label}')
 
 
 def histogram(values: Array, low: float, high: float, x_label: str, y_label: str) -> str:
-    """Return a histogram of 36 bars of equal width; what is not finite is left out."""
+    """Return a histogram of NUM_BINS bars from low to high; non-finite values are left out."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return NO_DATA
-    counts, edges = np.histogram(np.clip(finite, low, high), bins=36, range=(low, high))
-    across = Scale(low, high, *_horizontal())
-    up = Scale(0.0, float(counts.max()) * 1.05, *_vertical())
-    parts = [_axes(across, up, x_label, y_label)]
-    for count, start, end in zip(counts, edges, edges[1:], strict=False):
-        tip = f'{start:.3g} to {end:.3g}: {count}'
-        parts.append(
-            f'<rect class="bar" x="{across(start) + 0.5:.1f}" y="{up(count):.1f}" '
-            f'width="{across(end) - across(start) - 1:.1f}" height="{up(0) - up(count):.1f}">'
-            f'<title>{tip}</title></rect>'
-        )
-    return _picture(parts, x_label, y_label)
+    clipped = np.clip(finite, low, high)
+    counts, edges = np.histogram(clipped, bins=NUM_BINS, range=(low, high))
+    with _axes(HEIGHT) as (figure, axes):
+        axes.bar(edges[:-1], counts, np.diff(edges), align='edge', color=BAR)
+        axes.set(xlim=(low, high), xlabel=x_label, ylabel=y_label)
+        _label_numbers(axes)
+        return _svg(figure, f'{y_label} by {x_label}')
 
 
 def named_bars(counts: Mapping[str, int]) -> str:
-    """Return a horizontal bar for every name, with its number, the largest over all the width."""
+    """Return a horizontal bar for each name, labelled with its count."""
     if not counts:
         return NO_DATA
-    height, top = 24, max(max(counts.values()), 1)
-    parts = []
-    for row, (name, count) in enumerate(counts.items()):
-        y, length = row * height, 230.0 * count / top
-        parts.append(
-            f'<text x="190" y="{y + 16}" text-anchor="end">{escape(name)}</text>'
-            f'<rect class="bar" x="200" y="{y + 4}" width="{length:.1f}" height="16"/>'
-            f'<text x="{206 + length:.1f}" y="{y + 16}">{count}</text>'
-        )
-    size = f'viewBox="0 0 {WIDTH} {height * len(counts)}"'
-    return f'<svg {size} role="img">{"".join(parts)}</svg>'
+    with _axes(ROW_HEIGHT * len(counts) + 10) as (figure, axes):
+        rows = np.arange(len(counts))
+        bars = axes.barh(rows, list(counts.values()), 0.65, color=BAR)
+        axes.bar_label(bars, labels=[str(count) for count in counts.values()], padding=4)
+        axes.set_yticks(rows, [*counts])
+        axes.set_ylim(len(counts) - 0.5, -0.5)
+        axes.set_xlim(0.0, 1.15 * max(*counts.values(), 1))
+        axes.set_axisbelow(True)
+        axes.grid(visible=False)
+        axes.xaxis.set_visible(False)
+        axes.spines['bottom'].set_visible(False)
+        return _svg(figure, ', '.join(f'{name}: {count}' for name, count in counts.items()))
 
 
 def thinned(x: Array, y: Array) -> tuple[Array, Array]:
-    """Return a line of at most POINTS points: medians of stretches, nan where all are."""
+    """Return a line of at most POINTS points: medians of stretches, nan for a gap."""
     if len(x) <= POINTS:
         return x, y
     bounds = np.linspace(0, len(x), POINTS + 1).astype(np.int64)
@@ -133,68 +154,54 @@ def thinned(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def highest(values: Array) -> float:
-    """Return the largest value, unless it is alone so far above the rest that these vanish."""
+    """Return the top of the y axis: the maximum, at most five times the 95th percentile."""
     return float(min(values.max(), 5.0 * np.percentile(values, 95)) or values.max())
 
 
-def ticks(low: float, high: float) -> list[float]:
-    """Return some five round numbers in a range."""
-    step = 10.0 ** math.floor(math.log10((high - low) / 5.0))
-    step *= next(factor for factor in (1, 2, 5, 10) if (high - low) / (step * factor) <= 6.0)
-    first, last = math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9)
-    return [number * step for number in range(first, last + 1)]
-
-
 def short(value: float) -> str:
-    """Return a number with few letters: 1.5M, 20k, 0.1."""
+    """Return a number in few characters: 1.5M, 20k, 0.1."""
     for factor, letter in ((1e9, 'G'), (1e6, 'M'), (1e3, 'k')):
         if abs(value) >= factor:
             return f'{value / factor:.3g}{letter}'
     return f'{value:.3g}'
 
 
-def _horizontal() -> tuple[float, float]:
-    return LEFT, WIDTH - RIGHT
+@contextmanager
+def _axes(height: float) -> Iterator[tuple[Figure, Axes]]:
+    """Make a figure with one pair of axes in the style of the page."""
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH / 72.0, height / 72.0), dpi=72, layout='constrained')
+        axes = figure.add_subplot()
+        axes.grid(visible=True, axis='y')
+        axes.set_axisbelow(True)
+        yield figure, axes
 
 
-def _vertical() -> tuple[float, float]:
-    return HEIGHT - BOTTOM, TOP
+def _visible(name: str) -> str:
+    """Return a name that the legend shows; matplotlib hides those that begin with _."""
+    return f'\u200b{name}' if name.startswith('_') else name
 
 
-def _axes(across: Scale, up: Scale, x_label: str, y_label: str) -> str:
-    parts = []
-    for value in ticks(up.low, up.high):
-        y = up(value)
-        parts.append(
-            f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}"/>'
-            f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{short(value)}</text>'
-        )
-    for value in ticks(across.low, across.high):
-        parts.append(
-            f'<text x="{across(value):.1f}" y="{HEIGHT - BOTTOM + 16}" text-anchor="middle">'
-            f'{short(value)}</text>'
-        )
-    middle = (TOP + HEIGHT - BOTTOM) / 2
-    parts.append(
-        f'<text x="{(LEFT + WIDTH - RIGHT) / 2}" y="{HEIGHT - 6}" text-anchor="middle">'
-        f'{escape(x_label)}</text>'
-        f'<text transform="translate(12 {middle}) rotate(-90)" text-anchor="middle">'
-        f'{escape(y_label)}</text>'
-    )
-    return ''.join(parts)
+def _label_numbers(axes: Axes) -> None:
+    """Label the ticks of both axes with short numbers."""
+    axes.locator_params(nbins=6)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: short(value))
 
 
-def _legend(name: str, number: int, colour: str) -> str:
-    x, y = LEFT + 8 + 78 * (number % 6), TOP + 4 + 14 * (number // 6)
-    return (
-        f'<rect x="{x}" y="{y - 2}" width="10" height="3" fill="{colour}"/>'
-        f'<text x="{x + 14}" y="{y + 3}">{escape(name)}</text>'
-    )
-
-
-def _picture(parts: list[str], x_label: str, y_label: str) -> str:
-    about = escape(f'{y_label} by {x_label}', quote=True)
-    return (
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{about}">'
-        f'{"".join(parts)}</svg>'
-    )
+def _svg(figure: Figure, about: str) -> str:
+    """Return a figure as an SVG element: no prolog, no ids, colours of the page."""
+    file = io.StringIO()
+    metadata = dict.fromkeys(('Creator', 'Date', 'Format', 'Type'))
+    figure.savefig(file, format='svg', transparent=True, metadata=metadata)
+    text = file.getvalue()
+    text = text[text.index('<svg') :]
+    for pattern in UNWANTED:
+        text = re.sub(pattern, '', text)
+    for color, variable in VARIABLES.items():
+        text = text.replace(color, variable)
+    label = escape(about, quote=True)
+    return text.replace('<svg', f'<svg role="img" aria-label="{label}"', 1)

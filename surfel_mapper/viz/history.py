@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-History: what happened scan by scan during a replay, for the plots of a report.
+History: the figures of each scan of a replay, for the plots of the report.
 
-Numbers lie in flat arrays, 8 bytes each, some 100 bytes a scan: 4 MB an hour at 10 Hz. Surfels
-are counted now and then only, because that looks at every voxel of the map: of a run of any
-length there are between 128 and 256 counts, evenly spread.
+The figures are flat arrays, about 100 bytes a scan: 4 MB an hour at 10 Hz. Counting surfels visits
+every voxel of the map, so a run of any length has between 128 and 256 counts, evenly spread.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
 MAX_COUNTS = 256
-"""When there are so many counts of surfels, every other is dropped."""
+"""Number of surfel counts at which every second one is dropped."""
 
 
 class History:
@@ -30,12 +29,11 @@ class History:
     Attributes
     ----------
     milliseconds : dict of str to array
-        Time of each stage, one number a scan; nan for scans that had no such stage.
+        Time of each stage, one value a scan; nan for scans without the stage.
 
     """
 
     def __init__(self) -> None:
-        """Start without scans."""
         self.milliseconds: dict[str, array[float]] = {}
         self._stamps_ns: array[int] = array('q')
         self._voxels: array[int] = array('q')
@@ -49,7 +47,7 @@ class History:
         return len(self._stamps_ns)
 
     def add(self, mapper: Mapper, update: Update) -> None:
-        """Take note of a scan that was just mapped."""
+        """Record the figures of a scan that was just mapped."""
         for stage, milliseconds in update.milliseconds.items():
             if stage not in self.milliseconds:
                 self.milliseconds[stage] = array('d', [np.nan] * len(self))
@@ -71,27 +69,27 @@ class History:
 
     @property
     def seconds(self) -> npt.NDArray[np.float64]:
-        """Stamps of the scans, s after the first, (S,)."""
+        """Time of each scan after the first, (S,) s."""
         stamps = np.array(self._stamps_ns, np.int64)
         return np.asarray((stamps - stamps[:1].sum()) / 1e9)
 
     @property
     def voxels(self) -> npt.NDArray[np.int64]:
-        """Voxels of the map after each scan, (S,)."""
+        """Number of voxels in the map after each scan, (S,)."""
         return np.array(self._voxels, np.int64)
 
     @property
     def dropped(self) -> npt.NDArray[np.int64]:
-        """Scans dropped until each scan, (S,)."""
+        """Number of scans dropped before each scan, (S,)."""
         return np.array(self._dropped, np.int64)
 
     @property
     def trajectory(self) -> npt.NDArray[np.float64]:
-        """Where the sensor was at each scan, (S, 3) m in the fixed frame."""
+        """Position of the sensor at each scan, map frame, (S, 3) m."""
         return np.array(self._positions, np.float64).reshape(-1, 3)
 
     @property
     def surfels(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Scans after which surfels were counted, and how many there were, (C,) each."""
+        """Number of the scan of each surfel count, and the counts, (C,) each."""
         scan, count = np.array(self._counts, np.int64).reshape(-1, 2).T
         return scan, count

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The mesh of the TSDF for pages and viewers: normals of its vertices, and fewer triangles.
+Meshes for pages and viewers: vertex normals and simplification.
 
-A mesh is made smaller by merging the vertices in each cell of a grid (Rossignac and Borrel 1993):
-in one pass of array operations, whatever its topology. Triangles whose corners meet vanish. It
-rounds edges off by a cell, which on a page of 100,000 triangles is a pixel or two.
+A mesh is simplified by merging the vertices in each cell of a grid (Rossignac and Borrel 1993), in
+one pass of array operations for any topology. Triangles with merged corners vanish. Edges are
+rounded by a cell, a pixel or two for 100,000 triangles on a page.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from surfel_mapper.geometry import face_normals
 from surfel_mapper.tsdf.mesh import Mesh
 
 MAX_TRIANGLES = 150_000
-"""Shown on a page: 75,000 vertices of 16 bytes and 12 bytes a triangle, 4 MB of text."""
+"""Limit on a page: with 75,000 vertices of 16 bytes and 12 bytes a triangle, 4 MB of text."""
 
 VERTEX = np.dtype([('place', '<u2', 3), ('', '<u2'), ('color', 'u1', 4), ('normal', 'i1', 4)])
-"""A vertex as page/view.js takes it; the fourth colour and normal are spare."""
+"""Vertex format of page/view.js; the fourth components of colour and normal are unused."""
 
 GREY = np.array([200, 200, 205], np.uint8)
-"""Of meshes without colours."""
+"""Colour of meshes without colours."""
 
 
 def vertex_normals(mesh: Mesh) -> npt.NDArray[np.float32]:
-    """Return unit normals, (V, 3), towards free space; those of no triangle are 0."""
+    """Return unit normals towards free space, (V, 3); 0 for vertices without triangles."""
     corners = mesh.vertices[mesh.triangles]
     across = face_normals(corners)
     normals = np.zeros_like(mesh.vertices)
@@ -43,7 +43,7 @@ def vertex_normals(mesh: Mesh) -> npt.NDArray[np.float32]:
 
 
 def reduced(mesh: Mesh, max_triangles: int = MAX_TRIANGLES) -> Mesh:
-    """Return a mesh of at most so many triangles, its vertices merged in ever larger cells."""
+    """Return a mesh of at most max_triangles, its vertices merged in cells as large as needed."""
     if len(mesh) <= max_triangles:
         return mesh
     corners = mesh.vertices[mesh.triangles[:: max(len(mesh) // 10_000, 1)]]
@@ -56,7 +56,7 @@ def reduced(mesh: Mesh, max_triangles: int = MAX_TRIANGLES) -> Mesh:
 
 
 def merged(mesh: Mesh, cell_m: float) -> Mesh:
-    """Return a mesh whose vertices in one cell have become one, at their mean."""
+    """Return a mesh with the vertices of each cell merged at their mean."""
     index = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell_m).astype(np.int64)
     sides = index.max(axis=0) + 1
     key = (index[:, 2] * sides[1] + index[:, 1]) * sides[0] + index[:, 0]
@@ -86,7 +86,7 @@ def mesh_data(
     mesh: Mesh, low: npt.NDArray[np.float64], size: npt.NDArray[np.float64]
 ) -> dict[str, Any]:
     """
-    Return what page/view.js needs of a mesh: what is about the box of the map, from its middle.
+    Return the data of a mesh for page/view.js, relative to the middle of the map's box.
 
     Vertices farther from that box than half of its longest side are left out.
     """

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models in pictures: models.png, and the triangles of the 3D views.
+Models in pictures: models.png, the triangles of the 3D views, and the section of the report.
 
-models.png has a cloud, and beside it what the models that stand for it make of it. Both are seen
-from where the sensor was, without perspective, painted from far to near. Every plane and surface
+models.png shows a cloud, and beside it points sampled from its models. Both are seen from the
+position of the sensor, in parallel projection, painted from far to near. Every plane and surface
 has a colour of its own; Gaussians are grey.
 """
 
@@ -29,10 +29,10 @@ from surfel_mapper.viz.mesh import MAX_TRIANGLES
 Array = npt.NDArray[np.float64]
 
 MOST_POINTS = 120_000
-"""Of a larger cloud only every so many point is drawn."""
+"""Limit of the points drawn; larger clouds are subsampled."""
 
 MOST_OF_GAUSSIAN = 50
-"""So many points of each Gaussian are drawn at most: a voxel of a map may have thousands."""
+"""Limit of the points drawn for a Gaussian: a voxel of a map may have thousands."""
 
 WIDTH_INCH, HEIGHT_INCH, DPI = 13.0, 6.0, 120
 
@@ -52,13 +52,13 @@ def draw_models(
     path : str or Path
         The file.
     points : (N, 3) float, m
-        The cloud; what is not finite is left out.
+        The cloud; non-finite points are left out.
     model : MultiModel
         Its models.
     viewpoint : (3,) float64, m
-        Where they are seen from.
+        Position of the viewer.
     title : str
-        Of the cloud; without it, how many points it has.
+        Title of the cloud; by default its number of points.
 
     Raises
     ------
@@ -122,16 +122,16 @@ def models_mesh(shapes: Sequence[PatchShape], gaussians: Gaussians | None = None
 
 def page_mesh(shapes: Sequence[PatchShape], gaussians: Gaussians) -> Mesh:
     """
-    Return the mesh of models for a page: as many Gaussians, those of most points, as fit beside.
+    Return the mesh of models for a page: all patches, and the largest Gaussians that fit.
 
-    A mesh of more triangles would be made smaller by merging vertices, which mixes colours.
+    A mesh above the limit would be simplified by merging vertices, which mixes colours.
     """
     room = max(MAX_TRIANGLES - sum(len(shape.faces) for shape in shapes), 0)
     return models_mesh(shapes, most_points(gaussians, room // len(FACES)))
 
 
 def shaded(depth: Array) -> Array:
-    """Return the colours (N, 3) of points by how far they are: near ones are bright."""
+    """Return the colours (N, 3) of points by depth: near points are bright."""
     low, high = np.percentile(depth, [1.0, 99.0]) if len(depth) else (0.0, 1.0)
     far = np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)[:, None]
     near_color, far_color = np.array([0.95, 0.75, 0.25]), np.array([0.15, 0.2, 0.45])
@@ -141,9 +141,9 @@ def shaded(depth: Array) -> Array:
 
 def view_axes(cloud: Array, viewpoint: Array) -> Array:
     """
-    Return the axes (3, 3) of a picture as rows: to the right, up, away from the viewer.
+    Return the axes of a picture as the rows of (3, 3): right, up, away from the viewer.
 
-    Up is z, as of a map; for a camera that looks along z it is -y.
+    Up is z, or -y for a viewer who looks along z, such as a camera.
     """
     ahead = cloud.mean(axis=0) - viewpoint if len(cloud) else np.zeros(3)
     length = float(np.linalg.norm(ahead))
@@ -155,7 +155,7 @@ def view_axes(cloud: Array, viewpoint: Array) -> Array:
 
 
 MOST_ROWS = 25
-"""So many planes and surfaces have a row, the largest."""
+"""Limit of the rows of the table: the largest planes and surfaces."""
 
 TITLES = ('area (m\u00b2)', 'points', 'rms (mm)', 'slope (deg)')
 
@@ -171,9 +171,9 @@ def models_section(
     model : MultiModel
         The models.
     shapes : sequence of PatchShape
-        Of its planes and surfaces.
+        Shapes of its planes and surfaces.
     picture : str or Path, optional
-        A PNG file of them.
+        A PNG file that shows the models.
 
     """
     largest = sorted(shapes, key=lambda shape: -shape.area_m2)[:MOST_ROWS]
@@ -189,7 +189,7 @@ def models_section(
 
 
 def figures(model: MultiModel, shapes: Sequence[PatchShape]) -> str:
-    """Return how many models there are, and how large they are."""
+    """Return numbers and sizes of the models, as HTML."""
     labels = model.labels
     in_patches = np.isin(labels, [shape.patch.id for shape in shapes])
     shown = {
@@ -206,7 +206,7 @@ def figures(model: MultiModel, shapes: Sequence[PatchShape]) -> str:
 
 
 def table(shapes: Sequence[PatchShape]) -> str:
-    """Return a table of planes and surfaces, with their colours; nothing of none."""
+    """Return a table of planes and surfaces with their colours; an empty string for none."""
     if not shapes:
         return ''
     rows = ''.join(map(row, shapes))
@@ -215,7 +215,7 @@ def table(shapes: Sequence[PatchShape]) -> str:
 
 
 def row(shape: PatchShape) -> str:
-    """Return the row of a plane or surface."""
+    """Return the table row of a plane or surface."""
     patch = shape.patch
     red, green, blue = np.rint(255.0 * primitive_colors([patch.id])[0]).astype(int)
     slope_deg = np.degrees(np.arccos(min(abs(patch.normal[2]), 1.0)))

@@ -3,11 +3,14 @@
 """
 map.png: a map from above and from the side, its surfels coloured by planarity.
 
-The surfels are painted by a kernel, and matplotlib adds axes alone: drawn by it, they took 2 s for
-70,000, and as long again for each 70,000 more.
+A compiled kernel paints the surfels and matplotlib adds the axes: drawn by matplotlib, each 70,000
+surfels took 2 s. A surfel is drawn as a disc seen at an angle, an ellipse, so walls become lines
+from above. Surfels that face away from the viewer are left out, because they would hide
+the others: from above the ceiling of a hall, from the side its near wall. The rest is painted from
+far to near.
 
-Few far surfels would make all others tiny, so the picture ends where either end of an axis has
-only one in 200 surfels left.
+A few distant surfels would make all others tiny, so the picture leaves out half a percent of the
+surfels at either end of each axis.
 """
 
 from __future__ import annotations
@@ -31,37 +34,37 @@ if TYPE_CHECKING:
 Array = npt.NDArray[np.float64]
 
 Discs = tuple[Array, npt.NDArray[np.float32]]
-"""Discs and their colours, 0 to 255, as paint_discs takes them."""
+"""Discs and their colours, 0 to 255, in the form that paint_discs takes."""
 
 FACING_AWAY = -0.2
-"""A surfel is left out where the cosine between normal and direction to the viewer is below."""
+"""Smallest cosine between the normal of a drawn surfel and the direction to the viewer."""
 
 EDGE_ON = 0.18
-"""A disc seen edge-on is drawn this thick, by its radius."""
+"""Thickness of a disc seen edge-on, relative to its radius."""
 
 THINNEST_PX = 0.5
-"""Half of what no disc is drawn thinner than, so that there is a pixel in it."""
+"""Smallest half width of a drawn disc, so that it covers a pixel."""
 
 TICK_COLUMNS, TICK_ROWS = 160, 70
-"""Room for a number at a tick, px."""
+"""Space for the number at a tick, px."""
 
 GRID = 229.5
 LINE, LINE_PX = (214, 39, 40), 2.7
 """Grey of the grid; colour and width of the trajectory."""
 
 MOST_DOTS = 200_000
-"""A line of any length is drawn by at most so many dots."""
+"""Limit of the dots that a line is drawn with."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """One way to look at the map: the axes to the right, up and towards the viewer."""
+    """A viewing direction: the map axes to the right, up and towards the viewer."""
 
     right: int
     up: int
     near: int
     signs: tuple[int, int, int]
-    """-1 where the axis of the map runs the other way."""
+    """-1 for an axis that runs the other way."""
 
     def seen(self, vectors: Array) -> Array:
         """Return the components of (K, 3) vectors to the right, up and towards the viewer."""
@@ -72,7 +75,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A view of the map on pixels: the corner at its upper left, as ``View.seen`` has it."""
+    """A view of the map in pixels; left and top are its upper left corner as in ``View.seen``."""
 
     view: View
     left: float
@@ -89,20 +92,20 @@ class Frame:
         return cls(view, low[0], max(low[1], high[1]), width, height, px_per_m)
 
     def placed(self, positions: Array) -> Array:
-        """Return the columns and rows of (K, 3) positions, (K, 2)."""
+        """Return the columns and rows of (K, 3) positions, (K, 2) px."""
         right, up, _ = self.view.seen(positions)
         return np.column_stack([right - self.left, self.top - up]) * self.px_per_m - 0.5
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Where the axes of the map end: at the left and the right, below and above."""
+        """Limits of the axes, m: left and right, bottom and top."""
         right = self.left + self.width / self.px_per_m
         bottom = self.top - self.height / self.px_per_m
         across, up, _ = self.view.signs
         return (across * self.left, across * right), (up * bottom, up * self.top)
 
     def ticks(self) -> tuple[Array, Array]:
-        """Return round numbers of metres along either axis of the map."""
+        """Return the positions of the ticks along both axes, round numbers of metres."""
         from matplotlib.ticker import MaxNLocator
 
         found = []
@@ -123,7 +126,7 @@ class Frame:
         return image
 
     def discs(self, surfels: Surfels, half_m: Array) -> Discs:
-        """Return the surfels that face the viewer from far to near, each of half a length."""
+        """Return the surfels that face the viewer as discs of half sizes half_m, far to near."""
         from matplotlib import colormaps
 
         normal_right, normal_up, facing = self.view.seen(surfels.normal)
@@ -139,7 +142,7 @@ class Frame:
         return discs, colours.astype(np.float32)
 
     def line(self, positions: Array) -> Discs:
-        """Return a line through (S, 3) positions as discs, one for each pixel of its way."""
+        """Return a line through (S, 3) positions as discs, one for each pixel of its length."""
         places = self.placed(positions)
         steps = np.hypot(*np.diff(places, axis=0).T)
         way = np.concatenate([[0.0], np.cumsum(steps)])[: len(places)]
@@ -154,30 +157,30 @@ X, Y, Z = 0, 1, 2
 
 SPREAD = 1.45
 """
-Diameter of a disc by the side of the square whose points spread as far: just enough that the
-discs of neighbours that are full of points leave no gaps between them.
+Diameter of a disc relative to the side of the square with the same variance: just enough that the
+discs of neighbouring voxels full of points leave no gaps.
 """
 
 BEYOND = 0.5
-"""The picture leaves out this many per cent of the surfels at either end of an axis."""
+"""Surfels left out at either end of an axis, per cent."""
 
 FLATTEST = 0.08
-"""No axis is drawn shorter than this by the longest, so that the view of a plane has room."""
+"""Smallest length of an axis relative to the longest, so that a flat map has a visible side."""
 
 WIDTH_PX, HEIGHT_PX, DPI = 1760, 1440, 160
-"""The larger of the two views together takes so much of width or height; labels come on top."""
+"""Size of both views together, px; the larger map extent fills one of them. Labels are extra."""
 
 LEFT, RIGHT, BELOW, ABOVE = 120, 170, 90, 60
-"""Room around each view for its labels, on the right for the colour bar, px."""
+"""Margins around each view for its labels, on the right for the colour bar, px."""
 
 SMALLEST_PX = 640
-"""The picture is at least this wide, whatever is drawn."""
+"""Smallest width of the picture."""
 
 TITLE_PT, LETTER = 12.0, 0.55
-"""Size of the title, smaller where it is long: so wide is a letter by its size."""
+"""Font size of the title, reduced for long ones, and width of a letter relative to it."""
 
 FRAME_PX = 2
-"""Of each image so much is left out at its rim, where the frame of the axes is."""
+"""Rim of each image left to the frame of the axes, px."""
 
 
 def draw_map(
@@ -193,13 +196,13 @@ def draw_map(
     Parameters
     ----------
     surfels : Surfels
-        May be none.
+        The map; may be empty.
     path : str or Path
         The file.
     title : str
-        Stands above.
+        Title above the picture.
     trajectory : (S, 3) float64, m, optional
-        Where the sensor was; drawn as a line.
+        Positions of the sensor; drawn as a line.
 
     Raises
     ------
@@ -232,7 +235,7 @@ def draw_map(
 
 
 def limits(surfels: Surfels) -> tuple[Array, Array]:
-    """Return the corners of the box to be drawn, (3,) each; some box where there is no surfel."""
+    """Return the corners of the box to be drawn, (3,) each; 10 m wide for an empty map."""
     if not len(surfels):
         return np.full(3, -5.0), np.full(3, 5.0)
     low, high = np.percentile(surfels.position, [BEYOND, 100.0 - BEYOND], axis=0)
@@ -242,14 +245,14 @@ def limits(surfels: Surfels) -> tuple[Array, Array]:
 
 
 def sides_m(surfels: Surfels) -> Array:
-    """Return the side of the square that spreads as far as the points of each surfel."""
+    """Return the side of the square with the variance of each surfel in its plane, (K,) m."""
     # along either side of a square the variance is a twelfth of the side squared
     sides: Array = np.sqrt(6.0 * surfels.eigenvalues[:, 1:].sum(axis=1))
     return sides
 
 
 def views(extent: Array) -> tuple[View, View]:
-    """Return the views from above and from the side; the longer way lies across the picture."""
+    """Return the views from above and from the side, the longer axis to the right."""
     if extent[X] >= extent[Y]:
         return View(X, Y, Z, (1, 1, 1)), View(X, Z, Y, (1, 1, -1))
     return View(Y, X, Z, (1, -1, 1)), View(Y, Z, X, (1, 1, 1))
@@ -259,9 +262,9 @@ def framed(
     frames: Sequence[Frame], title: str
 ) -> tuple[npt.NDArray[np.uint8], list[tuple[int, int]]]:
     """
-    Return a picture with axes one below the other and a colour bar, but nothing in them.
+    Return a picture with empty axes, one below the other, and a colour bar.
 
-    Row and column of the corner of each come with it.
+    The second value holds row and column of the upper left corner of each pair of axes.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
@@ -292,7 +295,7 @@ def framed(
 
 
 def label(ax: Axes, frame: Frame) -> None:
-    """Give axes the scales and labels of a frame."""
+    """Set limits, ticks and labels of axes from a frame."""
     (along, up), (xticks, yticks) = frame.bounds, frame.ticks()
     names = [f'{"xyz"[axis]} (m)' for axis in (frame.view.right, frame.view.up)]
     ax.set(xlim=along, ylim=up, xlabel=names[0], ylabel=names[1], xticks=xticks, yticks=yticks)

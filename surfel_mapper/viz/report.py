@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-report.html: one page that says what was mapped, with plots and the map to turn around.
+report.html: one page about a map, with an interactive 3D view, plots and tables.
 
-Everything is inside the file, and a content security policy forbids the page to load anything
-else. Names in bags are anyone's: all text is escaped.
+The file is self-contained, and a content security policy forbids the page to load anything else.
+Names from bags are untrusted: all text is escaped.
 """
 
 from __future__ import annotations
@@ -48,21 +48,20 @@ def write_report(
     path : str or Path
         The file.
     title : str
-        Above the page: what was mapped.
+        Title of the page, for example the name of the bag.
     summary : mapping
-        As ``Mapper.summary`` returns it; ``recorded_s``, ``replay_s`` and ``settings`` beside it
-        where known.
+        As ``Mapper.summary`` returns it; with ``recorded_s``, ``replay_s`` and ``settings`` if
+        known.
     surfels : Surfels
         The map, or a part of it.
     history : History, optional
-        What happened scan by scan; without it there are no plots over time.
+        Figures of each scan; without it there are no plots over time.
     picture : str or Path, optional
-        A PNG file, for browsers that cannot draw in 3D.
+        A PNG file, for browsers without WebGL 2.
     layers : mapping of str to Mesh, optional
-        What can be shown in the place of the surfels, by its name: ``mesh``, that of the TSDF,
-        and ``models``.
+        Meshes that can be shown in place of the surfels, by name.
     sections : sequence of str
-        What else is said, as HTML, below the map.
+        Further sections as HTML, below the map.
 
     Raises
     ------
@@ -87,7 +86,7 @@ def write_report(
 
 
 def page(title: str, body: str) -> str:
-    """Return a whole page."""
+    """Return a complete HTML page."""
     folder = files('surfel_mapper.viz') / 'page'
     style = (folder / 'report.css').read_text(encoding='utf-8')
     script = (folder / 'view.js').read_text(encoding='utf-8')
@@ -102,14 +101,14 @@ def page(title: str, body: str) -> str:
 
 
 def about(summary: Mapping[str, Any]) -> str:
-    """Return in a line where the map came from."""
+    """Return the sources of the map and its digest in one line."""
     names = [*summary.get('topics', []), *summary.get('pose_topics', []), summary.get('poses')]
     source = ', '.join(str(name) for name in names if name)
     return ' \u00b7 '.join(filter(None, [source, f'digest {summary.get("digest", "unknown")}']))
 
 
 def figures(summary: Mapping[str, Any], history: History) -> str:
-    """Return the most important numbers."""
+    """Return the main figures of the map, as HTML."""
     scans = summary['scans']
     shown = {
         'scans mapped': f'{scans["mapped"]} of {scans["received"]}',
@@ -119,7 +118,7 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
     }
     if len(history) > 1:
         steps = np.diff(history.trajectory, axis=0)
-        shown['way of the sensor'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'
+        shown['distance driven'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'
     if 'recorded_s' in summary:
         shown['recorded'] = f'{summary["recorded_s"]:.1f} s'
     if summary.get('replay_s'):
@@ -130,7 +129,7 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
 
 
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:
-    """Return all plots."""
+    """Return the section with all plots."""
     seconds = history.seconds
     at, counts = history.surfels
     times = {
@@ -149,7 +148,7 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
         'Slope of the surfels': histogram(
             slope, 0.0, 90.0, 'angle of the normal to the vertical (deg)', 'surfels'
         ),
-        'Scans by what became of them': named_bars(fates(summary)),
+        'Scans by outcome': named_bars(fates(summary)),
         'Points left out': named_bars(named(summary.get('points_left_out', {}))),
     }
     if history.dropped.any():
@@ -163,7 +162,7 @@ def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str
 
 
 def fates(summary: Mapping[str, Any]) -> dict[str, int]:
-    """Return how many scans were mapped, and how many were not, by cause."""
+    """Return the number of scans mapped, and of others by cause."""
     scans = summary['scans']
     gated = {'left out by the motion gate': scans['gated']} if scans['gated'] else {}
     dropped = {f'dropped: {cause}': n for cause, n in named(scans['dropped']).items()}
@@ -171,12 +170,12 @@ def fates(summary: Mapping[str, Any]) -> dict[str, int]:
 
 
 def named(counts: Mapping[str, int]) -> dict[str, int]:
-    """Return counts by cause in words, those that are not zero."""
+    """Return the counts that are not zero, by cause in words."""
     return {str(cause).replace('_', ' '): int(n) for cause, n in counts.items() if n}
 
 
 def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
-    """Return how far the poses are from the true ones, where these are known."""
+    """Return a table of pose errors; an empty string if the true poses are unknown."""
     if errors is None:
         return ''
     rows = ''
@@ -200,7 +199,7 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
 
 
 def times_table(summary: Mapping[str, Any]) -> str:
-    """Return median and 99th percentile of every stage."""
+    """Return a table of the median and 99th percentile of every stage."""
     rows = ''.join(
         f'<tr><td>{escape(str(stage))}</td><td class="number">{times["median"]:.2f}</td>'
         f'<td class="number">{times["p99"]:.2f}</td></tr>'
@@ -213,12 +212,12 @@ def times_table(summary: Mapping[str, Any]) -> str:
 
 
 def stage_order(stage: str) -> int:
-    """Return where a stage stands among the others: unknown ones before the total."""
+    """Return the position of a stage in tables; unknown stages come before the total."""
     return STAGES.index(stage) if stage in STAGES else len(STAGES) - 1
 
 
 def settings_table(settings: Mapping[str, Any]) -> str:
-    """Return all settings, those that differ from their defaults first."""
+    """Return a table of all settings, those that differ from their defaults first."""
     default = Config().to_mapping()
     ours = {name: value for name, value in settings.items() if value != default.get(name)}
     rest = {name: value for name, value in settings.items() if name not in ours}

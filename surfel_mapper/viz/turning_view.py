@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The map to turn around in report.html: its data, and the elements that page/view.js draws into.
+The interactive 3D view of report.html: its elements and the data for page/view.js.
 
-Data for the script is JSON in which no tag can begin. A surfel takes 12 bytes, 1.6 MB of text for
-the 100,000 shown at most; the mesh of the TSDF and the models take up to 4 MB more each.
+The data is JSON without the character <, so it cannot begin a tag. A surfel takes 12 bytes: 1.6 MB
+of text for the limit of 100,000; each mesh takes up to 4 MB more.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from surfel_mapper.viz.picture import limits, sides_m, SPREAD
 Array = npt.NDArray[np.float64]
 
 MAX_SHOWN = 100_000
-"""Of a larger map so many surfels are shown, picked at random, always the same."""
+"""Limit of the surfels shown; larger maps are subsampled with a fixed seed."""
 
 SURFEL = np.dtype(
     [('place', '<u2', 3), ('radius', 'u1'), ('planarity', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
 )
-"""A surfel as page/view.js takes it."""
+"""Surfel format of page/view.js."""
 
 
 def turning_view(
@@ -45,7 +45,9 @@ def turning_view(
     layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
     note = 'Drag to turn, with shift to move, wheel to zoom.'
-    mixed = np.random.default_rng(0).permutation(len(shown))  # while it turns, the first are drawn
+    mixed = np.random.default_rng(0).permutation(
+        len(shown)
+    )  # while the view moves, only the first are drawn
     shown = shown.select(mixed[:MAX_SHOWN])
     if len(mixed) > MAX_SHOWN:
         note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
@@ -76,7 +78,7 @@ def turning_view(
 
 
 def within_sight(surfels: Surfels) -> Surfels:
-    """Return the surfels without those so far away that all others would be tiny."""
+    """Return the surfels without outliers so far away that all others would be tiny."""
     low, high = limits(surfels)
     spare = 0.5 * (high - low)
     inside = (surfels.position >= low - spare) & (surfels.position <= high + spare)
@@ -84,7 +86,7 @@ def within_sight(surfels: Surfels) -> Surfels:
 
 
 def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -> dict[str, Any]:
-    """Return what page/view.js needs: everything about the middle of the map, in metres."""
+    """Return the data for page/view.js, in metres from the middle of the map."""
     from matplotlib import colormaps
 
     low, high = np.zeros(3), np.ones(3)
@@ -114,5 +116,5 @@ def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -
 
 
 def encoded(values: npt.NDArray[Any]) -> str:
-    """Return the bytes of an array as text."""
+    """Return the bytes of an array in base64."""
     return base64.b64encode(values.tobytes()).decode()

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Viewer: a replay as it happens in rerun, on the screen or in an .rrd file to be opened later.
+Viewer: shows a replay in rerun, in a window or as an .rrd file.
 
-Logged at every scan are the sensor with its points, the surfels that it changed, and where the
-scans of the window were taken. The whole map is logged when a quarter of it is new since the last
-time, so that a recording holds each surfel some five times, not once a scan.
+Every scan logs the sensor with its points, the changed surfels, and the positions of the scans in
+the window. The whole map is logged when a quarter of it has changed since the last time, so a
+recording holds each surfel about five times instead of once a scan.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
 NEW = 0.25
-"""The whole map is logged when this share of it came or left since the last time."""
+"""Share of the map that has to come or leave before the whole map is logged again."""
 
 MAX_POINTS = 20_000
-"""Of a scan so many points are logged, evenly picked."""
+"""Limit of the points logged of a scan; larger scans are subsampled."""
 
 POINT_RADIUS_M = 0.02
 
@@ -42,14 +42,14 @@ RED, ORANGE = (219, 41, 33), (240, 150, 40)
 
 class Viewer:
     """
-    Shows a replay in rerun; a context manager, closed when all is written.
+    Shows a replay in rerun; a context manager.
 
     Parameters
     ----------
     mapper : Mapper
-        What is shown.
+        The mapper of the replay.
     path : str or Path, optional
-        An .rrd file to write; without it a window opens.
+        The .rrd file to write; by default a window opens.
 
     Raises
     ------
@@ -61,7 +61,6 @@ class Viewer:
     """
 
     def __init__(self, mapper: Mapper, path: str | Path | None = None) -> None:
-        """Open the file or the window."""
         self._mapper = mapper
         self._rerun = import_rerun()
         self._shapes = Shapes()
@@ -76,18 +75,18 @@ class Viewer:
         self._stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
     def __enter__(self) -> Viewer:
-        """Return the viewer, to be closed at the end of the block."""
+        """Return the viewer, which closes at the end of the block."""
         return self
 
     def __exit__(self, kind: object, *_: object) -> None:
-        """Log the map as it is in the end, and close."""
+        """Log the final map and close."""
         if kind is None and self._positions:
             self._log_map()
         self._stream.flush()
         self._stream.disconnect()
 
     def add(self, update: Update) -> None:
-        """Show what a scan did."""
+        """Log a scan and its changes of the map."""
         rerun, pose = self._rerun, update.T_map_sensor
         self._positions.append(pose[:3, 3])
         self._stream.set_time('stamp', timestamp=np.datetime64(update.stamp_ns, 'ns'))
@@ -110,12 +109,12 @@ class Viewer:
             self._log_map()
 
     def _way(self) -> npt.NDArray[np.float64]:
-        """Return where the sensor was, in at most a thousand steps."""
+        """Return the trajectory of the sensor, at most a thousand positions and the last."""
         step = max(len(self._positions) // 1000, 1)
         return np.array([*self._positions[::step], self._positions[-1]])
 
     def _log_map(self) -> None:
-        """Log all surfels, and the layers that there are."""
+        """Log all surfels and the active layers."""
         mapper = self._mapper
         self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
         self._logged_voxels, self._removed = mapper.map.num_voxels, 0
@@ -149,7 +148,7 @@ class Viewer:
         self._stream.log('map/models/gaussians', ellipsoids)
 
     def _log_mesh(self, name: str, mesh: Mesh) -> None:
-        """Log a mesh, in its colours where it has any."""
+        """Log a mesh, in its colours if it has any."""
         if len(mesh):
             self._stream.log(
                 name,
@@ -162,7 +161,7 @@ class Viewer:
             )
 
     def _log_surfels(self, name: str, surfels: Surfels) -> None:
-        """Log surfels as points as large as their discs, in the colours of planarity."""
+        """Log surfels as points of the size of their discs, coloured by planarity."""
         from matplotlib import colormaps
 
         valid = surfels.select(np.isfinite(surfels.planarity))
@@ -174,13 +173,13 @@ class Viewer:
 
 
 def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Return the finite ones of points, MAX_POINTS of them at most."""
+    """Return the finite points, subsampled to at most MAX_POINTS."""
     finite = points[np.isfinite(points).all(axis=1)]
     return np.ascontiguousarray(finite[:: max(-(-len(finite) // MAX_POINTS), 1)])
 
 
 def check_writable(path: Path) -> None:
-    """Refuse a file that cannot be written, which rerun would only say in a log."""
+    """Raise FileFormatError for a file that cannot be written; rerun would only log it."""
     try:
         with open(path, 'wb'):
             pass
@@ -189,7 +188,7 @@ def check_writable(path: Path) -> None:
 
 
 def import_rerun() -> Any:
-    """Return rerun."""
+    """Return the module rerun, or raise DependencyError with the command to install it."""
     try:
         import rerun
     except ImportError as error:

@@ -147,7 +147,7 @@ def test_progress_is_told_scan_by_scan(tmp_path):
     assert stamps == [simulation.stamp_ns(number) for number in range(NUM_SCANS)]
 
 
-def test_what_is_there_is_kept_and_an_interrupted_recording_leaves_nothing(tmp_path):
+def test_existing_bag_is_kept_and_an_interrupted_recording_leaves_nothing(tmp_path):
     simulation = small_simulation()
     record(simulation, tmp_path / 'street')
     before = read(tmp_path / 'street')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""World, primitives and street: what is refused, what the truth says, files, determinism."""
+"""World, primitives and street: refused values, true surfaces, files, determinism."""
 
 import json
 

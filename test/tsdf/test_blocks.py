@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The hashed blocks: found where they were placed, zero when reused, handed back when removed."""
+"""Hashed blocks are found after any growth, zero when reused, and returned when removed."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def every_channel(**settings):
 
 
 def indices(count, seed=1, size=40):
-    """Return so many different blocks, in no order."""
+    """Return num different block indices in random order."""
     rng = np.random.default_rng(seed)
     numbers = rng.permutation(size**3)[:count]
     return np.stack(np.unravel_index(numbers, (size, size, size)), axis=1) - size // 2
@@ -49,7 +49,7 @@ def test_blocks_are_found_after_any_growth_and_removal():
     assert blocks.find([[100, 0, 0], [1 << 30, 0, 0]]).tolist() == [-1, -1]
 
 
-def test_a_row_that_is_used_again_holds_nothing():
+def test_reused_row_is_zero():
     blocks = every_channel()
     rows = blocks.place(indices(300))
     for array in (blocks.field, blocks.color, blocks.votes, blocks.stamps):
@@ -62,7 +62,7 @@ def test_a_row_that_is_used_again_holds_nothing():
         assert (array[rows[200:]] == 7).all()
 
 
-def test_what_is_removed_can_be_put_back():
+def test_removed_blocks_can_be_inserted_again():
     blocks, rng = every_channel(), np.random.default_rng(4)
     index = indices(50)
     rows = blocks.place(index)
@@ -83,7 +83,7 @@ def test_what_is_removed_can_be_put_back():
     assert len(other.changed_since(0)) == 50
 
 
-def test_changes_are_told_since_any_version():
+def test_changed_since_lists_changes_after_any_version():
     blocks = every_channel()
     rows = blocks.place(indices(10))
     assert len(blocks.changed_since(0)) == 0  # placed, not changed
@@ -108,7 +108,7 @@ def test_beyond_the_budget_there_is_no_row():
         every_channel(max_blocks=10).insert(full.copied(full.rows()))
 
 
-def test_an_index_that_no_key_holds_is_refused():
+def test_index_beyond_20_bits_is_refused():
     blocks = every_channel()
     with pytest.raises(MapLimitError, match='local frame'):
         blocks.place([[0, 0, 0], [0, 1 << 20, 0]])

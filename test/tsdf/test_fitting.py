@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A lidar is told from its points: those of lidars that are known."""
+"""The fitted lidar model equals the known one that made the points."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ RANGES = {'min_range_m': 0.5, 'max_range_m': 40.0}
 
 
 def points_of(lidar, seed=0, keep=0.8):
-    """Return points and rings of a turn, some without return, some at no distance."""
+    """Return points and rings of a turn, some nan and some at 0."""
     rng = np.random.default_rng(seed)
     points = lidar.directions * rng.uniform(2.0, 30.0, (lidar.rows, lidar.columns, 1))
     points[rng.random((lidar.rows, lidar.columns)) > keep] = np.nan
@@ -38,7 +38,7 @@ def test_without_rings_the_beams_are_evenly_spaced():
     assert np.abs(np.degrees(found.elevations_rad) - np.linspace(15.0, -15.0, 16)).max() <= 1e-4
 
 
-def test_what_is_set_is_not_fitted():
+def test_given_rows_and_columns_are_not_fitted():
     points, ring = points_of(LidarModel(rows=16, columns=300, vertical_fov_deg=30.0))
     found = fitted_lidar(points, ring, rows=32, columns=512, **RANGES)
     assert (found.rows, found.columns, found.beam_elevations_deg) == (32, 512, ())
@@ -63,6 +63,6 @@ def test_rings_of_one_elevation_are_one_beam():
         np.array([[1.0, 0, 0.2]]),
     ],
 )
-def test_points_that_show_no_lidar_are_refused(points):
+def test_points_without_two_beams_are_refused(points):
     with pytest.raises(CloudFormatError, match='expected those of a lidar with two beams'):
         fitted_lidar(points, **RANGES)

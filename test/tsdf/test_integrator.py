@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T5 to T8, T12, T13, T17 and what is refused: one step of fusing, and several."""
+"""T5 to T8, T12, T13, T17: one and several integrations; refused input."""
 
 import numpy as np
 import pytest
@@ -159,7 +159,7 @@ def test_without_allocation_only_blocks_there_change():
 
 
 @pytest.mark.parametrize('by', ['dynamic_labels', 'invalid_labels', 'mask'])
-def test_what_moves_frees_space_and_leaves_no_surface(by):
+def test_masked_pixels_free_space_and_leave_no_surface(by):
     half = np.arange(80) * np.ones((60, 1)) < 40
     images = {'mask': half} if by == 'mask' else {'label': np.where(half, 7, 2)}
     settings = {} if by == 'mask' else {by: [7.0]}
@@ -257,14 +257,14 @@ def test_a_tiny_budget_is_kept_and_counted():
         np.diag([1, 1, np.inf, 1]),
     ],
 )
-def test_what_is_no_pose_is_refused(T):
+def test_invalid_pose_is_refused(T):
     one = integrator(**SIZES)
     with pytest.raises(PoseError, match='pose of the sensor'):
         one.integrate(wall(SMALL, 2.0), T)
     assert one.blocks.num_blocks == 0
 
 
-def test_what_the_map_cannot_index_is_refused_and_changes_nothing():
+def test_position_beyond_the_index_range_is_refused_and_the_map_unchanged():
     one = integrator(**SIZES)
     far = np.eye(4)
     far[0, 3] = 0.8 * (1 << 20) - 1.0

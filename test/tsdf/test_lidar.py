@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T16 and what a lidar needs: no seam, ground at grazing angles, no fat points."""
+"""T16 for lidars: no seam, ground at grazing angles, no fat points."""
 
 import numpy as np
 import pytest

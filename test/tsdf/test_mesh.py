@@ -33,7 +33,7 @@ def blocks_of(distance, first=(0, 0, 0), weight=1.0, color=None, **settings):
 
 
 def write(blocks, distance, first=(0, 0, 0), weight=1.0, color=None):
-    """Write a field into blocks, and whatever colour, (x, y, z, 3)."""
+    """Write a field (x, y, z) and optional colours (x, y, z, 3) into blocks."""
     weight = np.broadcast_to(weight, distance.shape)
     counts = np.array(distance.shape) // SIDE
     for place in np.ndindex(*counts):
@@ -242,7 +242,7 @@ def test_colours_are_mixed_along_the_edge():
     assert set(map(tuple, mesh.colors.tolist())) == {(160, 100, 20)}
 
 
-def test_of_a_voxel_without_colour_the_other_end_counts_alone():
+def test_vertex_beside_a_voxel_without_colour_takes_that_of_the_other_end():
     distance = np.broadcast_to(np.arange(8.0)[:, None, None] - 3.25, (8, 8, 8)) * 0.1
     color = np.full((8, 8, 8, 3), 90.0)
     blocks = blocks_of(distance.astype(np.float32), color=color)

@@ -32,7 +32,7 @@ def test_a_linear_field_is_read_exactly_across_blocks_and_zero():
     np.testing.assert_allclose(found.gradient, [SLOPE] * 2000, atol=1e-5)
 
 
-def test_where_one_voxel_of_eight_is_missing_nothing_is_known():
+def test_points_with_a_missing_voxel_among_eight_are_unknown():
     blocks = linear_field()
     row = blocks.find([0, 0, 0])
     blocks.field[row, 1, 0] = 0.5  # the voxel at (0.05, 0.05, 0.05)

@@ -53,7 +53,7 @@ def test_images_between_those_fused_lie_on_the_surface_and_have_its_colour(data_
         distance = sample(one.blocks, points).distance
         known = np.isfinite(distance)
         assert known.mean() > 0.8
-        # All images together make walls 18 mm thick: so much the poses are off.
+        # All images together make walls 18 mm thick: the error of the poses.
         assert np.median(abs(distance[known])) < 0.018
         before = (0.97 * rays) @ pose[:3, :3].T + pose[:3, 3]
         found = states(one.blocks, before)

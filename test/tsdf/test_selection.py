@@ -125,7 +125,7 @@ def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
     for along in np.linspace(0.0, 1.0, 60):
         at = (0.5 + along * (range_m - 0.5))[..., None] * rays + T[:3, 3]
         block, place = np.divmod(at.reshape(-1, 3), size)
-        # Deeper inside than what may be passed over.
+        # Deeper inside than the corners that may be missed.
         inside = (abs(place - size / 2) < size / 4).all(axis=1)
         found = {*map(tuple, block[inside].astype(int))}
         deep += len(found)

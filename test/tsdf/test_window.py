@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T15: the window of blocks that moves along, and what it hands back."""
+"""T15: the moving window of blocks, and the blocks that it evicts."""
 
 import numpy as np
 
@@ -88,7 +88,7 @@ def test_blocks_do_not_come_and_go_where_the_radius_holds_all_that_is_seen(caplo
     ]
 
 
-def test_what_left_and_comes_back_is_as_it_was():
+def test_evicted_blocks_inserted_again_are_unchanged():
     one = integrator(voxel_size_m=0.1, truncation_m=0.3, max_radius_m=1.5, color=True)
     one.integrate(image_of(SENSOR, np.full((8, 90), 2.5)), np.eye(4), 7)
     before = one.blocks.copied(one.blocks.rows())

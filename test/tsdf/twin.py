@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The integrator once more, in plain numpy and float64: slow, obvious, and independent.
+A second integrator in plain numpy and float64: slow, simple, and independent.
 
-Nothing is shared with the code under test but the sensors' properties and what a range image
-holds. Maps are dictionaries from block to the arrays of its voxels.
+It shares only the properties of the sensors and the range images with the code under test. Maps
+are dictionaries from block to the arrays of its voxels.
 """
 
 import numpy as np
@@ -19,7 +19,7 @@ def voxel_centres(config, block):
 
 
 def place_in_image(sensor, p):
-    """Return column and row of (N, 3) points, nan where they are out of view."""
+    """Return column and row of (N, 3) points, nan for points out of view."""
     with np.errstate(all='ignore'):
         if hasattr(sensor, 'fx'):
             u = sensor.fx * p[:, 0] / p[:, 2] + sensor.cx
@@ -59,7 +59,7 @@ def ray(sensor, column, row):
 
 
 def look_up(config, sensor, image, p, u, v):
-    """Return the range at one place, 0 for none, and what it is from: (row, column, share)."""
+    """Return the range at a position, 0 for none, and its pixels as (row, column, share)."""
     u0, v0 = int(np.floor(u)), int(np.floor(v))
     du, dv = u - u0, v - v0
     columns = sensor.columns + sensor.wraps
@@ -130,7 +130,7 @@ def measurements(config, image, T_map_sensor, block):
 
 
 def slant(image, u, v):
-    """Return the cosine at the nearest pixel, 1 where there are none."""
+    """Return the cosine at the nearest pixel, 1 without cosines."""
     if image.cosine is None:
         return 1.0
     return float(image.cosine[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The mesh on a page: where it is, how it is lit, and how it is made smaller."""
+"""The mesh on a page: positions, normals and simplification."""
 
 import base64
 import json

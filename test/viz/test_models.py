@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models on pages and in viewers: their triangles and colours, and what the report says."""
+"""Models on pages and in viewers: triangles, colours and the section of the report."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_the_section_names_every_patch_with_its_numbers(seen):
     assert f'<dt>Gaussians</dt><dd>{len(model.gaussians)}</dd>' in text
 
 
-def test_of_many_patches_the_largest_are_named(seen):
+def test_table_of_many_patches_lists_the_largest(seen):
     model, shapes = seen
     many = [
         replace(shape, patch=replace(shape.patch, id=100 * k + shape.patch.id))

@@ -52,7 +52,7 @@ def new_page(browser):
 
 @pytest.fixture
 def opened(browser, tmp_path):
-    """Return a page that shows a report, and what it complained about or asked for."""
+    """Return a page that shows a report, and its console messages, errors and requests."""
     report(tmp_path, plane(30))
     complaints, page = [], new_page(browser)
     address = (tmp_path / 'report.html').as_uri()
@@ -67,7 +67,7 @@ def opened(browser, tmp_path):
 
 
 def settle(page):
-    """Wait until what is to be drawn is drawn: past the rest that follows a movement."""
+    """Wait until drawing has finished, including the full frame that follows a movement."""
     page.evaluate(
         '() => new Promise((done) => setTimeout(() => requestAnimationFrame(done), 400))'
     )
@@ -80,7 +80,7 @@ def pixels(page):
 
 
 def picture_when(page, is_so):
-    """Return the picture once it is as it should be; it comes some time after what is done."""
+    """Return the picture once is_so(picture) holds, or the last one after WAIT_S."""
     end = time.monotonic() + WAIT_S
     while True:
         settle(page)

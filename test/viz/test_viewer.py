@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A recording for rerun holds what was mapped, and can be opened by rerun itself."""
+"""Recordings for rerun hold all entities and pass the verification of rerun."""
 
 import subprocess
 import sys

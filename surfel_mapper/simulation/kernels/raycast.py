@@ -22,7 +22,7 @@ from surfel_mapper.simulation.kernels.surfaces import (
 )
 
 STEEP = 1e300
-"""Stands for 1/0 in the box test, so that 0/0 is 0 and not nan."""
+"""Replaces 1/0 in the box test, so that 0 * (1/0) is 0 and not nan."""
 
 
 @njit(cache=True, nogil=True)
@@ -34,8 +34,8 @@ def cast(
 
     origins     (N, 3) or, for one common origin, (1, 3) float64 m, in the world
     directions  (N, 3) float64, unit vectors
-    range_m     (N,) float64 m; in: the farthest wanted; out: the range where something was hit
-    surface     (N,) int64; out: what was hit, -1 for nothing
+    range_m     (N,) float64 m; in: largest range; out: range of the hit, unchanged without one
+    surface     (N,) int64; out: surface hit, -1 for none
     """
     apart = 0 if len(origins) == 1 else 1
     ray, start = np.empty(6), np.empty(6)
@@ -130,7 +130,7 @@ def hit_cylinder(ray, half, capped):
     nearest, face = np.inf, 0
     radius_sq = half[0] * half[0]
     across = ray[3] * ray[3] + ray[4] * ray[4]
-    # The distance of the ray from the axis in this form loses nothing far from a thin pole.
+    # This form of the distance of the ray from the axis keeps its precision far from a thin pole.
     offset = ray[0] * ray[4] - ray[1] * ray[3]
     discriminant = across * radius_sq - offset * offset
     if across > 0.0 and discriminant >= 0.0:

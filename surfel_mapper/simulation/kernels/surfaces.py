@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Analytic surfaces: how primitives are stored, their normals, the surface nearest to a position.
+Analytic surfaces: tables of primitives, normals, nearest surface to a position.
 
 A primitive is a kind, a pose and half its extent along its own axes. Its faces are numbered, and
-a surface is ``primitive * FACES + face``: a box has six planes, so points of one plane can be
-told from points of one box. The primitives are the leaves of a tree of axis-parallel bounding
-boxes, stored in depth-first order with the node to go on with where a box is missed: a walk needs
-no stack.
+a surface is ``primitive * FACES + face``: a box has six planes, which distinguishes points on one
+plane from points on one box. The primitives are the leaves of a tree of axis-parallel bounding
+boxes in depth-first order, each with the node that follows a miss: traversal needs no stack.
 
 The tables, for P primitives and M nodes:
 
@@ -15,8 +14,8 @@ The tables, for P primitives and M nodes:
     pose            (P, 3, 4) float64, upper rows of T_world_primitive
     half            (P, 3) float64 m, half the extent along the primitive's own x, y, z
     node_box        (M, 6) float64 m, lowest x y z and highest x y z in the world
-    node_next       (M,) int64, the node after this one's whole branch
-    node_primitive  (M,) int64, the primitive of a leaf, else -1
+    node_next       (M,) int64, first node after the branch
+    node_primitive  (M,) int64, primitive of a leaf, else -1
 """
 
 import math
@@ -28,7 +27,7 @@ RECTANGLE, BOX, CYLINDER, TUBE, SPHERE = range(5)
 """Faces: a rectangle has 0 (+z); a box +x -x +y -y +z -z; a cylinder side, +z, -z; else 0."""
 
 FACES = 6
-"""Numbers set aside for the faces of a primitive."""
+"""Face numbers reserved for each primitive."""
 
 
 @njit(cache=True, nogil=True)
@@ -40,7 +39,7 @@ def nearest_surface(
 
     positions   (N, 3) float64 m, in the world
     distance_m  (N,) float64 m, out
-    surface     (N,) int64, out; -1 without primitives and for positions that are not finite
+    surface     (N,) int64, out; -1 without primitives and for non-finite positions
     """
     place, local = np.zeros(6), np.zeros(6)
     last = 0
@@ -51,7 +50,7 @@ def nearest_surface(
             place[axis] = positions[row, axis]
             finite = finite and np.isfinite(place[axis])
         if finite and len(kind) > 0:
-            # Neighbours often share their surface: its distance ends most of the walk at once.
+            # Neighbours often share their surface; its distance prunes most of the tree at once.
             into_primitive(place, pose[last], local)
             nearest = np.nextafter(gap(local, kind[last], half[last])[0], np.inf)
         node = 0
@@ -76,8 +75,8 @@ def outward_normals(positions, surface, kind, pose, normals):
 
     positions  (N, 3) float64 m, in the world
     surface    (N,) int64, -1 for none
-    normals    (N, 3) float64, out; nan where there is no surface or, on the axis of a cylinder
-               or the centre of a sphere, no direction
+    normals    (N, 3) float64, out; nan without a surface, on the axis of a cylinder and at the
+               centre of a sphere
     """
     place, local, normal = np.zeros(6), np.zeros(6), np.zeros(3)
     for row in range(len(positions)):
@@ -117,7 +116,7 @@ def local_normal(local, kind, face, normal):
 
 @njit(cache=True, nogil=True)
 def into_primitive(ray, pose, local):
-    """Take a position (0 to 2) and a direction (3 to 5) from the world into a primitive."""
+    """Transform a position (0 to 2) and a direction (3 to 5) from the world to a primitive."""
     x, y, z = ray[0] - pose[0, 3], ray[1] - pose[1, 3], ray[2] - pose[2, 3]
     for axis in range(3):
         a, b, c = pose[0, axis], pose[1, axis], pose[2, axis]

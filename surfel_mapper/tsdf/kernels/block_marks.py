@@ -1,19 +1,19 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which blocks the rays of a range image touch.
+Mark the blocks that the rays of a range image touch.
 
-Every ray is walked from block to block, exactly, through the band about the surface. Blocks are
-marked in a cube of bits about the sensor, so that a block met by a thousand rays costs little
-and is listed once, in the order of its index.
+Every ray is traversed exactly, block by block, through the band about the surface. Blocks are
+marked in a bit cube about the sensor, so that a block on many rays costs little and is listed
+once, in the order of its index.
 
-Rays are denser than blocks where they are short. Through the band only so many are walked that
-those next to each other are about half a voxel apart. Carving, a ray is walked only from where the
-coarser ones beside it, with columns and rows of larger powers of two, are an eighth of a block
-away or end: a lidar that sees 100 m walks 6 blocks a ray instead of 40, and what is missed are
-corners of blocks, less than a quarter of a block deep, in free space.
+Near the sensor rays are denser than blocks. In the band, rays are subsampled to a spacing of half
+a voxel or more. When carving, a ray is traversed only from the range at which its coarser
+neighbours (columns and rows divisible by larger powers of two) are an eighth of a block away or
+end: a lidar with a range of 100 m traverses 6 blocks a ray instead of 40. Blocks missed that way
+are touched at their corners only, less than a quarter of a block deep, in free space.
 
-Source: Amanatides and Woo 1987 for the walk; the number of steps along each axis is known
+Source: Amanatides and Woo 1987 for the traversal; the number of steps along each axis is computed
 beforehand, so rounding can neither lose the last block nor run past it.
 """
 
@@ -22,24 +22,24 @@ import numpy as np
 
 # What rays reach, float64 m.
 BEFORE = 0
-"""How far before a surface rays matter."""
+"""Distance before a surface at which the band begins, m; BEHIND is the end behind it."""
 BEHIND = 1
 NEAR = 2
 MAX_RANGE = 3
 CARVE = 4
-"""Not 0: from the sensor on."""
+"""Not 0: rays are traversed from the sensor on."""
 ROW_FREE = 5
-"""Range up to which neighbouring rows are an eighth of a block apart."""
+"""Range up to which neighbouring rows are within an eighth of a block, m."""
 COLUMN_FREE = 6
 ROW_BAND = 7
-"""Range up to which neighbouring rows are too near to each other for each to be walked."""
+"""Range up to which rows are denser than the spacing of rays in the band, m."""
 COLUMN_BAND = 8
 NUM_REACH = 9
 
 
 @njit(cache=True, nogil=True)
 def lowest_bits(count):
-    """Return the largest power of two that divides each number from 0 on; a large one for 0."""
+    """Return the largest power of two that divides each number below count; 1e12 for 0."""
     bits = np.empty(count, np.float64)
     for number in range(count):
         bits[number] = number & -number
@@ -49,7 +49,7 @@ def lowest_bits(count):
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def covered(image, row, column, down, across, reach):
-    """Return up to where coarser rays are so near to a ray that it need not be walked, m."""
+    """Return the range up to which coarser neighbours cover a ray, m."""
     beside = above = 0.0
     if column > 0:
         coarser = np.float64(image[row, column - np.int64(across)])
@@ -66,13 +66,12 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
     Mark the blocks that rays touch.
 
     image       (rows, columns or more) float32 m
-    cosine      likewise, 1 where distances are along rays; the band is longer by 1 / cosine; or
-                no rows
+    cosine      same shape, or no rows; the band is longer by 1 / cosine
     directions  (rows, columns, 3) float32, unit vectors in the frame of the sensor
-    pose        (3, 4) float64: sensor to the cube, blocks from metres; 0 is the cube's corner
+    pose        (3, 4) float64, from m in the sensor frame to blocks from the cube's corner
     reach       (NUM_REACH,) float64
-    side        blocks along the edge of the cube, which all rays stay in
-    marks       (side^3 / 64,) int64, bit by bit, z fastest
+    side        side of the cube in blocks; all rays stay inside
+    marks       (side^3 / 64,) int64, one bit a block, z fastest
     """
     rows, columns = directions.shape[0], directions.shape[1]
     down, across = lowest_bits(rows), lowest_bits(columns)
@@ -130,10 +129,10 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def walk(origin, along, start, end, stride):
     """
-    Prepare the walk along one axis.
+    Prepare the traversal along one axis.
 
-    Returns the number of the first block, the range where the next one begins (inf if none),
-    how far a block takes, the step to the next number, and how many steps there are.
+    Returns the number of the first block, the range at which the next one begins (inf if none),
+    the range from block to block, the step of the number, and the number of steps.
     """
     first = np.floor(origin + along * start)
     last = np.floor(origin + along * end)
@@ -147,7 +146,7 @@ def walk(origin, along, start, end, stride):
 
 @njit(cache=True, nogil=True)
 def count_marks(marks):
-    """Return how many bits are set."""
+    """Return the number of set bits."""
     count = 0
     for word in marks:
         while word != 0:
@@ -159,9 +158,9 @@ def count_marks(marks):
 @njit(cache=True, nogil=True)
 def list_marks(marks, side, low, index):
     """
-    List the blocks that are marked, and take the marks away.
+    List the marked blocks and clear the marks.
 
-    low    (3,) int64, the block at the corner of the cube
+    low    (3,) int64, block at the lower corner of the cube
     index  (K, 3) int64, out: ascending
     """
     place = 0

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Find, place and remove the blocks of a TSDF in the hash table of hashing.py.
+Find, place and remove the blocks of a TSDF in the hash table of kernels/hashing.py.
 
-Every block has a row in slabs, the first of which is its head: key, version, stamp. Rows that are
-not in use form a chain through their keys, as those of surfels do.
+Every block has one row in each slab; the slab of heads holds key, version and stamp. Free rows
+form a linked list through their keys, as those of surfels do.
 """
 
 from numba import njit
@@ -26,16 +26,16 @@ from surfel_mapper.kernels.layout import KEY
 
 # Columns of a head beside KEY.
 VERSION = 1
-"""Version of the map when the block last changed; NEW or FREE where there is none."""
+"""Version of the map at the last change of the block; NEW or FREE otherwise."""
 STAMP = 2
 """Stamp of the measurement that changed it last, ns."""
 HEAD = 4
-"""Columns of a head; the last is unused: a slab has rows that divide a page."""
+"""Columns of a head; the last is unused, because rows of a slab divide a page."""
 
 NEW = -1
-"""Version of a block that was placed and has never been changed."""
+"""Version of a block that was placed but never changed."""
 FREE = -2
-"""Version of a row that is not in use."""
+"""Version of a free row."""
 
 
 @njit(cache=True, nogil=True)
@@ -43,8 +43,8 @@ def find_blocks(keys, head, table, state, rows):
     """
     Look up the row of every block.
 
-    keys  (K,) int64; negative ones are nowhere
-    rows  (K,) int64, out: row, -1 where the map has no such block
+    keys  (K,) int64; negative keys are never found
+    rows  (K,) int64, out: row, -1 for blocks not in the map
     """
     depth = state[DEPTH]
     for place in range(len(keys)):
@@ -54,14 +54,14 @@ def find_blocks(keys, head, table, state, rows):
 @njit(cache=True, nogil=True)
 def place_blocks(keys, head, table, state, limit, start, rows):
     """
-    Look up the row of every block from start on, placing those that are missing.
+    Look up the row of every block from start on; place missing blocks.
 
     keys   (K,) int64
-    limit  no block is placed beyond so many
-    rows   (K,) int64, out: row, -1 where there was no place
+    limit  largest number of blocks
+    rows   (K,) int64, out: row, -1 for blocks beyond the limit
 
-    Returns how many are done; fewer than K where rows, segments or the directory are too small:
-    make room and go on from there.
+    Returns the number of blocks done; fewer than K if rows, segments or the directory are full:
+    make room and continue from there.
     """
     depth = state[DEPTH]
     for place in range(start, len(keys)):
@@ -91,7 +91,7 @@ def place_blocks(keys, head, table, state, limit, start, rows):
 
 @njit(cache=True, nogil=True)
 def remove_blocks(rows, head, table, state):
-    """Take blocks out of the table and put their rows, (K,) int64, into the chain of free ones."""
+    """Remove the blocks of rows, (K,) int64, from the table and free the rows."""
     for place in range(len(rows)):
         row = np.int64(rows[place])
         remove_row(head[row, KEY], row, table, state[DEPTH])

@@ -1,12 +1,24 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Masks, colours and stamps of the voxels of a block, where there are any.
+Masks, colours, labels and stamps of the voxels of a block.
 
-A voxel takes from an image what it took its range from: the four pixels that were mixed, with the
-same shares, or the one nearest. Colours are mixed; masks are voted on. A voxel is inside the band
-if its signed distance is less than the truncation; one that is just -tau stands for the extra
-band behind, and one that is tau is free.
+A voxel samples these images at the pixels of its range: four pixels with the same interpolation
+weights, or the nearest one. Colours are interpolated; masks and labels are voted on. A voxel is
+inside the band if its signed distance is below the truncation tau; -tau also stands for the extra
+band behind it, and tau for free space.
+
+Votes for labels of a voxel, ``votes`` (V, N) float32:
+
+    MAJORITY  V = labels      number of observations of each label
+    FIRST_K   V = 2 k         label + 1 (0: empty) and weight of each slot, the first k labels seen
+    SINGLE    V = 2           label + 1 and its lead: Boyer and Moore's majority vote, weighted
+    BINARY    V = 2           number of observations of label 0, and of other labels
+
+A label is stored as float32, exact up to 2^24. Label -1 means unknown.
+
+MAJORITY equals adding log-likelihoods if every label but the observed one gets the same
+likelihood: differences are those of the counts times log(c / (1 - c)), c the confidence.
 """
 
 from numba import njit
@@ -17,12 +29,12 @@ _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
 
 SKIP = np.float32(-1e30)
-"""Signed distance of a voxel that is not observed."""
+"""Signed distance of voxels that are not observed."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def pixel(u, v, mixed):
-    """Return column, row and the shares to the right and below of the pixels of a voxel."""
+    """Return column and row of the upper left pixel, and the weights to the right and below."""
     right, below = u + _ONE, v + _ONE
     i, j = np.int64(right), np.int64(below)
     du, dv = right - np.float32(i), below - np.float32(j)
@@ -34,10 +46,10 @@ def pixel(u, v, mixed):
 @njit(cache=True, nogil=True, error_model='numpy')
 def apply_mask(mask, tau, u, v, mixed, signed):
     """
-    Leave out the voxels of masked pixels unless they are free; return how many.
+    Skip the voxels of masked pixels unless they are free; return their number.
 
     mask    (rows, columns) uint8, 1 where masked
-    signed  (N,) float32 m, SKIP where a voxel is left out
+    signed  (N,) float32 m, in and out; SKIP for skipped voxels
     """
     left_out = 0
     for n in range(len(signed)):
@@ -58,7 +70,7 @@ def apply_mask(mask, tau, u, v, mixed, signed):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def all_known(alpha, mixed):
-    """Return whether the first of (2, 2) pixels, or all where they are mixed, are not 0."""
+    """Return whether the first of (2, 2) pixels, or all four if mixed, are not 0."""
     if mixed == 0:
         return alpha[0, 0] != 0
     return alpha[0, 0] != 0 and alpha[0, 1] != 0 and alpha[1, 0] != 0 and alpha[1, 1] != 0
@@ -67,7 +79,7 @@ def all_known(alpha, mixed):
 @njit(cache=True, nogil=True, error_model='numpy')
 def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
     """
-    Take the colours of the image into the mean colours of the band, in place.
+    Fuse the colours of the image into the mean colours of voxels in the band, in place.
 
     image   (rows, columns, 3 or 4) uint8; pixels whose fourth channel is 0 have no colour
     color   (4, N) float32: red, green, blue, and their weight
@@ -96,11 +108,11 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
 @njit(cache=True, nogil=True, error_model='numpy')
 def fuse_stamps(stamp, weight, total, stamps):
     """
-    Note when each voxel was observed.
+    Record the first and last stamp of each observed voxel.
 
     stamp   int64 ns
     weight  (N,) float32, of this measurement
-    total   (N,) float32, of those before
+    total   (N,) float32, of earlier measurements
     stamps  (2, N) int64 ns: first, last
     """
     for n in range(len(weight)):
@@ -123,10 +135,10 @@ _ZERO = np.float32(0.0)
 @njit(cache=True, nogil=True, error_model='numpy')
 def vote_labels(image, tau, u, v, mixed, signed, label):
     """
-    Find the label of every voxel of the band: of the pixels mixed, that with the largest share.
+    Find the label of every voxel in the band: that of the largest interpolation weight.
 
     image  (rows, columns) int32
-    label  (N,) int32, out; -1 where there is none; the smaller one on a tie
+    label  (N,) int32, out; -1 for unknown; the smaller one on a tie
     """
     names, shares = np.empty(4, np.int32), np.empty(4, np.float32)
     for n in range(len(signed)):
@@ -154,7 +166,7 @@ def vote_labels(image, tau, u, v, mixed, signed, label):
 @njit(cache=True, nogil=True, error_model='numpy')
 def keep_labels(wanted, tau, label, signed):
     """
-    Leave out the voxels of the extra band that are not of certain labels; return how many.
+    Skip the voxels of the extra band without a wanted label; return their number.
 
     wanted  (L,) int32
     """
@@ -174,10 +186,10 @@ def keep_labels(wanted, tau, label, signed):
 @njit(cache=True, nogil=True, error_model='numpy')
 def fuse_labels(semantics, tau, skip_extra, label, signed, weight, votes):
     """
-    Take the labels of a measurement into those of a block; return how many found no slot.
+    Fuse the labels of a measurement into the votes of a block; return how many found no slot.
 
     label, signed, weight  (N,)
-    votes                  (V, N) float32, see above
+    votes                  (V, N) float32, see the module docstring
     """
     overflow = 0
     for n in range(len(label)):
@@ -210,7 +222,7 @@ def vote_slot(name, weight, votes, n):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def vote_single(name, weight, votes, n):
-    """Let a label gain on the one kept, or take its place."""
+    """Add weight to the stored label, or reduce its lead; a larger weight replaces it."""
     if votes[0, n] == name:
         votes[1, n] += weight
     elif weight >= votes[1, n]:

@@ -3,14 +3,14 @@
 """
 Fuse a range image into blocks of a truncated signed distance field.
 
-Every voxel of a block is projected into the image, not every pixel into the voxels: no voxel is
-written twice, so blocks can be divided among threads and the result does not depend on how many
-there are. A block is done in passes over all of its voxels, each a plain loop over a few rows of
-float32, which the compiler turns into vector instructions; only the look-up in the image is done
-voxel by voxel. The rows of one block stay in the first cache.
+Voxels are projected into the image, not pixels into the voxels: each voxel is written once, so
+blocks can be divided among threads and the result does not depend on their number. A block is
+processed in passes over all of its voxels, plain loops over a few rows of float32 that compile to
+vector instructions; only the look-up in the image is scalar. The rows of one block fit the L1
+cache.
 
 The field of a block is two rows of float32: the distance, positive in front of a surface and
-negative behind it, and the weight, 0 where a voxel was never observed.
+negative behind it, and the weight, 0 for voxels never observed.
 """
 
 from numba import njit
@@ -53,21 +53,21 @@ def integrate_blocks(
     rows, corners, offsets, field, sensor, images, settings, modes, channels, observed
 ):
     """
-    Fuse a range image into blocks; return how many labels found no slot.
+    Fuse a range image into blocks; return the number of labels without a slot.
 
     rows      (K,) int64, row of each block
     corners   (K, 3) float32 m, centre of the first voxel of each block, in the sensor's frame
-    offsets   (3, N) float32 m, from there to every voxel, x fastest
+    offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations), see kernels/projection.py
     images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
-              subtract, fuse_color, vote_labels, apply_mask; those that are missing have no rows
+              subtract, fuse_color, vote_labels, apply_mask; missing images have no rows
     settings  (NUM_SETTINGS,) float32
     modes     (interpolation, power): weights fall by depth^-(2 power)
     channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
-              blocks, none where they are not kept; how labels are fused; labels that the extra
-              band is for, none for all; whether it is for distances alone; the stamp, ns
-    observed  (K,) int64, out: how many voxels of each block were fused
+              blocks, no rows for channels not kept; kind of semantics; labels of the extra band,
+              empty for all; whether the extra band has distances only; the stamp, ns
+    observed  (K,) int64, out: number of voxels fused in each block
     """
     num_voxels = offsets.shape[1]
     scratch = np.empty((13, num_voxels), np.float32)
@@ -132,14 +132,14 @@ def subtract(value, distance, factor, settings, signed):
     for n in range(len(value)):
         range_m, d = abs(value[n]), distance[n]
         s = (range_m - d) * factor[n]
-        # A pixel that clears knows nothing beyond the reach of the sensor.
+        # A clearing pixel says nothing beyond the range of the sensor.
         seen = (range_m > _ZERO) & (s >= -tau - extra) & ((range_m <= reach) | (d <= reach))
         signed[n] = min(max(s, -tau), tau) if seen else SKIP
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def count_observed(signed):
-    """Return how many voxels are observed."""
+    """Return the number of observed voxels."""
     count = np.int32(0)
     for n in range(len(signed)):
         count += np.int32(signed[n] > SKIP)
@@ -148,7 +148,7 @@ def count_observed(signed):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def flag_mixed(value, mixed):
-    """Find which voxels had four pixels mixed."""
+    """Flag the voxels whose range was interpolated from four pixels."""
     for n in range(len(value)):
         mixed[n] = value[n] > _ZERO
 
@@ -156,7 +156,7 @@ def flag_mixed(value, mixed):
 @njit(cache=True, nogil=True, error_model='numpy')
 def weigh(depth, signed, settings, power, weight):
     """
-    Find the weight of every measurement, 0 for a voxel that is not observed.
+    Compute the weight of every measurement, 0 for voxels not observed.
 
     depth, signed, weight  (N,) float32; weight is written
     """
@@ -185,12 +185,12 @@ def weigh(depth, signed, settings, power, weight):
 @njit(cache=True, nogil=True, error_model='numpy')
 def fuse(signed, weight, max_weight, mean, total):
     """
-    Take weighted measurements into the mean distance and the total weight, in place.
+    Fuse weighted measurements into the mean distance and the total weight, in place.
 
     signed, weight, mean, total  (N,) float32
     """
     for n in range(len(mean)):
-        # So written, a first measurement and one equal to the mean leave no rounding.
+        # In this form a first measurement, or one equal to the mean, is exact.
         gain = weight[n] / (total[n] + weight[n])
         value = mean[n] + (signed[n] - mean[n]) * gain
         mean[n] = value if weight[n] > _ZERO else mean[n]

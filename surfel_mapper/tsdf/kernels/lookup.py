@@ -3,9 +3,9 @@
 """
 Look voxels up in a range image.
 
-The four pixels about a voxel are fetched one by one; all else is plain loops that the compiler
-turns into vector instructions: each writes one array and reads few, and chooses without branches.
-A border of zeros, which say nothing, stands in for every test of bounds.
+The four pixels about a voxel are gathered one by one; all else is plain loops that compile to
+vector instructions: each writes one array and selects without branches. A border of zeros, which
+mean unknown, replaces tests of bounds.
 """
 
 from numba import njit
@@ -19,15 +19,15 @@ EXTRA = 1
 MIN_RANGE = 2
 MAX_RANGE = 3
 LIMIT = 4
-"""No voxel farther than this is observed, m."""
+"""Largest distance of an observed voxel from the sensor, m."""
 MAX_DIFFERENCE = 5
 MAX_DIFFERENCE_RATIO = 6
 MAX_OFFSET = 7
-"""Largest distance from the ray of the nearest pixel, m; 0: any."""
+"""Largest distance from the ray of the nearest pixel, m; 0 means no limit."""
 COLUMN_RAD = 8
 WEIGHT = 9
 DROPOFF = 10
-"""How far behind the surface weights begin to fall, m; not less than TAU: never."""
+"""Distance behind the surface at which weights begin to fall, m; TAU or more: never."""
 MIN_WEIGHT = 11
 MAX_WEIGHT = 12
 NUM_SETTINGS = 13
@@ -53,7 +53,7 @@ def locate(distance, u, v, stride, settings, place):
 
     u, v    (N,) float32, from -1 on, or u is OUTSIDE
     stride  columns of the image, border included
-    place   (N,) int32, out: number of the pixel; 0, in the border, if there is none in reach
+    place   (N,) int32, out: number of the pixel; 0, in the border, for voxels out of view
     """
     near, limit = settings[MIN_RANGE], settings[LIMIT]
     stride = np.int32(stride)
@@ -80,10 +80,9 @@ def gather(image, stride, place, pixels):
 @njit(cache=True, nogil=True, error_model='numpy')
 def mix(q00, q10, q01, q11, u, v, method, settings, value):
     """
-    Find the range at every voxel's place in the image: mixed, or that of the nearest pixel.
+    Find the range at every voxel: interpolated, or that of the nearest pixel.
 
-    value  (N,) float32, out: range if four pixels were mixed; -range if one was taken; 0 if there
-           is none
+    value  (N,) float32, out: range if interpolated; -range if of the nearest pixel; 0 if unknown
     """
     reach, ratio = settings[MAX_RANGE], settings[MAX_DIFFERENCE_RATIO]
     allowed = _LARGE if method == BILINEAR else settings[MAX_DIFFERENCE]
@@ -100,7 +99,7 @@ def mix(q00, q10, q01, q11, u, v, method, settings, value):
         lower_near = q01[n] if du < _HALF else q11[n]
         nearest = upper_near if dv < _HALF else lower_near
         alike = (high - low <= allowed) | (high - low <= ratio * low)
-        # A pixel that clears is not mixed with one that measured something.
+        # Clearing pixels are not interpolated with measurements.
         alike = alike & (low > _ZERO) & ((high <= reach) | (low > reach))
         value[n] = upper + dv * (lower - upper) if alike else -nearest
 
@@ -119,7 +118,7 @@ def row_gaps(kind, parameters, elevations, v, gap):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def drop_far(x, y, u, v, distance, gap, settings, value):
-    """Leave out voxels that took the range of one pixel too far from its ray."""
+    """Skip voxels with the range of a single pixel whose ray is too far."""
     column_rad, most = settings[COLUMN_RAD], settings[MAX_OFFSET] * settings[MAX_OFFSET]
     for n in range(len(value)):
         right, below = u[n] + _ONE, v[n] + _ONE
@@ -134,9 +133,9 @@ def drop_far(x, y, u, v, distance, gap, settings, value):
 @njit(cache=True, nogil=True, error_model='numpy')
 def slant(cosine, stride, place, u, v, factor):
     """
-    Find what to multiply distances along the ray with: 1, or the cosine at the nearest pixel.
+    Find the factor of distances along the ray: 1, or the cosine at the nearest pixel.
 
-    place   (N,) int32, number of the pixel above and left; in their stead, out, of the nearest
+    place   (N,) int32, in: number of the upper left pixel; out: of the nearest one
     cosine  (rows, columns) float32 with its border, or no rows
     factor  (N,) float32, out
     """

@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Marching cubes over blocks of voxels: where the distance changes its sign, in triangles.
+Marching cubes over blocks of voxels.
 
-The table of cases is made, not copied: on each face of a cube a line runs around every run of
-inside corners, the lines of the six faces close to loops, and every loop becomes a fan. What
-lines a face gets depends on its four corners alone, so that cubes on both sides of it agree and
-the surface has no cracks, in ambiguous cases neither. Corner c of a cube lies at
-(c & 1, c >> 1 & 1, c >> 2). Edge e = 3 c + axis begins at corner c and is named for the voxel
-there, which makes vertices of different cubes the same.
+The table of cases is computed: on each face of a cube a line separates every run of inside
+corners, the lines of the six faces form loops, and every loop becomes a fan of triangles. The
+lines of a face depend on its four corners only, so neighbouring cubes agree and the surface has no
+cracks, ambiguous cases included. Corner c of a cube lies at (c & 1, c >> 1 & 1, c >> 2). Edge
+e = 3 c + axis begins at corner c and is identified by the voxel there, so that cubes share
+vertices.
 
-A cube may be refused for being torn: where the field is free on one side of an edge and deep
-behind a surface on the other, nothing was seen between, it is where the shadow of a thing ends.
+Torn cubes can be skipped: an edge from free space to deep behind a surface crosses no surface but
+the boundary of an object's shadow.
 
 Source: Lorensen and Cline 1987; the rule for ambiguous faces keeps inside corners apart.
 """
@@ -70,7 +70,7 @@ def fan_of(loop):
 
 
 def num_on_faces(fan):
-    """Return how many sides within a fan lie on a face, where the next cube may have one too."""
+    """Return the number of diagonals of a fan that lie on a face of the cube."""
     apex, diagonals = fan[0][0], [triangle[1] for triangle in fan[1:]]
     return sum(
         {apex, end} <= {edge_between(face[place], face[place - 1]) for place in range(4)}
@@ -82,24 +82,24 @@ def num_on_faces(fan):
 CASES = [triangles_of(case) for case in range(256)]
 MOST = max(len(triangles) for triangles in CASES)
 TRIANGLES = np.full((256, MOST, 3), -1, np.int8)
-"""Edges of the triangles of every case; -1 behind the last."""
+"""Edges of the triangles of every case, padded with -1."""
 NUM_TRIANGLES = np.array([len(triangles) for triangles in CASES])
 for _case, _triangles in enumerate(CASES):
     if _triangles:
         TRIANGLES[_case, : len(_triangles)] = _triangles
 
 FLAT = 1e-6
-"""Where two distances differ by less, the vertex is halfway between."""
+"""For distances that differ by at most this, the vertex is the midpoint of the edge."""
 
 
 @njit(cache=True, nogil=True)
 def pad(neighbours, side, values, missing, padded):
     """
-    Copy a channel of a block with the first layer of those above.
+    Copy a channel of a block, with the first layer of the blocks above.
 
-    neighbours  (8,) int64, row of the block itself and of those above; -1 where missing
+    neighbours  (8,) int64, rows of the block and of those above; -1 if missing
     values      (R, N) float32, the channel; N = side^3
-    missing     what is put where there is no block
+    missing     value for missing blocks
     padded      (side + 1, side + 1, side + 1) float32, out, z first
     """
     for k in range(side + 1):
@@ -114,9 +114,9 @@ def pad(neighbours, side, values, missing, padded):
 @njit(cache=True, nogil=True)
 def cube_case(distance, weight, i, j, k, limits):
     """
-    Return the case of a cube; -1 where a corner was not observed well enough or it is torn.
+    Return the case of a cube; -1 if the weight of a corner is too small or the cube is torn.
 
-    limits  (least weight of a corner, largest step along an edge through the surface in m)
+    limits  (smallest weight of a corner, largest step along an edge across the surface, m)
     """
     min_weight, max_step_m = limits
     case = 0
@@ -166,13 +166,13 @@ def count_triangles(neighbours, side, field, limits, counts):
 @njit(cache=True, nogil=True)
 def march(neighbours, index, side, field, limits, starts, edges, places):
     """
-    Write the triangles of every block, each corner as the edge it is on and the place there.
+    Write the triangles of every block; a corner is an edge and a position along it.
 
     neighbours  (K, 8) int64
     index       (K, 3) int64, of the blocks
-    starts      (K,) int64, where the triangles of each block begin
-    edges       (T, 3, 4) int64, out: voxel index of the edge's begin (3), and its axis
-    places      (T, 3) float64, out: where on the edge, in [0, 1]
+    starts      (K,) int64, number of the first triangle of each block
+    edges       (T, 3, 4) int64, out: voxel index at the start of the edge (3), and its axis
+    places      (T, 3) float64, out: position along the edge, in [0, 1]
     """
     distance = np.empty((side + 1, side + 1, side + 1), np.float32)
     weight = np.empty((side + 1, side + 1, side + 1), np.float32)

@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Read the field at points: distance and gradient between eight voxels, state of the nearest one.
+Read the field at points: interpolated distance and gradient, state of the voxel.
 
-Blocks are found by hash; points next to each other mostly ask for the same block, which is
-remembered.
+Blocks are found by hash; the last block is cached, because neighbouring points mostly share it.
 """
 
 from numba import njit
@@ -20,7 +19,7 @@ OCCUPIED = 2
 
 @njit(cache=True, nogil=True)
 def block_row(a, b, c, head, table, depth):
-    """Return the row of a block, -1 where the map has none."""
+    """Return the row of a block, -1 if the map does not contain it."""
     low, high = -INDEX_OFFSET, INDEX_OFFSET
     if a < low or b < low or c < low or a >= high or b >= high or c >= high:
         return np.int64(-1)
@@ -31,11 +30,11 @@ def block_row(a, b, c, head, table, depth):
 @njit(cache=True, nogil=True)
 def find_voxel(i, j, k, bits, recent, head, table, depth):
     """
-    Return row and number of a voxel; row -1 where the map has no such block.
+    Return row and number of a voxel; row -1 if the map does not contain its block.
 
     i, j, k  int64, index of the voxel in the map
     bits     a block has 2^bits voxels a side
-    recent   (4,) int64: the block asked for last and its row, in and out
+    recent   (4,) int64, in and out: index and row of the last block
     """
     a, b, c = i >> bits, j >> bits, k >> bits
     if a != recent[0] or b != recent[1] or c != recent[2]:
@@ -50,12 +49,12 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
     """
     Interpolate the distance at points and its gradient.
 
-    points    (P, 3) float64, voxels; those not finite are nowhere
+    points    (P, 3) float64, in voxels; non-finite points are unknown
     scale     float64, voxels a metre
-    least     float32, what each of the eight voxels has to weigh
+    least     float32, smallest weight of each of the eight voxels
     field     (R, 2, N) float32
-    distance  (P,) float32 m, out; nan where a voxel is missing
-    gradient  (P, 3) float32, out; nan likewise
+    distance  (P,) float32 m, out; nan if a voxel is missing
+    gradient  (P, 3) float32, out; nan if a voxel is missing
     """
     recent = np.array([1 << 40, 0, 0, -1])
     corner = np.empty(8)
@@ -102,10 +101,10 @@ def sample(points, scale, bits, least, field, head, table, state, distance, grad
 @njit(cache=True, nogil=True)
 def classify(points, bits, least, occupied, field, head, table, state, found):
     """
-    Say of each point whether its voxel is unknown, free or occupied.
+    Classify the voxel of each point as unknown, free or occupied.
 
     points    (P, 3) float64, voxels
-    occupied  float32 m, distances up to this are
+    occupied  float32 m, largest distance of an occupied voxel
     found     (P,) uint8, out
     """
     recent = np.array([1 << 40, 0, 0, -1])

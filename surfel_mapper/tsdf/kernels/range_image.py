@@ -3,9 +3,9 @@
 """
 Range images from depth images and from points.
 
-A range image holds the length of each ray in metres, float32. 0 says that nothing is known. What
-is farther than the sensor reaches says that there is nothing up to there: such a pixel holds one
-finite value beyond max_range, `clearing`, so that no difference of infinities ever arises.
+A range image holds the length of each ray in metres, float32; 0 means unknown. Returns beyond the
+range of the sensor mean free space up to there: such pixels hold `clearing`, a finite value beyond
+max_range, which avoids differences of infinities.
 """
 
 from numba import njit
@@ -14,25 +14,25 @@ import numpy as np
 from surfel_mapper.kernels.projection import project
 
 LEAST_COSINE = np.float32(0.35)
-"""Rays that meet a surface at less than 20 deg are taken as if they met it so."""
+"""Smallest cosine: angles of incidence beyond 70 deg count as 70 deg."""
 
 GENTLE = 0.4
-"""Slopes up to this are believed from one neighbour."""
+"""Slopes up to this need one neighbour only."""
 
 STRAIGHT = 0.1
-"""Steeper ones where the other neighbour is off by at most this share of the rise."""
+"""Steeper slopes need a second neighbour within this share of the rise from the line."""
 
 MOST_PIXELS = 16.0
-"""Slopes are taken between pixels at most so far apart."""
+"""Largest step between the pixels of a slope."""
 
 CHUNK = 1024
-"""Points projected at once; their numbers stay in the first cache."""
+"""Points projected at once: the scratch arrays fit the L1 cache."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def range_value(range_m, limits):
     """
-    Return what a pixel holds for a measured range: 0, the range, or clearing.
+    Return the value of a pixel for a measured range: 0, the range, or clearing.
 
     limits  (3,) float32 m: min_range, max_range, clearing
     """
@@ -46,12 +46,12 @@ def from_depth(depth, scale, ray_length, limits, image):
     """
     Turn depths into ranges; return (largest, used).
 
-    depth       (rows, columns) float32, float64 or uint16; scale float32 makes metres of it
+    depth       (rows, columns) float32, float64 or uint16; scale float32, metres of one unit
     ray_length  (rows, columns) float32, range at depth 1
     image       (rows, columns or more) float32 m, out
 
-    largest is the largest range, max_range where a pixel clears; used counts the pixels that say
-    something.
+    largest is the largest range, max_range if a pixel clears; used counts the pixels that are not
+    unknown.
     """
     rows, columns = depth.shape
     largest, used = np.float32(0.0), 0
@@ -68,14 +68,15 @@ def from_depth(depth, scale, ray_length, limits, image):
 @njit(cache=True, nogil=True, error_model='numpy')
 def from_points(points, sensor, limits, image, index):
     """
-    Put points into the pixels nearest to them, the nearest point first; return (largest, used).
+    Project points to their nearest pixels, which keep the closest; return (largest, used).
 
-    points  (N, 3) float32 or float64 m, in the frame of the sensor; those not finite are left out
+    points  (N, 3) float32 or float64 m, in the frame of the sensor; non-finite points are skipped
     sensor  (kind, parameters, elevations), see kernels/projection.py
-    image   (rows, columns or one more) float32 m, in: 0; out, a first column repeated at the end
-    index   (rows, columns) int32, out where a pixel is filled: the point it is from
+    image   (rows, columns or one more) float32 m, in: 0; out: ranges, with the first column
+            repeated at the end if there is one more
+    index   (rows, columns) int32, out: number of the point of each filled pixel
 
-    largest is the largest range, max_range where a pixel clears; used counts the points in view.
+    largest is the largest range, max_range if a pixel clears; used counts the points in view.
     """
     rows, columns = np.int64(index.shape[0]), np.int64(index.shape[1])
     kind, parameters, elevations = sensor
@@ -93,7 +94,7 @@ def from_points(points, sensor, limits, image, index):
         project(x, y, z, kind, parameters, elevations, distance, u, v)
         for n in range(count):
             value = range_value(distance[n], limits)
-            # Not so for nan and inf, whose column may be anything.
+            # False for nan and inf, whose column is arbitrary.
             if value == 0.0 or not (u[n] >= np.float32(-0.5) and distance[n] < np.inf):
                 continue
             row = np.int64(np.floor(v[n] + np.float32(0.5)))
@@ -116,14 +117,14 @@ def from_points(points, sensor, limits, image, index):
 @njit(cache=True, nogil=True, error_model='numpy')
 def cosines(image, directions, pitch, reach_m, max_range, cosine):
     """
-    Find the cosine of the angle between each ray and the normal of the surface it meets.
+    Estimate the cosine of the angle of incidence of each ray.
 
-    image       (rows, columns or one more) float32 m; all around with one more
+    image       (rows, columns or one more) float32 m; one more for a full circle
     directions  (rows, columns, 3) float32
     pitch       (row, column) float64 rad, between neighbours
-    reach_m     float64, slopes are taken between points about so far apart
+    reach_m     float64, distance between the points of a slope
     max_range   float32 m, of the sensor
-    cosine      (rows, columns or one more) float32, out: in [LEAST_COSINE, 1]; 1 if not known
+    cosine      (rows, columns or one more) float32, out: in [LEAST_COSINE, 1]; 1 if unknown
     """
     rows, columns = np.int64(directions.shape[0]), np.int64(directions.shape[1])
     around = image.shape[1] > columns
@@ -169,7 +170,7 @@ def cosines(image, directions, pitch, reach_m, max_range, cosine):
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def steps(pixels):
-    """Return a number of pixels, whole and within bounds."""
+    """Return a step in pixels, rounded and within bounds."""
     return np.int64(min(max(pixels + 0.5, 1.0), MOST_PIXELS))
 
 
@@ -185,7 +186,7 @@ def unit(directions, row, column):
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def known(image, row, column, columns, max_range):
-    """Return the range of a pixel, 0 if it has none or lies beyond the image."""
+    """Return the range of a pixel, 0 if unknown or outside of the image."""
     if row < 0 or column < 0 or row >= image.shape[0] or column >= columns:
         return 0.0
     range_m = np.float64(image[row, column])
@@ -195,13 +196,13 @@ def known(image, row, column, columns, max_range):
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
 def slope(first, middle, second, gap_m):
     """
-    Return which of two neighbours is on a plane with a pixel, -1 or 1; 0 for neither.
+    Return which of two neighbours lies on a plane with the pixel, -1 or 1; 0 for neither.
 
-    first, middle, second  float64 m, ranges; 0 where there is none
-    gap_m                  how far apart they are across the ray
+    first, middle, second  float64 m, ranges; 0 for unknown
+    gap_m                  float64, distance between them across the ray
 
-    The one of the more similar range counts, so that the edge of a thing does not pass for its
-    slope; a steep slope only if the other goes on with it. Along a plane the inverse of the range
+    The neighbour of more similar range is taken, so that the edge of an object is not mistaken for
+    a slope; a steep slope must continue on the other side. Along a plane the inverse of the range
     is linear.
     """
     before = abs(first - middle) if first > 0.0 else np.inf

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Ellipses painted over each other into an image.
+Paint ellipses over an image.
 
-A library of plots takes 20 microseconds for each, so a map of a million surfels would be drawn
-for longer than it was mapped; this takes 0.3 for a few pixels.
+matplotlib takes 20 microseconds for an ellipse, so drawing a map of a million surfels would take
+longer than mapping; this takes 0.3 for an ellipse of a few pixels.
 """
 
 import math
@@ -15,15 +15,15 @@ from numba import njit
 @njit(cache=True, nogil=True)
 def paint_discs(discs, colours, image):
     """
-    Paint ellipses over an image, the last on top, their rims smoothed over a pixel.
+    Paint ellipses over an image, the last on top, with anti-aliased rims.
 
     discs    (K, 5) float64, px: column and row of the centre, half its length and half its
              width, and the angle of its length from the columns towards the rows, rad
     colours  (K, 3) float32
     image    (H, W, 3) float32; the centre of the first pixel is at 0, 0
 
-    How much of a pixel is covered is told by how far its centre is from the rim, along the line
-    through the centre of the ellipse.
+    The coverage of a pixel is the distance of its centre from the rim, along the line through the
+    centre of the ellipse.
     """
     height, width = image.shape[0], image.shape[1]
     for d in range(len(discs)):

@@ -83,7 +83,7 @@ def test_the_nearest_surface_is_that_of_the_twin(seed):
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_what_a_ray_hits_is_nearest_to_where_it_ends_and_has_the_same_normal(seed):
+def test_surface_hit_is_the_nearest_to_the_end_of_the_ray(seed):
     world = random_world(seed)
     origins, ahead = random_rays(300 + seed)
     range_m, surface, normal = world.raycast(origins, ahead)

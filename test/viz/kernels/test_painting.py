@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Painted ellipses cover what they should, against a twin that looks at every pixel."""
+"""Painted ellipses equal those of a twin that computes the coverage of every pixel."""
 
 import math
 
@@ -66,7 +66,7 @@ def test_the_length_runs_at_its_angle_and_the_last_is_on_top(call):
 
 
 @both
-def test_what_lies_outside_changes_nothing(call):
+def test_ellipses_outside_of_the_image_change_nothing(call):
     image = white()
     far = [[-50.0, 5.0], [90.0, 5.0], [5.0, -50.0], [5.0, 1e9]]
     discs = np.array([[*place, 3.0, 2.0, 0.3] for place in far])
