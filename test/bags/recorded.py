@@ -34,7 +34,7 @@ ROS1.register(get_types_from_msg('geometry_msgs/TransformStamped[] transforms', 
 
 
 class Entries(list):
-    """What to write, made with the classes of one ROS version."""
+    """Messages to write, made with the classes of one ROS version."""
 
     def __init__(self, store=ROS2):
         self.store = store

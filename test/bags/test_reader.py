@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags of every kind read the same; damaged and foolish ones are refused with a clear word."""
+"""Bags of every kind read the same; damaged ones are refused with a clear error."""
 
 from contextlib import suppress
 import logging
@@ -54,7 +54,7 @@ def assert_is_the_drive(found):
 
 
 @pytest.mark.parametrize(('storage', 'compression'), KINDS)
-def test_a_rosbag2_directory_yields_what_was_written(tmp_path, storage, compression):
+def test_a_rosbag2_directory_yields_the_written_messages(tmp_path, storage, compression):
     path = write_rosbag2(tmp_path / 'drive', drive(), storage, compression)
 
     assert_is_the_drive(read(path))
@@ -68,12 +68,12 @@ def test_the_only_file_of_a_directory_reads_like_the_directory(tmp_path, storage
     assert_is_the_drive(read(file))
 
 
-def test_a_rosbag2_directory_may_be_called_as_a_ros1_bag(tmp_path):
+def test_a_rosbag2_directory_may_have_the_suffix_of_ros1(tmp_path):
     assert_is_the_drive(read(write_rosbag2(tmp_path / 'drive.bag', drive())))
 
 
 @pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
-def test_a_ros1_bag_yields_what_was_written(tmp_path, compression):
+def test_a_ros1_bag_yields_the_written_messages(tmp_path, compression):
     path = write_ros1(tmp_path / 'drive.bag', drive(ROS1), compression)
 
     assert_is_the_drive(read(path))
@@ -119,7 +119,7 @@ def test_record_times_are_stated_to_the_nanosecond(tmp_path):
         assert reader.end_ns == recorded.START_NS + (NUM_SCANS - 1) * recorded.PERIOD_NS + 1000
 
 
-def test_a_topic_is_chosen_by_name_else_default_else_for_being_alone(tmp_path):
+def test_a_topic_is_chosen_by_name_else_default_else_as_the_only_one(tmp_path):
     messages = drive()
     messages.odometry('/wheel_odom', messages[-1][2] + 1, (0.0, 0.0, 0.0))
     with BagReader(write_rosbag2(tmp_path / 'drive', messages)) as reader:
@@ -147,7 +147,7 @@ def test_a_choice_that_cannot_be_made_names_the_candidates(tmp_path, type_, name
         reader.topics.choose(type_, name)
 
 
-def test_a_path_that_is_no_bag_is_refused(tmp_path):
+def test_a_path_without_a_bag_is_refused(tmp_path):
     (tmp_path / 'notes.txt').write_text('no bag')
     (tmp_path / 'empty').mkdir()
     for name, says in (
@@ -184,7 +184,7 @@ def test_a_ros1_bag_without_messages_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_bytes_overwritten_in_the_middle_never_make_anything_but_a_bag_error(tmp_path, storage):
+def test_overwritten_bytes_give_messages_or_a_bag_error(tmp_path, storage):
     path = write_rosbag2(tmp_path / 'drive', drive(num_scans=2), storage)
     (file,) = (file for file in path.iterdir() if file.name != 'metadata.yaml')
     content = file.read_bytes()
@@ -218,7 +218,7 @@ def test_damaged_metadata_is_refused(tmp_path, content, says):
         BagReader(path)
 
 
-def test_metadata_that_describes_a_topic_otherwise_than_the_file_loses_no_message(tmp_path):
+def test_no_message_is_lost_if_metadata_and_file_describe_a_topic_differently(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive())
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('RIHS01_', 'RIHS01_0'))
@@ -229,7 +229,7 @@ def test_metadata_that_describes_a_topic_otherwise_than_the_file_loses_no_messag
 NOTHING_READ = r'fewer messages than its index states: .*/pose 0 of 6'
 
 
-def test_a_topic_of_which_nothing_is_read_is_an_error(tmp_path):
+def test_a_topic_without_any_message_read_is_an_error(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
     with sqlite3.connect(path / 'drive.db3') as database:
         for raw in raw_of(path, '/pose'):
@@ -244,7 +244,7 @@ def raw_of(path, topic):
         return [bytes(message.raw) for message in reader.messages([topic])]
 
 
-def test_compressed_messages_of_a_topic_described_otherwise_are_read(tmp_path):
+def test_compressed_messages_of_a_topic_described_differently_are_read(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3', 'message')
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace('RIHS01_', 'RIHS01_0'))
@@ -252,7 +252,7 @@ def test_compressed_messages_of_a_topic_described_otherwise_are_read(tmp_path):
     assert_is_the_drive(read(path))
 
 
-def test_fewer_messages_than_stated_are_said(tmp_path, caplog):
+def test_fewer_messages_than_the_index_states_give_a_warning(tmp_path, caplog):
     path = write_rosbag2(tmp_path / 'drive', drive())
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace(f'count: {NUM_SCANS}\n', 'count: 50\n'))

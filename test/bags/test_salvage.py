@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Of a bag that ends too early all that is whole is read, and a warning says where it ends.
+All whole messages of a truncated bag are read, and a warning states the offset of the cut.
 
 (Longer than other files: four formats are cut in the same places.)
 """
@@ -53,7 +53,7 @@ def read_raws(path):
 
 @pytest.mark.parametrize('keep', KEPT)
 @pytest.mark.parametrize(('storage', 'compression'), KINDS)
-def test_of_a_file_cut_off_anywhere_what_is_whole_is_read(
+def test_the_whole_messages_of_a_truncated_file_are_read(
     tmp_path, caplog, storage, compression, keep
 ):
     written = raws(drive())
@@ -76,7 +76,7 @@ def test_of_a_file_cut_off_anywhere_what_is_whole_is_read(
 
 
 @pytest.mark.parametrize('keep', KEPT)
-def test_of_an_mcap_file_every_message_before_the_cut_is_read(tmp_path, keep):
+def test_every_message_before_the_cut_of_an_mcap_file_is_read(tmp_path, keep):
     path = write_rosbag2(tmp_path / 'drive', drive())
     cut(file_of(path), keep)
     left = file_of(path).read_bytes()
@@ -92,7 +92,7 @@ def test_of_an_mcap_file_every_message_before_the_cut_is_read(tmp_path, keep):
 
 @pytest.mark.parametrize('keep', KEPT)
 @pytest.mark.parametrize('compression', [None, 'BZ2', 'LZ4'])
-def test_of_a_ros1_bag_every_message_before_the_cut_is_read(tmp_path, compression, keep):
+def test_every_message_before_the_cut_of_a_ros1_bag_is_read(tmp_path, compression, keep):
     written = [ROS1.serialize_ros1(m, type_) for _, type_, _, m in drive(ROS1)]
     path = write_ros1(tmp_path / 'drive.bag', drive(ROS1), compression)
     cut(path, keep)
@@ -145,7 +145,7 @@ def many_small(number=3000):
 
 
 @pytest.mark.parametrize('keep', [0.1, 0.5, 0.97])
-def test_of_a_deep_database_the_rows_are_read_though_the_tree_above_them_is_lost(tmp_path, keep):
+def test_rows_of_a_deep_database_are_read_though_the_tree_above_them_is_lost(tmp_path, keep):
     path = write_rosbag2(tmp_path / 'many', many_small(), 'sqlite3')
     written, file = raws(many_small()), file_of(path)
     cut(file, keep)
@@ -163,7 +163,7 @@ def test_of_a_deep_database_the_rows_are_read_though_the_tree_above_them_is_lost
     assert f'at byte {4096 * whole} of ' in cuts[0]
 
 
-def test_messages_still_in_the_journal_are_said(tmp_path):
+def test_messages_in_the_journal_give_a_warning(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
     with sqlite3.connect(path / 'drive.db3') as database:
         database.execute('PRAGMA journal_mode=WAL')
@@ -229,7 +229,7 @@ def test_mcap_of_every_layout_reads_up_to_the_cut(tmp_path, options, keep):
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
 @pytest.mark.parametrize('keep', [1.0, 0.9])
-def test_latched_topics_are_known_with_and_without_index(tmp_path, storage, keep):
+def test_latched_topics_are_found_with_and_without_index(tmp_path, storage, keep):
     pose = StampedPose('base_link', 'lidar', START_NS, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     with BagWriter(tmp_path / 'a', storage) as bag:
         bag.write_transform('/tf_static', START_NS, pose, latched=True)
@@ -253,7 +253,7 @@ def test_messages_out_of_order_without_an_index_come_sorted(tmp_path):
     assert times == sorted(row[2] for row in drive())
 
 
-def test_of_several_files_the_last_may_hold_nothing(tmp_path, caplog):
+def test_the_last_of_several_files_may_be_unreadable(tmp_path, caplog):
     path = write_rosbag2(tmp_path / 'drive', drive())
     (path / 'metadata.yaml').unlink()
     (path / 'drive_2.mcap').write_bytes(b'')
@@ -262,7 +262,7 @@ def test_of_several_files_the_last_may_hold_nothing(tmp_path, caplog):
     assert 'drive_2.mcap: cannot be read' in caplog.text
 
 
-def test_of_several_files_the_first_may_not(tmp_path):
+def test_the_first_of_several_files_must_be_readable(tmp_path):
     path = write_rosbag2(tmp_path / 'drive', drive())
     (path / 'metadata.yaml').unlink()
     (path / 'a.mcap').write_bytes(b'')
@@ -272,7 +272,7 @@ def test_of_several_files_the_first_may_not(tmp_path):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3', 'ros1'])
-def test_a_cut_file_with_bytes_overwritten_never_makes_anything_but_a_bag_error(tmp_path, storage):
+def test_overwritten_bytes_in_a_truncated_file_give_messages_or_a_bag_error(tmp_path, storage):
     entries = drive(ROS1 if storage == 'ros1' else ROS2, num_scans=2)
     if storage == 'ros1':
         file = write_ros1(tmp_path / 'drive.bag', entries)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags are written whole or not at all, over nothing that is no bag, and read back the same."""
+"""Bags are written atomically, replace only bags, and read back the same."""
 
 import os
 
@@ -25,7 +25,7 @@ def write_some(path, **options):
 
 
 @pytest.mark.parametrize('storage', ['mcap', 'sqlite3'])
-def test_what_was_written_is_read_back(storage, tmp_path):
+def test_written_messages_are_read_back(storage, tmp_path):
     write_some(tmp_path / 'bag', storage=storage)
     with BagReader(tmp_path / 'bag') as reader:
         messages = list(reader.messages())
@@ -47,7 +47,7 @@ def test_what_was_written_is_read_back(storage, tmp_path):
     assert scan.points.tolist() == [[0, 1, 2], [1, 2, 3], [2, 3, 4]]
 
 
-def test_raw_messages_are_written_as_they_are(tmp_path):
+def test_raw_messages_are_written_unchanged(tmp_path):
     raw = b'\x00\x01\x00\x00' + (3).to_bytes(4, 'little') + b'hi\x00'
     with BagWriter(tmp_path / 'bag') as bag:
         bag.write('/text', 'std_msgs/msg/String', 1, raw)
@@ -70,7 +70,7 @@ def test_the_files_carry_the_name_of_the_bag_and_others_may_join_them(tmp_path):
 
 
 @pytest.mark.parametrize('error', [RuntimeError, KeyboardInterrupt])
-def test_after_an_error_nothing_is_left(error, tmp_path):
+def test_an_error_leaves_no_files(error, tmp_path):
     def fail(bag):
         bag.write_odometry('/odom', 1, POSE, np.zeros(6))
         raise error
@@ -80,7 +80,7 @@ def test_after_an_error_nothing_is_left(error, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_bag_gives_way_only_where_asked_for_and_only_at_the_end(tmp_path):
+def test_a_bag_is_replaced_only_on_request_and_only_at_the_end(tmp_path):
     path = tmp_path / 'bag'
     write_some(path)
     with pytest.raises(BagError, match='exists; name another directory'):
@@ -94,7 +94,7 @@ def test_a_bag_gives_way_only_where_asked_for_and_only_at_the_end(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ['bag']
 
 
-def test_an_empty_directory_may_be_filled_where_asked_for(tmp_path):
+def test_an_empty_directory_is_filled_on_request(tmp_path):
     (tmp_path / 'bag').mkdir()
     with pytest.raises(BagError, match='exists'):
         BagWriter(tmp_path / 'bag')
@@ -102,7 +102,7 @@ def test_an_empty_directory_may_be_filled_where_asked_for(tmp_path):
     assert (tmp_path / 'bag' / 'metadata.yaml').exists()
 
 
-def test_what_is_no_bag_is_never_overwritten(tmp_path):
+def test_paths_that_are_not_bags_are_never_overwritten(tmp_path):
     home, file, link = tmp_path / 'home', tmp_path / 'file', tmp_path / 'link'
     home.mkdir()
     (home / 'thesis.tex').write_text('years of work')
@@ -116,7 +116,7 @@ def test_what_is_no_bag_is_never_overwritten(tmp_path):
     assert link.is_symlink()
 
 
-def test_a_bag_that_appears_meanwhile_is_kept(tmp_path):
+def test_a_bag_that_appears_while_writing_is_kept(tmp_path):
     path = tmp_path / 'bag'
     with pytest.raises(BagError, match='exists'), BagWriter(path):
         write_some(path)
@@ -130,7 +130,7 @@ def test_an_unknown_storage_is_refused(tmp_path):
         BagWriter(tmp_path / 'bag', 'rosbag1')
 
 
-def test_a_place_that_cannot_be_written_is_named(tmp_path):
+def test_a_path_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / 'file').write_text('')
     with pytest.raises(BagError, match=r'file/bag: cannot be written'):
         write_some(tmp_path / 'file' / 'bag')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A file is replaced whole or not at all, whatever goes wrong while it is written."""
+"""A file is replaced completely or not at all, also after errors while it is written."""
 
 from contextlib import contextmanager
 import os
@@ -52,14 +52,14 @@ def test_an_error_leaves_the_old_file_and_nothing_else(tmp_path, error):
     assert os.listdir(tmp_path) == ['map.ply']
 
 
-def test_an_error_about_another_file_passes_as_it_is(tmp_path):
+def test_an_error_about_another_file_is_raised_unchanged(tmp_path):
     error = FileNotFoundError(2, 'No such file', 'absent')
     with pytest.raises(FileNotFoundError, match='absent'):
         write(tmp_path / 'map.ply', then=error)
     assert os.listdir(tmp_path) == []
 
 
-def test_two_at_once_do_not_meet(tmp_path):
+def test_two_writers_at_once_do_not_interfere(tmp_path):
     path = tmp_path / 'map.ply'
     with replace_file(path) as first, replace_file(path) as second:
         first.write(b'first')
@@ -68,7 +68,7 @@ def test_two_at_once_do_not_meet(tmp_path):
     assert os.listdir(tmp_path) == ['map.ply']
 
 
-def test_a_link_stays_and_leads_to_the_new_file(tmp_path):
+def test_a_symbolic_link_stays_and_leads_to_the_new_file(tmp_path):
     (tmp_path / 'disk').mkdir()
     path = tmp_path / 'map.ply'
     path.symlink_to(tmp_path / 'disk' / 'map.ply')
@@ -101,7 +101,7 @@ def test_a_name_too_long_is_refused_and_leaves_nothing(tmp_path):
 
 
 @pytest.mark.parametrize('path', ['.', '', os.devnull])
-def test_what_is_no_regular_file_is_never_replaced(tmp_path, monkeypatch, path):
+def test_only_regular_files_are_replaced(tmp_path, monkeypatch, path):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(FileFormatError, match='not a regular file'):
         write(path)
@@ -110,7 +110,7 @@ def test_what_is_no_regular_file_is_never_replaced(tmp_path, monkeypatch, path):
 
 @contextmanager
 def small_disk(directory, size):
-    """Mount a disk of so many bytes, where that is allowed."""
+    """Mount a disk of ``size`` bytes, or skip the test if that is not allowed."""
     if shutil.which('mount') is None or not sys.platform.startswith('linux'):
         pytest.skip('needs mount of Linux')
     options = ['-t', 'tmpfs', '-o', f'size={size}', 'tmpfs', str(directory)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Maps in files: what comes back is the map and its window to the bit, or an error."""
+"""A saved map comes back with its window exactly, or is refused."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_map_comes_back_with_its_digest_and_its_window(tmp_path, keep_points):
             np.testing.assert_array_equal(scan.points, kept.points)
 
 
-def test_a_loaded_map_goes_on_as_if_it_had_never_stopped(tmp_path):
+def test_a_loaded_map_continues_like_the_saved_one(tmp_path):
     surfel_map, window = driven()
     save_map(tmp_path / 'map.npz', surfel_map, window)
     loaded, scans = load_map(tmp_path / 'map.npz')
@@ -140,7 +140,7 @@ def damage_voxel_size(arrays, attributes):
     'damage', [value for name, value in sorted(globals().items()) if name.startswith('damage_')]
 )
 def test_contents_that_no_map_can_have_are_refused(tmp_path, damage):
-    """The hash of a file says that it is what was written, not that a map wrote it."""
+    """The hash of a file proves that it is unchanged, not that its content is a possible map."""
     surfel_map, window = driven()
     save_map(tmp_path / 'map.npz', surfel_map, window)
     arrays, attributes = load_state(tmp_path / 'map.npz')

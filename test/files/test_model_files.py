@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models in files: what JSON, Parquet and OBJ hold is what the models say."""
+"""JSON, Parquet, OBJ and DXF files agree with the models."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_json_holds_planes_surfaces_and_gaussians(model, tmp_path):
     assert (control == model.surfaces[0].spline.control).all()
 
 
-def test_parquet_has_a_row_a_primitive(model, tmp_path):
+def test_parquet_has_a_row_for_every_primitive(model, tmp_path):
     parquet = pytest.importorskip('pyarrow.parquet')
     write_parquet(tmp_path / 'models.parquet', model)
     table = parquet.read_table(tmp_path / 'models.parquet').to_pydict()
@@ -90,14 +90,14 @@ def test_ids_and_versions_of_models_that_live_are_kept(model, tmp_path):
     assert table['version'] == [number % 7 for number in ids]
 
 
-def test_models_of_nothing_are_written_too(tmp_path):
+def test_empty_models_are_written(tmp_path):
     empty = fit(np.empty((0, 3)))
     write_json(tmp_path / 'a.json', empty)
     write_obj(tmp_path / 'a.obj', empty)
     assert json.loads((tmp_path / 'a.json').read_text())['planes'] == []
 
 
-def test_a_directory_that_is_not_there_is_refused(model, tmp_path):
+def test_a_missing_directory_is_refused(model, tmp_path):
     with pytest.raises(FileFormatError, match='none'):
         write_json(tmp_path / 'none' / 'models.json', model)
 
@@ -113,7 +113,7 @@ def written(tmp_path_factory):
     return model, ezdxf.readfile(path)
 
 
-def test_the_drawing_is_in_metres_and_without_a_fault(written):
+def test_the_drawing_is_in_metres_and_passes_the_audit(written):
     drawing = written[1]
     assert drawing.units == ezdxf.units.M
     audit = drawing.audit()
@@ -140,7 +140,7 @@ def test_outlines_are_closed_rings_and_faces_have_their_area(written, kind):
         assert areas(corners).sum() == pytest.approx(shape.area_m2)
 
 
-def test_nothing_is_a_drawing_of_nothing(tmp_path):
+def test_empty_models_give_an_empty_drawing(tmp_path):
     write_dxf(tmp_path / 'a.dxf', fit(np.empty((0, 3))))
     assert len(ezdxf.readfile(tmp_path / 'a.dxf').modelspace()) == 0
 

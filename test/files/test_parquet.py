@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A map comes back from Parquet to the bit, pyarrow alone reads its rows, damage is refused."""
+"""A map comes back from Parquet exactly, pyarrow reads its rows, damage is refused."""
 
 import json
 
@@ -66,7 +66,7 @@ def test_pyarrow_reads_the_surfels_as_the_map_has_them(tmp_path):
 
 
 def changed(path, change):
-    """Write a file again with its columns, or what it says of itself, changed."""
+    """Write a file again with changed columns or attributes."""
     table = pq.read_table(path)
     columns, attributes = table.to_pydict(), json.loads(table.schema.metadata[METADATA])
     change(columns, attributes)
@@ -126,7 +126,7 @@ def test_many_rows_in_a_small_file_are_refused_before_they_are_read(tmp_path):
 
 
 @pytest.mark.parametrize('keep', [0.0, 0.1, 0.9, 0.999])
-def test_a_file_cut_off_is_refused(tmp_path, keep):
+def test_a_truncated_file_is_refused(tmp_path, keep):
     path = tmp_path / 'map.parquet'
     write_map(path, some_map())
     content = path.read_bytes()
@@ -136,7 +136,7 @@ def test_a_file_cut_off_is_refused(tmp_path, keep):
         read_map(path)
 
 
-def test_bytes_overwritten_are_refused_or_do_not_matter(tmp_path):
+def test_overwritten_bytes_are_refused_or_change_nothing(tmp_path):
     path, surfel_map = tmp_path / 'map.parquet', some_map()
     write_map(path, surfel_map)
     content = path.read_bytes()
@@ -152,6 +152,6 @@ def test_bytes_overwritten_are_refused_or_do_not_matter(tmp_path):
             continue
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FileFormatError, match='cannot be read: No such file'):
         read_map(tmp_path / 'map.parquet')

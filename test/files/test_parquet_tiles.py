@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a map in files make the whole map again, and its digest is taken tile by tile."""
+"""Parts of a map in files add up to the map, and its digest is computed tile by tile."""
 
 import numpy as np
 import pytest
@@ -97,7 +97,7 @@ def test_a_row_group_of_a_tile_holds_a_few_voxels_in_i(tmp_path):
         assert len(set.union(*blocks)) == len(blocks)
 
 
-def test_a_map_in_one_file_is_cut_without_reading_it_whole(tmp_path, monkeypatch):
+def test_a_map_in_one_file_is_split_without_loading_it(tmp_path, monkeypatch):
     surfel_map = scattered()
     write_map(tmp_path / 'map.parquet', surfel_map)
     monkeypatch.setattr(parquet_tiles, 'ROWS_READ', 1000)
@@ -112,7 +112,7 @@ def test_a_map_in_one_file_is_cut_without_reading_it_whole(tmp_path, monkeypatch
     assert again == surfel_map
 
 
-def test_a_tile_as_a_part_is_all_of_it(tmp_path):
+def test_a_tile_as_a_part_is_complete(tmp_path):
     (tile, path), *_ = tiles_in(dataset(tmp_path, scattered())).items()
     part = tile_part(path)
     assert read_part(part) == read_map(path)

@@ -123,7 +123,7 @@ HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOI
         (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'inconsistent PCD header'),
     ],
 )
-def test_what_is_no_whole_pcd_is_refused(tmp_path, content, says):
+def test_truncated_and_inconsistent_files_are_refused(tmp_path, content, says):
     (tmp_path / 'bad.pcd').write_bytes(content.encode('latin-1'))
 
     with pytest.raises(FileFormatError, match=rf'bad\.pcd: .*{says}'):
@@ -138,12 +138,12 @@ def test_a_small_file_that_claims_gigabytes_is_not_unpacked(tmp_path):
         read_points(tmp_path / 'bad.pcd')
 
 
-def test_a_file_that_is_not_there_is_refused(tmp_path):
+def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(FileFormatError, match='cannot be read: No such file'):
         read_points(tmp_path / 'a.pcd')
 
 
-def test_an_earlier_file_stays_where_the_new_one_cannot_be_written(tmp_path):
+def test_an_earlier_file_stays_if_the_new_one_cannot_be_written(tmp_path):
     (tmp_path / 'a.pcd').mkdir()
 
     with pytest.raises(FileFormatError, match='not a regular file'):

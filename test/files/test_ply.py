@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PLY: what is written is read back equal, by this package and by plyfile; damage is named."""
+"""PLY files are read back equal, by this package and by plyfile; damage is named."""
 
 import os
 from pathlib import Path
@@ -67,7 +67,7 @@ def test_plyfile_reads_the_same(tmp_path):
 
 
 @pytest.mark.parametrize('order', ['<', '>'])
-def test_what_plyfile_writes_is_read(tmp_path, order):
+def test_files_of_plyfile_are_read(tmp_path, order):
     plyfile = pytest.importorskip('plyfile')
     dtype = [('x', 'f4'), ('ring', 'u2'), ('t', 'f8'), ('a', 'i1'), ('b', 'u1'), ('c', 'i4')]
     table = np.array([(1.5, 2, 3.25, -4, 5, -6), (-1.5, 65535, 1e300, 7, 255, 9)], dtype)
@@ -130,14 +130,14 @@ HEADER = 'ply\nformat binary_little_endian 1.0\n'
         (HEADER + f'element vertex {10**30}\nproperty double x\nend_header\n', 'truncated'),
     ],
 )
-def test_what_is_no_whole_file_of_points_is_refused(tmp_path, content, expected):
+def test_truncated_and_inconsistent_files_are_refused(tmp_path, content, expected):
     path = tmp_path / 'bad.ply'
     path.write_bytes(content.encode())
     with pytest.raises(FileFormatError, match=rf'bad\.ply: .*{expected}'):
         read_points(path)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileFormatError, match=r'absent\.ply: cannot be read: No such file'):
         read_points(tmp_path / 'absent.ply')
 
@@ -155,7 +155,7 @@ def test_scans_of_real_lidars_are_read_like_plyfile_reads_them():
             np.testing.assert_array_equal(values, vertex[name])
 
 
-def test_intensity_and_colour_are_written_where_the_map_has_them(tmp_path):
+def test_intensity_and_colour_are_written_if_the_map_has_them(tmp_path):
     plyfile = pytest.importorskip('plyfile')
     surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
     columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 1, 7]])}
@@ -202,7 +202,7 @@ def test_a_mesh_is_read_back_by_plyfile(tmp_path, colored):
         assert found['vertex']['green'].tolist() == mesh.colors[:, 1].tolist()
 
 
-def test_a_mesh_of_nothing_is_a_file_of_nothing(tmp_path):
+def test_an_empty_mesh_gives_an_empty_file(tmp_path):
     write_mesh(tmp_path / 'mesh.ply', EMPTY)
     plyfile = pytest.importorskip('plyfile')
     found = plyfile.PlyData.read(tmp_path / 'mesh.ply')

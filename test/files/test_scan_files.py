@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scans in files of their own are read with all they carry, in the order of their numbers."""
+"""Scans in files are read with all their columns, in the order of their numbers."""
 
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def test_files_come_in_the_order_of_their_numbers(tmp_path):
         ),
     ],
 )
-def test_what_is_no_scan_is_refused(tmp_path, name, write, says):
+def test_files_that_are_not_scans_are_refused(tmp_path, name, write, says):
     write(tmp_path / name)
 
     with pytest.raises(FileFormatError, match=says):

@@ -55,7 +55,7 @@ def test_arrays_and_attributes_come_back_equal(tmp_path, compress):
     arrays['key'][0] = 1  # they are the caller's own
 
 
-def test_nothing_at_all_comes_back(tmp_path):
+def test_an_empty_state_comes_back(tmp_path):
     save_state(tmp_path / 'map.npz', {}, {})
     assert load_state(tmp_path / 'map.npz') == ({}, {})
 
@@ -81,7 +81,7 @@ def test_numpy_reads_the_arrays_alone(tmp_path):
             np.testing.assert_array_equal(archive[name], array)
 
 
-def test_what_packs_too_well_to_be_trusted_is_stored_unpacked_and_comes_back(tmp_path):
+def test_content_that_compresses_too_well_is_stored_uncompressed(tmp_path):
     arrays = {'zeros': np.zeros(10**6)}
     save_state(tmp_path / 'map.npz', arrays, {}, compress=True)
     assert os.path.getsize(tmp_path / 'map.npz') > arrays['zeros'].nbytes
@@ -105,14 +105,14 @@ def test_arrays_that_cannot_be_stored_are_refused_and_leave_no_file(tmp_path, ar
 
 
 @pytest.mark.parametrize('value', [np.int64(1), {1, 2}, float('nan')])
-def test_attributes_that_json_does_not_hold_are_refused(tmp_path, value):
+def test_attributes_that_are_not_json_are_refused(tmp_path, value):
     with pytest.raises((TypeError, ValueError)):
         save_state(tmp_path / 'map.npz', {}, {'a': value})
     assert os.listdir(tmp_path) == []
 
 
 @pytest.mark.parametrize('compress', [False, True])
-def test_a_flipped_byte_anywhere_is_refused_or_changes_nothing(tmp_path, compress):
+def test_a_flipped_byte_is_refused_or_changes_nothing(tmp_path, compress):
     path, arrays = tmp_path / 'map.npz', {'key': np.arange(20) ** 5, 'n': np.arange(3.0)}
     save_state(path, arrays, ATTRIBUTES, compress=compress)
     content = path.read_bytes()
@@ -143,7 +143,7 @@ def test_a_truncated_file_is_refused_at_any_length(tmp_path, compress):
             load_state(path)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
+def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(FileFormatError, match=r'absent\.npz: cannot be read: No such file'):
         load_state(tmp_path / 'absent.npz')
 
@@ -215,7 +215,7 @@ def test_a_forged_state_is_refused(tmp_path, changes, members, expected):
         load_state(tmp_path / 'map.npz')
 
 
-def test_nesting_without_end_is_refused(tmp_path):
+def test_deep_nesting_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / 'map.npz', 'w') as archive:
         archive.writestr('manifest.json', '[' * 10**6)
     with pytest.raises(FileFormatError, match='damaged'):
@@ -223,7 +223,7 @@ def test_nesting_without_end_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('compression', [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_another_packing_is_refused(tmp_path, compression):
+def test_another_compression_is_refused(tmp_path, compression):
     forge(tmp_path / 'map.npz', {}, compression=compression)
     with pytest.raises(FileFormatError, match='packing'):
         load_state(tmp_path / 'map.npz')
@@ -242,7 +242,7 @@ from pathlib import Path
 import sys
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.state import load_state
-def peak():  # not ru_maxrss, which begins with that of whoever starts the process
+def peak():  # not ru_maxrss, which begins with that of the parent process
     words = Path('/proc/self/status').read_text().split()
     return int(words[words.index('VmHWM:') + 1])
 before = peak()
@@ -253,7 +253,7 @@ except FileFormatError:
 """
 
 
-@pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='nobody counts the memory')
+@pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='the memory is not counted')
 def test_a_zip_bomb_that_claims_to_be_small_costs_no_memory(tmp_path):
     path = tmp_path / 'map.npz'
     bomb = bytes(10**8)  # packed 0.1 MB

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Trajectories come back as they were written; files of others read; foolish ones are refused."""
+"""Trajectories come back as written; files of other tools are read; invalid ones are refused."""
 
 import numpy as np
 import pytest
@@ -66,7 +66,7 @@ KITTI = """\
 """
 
 
-def test_kitti_rows_are_matrices_and_have_no_stamps_of_their_own(tmp_path):
+def test_kitti_rows_are_matrices_without_stamps(tmp_path):
     found = read_trajectory(text_file(tmp_path, KITTI))
 
     assert found.stamp_ns is None
@@ -124,12 +124,12 @@ def test_csv_columns_are_found_by_name_and_stamps_by_unit(tmp_path, text):
         ('stamp[h],x,y,z,qx,qy,qz,qw\n1,0,0,0,0,0,0,1', None, ":2: unit 'h'"),
     ],
 )
-def test_what_is_no_trajectory_is_refused_with_its_line(tmp_path, text, format_, says):
+def test_invalid_trajectories_are_refused_with_their_line(tmp_path, text, format_, says):
     with pytest.raises(FileFormatError, match=f'poses.txt.*{says}'):
         read_trajectory(text_file(tmp_path, text), format_)
 
 
-def test_times_that_are_not_one_for_each_pose_are_refused(tmp_path):
+def test_a_number_of_times_other_than_that_of_poses_is_refused(tmp_path):
     text_file(tmp_path, '0\n', 'times.txt')
 
     with pytest.raises(FileFormatError, match=r'times\.txt: 1 stamps for 2 poses'):
@@ -137,7 +137,7 @@ def test_times_that_are_not_one_for_each_pose_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize('content', [b'\xff\xfe\x00', None])
-def test_what_is_no_text_or_not_there_is_refused(tmp_path, content):
+def test_binary_and_missing_files_are_refused(tmp_path, content):
     path = tmp_path / 'poses.txt'
     if content is not None:
         path.write_bytes(content)

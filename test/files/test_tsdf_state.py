@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T20: a TSDF saved and loaded is the same, and what does not fit or is damaged is refused."""
+"""T20: a saved and loaded TSDF is the same; damaged files and other settings are refused."""
 
 from dataclasses import asdict, replace
 
@@ -43,7 +43,7 @@ def content(blocks):
 
 @pytest.mark.parametrize('config', [PLAIN, FULL], ids=['plain', 'full'])
 @pytest.mark.parametrize('compress', [False, True])
-def test_what_is_loaded_is_what_was_saved_and_goes_on(tmp_path, config, compress):
+def test_a_loaded_tsdf_equals_the_saved_one_and_continues(tmp_path, config, compress):
     one, path = filled(config), tmp_path / 'map.tsdf.npz'
     save_tsdf(path, one.blocks, compress=compress)
     other = Integrator(load_tsdf(path, config))
@@ -61,7 +61,7 @@ def test_equal_maps_give_equal_bytes(tmp_path):
     assert (tmp_path / 'a').read_bytes() == (tmp_path / 'b').read_bytes()
 
 
-def test_an_empty_map_is_saved_too(tmp_path):
+def test_an_empty_map_is_saved(tmp_path):
     save_tsdf(tmp_path / 'a', BlockMap(FULL))
     assert load_tsdf(tmp_path / 'a', FULL).num_blocks == 0
 
@@ -140,7 +140,7 @@ def test_damaged_content_is_refused(tmp_path, damage):
         load_tsdf(tmp_path / 'b', FULL)
 
 
-def test_files_of_another_kind_or_cut_short_are_refused(tmp_path):
+def test_files_of_another_kind_and_truncated_ones_are_refused(tmp_path):
     save_state(tmp_path / 'a', {'x': np.zeros(3)}, {'kind': 'surfel map'})
     with pytest.raises(FileFormatError, match="'surfel map', expected a tsdf"):
         load_tsdf(tmp_path / 'a', FULL)

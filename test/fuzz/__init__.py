@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Whatever comes in, what comes out is a result or an error of this package, in bounded memory.
+Any input gives a result or an error of this package, in bounded memory and time.
 
 Each harness is a function of bytes. The tests feed it its corpus and some seeded mutations of
 that; ``make fuzz`` lets atheris search, led by the branches that the bytes make the code take.

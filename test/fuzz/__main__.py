@@ -31,7 +31,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what the command line asks for; return how many harnesses broke."""
+    """Run the command line; return the number of harnesses that broke."""
     args = parser().parse_args(arguments)
     names = args.names or list(HARNESSES)
     unknown = sorted({*names} - {*HARNESSES})

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Where the search begins: small inputs that are well formed, made when they are asked for."""
+"""Seeds of the search: small well-formed inputs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NUM_POINTS = 7
 
 
 def written(write: Callable[[Path], object], name: str) -> bytes:
-    """Return what a function writes to a file."""
+    """Return the bytes that a function writes to a file."""
     with tempfile.TemporaryDirectory() as directory:
         path = Path(directory, name)
         found = write(path)
@@ -176,7 +176,7 @@ def points_pcd() -> list[bytes]:
         b'VERSION 0.7\nFIELDS x y z _ n\nSIZE 4 4 4 1 4\nTYPE F F F U F\nCOUNT 1 1 1 3 2\n'
         b'WIDTH 1\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 1\nDATA '
     )
-    literal = b'\x16' + bytes(range(23))  # as LZF has it: so many bytes as they are
+    literal = b'\x16' + bytes(range(23))  # an LZF literal: 23 bytes uncompressed
     packed = struct.pack('<II', len(literal), 23) + literal
     return [
         written(lambda path: pcd.write_points(path, columns()), 'a.pcd'),

@@ -29,7 +29,7 @@ from surfel_mapper.filters.chain import example as example_scan
 from test.fuzz.source import Source
 
 MOST_MESSAGES = 10_000
-"""So many messages of a bag are read: one that is twice as long holds nothing new."""
+"""Number of messages read of a bag."""
 
 
 @cache
@@ -39,7 +39,7 @@ def folder() -> tempfile.TemporaryDirectory:
 
 
 def refused(function: Callable[..., object], name: str, data: bytes) -> None:
-    """Have a function read bytes as a file; an error of ours is an answer, any other a finding."""
+    """Pass bytes to a function as a file; accept our own errors."""
     path = Path(folder().name, name)
     path.write_bytes(data)
     with contextlib.suppress(SurfelMapperError):
@@ -126,7 +126,7 @@ def state_bytes(data: bytes) -> None:
 
 
 def state_content(data: bytes) -> None:
-    """Read a state that is whole and has the right hash, but holds what no map does."""
+    """Read a state with the right hash but impossible content."""
     source = Source(data)
     base = Path(folder().name, 'base.npz')
     kind = source.pick(('map', 'tsdf'))
@@ -213,7 +213,7 @@ def chain(data: bytes) -> None:
 
 
 def map_url(data: bytes) -> None:
-    """Ask for a map by any name: what is answered is inside the directory, or nothing."""
+    """Resolve a map URL: the result is inside the directory, or an error."""
     from surfel_mapper.ros.map_files import path_inside
 
     directory = Path(folder().name, 'maps')

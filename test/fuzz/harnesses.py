@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""All harnesses by name, each with where it begins and how many mutations the tests try."""
+"""All harnesses by name, each with its seeds and the number of mutations in the tests."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from test.fuzz import corpus, files, messages
 
 
 class Harness(NamedTuple):
-    """A function that must take any bytes, and what it is tried with."""
+    """A function that must accept any bytes, with its seeds."""
 
     one_input: Callable[[bytes], None]
     corpus: Callable[[], list[bytes]]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Harnesses of messages: clouds, depth images, poses, and what a map makes of them."""
+"""Harnesses of messages: clouds, images, poses, and a mapper that receives them."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def packed_image(data: bytes) -> None:
 
 
 def drive(data: bytes) -> None:
-    """Map scans and poses that are made up: whatever they say, all scans are accounted for."""
+    """Map generated scans and poses; every scan must be counted."""
     source = Source(data)
     mapper = Mapper(
         Config.from_mapping(

@@ -14,7 +14,7 @@ MAX_BYTES = 1 << 16
 
 
 def mutations(corpus: Sequence[bytes], number: int, seed: int = 1) -> Iterator[bytes]:
-    """Yield the corpus and then so many inputs made of it."""
+    """Yield the corpus and then ``number`` mutations of it."""
     yield from corpus
     rng = random.Random(seed)
     for _ in range(number):

@@ -82,7 +82,7 @@ class Source:
         return found.ljust(size, b'\0')
 
     def rest(self) -> bytes:
-        """Return what is left."""
+        """Return the remaining bytes."""
         return self._data[self._at :]
 
     def below(self, end: int) -> int:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What fuzzing and reading for it have found, each as small as it gets."""
+"""Minimal inputs of faults that fuzzing and reviews found."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
     ],
     ids=['laughs', 'itself', 'brackets', 'dashes', 'date', 'binary'],
 )
-def test_yaml_that_grows_or_is_no_value_is_refused(tmp_path, text):
+def test_yaml_that_expands_or_is_malformed_is_refused(tmp_path, text):
     path = tmp_path / 'metadata.yaml'
     path.write_text(text)
     with pytest.raises(ConfigError, match=r'metadata\.yaml'):
@@ -56,13 +56,13 @@ def test_yaml_that_grows_or_is_no_value_is_refused(tmp_path, text):
         Chain.load(path)
 
 
-def test_names_for_what_was_written_before_may_be_used_in_yaml(tmp_path):
+def test_aliases_are_allowed_in_yaml(tmp_path):
     path = tmp_path / 'a.yaml'
     path.write_text('- &a {range_limit: {min_m: 2}}\n- *a\n')
     assert len(Chain.load(path)) == 2
 
 
-def test_one_long_number_in_a_text_of_many_costs_no_memory_for_the_others(tmp_path):
+def test_one_long_number_in_a_text_does_not_multiply_memory(tmp_path):
     path = tmp_path / 'a.ply'
     number = 20_000
     head = f'ply\nformat ascii 1.0\nelement vertex {number}\nproperty float x\nend_header\n'
@@ -95,7 +95,7 @@ def test_a_map_without_its_digest_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize('level', [2**70, 21, -1, 0.5, 1.0])
-def test_a_map_of_no_level_that_there_is_is_refused(tmp_path, level):
+def test_a_map_of_an_invalid_level_is_refused(tmp_path, level):
     path = tmp_path / 'a.npz'
     save_map(path, *corpus.small_map())
     arrays, attributes = load_state(path)
@@ -115,12 +115,12 @@ def test_a_tsdf_whose_arrays_are_single_numbers_is_refused(tmp_path):
 
 @pytest.fixture
 def little(monkeypatch):
-    """Have bombs be small ones: what may come of anything is a megabyte."""
-    monkeypatch.setattr(bag_compression, 'FREE_BYTES', 1 << 20)
+    """Lower the floor of unpacked sizes to 1 MiB, so that test bombs are small."""
+    monkeypatch.setattr(bag_compression, 'FLOOR_BYTES', 1 << 20)
 
 
 def peak_of(function):
-    """Return what a function raises, and how much memory it took."""
+    """Return the exception of a function and its peak of traced memory."""
     tracemalloc.start()
     try:
         with pytest.raises((BagError, ValueError)) as raised:
@@ -131,7 +131,7 @@ def peak_of(function):
 
 
 @pytest.mark.parametrize('packing', ['zstd', 'bz2'])
-def test_a_chunk_that_claims_to_be_small_costs_no_more(little, packing):
+def test_a_chunk_that_claims_to_be_small_takes_little_memory(little, packing):
     content = bytes(50_000_000)
     packed = import_zstd().compress(content) if packing == 'zstd' else bz2.compress(content)
     tracemalloc.start()
@@ -148,7 +148,7 @@ def test_a_chunk_that_claims_more_than_is_plausible_is_refused(little, packing):
         unpacked(bytes(100), packing, 1 << 21)
 
 
-def test_a_file_that_gets_too_large_is_refused_before_the_disk_is_full(little, tmp_path):
+def test_unpacking_a_file_stops_at_the_plausible_size(little, tmp_path):
     path = tmp_path / 'a.mcap.zstd'
     path.write_bytes(import_zstd().compress(bytes(50_000_000)))
     with pytest.raises(BagError, match='more than is plausible'):
@@ -167,7 +167,7 @@ def test_a_file_of_several_frames_is_unpacked_whole(tmp_path):
 
 
 @pytest.mark.skipif(find_spec('mcap') is None, reason='mcap is not installed')
-def test_an_mcap_file_with_a_bomb_in_a_chunk_is_refused_before_it_goes_off(little, tmp_path):
+def test_a_bomb_in_a_chunk_of_mcap_is_refused_before_unpacking(little, tmp_path):
     from mcap.writer import Writer
 
     stream = io.BytesIO()
@@ -186,7 +186,7 @@ def test_an_mcap_file_with_a_bomb_in_a_chunk_is_refused_before_it_goes_off(littl
     assert peak < 10_000_000
 
 
-def test_a_bag_of_ros_1_with_a_bomb_in_a_chunk_is_refused_before_it_goes_off(little, tmp_path):
+def test_a_bomb_in_a_chunk_of_ros1_is_refused_before_unpacking(little, tmp_path):
     entries = recorded.Entries(recorded.ROS1)
     entries.cloud('/points', recorded.START_NS, np.zeros((2_000_000, 3)))
     path = recorded.write_ros1(tmp_path / 'a.bag', entries, 'BZ2')
@@ -201,7 +201,7 @@ def test_a_bag_of_ros_1_with_a_bomb_in_a_chunk_is_refused_before_it_goes_off(lit
     assert peak < 10_000_000
 
 
-def test_a_map_without_a_name_is_refused_as_any_other_place(tmp_path):
+def test_map_urls_without_a_file_name_are_refused(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
     from surfel_mapper.ros.map_files import path_inside
 
@@ -210,7 +210,7 @@ def test_a_map_without_a_name_is_refused_as_any_other_place(tmp_path):
             path_inside(tmp_path, url)
 
 
-def test_ever_new_transforms_do_not_fill_the_buffer(monkeypatch):
+def test_the_number_of_transforms_is_limited(monkeypatch):
     monkeypatch.setattr(buffer_module, 'MAX_EDGES', 3)
     buffer = buffer_module.TransformBuffer()
     for number in range(3):

@@ -22,10 +22,10 @@ from test.fuzz.mutations import mutations
 NEEDED = {'parquet': 'pyarrow', 'pcd': 'lzf', 'mcap': 'mcap', 'map_url': 'rclpy'}
 
 MOST_BYTES = 64 << 20
-"""What one input may take: the heap grows in steps, and packed bytes may unpack to so much."""
+"""Memory that any input may take: the heap grows in steps, and chunks may unpack to 64 MiB."""
 
 MOST_RATIO = 300
-"""And for each byte of it: numbers in text become objects, zlib packs a hundredfold."""
+"""Memory per input byte: numbers in text become objects, zlib compresses a hundredfold."""
 
 
 @pytest.fixture(autouse=True)
@@ -43,7 +43,7 @@ def harness(name):
 
 
 def resident(what):
-    """Return the bytes of memory in use, VmRSS, or their peak, VmHWM; 0 where nobody counts."""
+    """Return the resident memory (VmRSS) or its peak (VmHWM), bytes; 0 if /proc is missing."""
     try:
         lines = Path('/proc/self/status').read_text(encoding='ascii').splitlines()
     except OSError:
@@ -58,10 +58,10 @@ def reset_peak():
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 @pytest.mark.parametrize('name', HARNESSES)
-def test_no_input_makes_anything_but_a_result_or_an_error_of_ours(name):
+def test_inputs_give_results_or_our_errors_in_bounded_memory(name):
     one_input, corpus, number = harness(name)
     first, *others = mutations(corpus(), number)
-    one_input(first)  # what is loaded once is no part of the input
+    one_input(first)  # imports and compiled kernels are not counted
     for data in others:
         reset_peak()
         before = resident('VmRSS')

@@ -8,7 +8,7 @@ from surfel_mapper.mapping.surfels import Surfels
 
 
 def make_surfels(number, centre=(0.0, 0.0, 0.0)):
-    """Return so many surfels within 50 m of a place, with values of every kind."""
+    """Return ``number`` surfels within 50 m of a place, with values of every kind."""
     rng = np.random.default_rng(1)
     normal = rng.normal(size=(number, 3))
     return Surfels(

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Serialised markers: equal to what rclpy writes, and to a twin that writes number by number.
+Serialised markers are equal to those of rclpy and of a twin that writes number by number.
 
-Bytes that only pad are compared with nothing: rclpy leaves in them what was in memory.
+Padding bytes are not compared: rclpy leaves them uninitialised.
 """
 
 from dataclasses import replace
@@ -174,7 +174,7 @@ def test_rclpy_writes_the_same_bytes(frame_id, ns):
 
 @given(MARKERS)
 @settings(max_examples=30, deadline=None)
-def test_rclpy_reads_what_was_written(markers):
+def test_rclpy_reads_our_bytes(markers):
     serialization = pytest.importorskip('rclpy.serialization')
     expected = ros_message(markers)
     found = serialization.deserialize_message(marker_array(markers), type(expected))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Images packed as image_transport packs them, and what is none of them."""
+"""Compressed images as image_transport writes them are decoded; others are refused."""
 
 import io
 from types import SimpleNamespace
@@ -43,13 +43,13 @@ def scene(kind, message):
 
 
 @pytest.mark.parametrize('format_', ['rgb8; png compressed bgr8', 'bgr8; png compressed', 'png'])
-def test_a_png_has_its_colours_whatever_it_was_before(format_):
+def test_a_png_of_any_encoding_keeps_its_colours(format_):
     found = scene('color', packed(SMOOTH, format_))
     np.testing.assert_array_equal(found.pixels, SMOOTH)
     assert (found.stamp_ns, found.frame_id) == (5_000_000_006, 'optical')
 
 
-def test_a_jpeg_has_nearly_its_colours():
+def test_a_jpeg_keeps_its_colours_within_its_losses():
     found = scene('color', packed(SMOOTH, 'bgr8; jpeg compressed bgr8', 'JPEG'))
     off = np.abs(found.pixels.astype(int) - SMOOTH)
     assert found.pixels.shape == SMOOTH.shape
@@ -66,7 +66,7 @@ def test_grey_and_transparent_images_have_colours_too(kind):
 
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
-def test_labels_of_a_png_are_whole(dtype):
+def test_labels_of_a_png_are_exact(dtype):
     labels = (np.arange(12).reshape(3, 4) * (20 if dtype == np.uint8 else 5000)).astype(dtype)
     np.testing.assert_array_equal(scene('label', packed(labels, 'png')).pixels, labels)
 
@@ -84,7 +84,7 @@ def test_depth_in_millimetres_is_the_same_packed(format_):
     np.testing.assert_array_equal(plain.points, scan.points)
 
 
-def test_depth_in_metres_is_as_exact_as_the_steps_of_its_inverse():
+def test_depth_in_metres_has_the_resolution_of_its_quantised_inverse():
     # As image_transport packs it: quantisation 100, largest depth 10 m.
     first = 100.0 * 101.0
     second = 1.0 - first / 10.0
@@ -114,13 +114,13 @@ def test_depth_in_metres_is_as_exact_as_the_steps_of_its_inverse():
         (packed(DEPTH_MM.T.copy(), 'png'), r'shape \(4, 3\), expected \(3, 4\)'),
     ],
 )
-def test_what_is_no_depth_is_refused_by_topic(message, said):
+def test_an_image_without_depth_is_refused_by_topic(message, said):
     with pytest.raises(CloudFormatError, match=f'^{TOPIC}: .*{said}'):
         depth_scan(CameraImage(message, CAMERA), TOPIC)
 
 
 @pytest.mark.parametrize('kind', ['PNG', 'JPEG'])
-def test_damaged_bytes_are_refused_wherever_they_end_or_change(kind):
+def test_truncated_and_changed_images_are_refused(kind):
     message = packed(SMOOTH, kind.lower(), kind)
     whole = message.data
     for length in range(0, len(whole) - 20, max(len(whole) // 40, 1)):
@@ -141,7 +141,7 @@ def test_damaged_bytes_are_refused_wherever_they_end_or_change(kind):
 
 
 @pytest.mark.parametrize('side', [9000, 2**31 - 1])
-def test_an_image_of_more_pixels_than_a_camera_has_is_refused_before_it_is_unpacked(side):
+def test_an_image_of_too_many_pixels_is_refused_before_decoding(side):
     message = packed(SMOOTH, 'png')
     size = np.array([side, side], '>u4').tobytes()
     header = b'IHDR' + size + message.data[24:29]
@@ -152,13 +152,13 @@ def test_an_image_of_more_pixels_than_a_camera_has_is_refused_before_it_is_unpac
         unpacked(message, TOPIC, exact=True)
 
 
-def test_other_formats_are_not_tried():
+def test_formats_other_than_png_and_jpeg_are_refused():
     message = packed(SMOOTH, 'bmp', 'BMP')
     with pytest.raises(CloudFormatError, match='not a readable PNG or JPEG'):
         unpacked(message, TOPIC, exact=False)
 
 
-def test_the_name_of_a_topic_says_whether_and_where_its_camera_is():
+def test_the_name_of_a_topic_gives_its_transport_and_camera_info():
     assert is_packed('/camera/color/image_raw/compressed')
     assert is_packed('/camera/depth/image_raw/compressedDepth')
     assert not is_packed('/camera/compressed/image_raw')

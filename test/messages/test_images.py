@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images and calibrations as messages of any library, and which belong together."""
+"""Images of depth, colours and labels are decoded and paired with their calibration."""
 
 from __future__ import annotations
 
@@ -92,13 +92,13 @@ def test_a_damaged_image_is_refused_by_topic(changes, message):
 
 
 @pytest.mark.parametrize('ros1', [False, True])
-def test_a_camera_is_that_of_the_rectified_image_where_there_is_one(ros1):
+def test_the_camera_of_the_rectified_image_is_preferred(ros1):
     assert camera_in(info(ros1=ros1)) == CAMERA
     rectified = camera_in(info(p=(7.0, 0, 2.0, 0, 0, 8.0, 1.5, 0, 0, 0, 1, 0), ros1=ros1))
     assert rectified == PinholeCamera(4, 3, 7.0, 8.0, 2.0, 1.5)
 
 
-def test_binning_and_a_part_of_the_image_are_taken_into_account():
+def test_binning_and_region_of_interest_change_the_camera():
     binned = camera_in(info(width=8, height=6, binning=2))
     assert binned == PinholeCamera(4, 3, 2.5, 3.0, 0.75, 0.5)
     part = camera_in(info(width=80, height=60, roi=(1, 2, 4, 3)))
@@ -120,11 +120,11 @@ def test_a_camera_that_is_not_calibrated_is_refused(k):
         ('depth', 'camera_info'),
     ],
 )
-def test_the_calibration_is_the_neighbour_of_the_image(image_topic, expected):
+def test_the_calibration_topic_is_beside_the_image_topic(image_topic, expected):
     assert camera_info_topic(image_topic) == expected
 
 
-def test_images_wait_for_the_first_calibration_of_their_own_camera():
+def test_images_wait_for_the_first_calibration_of_their_camera():
     images = DepthImages()
     first, second, other = image(), image(), image()
     assert images.add_image('/a', first) == images.add_image('/a', second) == []
@@ -135,7 +135,7 @@ def test_images_wait_for_the_first_calibration_of_their_own_camera():
     assert images.add_image('/a', first) == [CameraImage(first, CAMERA)]
 
 
-def test_only_so_many_images_wait_and_the_oldest_is_given_up():
+def test_a_limited_number_of_images_wait_and_the_oldest_is_dropped():
     images = DepthImages()
     given_up = [found for n in range(MAX_EARLY + 3) for found in images.add_image('/a', n)]
     assert given_up == [CameraImage(number, None) for number in range(3)]
@@ -144,7 +144,7 @@ def test_only_so_many_images_wait_and_the_oldest_is_given_up():
         depth_scan(CameraImage(image(), None), TOPIC)
 
 
-def test_a_later_calibration_holds_from_then_on():
+def test_a_later_calibration_replaces_the_earlier():
     images = DepthImages()
     images.add_info('/a', info())
     images.add_info('/a', info(k=(9.0, 0, 1.5, 0, 9.0, 1.0, 0, 0, 1)))
@@ -188,7 +188,7 @@ def test_grey_is_a_colour():
 @pytest.mark.parametrize(
     ('encoding', 'dtype'), [('8UC1', 'u1'), ('mono16', 'u2'), ('16UC1', 'u2'), ('32SC1', 'i4')]
 )
-def test_labels_are_whole_numbers(encoding, dtype, big):
+def test_labels_are_integers(encoding, dtype, big):
     labels = np.arange(12).reshape(3, 4).astype(dtype) * 20
     if dtype == 'i4':
         labels[0, 0] = -1
@@ -203,7 +203,7 @@ def test_labels_are_whole_numbers(encoding, dtype, big):
         ('color', {'step': 4}, r'expected height 3 rows of at least 12'),
     ],
 )
-def test_what_is_no_such_image_is_refused(kind, changes, message):
+def test_images_of_wrong_encoding_or_size_are_refused(kind, changes, message):
     with pytest.raises(CloudFormatError, match=message):
         read(kind, image(RGB, **{'encoding': 'rgb8', **changes}))
 
@@ -216,7 +216,7 @@ def test_beside_a_lidar_images_wait_for_their_camera():
     assert len(images.add_image('color', COLOR_TOPIC, image(RGB, 'rgb8'))) == 1
 
 
-def test_an_image_whose_camera_never_comes_is_refused():
+def test_an_image_without_calibration_is_refused():
     images = SceneImages(Config())
     for _ in range(MAX_EARLY):
         images.add_image('color', COLOR_TOPIC, image(RGB, 'rgb8'))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models as markers and as columns of clouds: what they say is what the models are."""
+"""Markers and columns of models agree with the models."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_every_patch_is_filled_and_has_outline_and_id(seen, markers):
     assert set(found) == names
 
 
-def test_the_id_stands_a_voxel_above_its_plane(seen, markers):
+def test_the_text_of_the_id_is_a_voxel_above_its_plane(seen, markers):
     found = by_name(markers)
     for plane in seen[0].planes:
         place = np.array(found['ids', plane.id].pose[:3])
@@ -128,13 +128,13 @@ def test_surfaces_and_gaussians_are_shaded(seen, markers):
     assert (cloud.colors[:, 3] == 1.0).all()
 
 
-def test_nothing_is_one_marker_that_deletes():
+def test_no_models_give_one_marker_that_deletes_all():
     (only,) = model_markers([], no_gaussians(), A, stamp_ns=5, frame_id='map')
     assert only.action == DELETE_ALL
     assert len(marker_array([only])) < 400
 
 
-def test_of_too_many_gaussians_those_of_most_points_are_drawn():
+def test_the_gaussians_with_most_points_are_drawn_if_there_are_too_many():
     number = MAX_GAUSSIANS + 9
     many = Gaussians(
         id=np.arange(number),
@@ -147,7 +147,7 @@ def test_of_too_many_gaussians_those_of_most_points_are_drawn():
     assert len(drawn.points) == 60 * MAX_GAUSSIANS
 
 
-def test_a_row_a_primitive_says_what_it_is(seen):
+def test_each_row_describes_its_primitive(seen):
     model, versions, shapes = seen
     columns = primitive_columns(shapes, model.gaussians, versions)
     num_patches = len(model.patches)
@@ -194,7 +194,7 @@ def test_the_box_of_a_gaussian_has_the_axes_of_its_covariance(seen):
         assert R @ np.diag(sigma**2) @ R.T == pytest.approx(covariance, abs=1e-6)
 
 
-def test_no_primitives_are_a_cloud_of_no_rows():
+def test_no_primitives_give_a_cloud_without_rows():
     content = from_columns(primitive_columns([], no_gaussians(), {}))
     assert content.width == 0
     assert len(content.fields) == 20

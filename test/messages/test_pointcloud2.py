@@ -82,7 +82,7 @@ def assert_decodes(msg):
         if field.name:
             first.setdefault(field.name, field)
     xyz = [twin(msg, first[name]) for name in 'xyz']
-    expected = np.stack(xyz, axis=1)  # float64 where one of them is
+    expected = np.stack(xyz, axis=1)  # float64 if one of them is
     assert scan.points.dtype == expected.dtype
     assert scan.points.flags.f_contiguous
     np.testing.assert_array_equal(scan.points, expected)
@@ -137,7 +137,7 @@ def test_organised_points_are_in_the_order_of_their_rows():
 @pytest.mark.parametrize(
     'kind', [bytes, bytearray, memoryview, lambda b: array.array('B', b), lambda b: b]
 )
-def test_any_buffer_of_bytes_will_do(kind):
+def test_data_may_be_any_buffer_of_bytes(kind):
     msg = message(*LAYOUTS['22 bytes'])
     data = kind(msg.data if kind is memoryview else msg.data.tobytes())
     assert_decodes(replace(msg, data=data))
@@ -153,7 +153,7 @@ def test_columns_are_read_only_views_into_the_message_and_points_are_not():
     assert scan.points.flags.writeable
 
 
-def test_header_goes_into_the_scan():
+def test_the_scan_has_stamp_and_frame_of_the_header():
     scan = to_scan(replace(message(XYZ, 12), stamp=(2**31 - 1, 999_999_999)))
     assert scan.stamp_ns == (2**31 - 1) * 10**9 + 999_999_999
     assert scan.frame_id == 'lidar'
@@ -170,7 +170,7 @@ def test_nan_and_inf_stay_as_they_are():
     [(0, 0, 0, b''), (1, 0, 0, b''), (0, 5, 60, b''), (2, 0, 3, b'123456')],
 )
 @pytest.mark.parametrize('fields', [[], [Field('x', 99, 99, 9)]])
-def test_a_cloud_of_no_points_is_an_empty_scan(height, width, row_step, data, fields):
+def test_a_cloud_without_points_is_an_empty_scan(height, width, row_step, data, fields):
     scan = to_scan(Message(height, width, fields, 0, row_step, data))
     assert scan.points.shape == (0, 3)
     assert scan.points.dtype == np.float32
@@ -314,7 +314,7 @@ def test_columns_of_every_type_come_back_equal():
     np.testing.assert_array_equal(scan.points[:, 1], columns['y'])
 
 
-def test_four_byte_columns_are_packed_without_holes():
+def test_four_byte_columns_are_packed_without_padding():
     cloud = from_columns({name: np.ones(2, np.float32) for name in ('x', 'y', 'z', 'i')})
     assert [field.offset for field in cloud.fields] == [0, 4, 8, 12]
     assert (cloud.point_step, cloud.row_step, len(cloud.data)) == (16, 32, 32)
@@ -345,7 +345,7 @@ def test_a_number_that_is_not_finite_makes_a_cloud_not_dense(value):
         {'x': np.array(['a'])},
     ],
 )
-def test_columns_that_are_no_table_are_refused(columns):
+def test_columns_of_different_lengths_are_refused(columns):
     with pytest.raises(ValueError, match='column'):
         from_columns(columns)
 
@@ -426,7 +426,7 @@ def test_messages_of_rosbags_decode():
     assert (scan.stamp_ns, scan.frame_id) == (5_000_000_006, 'lidar')
 
 
-def test_surfels_have_intensity_and_colour_where_the_map_has_them():
+def test_surfels_have_intensity_and_colour_if_the_map_has_them():
     surfel_map = SurfelMap(0.5, columns=('intensity', 'rgb'))
     columns = {'intensity': np.array([1.0, 2.0]), 'rgb': np.array([[255, 0, 7], [255, 0, 7]])}
     surfel_map.add([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1]], columns=columns)
@@ -500,14 +500,14 @@ def test_the_data_is_a_view_of_the_message():
     assert not data.flags.writeable
 
 
-def test_a_message_that_ends_early_is_refused_wherever_it_ends():
+def test_a_message_truncated_at_any_byte_is_refused():
     raw = drive_cloud()
     for size in range(len(raw)):
         with pytest.raises(CloudFormatError, match=f'/lidar: {size} bytes that are not a whole'):
             parse_cloud(raw[:size], topic='/lidar')
 
 
-def test_counts_beyond_the_message_are_refused_before_they_are_followed():
+def test_counts_beyond_the_message_are_refused_before_the_loop():
     raw = bytearray(drive_cloud())
     at = raw.index(b'\4\0\0\0\2\0\0\0x\0')
     raw[at : at + 4] = b'\xff\xff\xff\xff'
@@ -523,7 +523,7 @@ def test_an_encoding_other_than_plain_cdr_is_refused():
         parse_cloud(raw)
 
 
-def test_a_name_that_is_no_text_is_refused():
+def test_a_name_that_is_not_utf8_is_refused():
     raw = drive_cloud().replace(b'intensity', b'intens\xff\xfey')
 
     with pytest.raises(CloudFormatError, match='utf-8'):

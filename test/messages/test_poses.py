@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Poses come out of messages with frames, stamp and numbers as they were written."""
+"""Poses read from messages have the frames, stamps and numbers that were written."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -47,7 +47,7 @@ def test_all_transforms_of_a_message_are_yielded_in_order():
     assert [pose.child for pose in poses_in('tf', message, base='')] == ['a', 'b', 'c']
 
 
-def test_numbers_are_handed_on_as_they_are():
+def test_numbers_are_unchanged():
     entries = Entries()
     entries.odometry('/odom', STAMP_NS, XYZ)
     turn = entries[0][3].pose.pose.orientation
@@ -132,7 +132,7 @@ def serialised(kind):
 
 
 @pytest.mark.parametrize('kind', ['odometry', 'tf', 'pose'])
-def test_bytes_that_end_before_the_pose_are_refused_wherever_they_end(kind):
+def test_bytes_truncated_before_the_end_of_the_pose_are_refused(kind):
     raw, num_needed = serialised(kind)
     assert raw_poses(kind, raw[:num_needed], 'base_link', '/odom')
     for size in range(num_needed):
@@ -140,14 +140,14 @@ def test_bytes_that_end_before_the_pose_are_refused_wherever_they_end(kind):
             raw_poses(kind, raw[:size], 'base_link', '/odom')
 
 
-def test_a_count_of_transforms_beyond_the_message_is_refused_before_it_is_followed():
+def test_a_count_of_transforms_beyond_the_message_is_refused_before_the_loop():
     raw = bytearray(serialised('tf')[0])
     raw[4:8] = b'\xff\xff\xff\xff'
     with pytest.raises(PoseError, match='4294967295 transforms announced'):
         raw_poses('tf', bytes(raw), '', '/tf')
 
 
-def test_the_name_of_a_frame_that_is_no_text_is_refused():
+def test_a_frame_name_that_is_not_utf8_is_refused():
     raw = serialised('odometry')[0].replace(b'base_link', b'base\xff\xfeink')
     with pytest.raises(PoseError, match='utf-8'):
         raw_poses('odometry', raw, '', '/odom')

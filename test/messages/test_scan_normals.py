@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clouds with normals: every byte that came in, and what the map says of each point."""
+"""Clouds with normals keep every input byte and get the surfel of each point."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ def test_every_point_gets_its_surfel_and_keeps_its_bytes(settings):
     assert 0.5 < (expected[:, 4] > 0).mean() < 1.0
 
 
-def test_fields_that_have_the_names_of_ours_stay():
+def test_fields_with_the_names_of_appended_ones_stay():
     message = cloud(step=32, named=('normal_x', 'planarity'))
     scan = to_scan(message)
     found = to_scan(as_message(scan_with_normals(scan, POSE, mapped(scan), MIN_POINTS), message))
@@ -123,7 +123,7 @@ def test_fields_that_have_the_names_of_ours_stay():
     assert {'normal_y', 'normal_z', 'num_points'} <= set(found.columns)
 
 
-def test_points_that_are_not_in_the_map_get_its_surfels_all_the_same():
+def test_points_that_were_not_inserted_get_surfels_too():
     message = cloud()
     scan = to_scan(message)
     surfel_map = mapped(scan.select(np.arange(0, len(scan), 2)))
@@ -135,7 +135,7 @@ def test_points_that_are_not_in_the_map_get_its_surfels_all_the_same():
     assert known[1::2].mean() > 0.5
 
 
-def test_an_empty_map_says_nothing():
+def test_an_empty_map_gives_nan():
     message = cloud()
     scan = to_scan(message)
     found = to_scan(as_message(scan_with_normals(scan, POSE, SurfelMap(0.5), 1), message))
@@ -143,7 +143,7 @@ def test_an_empty_map_says_nothing():
     assert np.isnan(found.columns['planarity']).all()
 
 
-def test_a_scan_that_was_no_cloud_becomes_one():
+def test_a_scan_without_a_message_becomes_a_cloud():
     points = np.random.default_rng(1).normal(scale=[0.8, 0.6, 0.1], size=(500, 3))
     points = points.astype(np.float32)
     scan = Scan(points=points, stamp_ns=5, frame_id='camera', columns={'score': points[:, 0]})
@@ -163,7 +163,7 @@ def table_of(keys):
 
 
 @both
-def test_the_kernel_attaches_and_leaves_out(call):
+def test_the_kernel_agrees_with_a_loop_over_points(call):
     points = np.array([[0.1, 0.2, 0.3], [1.1, 0.2, 0.3], [np.nan, 0, 0], [0.9, 0.9, 0.9]])
     keys = point_keys(points[:1], np.eye(4), 1.0)
     values = (np.array([[0.0, 0.6, 0.8]]), np.array([0.25]), np.array([7]))
@@ -178,7 +178,7 @@ def test_the_kernel_attaches_and_leaves_out(call):
 
 
 @both
-def test_the_first_mark_stays_and_what_it_was_for_is_not_asked_again(call):
+def test_the_first_mark_stays_and_is_not_computed_again(call):
     keys, seen = np.array([5, 9, 2]), np.array([9, 2, 77])
     marks, left = np.array([-1, 40, -1]), np.empty(3, np.int64)
     limit = np.uint64(2**64 - 1)

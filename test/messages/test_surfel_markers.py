@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Surfels drawn: discs where, as large and turned as they should be, colours, lines."""
+"""Discs of surfels have the right place, size, normal and colour; meshes become triangles."""
 
 import numpy as np
 import pytest
@@ -163,7 +163,7 @@ def test_surfels_without_a_normal_are_left_out():
     assert marker_array(draw(surfels)) == marker_array(expected)
 
 
-def test_where_nothing_is_to_be_drawn_both_markers_are_deleted():
+def test_both_markers_are_deleted_if_there_is_nothing_to_draw():
     surfels = make_surfels(2)
     surfels.normal[:] = np.nan
     for empty in (surfels, make_surfels(0)):
@@ -196,21 +196,21 @@ def test_colours_of_vertices_are_those_of_the_corners():
     assert np.allclose(found, colors[TRIANGLES.ravel()[:6]] / 255.0, atol=1e-6)
 
 
-def test_without_colours_what_looks_up_is_brighter_than_what_looks_down():
+def test_without_colours_faces_upwards_are_brighter_than_faces_downwards():
     up, _, down, none = marker_of().colors.reshape(4, 3, 4)[:, 0, 0]
     assert 0.3 <= down < none < up <= 1.0
 
 
-def test_a_mesh_of_nothing_deletes_what_was_drawn():
+def test_an_empty_mesh_deletes_the_marker():
     marker = mesh_marker(EMPTY, stamp_ns=5, frame_id='odom')
     assert (marker.action, len(marker.points)) == (DELETE, 0)
 
 
-def test_a_marker_alone_is_written_as_in_an_array_of_one():
+def test_a_single_marker_is_serialised_as_in_an_array():
     marker = marker_of()
     header, number = b'\x00\x01\x00\x00', b'\x01\x00\x00\x00'
     alone = marker_bytes(marker)
-    # four bytes on, what is aligned to eight moves: compared where nothing is, up to the pose
+    # shifted by four bytes, members aligned to eight move: compared up to the pose
     assert alone[:4] == header
     assert marker_array([marker])[:8] == header + number
     assert alone[4:24] == marker_array([marker])[8:28]
