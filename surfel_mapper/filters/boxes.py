@@ -36,10 +36,13 @@ from surfel_mapper.filters.descriptors import TIME_COLUMNS, times_of
 from surfel_mapper.filters.kernels.boxes import cut
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
-from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, ShapeFilter, shares
+from surfel_mapper.filters.shapes import as_matrices, eigen, EIGEN_OF, Moments, ShapeFilter, shares
 from surfel_mapper.scan import Scan
 
 INT32_MAX = 2**31 - 1
+
+ON_A_LINE = 4e-7
+"""Ratio of the middle eigenvalue to the largest up to which float32 points are on a line."""
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -140,6 +143,11 @@ class BoxFilter(ShapeFilter):
         'Columns of a mean, 1: averages; 0: those of the first point.',
         libpointmatcher='averageExistingDescriptors',
     )
+    drop_degenerate: bool = parameter(
+        False,
+        'Drop boxes without a normal: of one or two points, or points on a line.',
+        libpointmatcher_default=True,
+    )
     keep_densities: bool = parameter(
         False,
         'Add densities, points per m^3 of the ball about the mean of the box.',
@@ -179,14 +187,22 @@ class BoxFilter(ShapeFilter):
 
     def fit(self, scan: Scan, boxes: Boxes) -> Mask:
         """Return which boxes are sampled, (M,) bool."""
-        if self.max_box_m == math.inf:
-            return np.ones(len(boxes), np.bool_)
-        extents = [boxes.spread(axis) for axis in boxes.points.T]
-        return np.asarray(np.max(extents, axis=0) <= self.max_box_m, np.bool_)
+        fit = np.ones(len(boxes), np.bool_)
+        if self.max_box_m < math.inf:
+            extents = [boxes.spread(axis) for axis in boxes.points.T]
+            fit &= np.max(extents, axis=0) <= self.max_box_m
+        if self.drop_degenerate and self.needs_shapes:
+            fit &= boxes.values[:, 1] > ON_A_LINE * boxes.values[:, 2]
+        return fit
+
+    @property
+    def needs_shapes(self) -> bool:
+        """Whether a column or limit depends on the eigenvectors of a box."""
+        return self.keep_normals or self.keep_eigen_values or self.keep_eigen_vectors
 
     def columns_of(self, boxes: Boxes) -> Columns:
         """Return the selected columns, one row per box."""
-        columns = self.shape_columns(boxes.values, boxes.vectors)
+        columns = self.shape_columns(boxes.values, boxes.vectors, boxes.moments.count)
         if self.keep_densities:
             columns[DENSITIES] = boxes.moments.density
         return columns
@@ -209,6 +225,13 @@ class Ellipsoids(BoxFilter):
         low=1e-7,
         high=0.9999999,
         libpointmatcher='ratio',
+    )
+    eigen_of: str = parameter(
+        'covariance',
+        'Matrix of the eigenvalues and of covariance: covariance, scatter / (n - 1); mean_square, '
+        'scatter / n; scatter, the sum over the n points.',
+        choices=tuple(EIGEN_OF),
+        libpointmatcher_default='scatter',
     )
     max_time_window: float = parameter(
         math.inf,
@@ -247,13 +270,21 @@ class Ellipsoids(BoxFilter):
             fit = fit & (boxes.spread(times_of(scan)) <= self.max_time_window)
         return fit
 
+    @property
+    def needs_shapes(self) -> bool:
+        """Whether a column or limit depends on the eigenvectors of a box."""
+        asked_for = self.keep_covariances or self.keep_shapes or self.min_planarity > 0.0
+        return asked_for or BoxFilter.needs_shapes.fget(self)  # type: ignore[attr-defined]
+
     def columns_of(self, boxes: Boxes) -> Columns:
         """Return the selected columns, one row per box."""
         columns = BoxFilter.columns_of(self, boxes)
         if self.keep_means:
             columns['means'] = boxes.moments.mean
         if self.keep_covariances:
-            columns['covariance'] = as_matrices(boxes.moments.covariance).reshape(-1, 9)
+            factor = EIGEN_OF[self.eigen_of](boxes.moments.count)
+            matrices = as_matrices(boxes.moments.covariance * factor)
+            columns['covariance'] = matrices.reshape(-1, 9)
         if self.keep_weights:
             columns['weights'] = boxes.moments.count.astype(np.float64)
         if self.keep_shapes:

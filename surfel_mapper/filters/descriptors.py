@@ -57,7 +57,14 @@ class AddDescriptor(Filter):
             raise ConfigError(f'{self.name}: column_name (descriptorName): empty')
 
     def apply(self, scan: Scan) -> Scan:
-        """Return the scan with the column."""
+        """Return the scan with the column; one of another number of components is not replaced."""
+        if self.column_name in scan.columns:
+            found = math.prod(scan.columns[self.column_name].shape[1:])
+            if found != self.num_components:
+                raise FilterError(
+                    f'the points have a column {self.column_name!r} of {found} components, '
+                    f'expected {self.num_components}; choose another column_name'
+                )
         column = np.empty((len(scan), self.num_components), scan.points.dtype)
         column[:] = self.values
         return with_columns(

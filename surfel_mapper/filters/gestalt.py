@@ -30,7 +30,7 @@ from surfel_mapper.filters.descriptors import times_of
 from surfel_mapper.filters.grids import least_of_each, ScanVoxels
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points, search_tree
 from surfel_mapper.filters.registry import register
-from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, ShapeFilter, shares
+from surfel_mapper.filters.shapes import as_matrices, eigen, EIGEN_OF, Moments, ShapeFilter, shares
 from surfel_mapper.scan import Scan
 
 RINGS, SECTORS = 4, 8
@@ -85,6 +85,13 @@ class Gestalt(ShapeFilter):
     )
     size_y_m: float = parameter(1.0, 'Edge along y, m.', low=0.001, libpointmatcher='vSizeY')
     size_z_m: float = parameter(1.0, 'Edge along z, m.', low=0.001, libpointmatcher='vSizeZ')
+    eigen_of: str = parameter(
+        'covariance',
+        'Matrix of the eigenvalues and of covariance: covariance, scatter / (n - 1); mean_square, '
+        'scatter / n; scatter, the sum over the n neighbours.',
+        choices=tuple(EIGEN_OF),
+        libpointmatcher_default='scatter',
+    )
     keep_means: bool = parameter(
         False, 'Add means: mean of the neighbours, m.', libpointmatcher='keepMeans'
     )
@@ -157,7 +164,8 @@ class Gestalt(ShapeFilter):
         """Return the columns asked for."""
         values = np.array([each['values'] for each in found]).reshape(-1, 3)
         vectors = np.array([each['vectors'] for each in found]).reshape(-1, 3, 3)
-        columns = self.shape_columns(values, vectors)
+        count = np.array([each['count'] for each in found], np.int64)
+        columns = self.shape_columns(values, vectors, count)
         if self.keep_normals:
             columns[NORMALS] = np.array([each['normal'] for each in found]).reshape(-1, 3)
         names = [name for name in SIZES if 'gestalt' in name or name == 'warpedXYZ']
@@ -166,6 +174,8 @@ class Gestalt(ShapeFilter):
         names += ['covariance'] if self.keep_covariances else []
         for name in names:
             columns[name] = np.array([each[name] for each in found]).reshape(-1, SIZES[name])
+        if self.keep_covariances:
+            columns['covariance'] = columns['covariance'] * EIGEN_OF[self.eigen_of](count)[:, None]
         return columns
 
 
@@ -182,6 +192,7 @@ def describe(place: Points, around: Points, radius_m: float) -> dict[str, Any] |
     R_keypoint_scan = np.array([[x, y, 0.0], [-y, x, 0.0], [0.0, 0.0, 1.0]])
     means, variances = relief((around - place) @ R_keypoint_scan.T, radius_m)
     return {
+        'count': len(around),
         'values': values[0],
         'vectors': vectors[0],
         'normal': normal,

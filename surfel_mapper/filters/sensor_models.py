@@ -99,8 +99,8 @@ PULSE_S = 50e-9
 PULSE_SIGMA_S = PULSE_S / math.sqrt(2.0 * math.pi)
 
 BIASED = {
-    0: (1.413717e-2, 1.54987849, 0.00359711),  # Sick LMS-1xx
-    1: (2.967060e-3, 2.52773563, 0.007084910),  # Velodyne HDL-32E
+    0: (7.5049e-3, 6.08040951, 3.17921789e-3),  # Sick LMS-1xx
+    1: (1.4835e-3, 10.3211569, 7.07893371e-3),  # Velodyne HDL-32E
 }
 """Aperture (rad), gain on the shift of the peak, gain on the change of its curvature (m)."""
 

@@ -15,6 +15,7 @@ have unit length. A normal has no side; orient_normals gives it one.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
 from typing import Any
@@ -39,6 +40,14 @@ from surfel_mapper.scan import Scan
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 """Row and column of each stored element of a symmetric matrix: xx xy xz yy yz zz."""
+
+
+EIGEN_OF: dict[str, Callable[[npt.NDArray[Any]], npt.NDArray[Any]]] = {
+    'covariance': np.ones_like,
+    'mean_square': lambda count: np.maximum(count - 1, 1) / count,
+    'scatter': lambda count: np.maximum(count - 1, 1),
+}
+"""Factor on the covariance of a number of points that gives each matrix."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,6 +134,33 @@ def eigen(matrices: Points) -> tuple[Points, Points]:
     return values.T.copy(), vectors
 
 
+def eigen_by_size(matrices: Points) -> tuple[Points, Points]:
+    """
+    Return eigenvalues and eigenvectors of symmetric matrices that may be indefinite.
+
+    Parameters
+    ----------
+    matrices : (6, M) float64
+        Rows in the order of PAIRS.
+
+    Returns
+    -------
+    values : (M, 3) float64
+        Absolute values, ascending.
+    vectors : (M, 3, 3) float64
+        As by eigen.
+
+    """
+    found, columns = np.linalg.eigh(as_matrices(matrices))
+    order = np.argsort(np.abs(found), axis=1, kind='stable')
+    values = np.take_along_axis(np.abs(found), order, axis=1)
+    vectors = np.take_along_axis(columns.transpose(0, 2, 1), order[:, :, None], axis=1)
+    leading = np.abs(vectors).argmax(axis=2)[:, :, None]
+    vectors = vectors * np.where(np.take_along_axis(vectors, leading, axis=2) < 0.0, -1.0, 1.0)
+    vectors[values[:, 2] == 0.0] = np.nan
+    return values, vectors
+
+
 def as_matrices(rows: Points) -> Points:
     """Return symmetric matrices (M, 3, 3) from their rows in the order of PAIRS, (6, M)."""
     return np.asarray(rows[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3))
@@ -155,6 +191,14 @@ def shares(values: Points) -> Points:
 class ShapeFilter(Filter):
     """Base of the filters that add normals and eigenvectors."""
 
+    eigen_of: str = parameter(
+        'covariance',
+        'Matrix of the eigenvalues: covariance, scatter / (n - 1); mean_square, scatter / n; '
+        'scatter, the sum over the n points.',
+        choices=tuple(EIGEN_OF),
+        libpointmatcher_default='mean_square',
+    )
+
     keep_normals: bool = parameter(True, 'Add the column normals.', libpointmatcher='keepNormals')
     keep_eigen_values: bool = parameter(
         False,
@@ -165,13 +209,15 @@ class ShapeFilter(Filter):
         False, 'Add eigVectors, one after another.', libpointmatcher='keepEigenVectors'
     )
 
-    def shape_columns(self, values: Points, vectors: Points) -> dict[str, npt.NDArray[Any]]:
-        """Return the columns asked for, from eigenvalues and eigenvectors."""
+    def shape_columns(
+        self, values: Points, vectors: Points, count: npt.NDArray[np.int64]
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Return the selected columns, from eigenpairs of the covariances of count points."""
         columns = {}
         if self.keep_normals:
             columns[NORMALS] = vectors[:, 0]
         if self.keep_eigen_values:
-            columns[EIGEN_VALUES] = values
+            columns[EIGEN_VALUES] = values * EIGEN_OF[self.eigen_of](count)[:, None]
         if self.keep_eigen_vectors:
             columns[EIGEN_VECTORS] = vectors.reshape(-1, 9)
         return columns
@@ -231,7 +277,9 @@ class SurfaceNormal(ShapeFilter):
             if ids is not None:
                 ids[rows] = np.where(near < len(points), near, -1)
         moments = Moments.joined(parts)
-        columns: dict[str, npt.NDArray[Any]] = self.shape_columns(*eigen(moments.covariance))
+        columns: dict[str, npt.NDArray[Any]] = self.shape_columns(
+            *eigen(moments.covariance), moments.count
+        )
         if self.keep_densities:
             columns[DENSITIES] = moments.density
         if self.keep_mean_distances:

@@ -7,15 +7,19 @@ Every neighbour casts a vote, a symmetric matrix that is large in the directions
 no continuation of the point. Of the eigenvalues l1 >= l2 >= l3 of the sum, l1 - l2 is the saliency
 of a surface (stick, along the normal), l2 - l3 that of a curve (plate, across the tangent) and l3
 that of a junction (ball), each over the number of neighbours. libpointmatcher confuses saliencies
-and eigenvalues when Saliency labels points; here the label is the largest saliency.
+and eigenvalues when Saliency labels points; here the label is the largest saliency. Under its name
+the votes are its own: in the first round a point votes for its nearest neighbours, which differ
+from those that have it among theirs; a vote of the second round is no symmetric matrix, and only
+its lower triangle counts.
 
 SpectralDecomposition thins surfaces, curves and junctions to an even density each. If nothing is
 known of the neighbours, the eigenvalues of their votes have known ratios for points spread evenly
 on a curve, on a surface and in space; the nearest ratio classifies a point. If the largest
 eigenvalue exceeds that of neighbours which fill the radius, the place is too dense, and every
 other point of it, drawn at random, is dropped. Then all vote again, until hardly any is dropped.
-libpointmatcher tests every point for all three, drops four of five at once, and ends well below
-the density asked for. Points with no neighbour near enough to vote are outliers and are dropped.
+Points with no neighbour near enough to vote are outliers and are dropped. Under libpointmatcher's
+name its rules hold: every class has limits of its own, four of five points beyond those of a
+junction are dropped at once, and points below a tenth of the range of saliency are outliers.
 
 Source: Labussiere et al. 2020, Geometry preserving sampling method based on spectral
 decomposition for large-scale environments.
@@ -35,7 +39,7 @@ from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, Points
 from surfel_mapper.filters.registry import register
-from surfel_mapper.filters.shapes import eigen, PAIRS
+from surfel_mapper.filters.shapes import eigen, eigen_by_size, PAIRS
 from surfel_mapper.scan import Scan
 
 Columns = dict[str, npt.NDArray[Any]]
@@ -104,21 +108,23 @@ class Voting:
     points: Points
     ids: npt.NDArray[np.int32]
     sigma: float
+    is_symmetric: bool
+    """Whether votes are gathered and made symmetric; else as in libpointmatcher."""
 
     @classmethod
-    def among(cls, points: Points, num_neighbours: int, sigma: float) -> Voting:
-        """Return the voting in which num_neighbours nearest neighbours vote for each point."""
-        number = min(num_neighbours + 1, len(points))  # the nearest is the point itself
+    def among(cls, points: Points, filter_: VotingFilter) -> Voting:
+        """Return the voting of the nearest neighbours of each point, with a filter's settings."""
+        number = min(filter_.num_neighbours + 1, len(points))  # the nearest is the point itself
         ids = np.empty((len(points), number), np.int32)
         for rows, near, _ in neighbourhoods(points, number):
             ids[rows] = near
-        return cls(points, ids, sigma)
+        return cls(points, ids, filter_.sigma, filter_.symmetric_votes)
 
     def first(self) -> Votes:
         """Return the votes of voters without tensors, sparse."""
         votes = np.empty((6, len(self.points)))
-        first_votes(self.points, self.ids, self.sigma, votes)
-        return self._decomposed(votes)
+        first_votes(self.points, self.ids, self.sigma, not self.is_symmetric, votes)
+        return Votes(*eigen(votes), self.ids.shape[1] - 1)
 
     def balls(self) -> Votes:
         """Return the votes of voters without tensors, in closed form."""
@@ -128,11 +134,9 @@ class Voting:
     def again(self, tensors: Points) -> Votes:
         """Return the votes of voters with tensors (N, 6)."""
         votes = np.empty((6, len(self.points)))
-        closed_form_votes(self.points, self.ids, tensors, self.sigma, votes)
-        return self._decomposed(votes)
-
-    def _decomposed(self, votes: Points) -> Votes:
-        return Votes(*eigen(votes), self.ids.shape[1] - 1)
+        closed_form_votes(self.points, self.ids, tensors, self.sigma, self.is_symmetric, votes)
+        decompose = eigen if self.is_symmetric else eigen_by_size
+        return Votes(*decompose(votes), self.ids.shape[1] - 1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -147,6 +151,12 @@ class VotingFilter(Filter):
         'Scale of the votes: exp(-d^2 / sigma) at a distance of d m, none beyond 3 sigma m.',
         low=0.0,
         libpointmatcher='sigma',
+    )
+    symmetric_votes: bool = parameter(
+        True,
+        '1: every point takes the symmetric part of the votes of its neighbours; 0: in the first '
+        'round a point votes for its neighbours, in the second the lower triangle counts.',
+        libpointmatcher_default=False,
     )
     keep_normals: bool = parameter(
         True, 'Add normals, and tangents of curves.', libpointmatcher='keepNormals'
@@ -178,7 +188,7 @@ class Saliency(VotingFilter):
 
     def apply(self, scan: Scan) -> Scan:
         """Return the scan with the columns added."""
-        voting = Voting.among(coordinates(scan), self.num_neighbours, self.sigma)
+        voting = Voting.among(coordinates(scan), self)
         return self.with_votes(scan, voting.again(voting.first().tensors))
 
 
@@ -187,7 +197,15 @@ EVEN = 5
 
 
 RATIOS = np.array([[0.5, 1.0], [0.75, 0.75], [1.0, 1.0]])
-"""Ratios of the smallest and middle eigenvalue to the largest: on a curve, a surface, in space."""
+"""Ratios of the smallest and middle eigenvalue to the largest on curves, surfaces, in space."""
+
+
+CLASSES = (
+    (3, (5.0 / 6.0, 5.0 / 6.0, 5.0 / 6.0), 0.2),
+    (1, (0.5, 1.0, 1.0), 0.5),
+    (2, (0.75, 0.75, 1.0), 0.5),
+)
+"""libpointmatcher's classes: dimension, limits of the eigenvalues, chance to stay above them."""
 
 
 @register(libpointmatcher='SpectralDecompositionDataPointsFilter')
@@ -209,6 +227,20 @@ class SpectralDecomposition(VotingFilter):
         'Add lambda1, lambda2, lambda3, the eigenvalues, descending.',
         libpointmatcher='keepLambdas',
     )
+    thinning: str = parameter(
+        'nearest',
+        'nearest: drop half of the points denser than expected for the class nearest to them; '
+        'each: for every class in turn, drop a share of the points beyond all of its limits.',
+        choices=('nearest', 'each'),
+        libpointmatcher_default='each',
+    )
+    min_saliency: float = parameter(
+        0.0,
+        'Points whose largest saliency is below this share of its range in the scan are dropped.',
+        low=0.0,
+        high=1.0,
+        libpointmatcher_default=0.1,
+    )
     seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
     def apply(self, scan: Scan) -> Scan:
@@ -226,19 +258,32 @@ class SpectralDecomposition(VotingFilter):
             if np.count_nonzero(~stays) < EVEN:
                 break
         votes = voting.again(votes.tensors)
-        voted_for = votes.values[:, 2] > 0.0
-        votes = Votes(votes.values[voted_for], votes.vectors[voted_for], votes.num_neighbours)
+        salient = self.salient(votes)
+        votes = Votes(votes.values[salient], votes.vectors[salient], votes.num_neighbours)
         names = ('lambda3', 'lambda2', 'lambda1') if self.keep_lambdas else ()
         lambdas = dict(zip(names, votes.values.T, strict=False))
-        return self.with_votes(select(scan, rows[voted_for]), votes, **lambdas)
+        return self.with_votes(select(scan, rows[salient]), votes, **lambdas)
 
     def vote(self, points: Points) -> tuple[Voting, Votes]:
         """Return the votes of points without tensors."""
-        voting = Voting.among(points, self.num_neighbours, self.sigma)
+        voting = Voting.among(points, self)
         return voting, voting.balls()
+
+    def salient(self, votes: Votes) -> Mask:
+        """Return which points have votes and a sufficient saliency."""
+        saliencies = votes.saliencies
+        has_votes = votes.values[:, 2] > 0.0
+        if self.min_saliency == 0.0 or not len(saliencies):
+            return np.asarray(has_votes)
+        low, high = saliencies.min(axis=0), saliencies.max(axis=0)
+        largest = saliencies.argmax(axis=1)
+        limits = (low + self.min_saliency * (high - low))[largest]
+        return np.asarray(has_votes & (saliencies.max(axis=1) >= limits))
 
     def stays(self, votes: Votes, random: np.random.Generator) -> Mask:
         """Return which points stay for the next round."""
+        if self.thinning == 'each':
+            return self.stays_in_each_class(votes, random)
         lowest, middle, highest = votes.values.T / votes.num_neighbours
         with np.errstate(invalid='ignore'):  # nan without votes, then not dense
             ratios = np.stack([lowest, middle], axis=1) / highest[:, None]
@@ -252,6 +297,16 @@ class SpectralDecomposition(VotingFilter):
         )
         is_dense = highest > expected[nearest]
         return np.asarray(~is_dense | (random.random(len(is_dense)) < 0.5))
+
+    def stays_in_each_class(self, votes: Votes, random: np.random.Generator) -> Mask:
+        """Return which points stay by libpointmatcher's limits of every class."""
+        values = votes.values / votes.num_neighbours
+        stays = np.ones(len(values), np.bool_)
+        for dimension, shares, chance in CLASSES:
+            limits = np.array(shares) * mean_decay(dimension, self.sigma, self.radius_m)
+            is_dense = (values >= limits).all(axis=1)
+            stays &= ~is_dense | (random.random(len(values)) < chance)
+        return stays
 
 
 def mean_decay(dimension: int, sigma: float, radius_m: float) -> float:

@@ -12,7 +12,7 @@ from surfel_mapper.filters.boxes import cut_into_boxes
 from surfel_mapper.filters.kernels.boxes import cut
 from test.filters.examples import filter_of, random_scan, scan_of
 
-SAMPLING, ELLIPSOIDS = 'SamplingSurfaceNormalDataPointsFilter', 'ElipsoidsDataPointsFilter'
+SAMPLING, ELLIPSOIDS = 'sampling_surface_normal', 'ellipsoids'
 
 BOTH = pytest.mark.parametrize('name', [SAMPLING, ELLIPSOIDS])
 

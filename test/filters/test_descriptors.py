@@ -16,7 +16,7 @@ AXES = np.eye(3)
 
 
 def test_add_descriptor_gives_every_point_the_value():
-    scan = scan_of(np.zeros((2, 3)), test=[7.0, 8.0])
+    scan = scan_of(np.zeros((2, 3)), test=np.zeros((2, 3)), one=[7.0, 8.0])
     found = filter_of(
         'AddDescriptorDataPointsFilter',
         descriptorName='test',
@@ -25,7 +25,9 @@ def test_add_descriptor_gives_every_point_the_value():
     ).apply(scan)
     np.testing.assert_array_equal(found.columns['test'], [[2.2, 3.0, 6.1]] * 2)
     one = filter_of('add_descriptor', column_name='p', values=[0.6]).apply(scan)
-    assert (one.columns['p'].tolist(), one.columns['test'].tolist()) == ([0.6, 0.6], [7.0, 8.0])
+    assert (one.columns['p'].tolist(), one.columns['one'].tolist()) == ([0.6, 0.6], [7.0, 8.0])
+    with pytest.raises(FilterError, match="column 'test' of 3 components, expected 1"):
+        filter_of('add_descriptor', column_name='test', values=[0.6]).apply(scan)
 
 
 def test_add_descriptor_wants_as_many_values_as_components_and_a_name():

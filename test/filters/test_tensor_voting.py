@@ -14,20 +14,21 @@ from surfel_mapper.filters.shapes import as_matrices, PAIRS
 from surfel_mapper.filters.tensor_voting import mean_decay, Voting
 from test.filters.examples import filter_of, scan_of
 
-SALIENCY, SPECTRAL = 'SaliencyDataPointsFilter', 'SpectralDecompositionDataPointsFilter'
+SALIENCY, SPECTRAL = 'saliency', 'spectral_decomposition'
 
 CURVE, SURFACE = 2, 3
 
 EYE = np.eye(3)
 
 
-def slow_first(points, ids, sigma):
+def slow_first(points, ids, sigma, to_neighbours):
     """Return the first votes as matrices."""
     found = np.tile(EYE, (len(ids), 1, 1))
-    for votes, near in zip(found, ids, strict=True):
+    for row, near in enumerate(ids):
         for other in near[1:]:
             if other == len(points):
                 continue
+            votes = found[other if to_neighbours else row]
             v = points[other] - points[near[0]]
             far = np.linalg.norm(v) / sigma
             if 0.0 < far < 3.0:
@@ -36,7 +37,7 @@ def slow_first(points, ids, sigma):
     return found
 
 
-def slow_closed_form(points, ids, tensors, sigma):
+def slow_closed_form(points, ids, tensors, sigma, symmetric):
     """Return the votes in closed form as matrices, from equation 11 as it stands."""
     found = np.zeros((len(ids), 3, 3))
     for votes, near in zip(found, ids, strict=True):
@@ -49,13 +50,16 @@ def slow_closed_form(points, ids, tensors, sigma):
                 r = np.outer(v, v) / distance**2
                 turn = EYE - 2.0 * r
                 vote = turn @ tensors[other] @ (EYE - 0.5 * r) @ turn
-                votes += math.exp(-(distance**2) / sigma) * 0.5 * (vote + vote.T)
+                lower = np.tril(vote) + np.tril(vote, -1).T
+                taken = 0.5 * (vote + vote.T) if symmetric else lower
+                votes += math.exp(-(distance**2) / sigma) * taken
     return found
 
 
 @pytest.mark.parametrize('sigma', [0.05, 0.3, 5.0, math.inf, 0.0])
 @pytest.mark.parametrize('compiled', [True, False])
-def test_the_kernels_cast_the_votes_that_their_slow_twins_cast(sigma, compiled):
+@pytest.mark.parametrize('symmetric', [True, False])
+def test_the_kernels_cast_the_votes_that_their_slow_twins_cast(sigma, compiled, symmetric):
     rng = np.random.default_rng(1)
     points = rng.uniform(-1.0, 1.0, (40, 3))
     points[7] = points[6]  # at one place: no direction, no vote
@@ -68,11 +72,11 @@ def test_the_kernels_cast_the_votes_that_their_slow_twins_cast(sigma, compiled):
     first, again = (k if compiled else k.py_func for k in (first_votes, closed_form_votes))
 
     with np.errstate(divide='ignore', invalid='ignore'):
-        first(points, ids, np.float64(sigma), votes)
-        expected = slow_first(points, ids, np.float64(sigma))
+        first(points, ids, np.float64(sigma), not symmetric, votes)
+        expected = slow_first(points, ids, np.float64(sigma), not symmetric)
         np.testing.assert_allclose(as_matrices(votes), expected, atol=1e-12)
-        again(points, ids, rows, np.float64(sigma), votes)
-        expected = slow_closed_form(points, ids, tensors, np.float64(sigma))
+        again(points, ids, rows, np.float64(sigma), symmetric, votes)
+        expected = slow_closed_form(points, ids, tensors, np.float64(sigma), symmetric)
         np.testing.assert_allclose(as_matrices(votes), expected, atol=1e-11)
 
 
@@ -141,7 +145,7 @@ def test_a_point_that_nobody_votes_for_has_no_normal():
 def test_votes_of_unknown_neighbours_are_those_that_thinning_expects():
     # on an even plane the eigenvalues are 1, 3/4 and 3/4 of the mean decay, on a line 1, 1, 1/2
     for points, shares in ((PLANE, (0.75, 0.75, 1.0)), (CURVE_X, (0.5, 1.0, 1.0))):
-        votes = Voting.among(points, 28, 0.2).balls()
+        votes = Voting.among(points, filter_of(SALIENCY, k=28)).balls()
         inside = middle(points, points.mean(axis=0), 0.1)
         found = votes.values[inside] / votes.values[inside][:, 2:]
         np.testing.assert_allclose(found, np.tile(shares, (inside.sum(), 1)), atol=0.05)

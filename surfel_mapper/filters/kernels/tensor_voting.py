@@ -34,20 +34,24 @@ def direction(points, own, other):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def first_votes(points, ids, sigma, votes):
+def first_votes(points, ids, sigma, to_neighbours, votes):
     """
     Sum the votes of neighbours without tensors and the ball of the point itself.
 
     points  (N, 3) float64, m
     ids     (P, K) int32, neighbours of P points, the point itself first; padded by N
     sigma   scale of the votes
+    to_neighbours  whether each point votes for its neighbours, or they for it
     votes   (6, P) float64, out: their sum, xx xy xz yy yz zz
 
-    The weight is z^2 (z - 3)^4 / 16, z the distance over sigma; largest at z = 1.
+    The weight is z^2 (z - 3)^4 / 16, z the distance over sigma; largest at z = 1. Votes to
+    neighbours differ if a point is no neighbour of its neighbour; P is N then.
     """
     for i in range(len(ids)):
+        votes[:, i] = 0.0
+        votes[0, i] = votes[3, i] = votes[5, i] = 1.0
+    for i in range(len(ids)):
         own = ids[i, 0]
-        xx, xy, xz, yy, yz, zz = 1.0, 0.0, 0.0, 1.0, 0.0, 1.0
         for k in range(1, ids.shape[1]):
             other = ids[i, k]
             if other == len(points):
@@ -58,18 +62,17 @@ def first_votes(points, ids, sigma, votes):
                 continue
             end = (far - REACH) * (far - REACH)
             weight = far * far * (end * end) / 16.0
-            xx += weight * (1.0 - x * x)
-            xy -= weight * x * y
-            xz -= weight * x * z
-            yy += weight * (1.0 - y * y)
-            yz -= weight * y * z
-            zz += weight * (1.0 - z * z)
-        votes[0, i], votes[1, i], votes[2, i] = xx, xy, xz
-        votes[3, i], votes[4, i], votes[5, i] = yy, yz, zz
+            to = other if to_neighbours else i
+            votes[0, to] += weight * (1.0 - x * x)
+            votes[1, to] -= weight * x * y
+            votes[2, to] -= weight * x * z
+            votes[3, to] += weight * (1.0 - y * y)
+            votes[4, to] -= weight * y * z
+            votes[5, to] += weight * (1.0 - z * z)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def closed_form_votes(points, ids, tensors, sigma, votes):
+def closed_form_votes(points, ids, tensors, sigma, symmetric, votes):
     """
     Sum the votes of neighbours with tensors.
 
@@ -77,8 +80,11 @@ def closed_form_votes(points, ids, tensors, sigma, votes):
     ids      (P, K) int32, neighbours of P points, the point itself first; padded by N
     tensors  (N, 6) float64, of the neighbours, xx xy xz yy yz zz
     sigma    scale of the votes
+    symmetric  whether to take the symmetric part of a vote, or its lower triangle
     votes    (6, P) float64, out: their sum
     """
+    # the vote is K - 2 r u' - 3/2 u r' + 3 s r r', with u = K r, s = r u
+    first, second = (1.75, 1.75) if symmetric else (2.0, 1.5)
     for i in range(len(ids)):
         own = ids[i, 0]
         xx, xy, xz, yy, yz, zz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -91,18 +97,16 @@ def closed_form_votes(points, ids, tensors, sigma, votes):
                 continue
             txx, txy, txz = tensors[other, 0], tensors[other, 1], tensors[other, 2]
             tyy, tyz, tzz = tensors[other, 3], tensors[other, 4], tensors[other, 5]
-            # with u = K r, s = r u: R K R = K - 2 (u r' + r u') + 4 s r r', R K R r = 2 s r - u
             ux = (txx * x + txy * y) + txz * z
             uy = (txy * x + tyy * y) + tyz * z
             uz = (txz * x + tyz * y) + tzz * z
             s = (ux * x + uy * y) + uz * z
-            # less the quarter of (2 s r - u) r' + r (2 s r - u)': 3 s r r' and 7/4 remain
             weight = math.exp(-length_sq / sigma)
             xx += weight * (txx - 3.5 * ux * x + 3.0 * s * x * x)
-            xy += weight * (txy - 1.75 * (ux * y + uy * x) + 3.0 * s * x * y)
-            xz += weight * (txz - 1.75 * (ux * z + uz * x) + 3.0 * s * x * z)
+            xy += weight * (txy - first * y * ux - second * uy * x + 3.0 * s * x * y)
+            xz += weight * (txz - first * z * ux - second * uz * x + 3.0 * s * x * z)
             yy += weight * (tyy - 3.5 * uy * y + 3.0 * s * y * y)
-            yz += weight * (tyz - 1.75 * (uy * z + uz * y) + 3.0 * s * y * z)
+            yz += weight * (tyz - first * z * uy - second * uz * y + 3.0 * s * y * z)
             zz += weight * (tzz - 3.5 * uz * z + 3.0 * s * z * z)
         votes[0, i], votes[1, i], votes[2, i] = xx, xy, xz
         votes[3, i], votes[4, i], votes[5, i] = yy, yz, zz
