@@ -36,7 +36,7 @@ def pair():
         (lambda lum: lum.set_correspondences(1, 1, [[0, 0]]), 'edge 1 -> 1: from a vertex to'),
         (lambda lum: lum.set_correspondences(0, 1, [[0, 3]]), 'names point 3 of vertex 1'),
         (lambda lum: lum.set_correspondences(0, 1, [[-1, 0]]), 'names point -1 of vertex 0'),
-        (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'whole numbers'),
+        (lambda lum: lum.set_correspondences(0, 1, [[0.5, 1]]), 'integers'),
         (lambda lum: lum.set_correspondences(0, 1, [0, 1, 2]), r'pairs of shape \(3,\)'),
         (lambda lum: lum.set_correspondences(0, 1, [[0, 0]], np.eye(3)), 'weights of shape'),
         (

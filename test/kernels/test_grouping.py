@@ -1,0 +1,73 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The hash table that groups points by voxel, against a dict."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from surfel_mapper.kernels.grouping import (
+    build_table,
+    CHUNK,
+    enlarged_table,
+    find_key,
+    find_run_rows,
+    find_runs,
+    hash_shift,
+)
+from test.kernels.modes import both
+
+
+def keys_in_runs(num, num_voxels, seed=0):
+    """Return voxel keys (num,) in runs; some are -1, which leaves a point out."""
+    rng = np.random.default_rng(seed)
+    voxels = rng.integers(0, 2**62, num_voxels)
+    voxels[0] = -1
+    return np.repeat(rng.choice(voxels, num), rng.integers(1, 4, num))[:num]
+
+
+@both
+@pytest.mark.parametrize('num_voxels', [1, 2, 40, 400])
+@pytest.mark.parametrize('width', [4, 10])
+def test_runs_get_the_row_of_their_voxel_in_the_order_of_first_use(call, num_voxels, width):
+    keys, sums = np.full(900, -7, np.int64), np.full((900, width), np.nan)
+    table = np.full(2048, -1, np.int32)
+    starts, run_rows = np.empty(CHUNK + 1, np.int32), np.empty(CHUNK, np.int32)
+    expected: dict[int, int] = {}
+    num_rows = 0
+    for seed in range(2):  # the second chunk meets voxels of the first
+        chunk = keys_in_runs(300, num_voxels, seed=1)[seed:]
+        num_runs = find_runs(chunk, len(chunk), starts)
+        num_rows = call(
+            find_run_rows, chunk, starts, num_runs, table, keys, sums, num_rows, run_rows
+        )
+        groups = [key for key, _ in itertools.groupby(chunk.tolist())]
+        rows = [expected.setdefault(k, len(expected)) if k >= 0 else -1 for k in groups]
+        np.testing.assert_array_equal(run_rows[:num_runs], rows)
+    assert num_rows == len(expected)
+    assert keys[:num_rows].tolist() == list(expected)
+    assert not sums[:num_rows].any()
+    assert np.isnan(sums[num_rows:]).all()
+
+
+@both
+def test_an_enlarged_table_finds_the_same_rows(call):
+    keys = np.unique(np.random.default_rng(2).integers(0, 2**62, 500))
+    table = np.empty(1024, np.int32)
+    call(build_table, keys, table)
+    larger = call(enlarged_table, table, keys, len(keys))
+    assert len(larger) == 4 * len(table)
+    for row, key in enumerate(keys):
+        assert call(find_key, key, keys, table, hash_shift(len(table))) == row
+        assert call(find_key, key, keys, larger, hash_shift(len(larger))) == row
+    for key in keys + 1:
+        if key not in keys:
+            assert call(find_key, key, keys, larger, hash_shift(len(larger))) == -1
+
+
+@both
+def test_an_empty_table_finds_nothing(call):
+    keys, table = np.empty(0, np.int64), np.empty(2, np.int32)
+    call(build_table, keys, table)
+    assert call(find_key, np.int64(5), keys, table, hash_shift(2)) == -1

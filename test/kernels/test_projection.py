@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Projection into camera and lidar images, against float64 trigonometry of numpy.
+
+Angles may be 1 microradian off, that is 4e-4 of the columns and rows used here; a point this near
+to the border of the image may be on either side.
+"""
+
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.kernels.projection import (
+    arc_tangent,
+    CAMERA,
+    LIDAR,
+    LIDAR_TABLE,
+    OUTSIDE,
+    project,
+)
+from test.kernels.modes import both
+
+NO_TABLE = np.zeros(1, np.float32)
+
+
+def points(num=500):
+    xyz = np.random.default_rng(1).normal(0.0, 5.0, (3, num)).astype(np.float32)
+    xyz[:, :4] = [[0, 0, 0, 1e-10], [0, 1, 0, 0], [0, 0, 1, 0]]
+    return xyz
+
+
+def projected(call, kind, sensor, elevations=NO_TABLE):
+    xyz = points()
+    distance, u, v = np.full((3, xyz.shape[1]), np.nan, np.float32)
+    sensor = np.array(sensor, np.float32)
+    call(project, *xyz, kind, sensor, elevations, distance, u, v)
+    np.testing.assert_allclose(distance, np.sqrt((xyz.astype(float) ** 2).sum(axis=0)), rtol=1e-6)
+    return xyz.astype(float), u, v
+
+
+@both
+def test_the_arc_tangent_is_within_a_microradian(call):
+    for angle in np.linspace(-math.pi, math.pi, 721):
+        y, x = np.float32(math.sin(angle)), np.float32(math.cos(angle))
+        assert call(arc_tangent, y, x) == pytest.approx(math.atan2(y, x), abs=1e-6)
+    assert call(arc_tangent, np.float32(0.0), np.float32(0.0)) == 0.0
+
+
+@both
+def test_a_camera_projects_by_its_focal_lengths(call):
+    (x, y, z), u, v = projected(call, CAMERA, [300, 310, 160, 120, 320, 240, 0, 0])
+    with np.errstate(all='ignore'):
+        expected_u, expected_v = 300 * x / z + 160, 310 * y / z + 120
+        inside = (z > 0) & (expected_u >= 0) & (expected_u <= 320)
+        inside &= (expected_v >= 0) & (expected_v <= 240)
+    assert inside.sum() > 10
+    np.testing.assert_array_equal(u != OUTSIDE, inside)
+    np.testing.assert_allclose(u[inside], expected_u[inside], atol=1e-3)
+    np.testing.assert_allclose(v[inside], expected_v[inside], atol=1e-3)
+
+
+@both
+@pytest.mark.parametrize('is_full_turn', [True, False])
+def test_a_lidar_projects_by_azimuth_and_elevation(call, is_full_turn):
+    columns = 1024 if is_full_turn else 300
+    step, lowest = 2 * math.pi / 1024, (0.0 if is_full_turn else -0.5)
+    sensor = [0.3, step, 0.4, 0.8 / 31, columns, 32, 1024, lowest]
+    (x, y, z), u, v = projected(call, LIDAR, sensor)
+    column = (0.3 - np.arctan2(y, x)) / step
+    column = (column - lowest) % 1024 + lowest
+    row = (0.4 - np.arctan2(z, np.hypot(x, y))) / (0.8 / 31)
+    end = 1024 + lowest if is_full_turn else columns - 0.5
+    inside = (row >= -0.5) & (row <= 31.5) & (column < end)
+    near = np.minimum.reduce([abs(row + 0.5), abs(row - 31.5), abs(column - end)]) < 1e-2
+    assert inside.sum() > 50
+    np.testing.assert_array_equal((u != OUTSIDE)[~near], inside[~near])
+    both_inside = inside & (u != OUTSIDE)
+    turn = abs(u - column)[both_inside]
+    assert np.minimum(turn, 1024 - turn).max() < 1e-2
+    np.testing.assert_allclose(v[both_inside], row[both_inside], atol=1e-3)
+
+
+@both
+def test_rows_of_uneven_beams_are_interpolated(call):
+    beams = np.array([0.4, 0.3, 0.1, 0.05, -0.2], np.float32)
+    sensor = [0.0, 2 * math.pi / 512, 0, 0, 512, 5, 512, 0]
+    (x, y, z), u, v = projected(call, LIDAR_TABLE, sensor, beams)
+    elevation = np.arctan2(z, np.hypot(x, y))
+    expected = np.interp(elevation, beams[::-1], np.arange(5)[::-1].astype(float))
+    inside = (elevation < 0.4) & (elevation > -0.2) & (u != OUTSIDE)
+    assert inside.sum() > 50
+    np.testing.assert_allclose(v[inside], expected[inside], atol=1e-3)
