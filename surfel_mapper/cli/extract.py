@@ -100,7 +100,7 @@ def read(
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files import map_state, parquet
     from surfel_mapper.files.scan_files import read_scan, SUFFIXES
-    from surfel_mapper.models.surfel_points import above, surfel_points
+    from surfel_mapper.models.fitting import above, surfel_points
 
     if args.cloud.suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(

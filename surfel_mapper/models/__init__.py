@@ -1,17 +1,17 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Planes, B-spline surfaces and Gaussians that stand for a cloud.
+Planes, B-spline surfaces and Gaussians that represent a cloud.
 
-``fit`` makes them from the points of one; see docs/models.md.
+``fit`` computes them from the points of one cloud; see docs/models.md.
 """
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.evaluation import evaluate, Evaluation
+from surfel_mapper.models.evaluation import Evaluation
 from surfel_mapper.models.fitting import fit
 from surfel_mapper.models.grid import Grid
-from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
+from surfel_mapper.models.multi_model import evaluate, Gaussians, MultiModel, Plane, Surface
 
 __all__ = [
     'Evaluation',

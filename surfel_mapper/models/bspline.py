@@ -4,13 +4,13 @@
 Height fields: z(x, y) as a tensor product of B-splines over the grid of a patch.
 
 A grid of N cells an axis has N + 2 control points, one beyond each end, and clamped knots. The
-parameter is affine in x, as the fit needs it; equally spaced control points would bend x by up
-to 0.9 of a cell, so as a NURBS patch they stand at the Greville abscissae, where x(u) is affine
-and z the same.
+parameter is affine in x, as the least squares fit requires. Equally spaced control points would
+bend x by up to 0.9 of a cell; as a NURBS patch they are placed at the Greville abscissae, where
+x(u) is affine and z unchanged.
 
-There are more control points than cells, so the fit needs more than the data: pspline adds
-second differences (Eilers and Marx 1996) and fills holes and rims with them; lsqr takes the
-solution nearest to the initial control points, which is where gradient descent would end.
+There are more control points than cells, so the fit is underdetermined. ``pspline`` adds second
+differences (Eilers and Marx 1996), which fill holes and boundaries; ``lsqr`` takes the solution
+nearest to the initial control points, the limit of gradient descent.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.banded import solve_band
-from surfel_mapper.models.kernels.splines import (
+from surfel_mapper.models.kernels.bspline import (
     add_differences,
     add_equations,
-    basis_at,
-    heights_at,
+    evaluate_basis,
+    evaluate_field,
+    solve_band,
 )
 
 Array = npt.NDArray[np.float64]
 
 RIDGE = 1e-6
-"""Keeps control points far from all data at 0 instead of anywhere."""
+"""Weight that pulls control points without data nearby to 0."""
 
 LSQR_STEPS = 2000
+"""Most iterations of LSQR."""
 
-SMALL = 1e6
-"""Multiplications of a banded solve up to which LAPACK is not worth its checks."""
+SMALL_SOLVE = 1e6
+"""Our kernel is faster than LAPACK up to this number of multiplications."""
 
-KEPT = 4096
-"""Axes of which knots and places are kept: most fields are as small as others before them."""
+CACHED_AXES = 4096
+"""Cached axes (knots, Greville abscissae): few different sizes occur."""
 
 
-@lru_cache(KEPT)
+@lru_cache(CACHED_AXES)
 def knots(num_cells: int, degree: int) -> Array:
     """
-    Return the clamped knots for num_cells + 2 control points, in [0, 1]; not to be changed.
+    Return the clamped knots for num_cells + 2 control points, in [0, 1]; cached, read-only.
 
     Parameters
     ----------
@@ -60,9 +61,9 @@ def knots(num_cells: int, degree: int) -> Array:
     return np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
 
 
-@lru_cache(KEPT)
+@lru_cache(CACHED_AXES)
 def greville_cells(num_cells: int, degree: int) -> Array:
-    """Return where control points stand along an axis, in cells; not to be changed."""
+    """Return the Greville abscissae along an axis, in cells; cached, read-only."""
     knot = knots(num_cells, degree)
     total = sum((knot[k : k + num_cells + 2] for k in range(1, degree + 1)), 0.0)
     found: Array = np.asarray(total) * ((num_cells + 1) / degree) - 0.5
@@ -70,27 +71,27 @@ def greville_cells(num_cells: int, degree: int) -> Array:
 
 
 def axis_degree(num_cells: int, degree: int) -> int:
-    """Return the degree that an axis of so many cells can have."""
+    """Return the degree of the splines along an axis, reduced if it has too few cells."""
     return min(degree, num_cells + 1)
 
 
 def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Array, Array]:
     """
-    Evaluate the splines that are not zero.
+    Evaluate the non-zero basis functions.
 
     Parameters
     ----------
     u : (M,) float64
-        In [0, 1].
+        Parameters in [0, 1].
     knot : (n,) float64
-        Of knots().
+        See knots().
     degree : int
-        Of the splines.
+        Degree of the splines.
 
     Returns
     -------
     (M,) int64
-        The first spline that is not zero; the others follow it.
+        Index of the first non-zero basis function; the others follow it.
     (M, degree + 1) float64
         Their values; each row sums to 1.
     (M, degree + 1) float64
@@ -99,7 +100,7 @@ def basis(u: Array, knot: Array, degree: int) -> tuple[npt.NDArray[np.int64], Ar
     """
     first = np.empty(len(u), np.int64)
     values, slopes = np.empty((2, len(u), degree + 1))
-    basis_at(u, knot, degree, first, values, slopes)
+    evaluate_basis(u, knot, degree, first, values, slopes)
     return first, values, slopes
 
 
@@ -115,7 +116,7 @@ class HeightField:
     origin : (2,) float64, m
         Lowest corner of the grid.
     degrees : (2,) int
-        Of the splines along x and y.
+        Degrees along x and y.
     control : (Nx + 2, Ny + 2) float64, m
         Heights of the control points.
 
@@ -127,9 +128,9 @@ class HeightField:
     control: Array
 
     def heights(self, xy: Array) -> Array:
-        """Return z at (M, 2) x and y, m; beyond the grid, that of its end."""
+        """Return z at (M, 2) x and y, m; beyond the grid, the height at its boundary."""
         result = np.empty(len(xy))
-        heights_at(np.ascontiguousarray(xy), self.parts(), result)
+        evaluate_field(np.ascontiguousarray(xy), self.parts(), result)
         return result
 
     def slopes(self, xy: Array) -> Array:
@@ -141,7 +142,7 @@ class HeightField:
         return result
 
     def parts(self) -> tuple[Array, float, tuple[int, int], tuple[Array, Array], Array]:
-        """Return what the kernels take: origin, pitch, degrees, knots, control points."""
+        """Return the arguments of the kernels: origin, pitch, degrees, knots, control points."""
         x, y = self.degrees
         num_x, num_y = self.control.shape
         both = knots(num_x - 2, x), knots(num_y - 2, y)
@@ -149,7 +150,7 @@ class HeightField:
         return np.ascontiguousarray(self.origin), self.pitch_m, self.degrees, both, control
 
     def greville(self) -> tuple[Array, Array]:
-        """Return x (Nx + 2,) and y (Ny + 2,) of the control points of the same NURBS patch, m."""
+        """Return x (Nx + 2,) and y (Ny + 2,) of the control points as a NURBS patch, m."""
         x, y = (
             self.origin[axis]
             + self.pitch_m * greville_cells(self.control.shape[axis] - 2, self.degrees[axis])
@@ -162,25 +163,25 @@ def design(
     field: HeightField, xy: Array, along: int = -1
 ) -> tuple[npt.NDArray[np.int64], Array, float]:
     """
-    Return which control points a height depends on, and how much on each.
+    Return the rows of the design matrix: control points and their weights for each location.
 
     Parameters
     ----------
     field : HeightField
-        Its control points do not matter.
+        Grid and degrees; control points are not used.
     xy : (M, 2) float64, m
-        Where.
+        Locations.
     along : int
-        0 or 1: the derivative along that axis instead; -1: the height.
+        0 or 1: the derivative along that axis; -1: the height.
 
     Returns
     -------
     (M, W) int64
-        Numbers of the control points, x by x.
+        Indices of the control points, y within x.
     (M, W) float64
         Their weights.
     float
-        The derivatives are to be multiplied by this.
+        Factor of the derivatives.
 
     """
     firsts, parts, unit = [], [], 1.0
@@ -201,7 +202,7 @@ def initial_field(
     pitch_m: float, origin: Array, heights: Array, filled: npt.NDArray[np.bool_], degree: int
 ) -> HeightField:
     """
-    Return the field whose control points are the mean heights of the cells, 0 elsewhere.
+    Return the field whose control points are the mean heights of the cells, 0 for empty cells.
 
     Parameters
     ----------
@@ -212,9 +213,9 @@ def initial_field(
     heights : (Nx, Ny) float64, m
         Mean z in each cell.
     filled : (Nx, Ny) bool
-        Which cells hold points.
+        Cells that hold points.
     degree : int
-        Of the splines, where the grid has cells enough.
+        Degree of the splines, reduced along axes with too few cells.
 
     """
     control = np.zeros((heights.shape[0] + 2, heights.shape[1] + 2))
@@ -224,12 +225,8 @@ def initial_field(
 
 
 def fit_lsqr(start: HeightField, xy: Array, z: Array) -> HeightField:
-    """
-    Return the field through (M,) heights at (M, 2) that is nearest to the one to start from.
-
-    Where it cannot pass through all, the sum of squares is least.
-    """
-    from scipy.sparse import csr_array  # 0.4 s, which mapping without models need not pay
+    """Return the least squares field of (M,) heights at (M, 2) nearest to the initial one."""
+    from scipy.sparse import csr_array  # 0.4 s that mapping without models saves
     from scipy.sparse.linalg import lsqr
 
     rows, weights, _ = design(start, xy)
@@ -246,19 +243,19 @@ def fit_pspline(
     start: HeightField, xy: Array, z: Array, weight: Array, smoothing: float
 ) -> HeightField:
     """
-    Return the field of least weighted squares at (M, 2) and squared second differences.
+    Return the field that minimises weighted squared residuals plus squared second differences.
 
     Parameters
     ----------
     start : HeightField
         Grid and degrees.
     xy, z, weight : (M, 2), (M,), (M,) float64
-        What to fit, and how much each counts.
+        Samples, m, and their weights.
     smoothing : float
-        Weight of the second differences, where the mean weight is 1.
+        Weight of the second differences, for a mean weight of 1.
 
     """
-    if start.control.shape[1] > start.control.shape[0]:  # the band is as wide as the short side
+    if start.control.shape[1] > start.control.shape[0]:  # the bandwidth is the short side
         turned = fit_pspline(transposed(start), xy[:, ::-1], z, weight, smoothing)
         return transposed(turned)
     num_x, num_y = start.control.shape
@@ -267,7 +264,7 @@ def fit_pspline(
     add_equations(np.column_stack([xy, z]), weight / weight.mean(), start.parts(), band, right)
     add_differences(*start.greville(), smoothing, band)
     band[:, 0] += RIDGE
-    if band.size * reach < SMALL:
+    if band.size * reach < SMALL_SOLVE:
         solve_band(band, right)
     else:
         from scipy.linalg import solveh_banded

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Charts: what hangs together, cut until each part has one height everywhere over one plane.
+Charts: connected components of surfels, bisected until each part is a height field.
 
-A component is cut where its normals turn too far from their mean, or where it lies over itself, as
-ramps do. The result depends on the voxels of the component alone, not on how it was cut before.
+A component is bisected if its normals deviate too far from their mean, or if it overlaps itself,
+as parking ramps do. The result depends on the voxels of the component only, not on its history.
 """
 
 from __future__ import annotations
@@ -14,73 +14,77 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.folds import halve_part
-from surfel_mapper.models.kernels.piece_groups import hang_together, mean_normals, suspects
-from surfel_mapper.models.pieces import Pieces
+from surfel_mapper.models.kernels.charts import bisect_chart
+from surfel_mapper.models.kernels.surfel_groups import (
+    connected_components,
+    find_doubtful,
+    mean_normals,
+)
+from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.int64]
 
 STACKED_VOXELS = 4.0
-"""A part lies over itself in columns that are so high; a slope of 60 deg is 2.5 voxels high."""
+"""Height of a column that overlaps itself, in voxels; a slope of 60 deg is 2.5 voxels high."""
 
 
-def charts_of(
-    pieces: Pieces, rows: Rows, starts: Indices, fold_angle_deg: float, least: int
+def chart_components(
+    graph: SurfelGraph, rows: Rows, starts: Indices, fold_angle_deg: float, least: int
 ) -> list[Rows]:
     """
     Return the voxels of every chart.
 
     Parameters
     ----------
-    pieces : Pieces
+    graph : SurfelGraph
         The voxels.
     rows, starts : (M,) int32, (K + 1,) int64
         Components: k has rows starts[k] to starts[k + 1] - 1.
     fold_angle_deg : float
-        Normals turn at most so far from their mean.
+        Largest angle between a normal and the mean of its chart.
     least : int
-        Charts of fewer voxels are left out.
+        Charts of fewer voxels are dropped.
 
     """
     means, doubtful = np.empty((len(starts) - 1, 3)), np.empty(len(starts) - 1, np.bool_)
-    flat = np.ones(len(pieces.key), np.bool_)
-    mean_normals(rows, starts, flat, pieces.normal, means)
-    rules = (math.cos(math.radians(fold_angle_deg)), STACKED_VOXELS * pieces.map.voxel_size_m)
-    suspects(rows, starts, means, pieces.normal, pieces.position, rules, doubtful)
+    flat = np.ones(len(graph.key), np.bool_)
+    mean_normals(rows, starts, flat, graph.normal, means)
+    rules = (math.cos(math.radians(fold_angle_deg)), STACKED_VOXELS * graph.map.voxel_size_m)
+    find_doubtful(rows, starts, means, graph.normal, graph.position, rules, doubtful)
     found: list[Rows] = []
     for k in range(len(means)):
         members = rows[starts[k] : starts[k + 1]]
         if doubtful[k]:
-            found += cut(pieces, members[np.argsort(pieces.key[members])], rules[0], least)
+            found += bisected(graph, members[np.argsort(graph.key[members])], rules[0], least)
         else:
             found.append(members)
     return found
 
 
-def cut(pieces: Pieces, members: Rows, limit: float, least: int) -> list[Rows]:
-    """Return the charts of one component whose rows are in the order of their keys."""
-    found, waiting, size_m = [], [members], pieces.map.voxel_size_m
+def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> list[Rows]:
+    """Return the charts of one component whose rows are sorted by key."""
+    found, waiting, size_m = [], [members], graph.map.voxel_size_m
     while waiting:
         part = waiting.pop()
         if len(part) < least:
             continue
         side = np.empty(len(part), np.bool_)
-        normals, points = pieces.normal[part], pieces.position[part]
-        if halve_part(normals, points, limit, STACKED_VOXELS * size_m, size_m, side):
+        normals, points = graph.normal[part], graph.position[part]
+        if bisect_chart(normals, points, limit, STACKED_VOXELS * size_m, size_m, side):
             for half in (part[side], part[~side]):
-                waiting += connected(pieces, half)
+                waiting += connected_parts(graph, half)
         else:
             found.append(part)
     return found
 
 
-def connected(pieces: Pieces, rows: Rows) -> list[Rows]:
-    """Return which of some rows hang together, each part in their order."""
+def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:
+    """Return the connected components of rows, each in the order of the rows."""
     parent = np.empty(len(rows), np.int64)
-    hang_together(rows, pieces.links, pieces.around, pieces.places, parent)
-    if not parent.any():  # as mostly: all with the first
+    connected_components(rows, graph.links, graph.neighbours, graph.places, parent)
+    if not parent.any():  # the usual case: one component
         return [rows]
     order = np.argsort(parent, kind='stable')
     return np.split(rows[order], np.flatnonzero(np.diff(parent[order])) + 1)

@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-From a cloud to planes, B-spline surfaces and Gaussians.
+Fit planes, B-spline surfaces and Gaussians to a cloud.
 
 The cloud is thinned to a point a voxel, in the order of the voxels, so that the result does not
-depend on the order of the points; then clustered until every cluster is flat or small; flat ones
-are joined to surfaces, which become planes or height fields; the rest are Gaussians.
+depend on the order of the points; then bisected into clusters that are flat or small. Flat ones
+are merged to surfaces, which become planes or height fields; the others are Gaussians.
+
+A map of surfels is fitted as a cloud of nine points across each surfel, which carry its slope.
 
 Source: Gao and Dong 2025 (A Real-Time Multi-Model Parametric Representation of Point Clouds).
 """
@@ -24,25 +26,26 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
-from surfel_mapper.models.clusters import (
-    Clusters,
-    clusters_of,
-    is_paper,
-    mean_normal,
-    surfaces_of,
-    thickness,
-)
+from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.kernels.voxel_means import (
+    average_runs,
     finite_ends,
-    give_labels,
-    mean_runs,
+    label_points,
     row_bits,
     sorted_runs,
     voxel_keys,
     voxel_runs,
 )
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
-from surfel_mapper.models.patches import Groups, patches_of
+from surfel_mapper.models.patches import fit_patches, PatchPoints
+from surfel_mapper.models.segmentation import (
+    Clusters,
+    is_paper,
+    mean_normal,
+    merge_clusters,
+    segment_cloud,
+    thickness,
+)
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -54,26 +57,26 @@ def fit(
     viewpoint: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> MultiModel:
     """
-    Return planes, surfaces and Gaussians for a cloud.
+    Fit planes, surfaces and Gaussians to a cloud.
 
     Parameters
     ----------
     points : (..., 3) float32 or float64, m
-        Organised or not; what is not finite is left out.
+        Organised or not; points that are not finite are left out.
     config : ModelsConfig, optional
-        Settings; the defaults without it.
+        Settings; defaults if omitted.
     viewpoint : (3,) float, m
-        Where the sensor was; normals face it, and its noise grows with the distance.
+        Position of the sensor; normals face it, and noise grows with the distance from it.
 
     Returns
     -------
     MultiModel
-        Empty for no points; exact planes, points on a line and repeated ones are no exception.
+        Empty for no points; exact planes, collinear and repeated points are valid input.
 
     Raises
     ------
     ModelError
-        If points or viewpoint are of another shape or type.
+        If points or viewpoint have a wrong shape or dtype.
     FilterError
         If the cloud extends over more voxels than can be numbered.
 
@@ -89,10 +92,10 @@ def fit(
     laps = [perf_counter()]
     thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
     laps.append(perf_counter())
-    clusters = clusters_of(thinned.means, config, view)
+    clusters = segment_cloud(thinned.means, config, view)
     laps.append(perf_counter())
     everything = config.kinds == 'all'
-    surfaces = surfaces_of(clusters, config, view) if everything else []
+    surfaces = merge_clusters(clusters, config, view) if everything else []
     laps.append(perf_counter())
     patches = fitted_patches(clusters, surfaces, config, view)
     laps.append(perf_counter())
@@ -100,22 +103,22 @@ def fit(
     times = [1e3 * (end - start) for start, end in pairwise(laps)]
     model, labels = assembled(clusters, patches, config)
     stages = dict(zip(names, times, strict=True))
-    return replace(model, labels=thinned.spread(labels), milliseconds=stages)
+    return replace(model, labels=thinned.point_labels(labels), milliseconds=stages)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Thinned:
     """
-    A point for every voxel with points.
+    Mean point of every occupied voxel.
 
     Attributes
     ----------
     means : (M, 3) float64, m
-        Means of the points, in the order of the voxels.
+        In the order of the voxels.
     runs : (R,) int64
-        Which rows of the cloud are in which voxel; see models/kernels/voxel_means.py.
+        Rows of the cloud by voxel; see models/kernels/voxel_means.py.
     num_points : int
-        All points, finite or not.
+        Number of all points, finite or not.
 
     """
 
@@ -123,10 +126,10 @@ class Thinned:
     runs: Indices
     num_points: int
 
-    def spread(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-        """Return labels for all points from those of the means, -1 where they are not finite."""
+    def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
+        """Return labels of all points from those of the means; -1 if not finite."""
         found = np.full(self.num_points, -1, np.int32)
-        give_labels(self.runs, row_bits(self.num_points), labels, found)
+        label_points(self.runs, row_bits(self.num_points), labels, found)
         return found
 
 
@@ -139,20 +142,20 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     keys, to_key = np.empty(len(points), np.int64), row_bits(len(points))
     voxel_keys(points, grid.size, grid.shift, grid.base, grid.bits, keys)
     key_bits = int(grid.bits.sum())
-    if key_bits + to_key > 63:  # far more voxels than points: number those that hold any
+    if key_bits + to_key > 63:  # keys too long: renumber the occupied voxels
         held = keys >= 0
         keys[held] = np.unique(keys[held], return_inverse=True)[1]
         key_bits = len(points).bit_length()
     num = voxel_runs(keys, to_key)
     runs = sorted_runs(keys[:num], key_bits, to_key)
     means = np.empty((num, 3))
-    return Thinned(means[: mean_runs(points, runs, to_key, means)], runs, len(points))
+    return Thinned(means[: average_runs(points, runs, to_key, means)], runs, len(points))
 
 
 def fitted_patches(
     clusters: Clusters, surfaces: list[Indices], config: ModelsConfig, viewpoint: Array
 ) -> list[tuple[Plane, Indices]]:
-    """Return the patches that fit, each with the rows of its clusters."""
+    """Return the patches that could be fitted, each with the rows of its clusters."""
     least = 1 if is_paper(config) else config.min_surface_points
     counts = clusters.num_points
     kept = [members for members in surfaces if counts[members].sum() >= least]
@@ -162,20 +165,20 @@ def fitted_patches(
     points = np.empty((starts[-1], 3))
     copy_ranges(clusters.points, clusters.rows[np.concatenate(kept)], points)
     means = np.array([counts[m] @ clusters.mean[m] / counts[m].sum() for m in kept])
-    groups = Groups(
+    groups = PatchPoints(
         points=points,
         starts=starts,
         normals=np.array([mean_normal(clusters, members) for members in kept]),
         thickness=thickness(means, config, viewpoint),
     )
-    patches = patches_of(groups, config, viewpoint)
+    patches = fit_patches(groups, config, viewpoint)
     return [(p, members) for p, members in zip(patches, kept, strict=True) if p is not None]
 
 
 def assembled(
     clusters: Clusters, patches: list[tuple[Plane, Indices]], config: ModelsConfig
 ) -> tuple[MultiModel, npt.NDArray[np.int32]]:
-    """Return the model, numbered anew, and the labels (M,) of the thinned points."""
+    """Return the model, with ids from 0, and the labels (M,) of the thinned points."""
     planes = [patch for patch in patches if not isinstance(patch[0], Surface)]
     surfaces = [patch for patch in patches if isinstance(patch[0], Surface)]
     of_cluster = np.full(len(clusters), -1, np.int64)
@@ -201,3 +204,56 @@ def assembled(
         num_thinned=len(clusters.points),
     )
     return model, labels
+
+
+LEAST_WIDTH = 0.04
+"""A surfel with a smaller ratio of the tangential variances is a line: one point."""
+
+ABOVE_EXTENTS = 1.0
+"""Height of the virtual viewpoint above a map, in diagonals of the map."""
+
+
+def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
+    """
+    Return points (9 K, 3) across surfels, m; surfels without a normal are left out.
+
+    A full square of width w has sigma w / sqrt(12), so its half width is sqrt(3) sigma.
+
+    Parameters
+    ----------
+    surfels : Surfels
+        K of them with a normal.
+    voxel_size_m : float
+        Edge of their voxels, m: no point leaves its voxel.
+
+    """
+    surfels = surfels.select(np.flatnonzero(np.isfinite(surfels.planarity)))
+    x, y = across(surfels.normal)
+    # surfels do not store their tangential axes: the disc is taken as round
+    wide = np.sqrt(3.0 * surfels.eigenvalues[:, 1:].mean(axis=1))
+    wide[surfels.eigenvalues[:, 1] < LEAST_WIDTH * surfels.eigenvalues[:, 2]] = 0.0
+    half = np.minimum(wide, voxel_size_m * np.sqrt(0.5))[:, None]
+    low = surfels.voxel_index * voxel_size_m
+    steps = [(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+    parts = [surfels.position + half * (i * x + j * y) for i, j in steps]
+    inside = [np.clip(part, low, np.nextafter(low + voxel_size_m, low)) for part in parts]
+    points: Array = np.stack(inside, axis=1).reshape(-1, 3)
+    return points
+
+
+def across(normals: Array) -> tuple[Array, Array]:
+    """Return two unit vectors (K, 3) orthogonal to each normal and to each other."""
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    x = np.cross(helper, normals)
+    x /= np.linalg.norm(x, axis=1, keepdims=True)
+    return x, np.cross(normals, x)
+
+
+def above(surfels: Surfels) -> Array:
+    """Return a viewpoint (3,) far above the middle of surfels, m."""
+    if not len(surfels):
+        return np.zeros(3)
+    low, high = surfels.position.min(axis=0), surfels.position.max(axis=0)
+    middle: Array = 0.5 * (low + high)
+    middle[2] = high[2] + ABOVE_EXTENTS * float(np.linalg.norm(high - low))
+    return middle

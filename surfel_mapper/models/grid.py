@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which part of its plane a patch covers: cells, and what is cut off those at the rim.
+The part of its plane that a patch covers: cells, and cuts of the boundary cells.
 
-A byte a cut, in 1/255 of the pitch (2/255 for the triangle), rounded down when it is made, so
-that no point that the patch was made of lies outside.
+A cut is one byte, in 1/255 of the pitch (2/255 for the triangle), rounded down, so that no point
+of the patch lies outside.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.coverage import cover_parts, cover_places
+from surfel_mapper.models.kernels.grid import find_covered, find_covered_squares
 
 Array = npt.NDArray[np.float64]
 
@@ -34,11 +34,11 @@ class Grid:
     filled : (Nx, Ny) bool
         Cells that hold points.
     rim : (Nx, Ny) bool
-        Those of them with an empty neighbour across an edge; there is nothing beyond the grid.
+        Boundary cells: filled, with an empty 4-neighbour; cells beyond the grid are empty.
     corner : (Nx, Ny) uint8
-        Where a rim cell is cut: 1 for its high x, 2 for its high y.
+        The cut corner of a boundary cell: 1 for its high x, 2 for its high y.
     cuts : (Nx, Ny, 3) uint8
-        How much: strip along x and y in 1/255 of the pitch, triangle in 2/255.
+        Cut strips along x and y in 1/255 of the pitch, triangle in 2/255.
 
     """
 
@@ -51,17 +51,17 @@ class Grid:
 
     @property
     def _cells(self) -> tuple[npt.NDArray[Any], ...]:
-        """What kernels take."""
+        """The tables, as the kernels take them."""
         return self.filled, self.rim, self.corner, self.cuts
 
     def contains(self, xy: Array) -> npt.NDArray[np.bool_]:
-        """Return which of (M, 2) places in the frame of the patch are covered, (M,) bool."""
+        """Return which (M, 2) locations in the frame of the patch are covered, (M,) bool."""
         inside = np.empty(len(xy), np.bool_)
-        cover_places(xy, self._cells, self.pitch_m, self.origin, inside)
+        find_covered(xy, self._cells, self.pitch_m, self.origin, inside)
         return inside
 
     def samples(self, step_m: float) -> Array:
-        """Return covered places (M, 2) at about this distance, so many a cell, m."""
+        """Return covered locations (M, 2) at about this spacing, m."""
         per_side = max(round(self.pitch_m / step_m), 1)
         inner = np.argwhere(np.ones((per_side, per_side))) + 0.5
         cells = np.argwhere(self.filled)
@@ -71,18 +71,18 @@ class Grid:
         return kept
 
     def mask(self, per_side: int) -> npt.NDArray[np.bool_]:
-        """Return which parts of the cells are covered by their middle, so many a side."""
+        """Return which squares are covered at their centre; per_side^2 squares a cell."""
         covered = np.empty(per_side * np.array(self.filled.shape), np.bool_)
-        cover_parts(per_side, self._cells, self.pitch_m, self.origin, covered)
+        find_covered_squares(per_side, self._cells, self.pitch_m, self.origin, covered)
         return covered
 
     def area_m2(self, per_side: int = 16) -> float:
-        """Return how much is covered, m^2, from so many samples along a cell."""
+        """Return the covered area, m^2, from per_side^2 samples a cell."""
         step_m = self.pitch_m / per_side
         return float(len(self.samples(step_m)) * step_m**2)
 
     @property
     def size_bytes(self) -> int:
-        """Bytes when packed: header, two bits a cell, two bits and three bytes a rim cell."""
+        """Bytes when packed: header, two bits a cell, two bits and three bytes a boundary cell."""
         cuts = int(self.rim.sum())
         return 16 + 2 * -(-self.filled.size // 8) + 3 * cuts + -(-cuts // 4)

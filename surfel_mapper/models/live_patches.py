@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Planes and surfaces through voxels, in frames that stay while what they hold changes little.
+Planes and surfaces of voxels, in frames that stay put while their content changes little.
 
-Mean, covariance and rms come from the exact moments of all points. What is covered, and the
-spline, come from nine points across each voxel, which carry its slope and count alike however
-often it was seen. The grid keeps its place in the world as long as the frame does, so cells that
-nothing changed in stay what they were.
+Mean, covariance and rms come from the exact moments of all points. Coverage and spline come from
+nine points across each surfel, which carry its slope and weigh every location equally, however
+often it was seen. The grid keeps its place in the map frame as long as the frame stays, so cells
+without changes stay the same.
 """
 
 from __future__ import annotations
@@ -19,49 +19,50 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.kernels.banded import rms_off_field
-from surfel_mapper.models.kernels.patches import describe
-from surfel_mapper.models.kernels.piece_classes import FLAT
-from surfel_mapper.models.kernels.piece_groups import mean_normals
-from surfel_mapper.models.kernels.pieces import merge_moments, spread
-from surfel_mapper.models.large_fields import fit_field, Fitted
+from surfel_mapper.models.bspline_incremental import fit_field, FittedField
+from surfel_mapper.models.kernels.bspline import rms_off_field
+from surfel_mapper.models.kernels.patches import describe_patches
+from surfel_mapper.models.kernels.surfel_classes import FLAT
+from surfel_mapper.models.kernels.surfel_groups import mean_normals, merge_voxels, sample_voxels
 from surfel_mapper.models.multi_model import Plane, Surface
-from surfel_mapper.models.patches import cells_of, Groups, rms_across
-from surfel_mapper.models.pieces import Pieces
+from surfel_mapper.models.patches import cells_of, PatchPoints, rms_across
+from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
 Rows = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.int64]
 
 PLANE_PITCH_VOXELS = 2.0
+"""Edge of the cells of a plane."""
 POINTS = 9
-"""Across each voxel."""
+"""Points across each surfel."""
 
 STILL = 0.1
-"""A frame stays while its rim would move by less than so much of the thickness of a plane."""
+"""A frame stays while its boundary would move by less than this share of the thickness."""
 
 STILL_RAD = math.radians(1.0)
+"""A frame stays while its normal turns by less."""
 MOST_TURN_RAD = math.radians(45.0)
-"""Beyond this a frame is made anew; below, its x is kept."""
+"""A frame that turns farther is rebuilt; below, its x is kept."""
 
 
 @dataclass(slots=True, eq=False)
 class Tracked:
     """
-    A patch and what it was made of.
+    A patch and its input.
 
     Attributes
     ----------
     patch : Plane
-        Or Surface; as it is handed out.
+        Plane or Surface, as published.
     rows : (n,) int32
         Rows of its voxels.
     component : int
-        What its voxels hang together with.
+        Connected component of its voxels.
     origin : (3,) float64, m
-        Where the lattice of its grid is anchored.
-    fitted : Fitted, optional
-        The height field of a surface about there.
+        Anchor of the lattice of its grid.
+    fitted : FittedField, optional
+        Height field of a surface, relative to the anchor.
 
     """
 
@@ -69,51 +70,50 @@ class Tracked:
     rows: Rows
     component: int
     origin: Array
-    fitted: Fitted | None
+    fitted: FittedField | None
 
 
 class PatchFitter:
     """
-    Makes patches from voxels.
+    Fits patches to voxels.
 
     Parameters
     ----------
-    pieces : Pieces
+    graph : SurfelGraph
         The voxels.
 
     """
 
-    def __init__(self, pieces: Pieces) -> None:
-        """Take over how thick flat things are."""
-        self._pieces = pieces
-        self._size_m = pieces.map.voxel_size_m
-        self._surface_pitch_m = max(self._size_m, 3.0 * pieces.thickness_m)
+    def __init__(self, graph: SurfelGraph) -> None:
+        self._graph = graph
+        self._size_m = graph.map.voxel_size_m
+        self._surface_pitch_m = max(self._size_m, 3.0 * graph.thickness_m)
 
     def fit(
         self, ids: list[int], rows: list[Rows], before: list[Tracked | None]
-    ) -> list[tuple[Plane, Array, Fitted | None]]:
+    ) -> list[tuple[Plane, Array, FittedField | None]]:
         """
-        Return patches, where the lattices of their grids are anchored, and fields about there.
+        Return patches, the anchors of their grids, and fields relative to these.
 
         Parameters
         ----------
         ids : list of int
-            What they are called.
+            Ids of the patches.
         rows : list of (n,) int32
             Rows of their voxels.
         before : list of Tracked or None
-            What they were.
+            The previous patches.
 
         """
         if not ids:
             return []
-        pieces, every = self._pieces, np.concatenate(rows)
+        graph, every = self._graph, np.concatenate(rows)
         starts = np.concatenate([[0], np.cumsum([len(part) for part in rows])])
         total, means, covariances = self._merged(every, starts)
         normals = np.empty_like(means)
-        mean_normals(every, starts, pieces.kind == FLAT, pieces.normal, normals)
-        thickness = np.full(len(ids), pieces.limit_m)
-        groups = Groups(self._points(every), POINTS * starts, normals, thickness)
+        mean_normals(every, starts, graph.kind == FLAT, graph.normal, normals)
+        thickness = np.full(len(ids), graph.limit_m)
+        groups = PatchPoints(self._points(every), POINTS * starts, normals, thickness)
         frames, curved = self._described(groups)
         frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
         origins, stays = self._steadied(before, frames, means, covariances, curved)
@@ -132,7 +132,7 @@ class PatchFitter:
                 field = fit_field(float(pitches[k]), cells.origins[k].copy(), sums, was)
                 rms_m = self._rms_m(field.field, frames[k], origins[k], rows[k])
                 spline = moved(field.field, shift)
-            cells.origins[k] -= shift[:2]  # the grid is handed out about the mean
+            cells.origins[k] -= shift[:2]  # published grids are relative to the mean
             common = (ids[k], int(total[k]), means[k], covariances[k], frames[k])
             if spline is None:
                 rms_m = rms_across(covariances[k], frames[k, 2], int(total[k]))
@@ -144,28 +144,28 @@ class PatchFitter:
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
         """Return number, mean and covariance of all points of groups of voxels."""
-        number, pieces = len(starts) - 1, self._pieces
+        number, graph = len(starts) - 1, self._graph
         total, merged = np.empty(number, np.int64), np.empty((number, 6))
         means = np.empty((number, 3))
-        merge_moments(
-            rows, starts, pieces.count, pieces.position, pieces.covariance, total, means, merged
+        merge_voxels(
+            rows, starts, graph.count, graph.position, graph.covariance, total, means, merged
         )
         return total, means, symmetric(merged)
 
     def _points(self, rows: Rows) -> Array:
-        """Return the points (9 n, 3) across voxels, m."""
-        pieces = self._pieces
-        low = unpack_keys(pieces.key[rows]) * self._size_m
+        """Return the points (9 n, 3) across surfels, m."""
+        graph = self._graph
+        low = unpack_keys(graph.key[rows]) * self._size_m
         points = np.empty((POINTS * len(rows), 3))
-        spread(rows, pieces.position, pieces.axes, low, self._size_m, points)
+        sample_voxels(rows, graph.position, graph.axes, low, self._size_m, points)
         return points
 
-    def _described(self, groups: Groups) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return the frames (K, 3, 3) of groups as surfaces, and which of them are."""
+    def _described(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
         number = len(groups.thickness)
         means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
         covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
-        describe(
+        describe_patches(
             groups.points,
             groups.starts,
             groups.normals,
@@ -186,7 +186,7 @@ class PatchFitter:
         covariances: Array,
         curved: npt.NDArray[np.bool_],
     ) -> tuple[Array, npt.NDArray[np.bool_]]:
-        """Return where patches are anchored, and which frames stay; frames change in place."""
+        """Return anchors, and whether frames stay; frames are changed in place."""
         origins, stays = means.copy(), np.zeros(len(means), np.bool_)
         known = {
             k: tracked
@@ -201,8 +201,8 @@ class PatchFitter:
         normals = frames[rows, 2]
         turn = np.linalg.norm(was[:, 2] - normals, axis=1)
         radius = 3.0 * np.sqrt(np.trace(covariances[rows], axis1=1, axis2=2))
-        # what a plane is off its points at the rim counts; a field says itself where it is
-        near = curved[rows] | (turn * radius < STILL * self._pieces.thickness_m)
+        # a plane must fit at its boundary; a field adapts its heights
+        near = curved[rows] | (turn * radius < STILL * self._graph.thickness_m)
         still = (turn < STILL_RAD) & near
         frames[rows[still]], origins[rows[still]] = was[still], anchors[still]
         stays[rows] = still
@@ -214,13 +214,13 @@ class PatchFitter:
 
     def _rms_m(self, field: HeightField, frame: Array, origin: Array, rows: Rows) -> float:
         """Return the root mean square distance of the points of voxels from a field, m."""
-        held = self._pieces.count, self._pieces.position, self._pieces.eigenvalues
+        held = self._graph.count, self._graph.position, self._graph.eigenvalues
         found: float = rms_off_field(rows, held, frame, origin, field.parts())
         return found
 
 
 def turned(x: Array, normals: Array) -> Array:
-    """Return the frames (K, 3, 3) of normals whose x are as near to others as they can be."""
+    """Return the frames (K, 3, 3) of normals with x nearest to given axes."""
     along = x - np.einsum('ij,ij->i', x, normals)[:, None] * normals
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return np.stack([along, np.cross(normals, along), normals], axis=1)
@@ -233,7 +233,7 @@ def symmetric(packed: Array) -> Array:
 
 
 def plane_frames(covariances: Array, normals: Array) -> Array:
-    """Return frames (K, 3, 3) along the axes of covariances, z on the side of the normals."""
+    """Return principal frames (K, 3, 3) of covariances, with z on the side of the normals."""
     vectors = np.linalg.eigh(covariances)[1]
     z, x = vectors[:, :, 0], vectors[:, :, 2]
     z = z * np.where(np.einsum('ij,ij->i', z, normals) < 0.0, -1.0, 1.0)[:, None]
@@ -244,6 +244,6 @@ def plane_frames(covariances: Array, normals: Array) -> Array:
 
 
 def moved(field: HeightField, shift: Array) -> HeightField:
-    """Return a field about a place that is so far from the one it was about, (3,) m."""
+    """Return a field relative to an origin shifted by (3,) m."""
     origin, control = field.origin - shift[:2], field.control - shift[2]
     return HeightField(field.pitch_m, origin, field.degrees, control)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The result: planes, surfaces and Gaussians that stand for a cloud, and clouds made from them.
+Planes, surfaces and Gaussians of a cloud, and clouds sampled from them.
 
-A patch has a frame: R_patch_map takes offsets from its mean to x, y and z across it, z towards
-the viewpoint.
+A patch has a frame: R_patch_map rotates offsets from its mean to x, y and z, with z towards the
+viewpoint.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.evaluation import evaluate, Evaluation
+from surfel_mapper.models.evaluation import compare, Evaluation
 from surfel_mapper.models.grid import Grid
 
 Array = npt.NDArray[np.float64]
 
 PATCH_BYTES = 4 + 1 + 8 + 24 + 16 + 24 + 4 + 12
-"""Number, kind, points, mean, rotation, covariance, error and direction of view."""
+"""Id, kind, number of points, mean, rotation, covariance, rms and viewing direction."""
 
 GAUSSIAN_BYTES = 4 + 8 + 12 + 24 + 4
-"""Number, points, mean, covariance and weight."""
+"""Id, number of points, mean, covariance and weight."""
 
 SIGMAS = 3.0
-"""Samples of a Gaussian farther out are drawn again."""
+"""Samples of a Gaussian beyond this number of sigmas are drawn again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -39,19 +39,19 @@ class Plane:
     Attributes
     ----------
     id : int
-        What labels call it.
+        Its label.
     num_points : int
-        Of the thinned cloud.
+        Points of the thinned cloud.
     mean : (3,) float64, m
-        Of the points.
+        Mean of the points.
     covariance : (3, 3) float64, m^2
-        Of the points.
+        Covariance of the points.
     R_patch_map : (3, 3) float64
         Rows x, y and normal; right-handed.
     rms_m : float
         Root mean square distance of the points along the normal.
     grid : Grid
-        What is covered.
+        Covered area.
 
     """
 
@@ -71,26 +71,26 @@ class Plane:
 
     @property
     def offset_m(self) -> float:
-        """Number d of the plane normal . p + d = 0."""
+        """Offset d of the plane normal . p + d = 0."""
         return -float(self.normal @ self.mean)
 
     def heights(self, xy: Array) -> Array:
-        """Return z of (M, 2) places in the frame, m."""
+        """Return z at (M, 2) locations in the frame, m."""
         return np.zeros(len(xy))
 
     def to_local(self, points: Array) -> Array:
-        """Take (M, 3) points to the frame of the patch."""
+        """Transform (M, 3) points to the frame of the patch."""
         local: Array = (points - self.mean) @ self.R_patch_map.T
         return local
 
     def lifted(self, xy: Array) -> Array:
-        """Return the points (M, 3) of the patch at (M, 2) places in its frame."""
+        """Return the points (M, 3) of the patch at (M, 2) locations in its frame."""
         local = np.column_stack([xy, self.heights(xy)])
         points: Array = local @ self.R_patch_map + self.mean
         return points
 
     def samples(self, step_m: float) -> Array:
-        """Return points (M, 3) on the patch at about this distance."""
+        """Return points (M, 3) on the patch at about this spacing."""
         return self.lifted(self.grid.samples(step_m))
 
     @property
@@ -106,11 +106,11 @@ class Surface(Plane):
     spline: HeightField
 
     def heights(self, xy: Array) -> Array:
-        """Return z of (M, 2) places in the frame, m."""
+        """Return z at (M, 2) locations in the frame, m."""
         return self.spline.heights(xy)
 
     def normals(self, xy: Array) -> Array:
-        """Return the unit normals, (M, 3), at (M, 2) places in the frame."""
+        """Return the unit normals, (M, 3), at (M, 2) locations in the frame."""
         slopes = self.spline.slopes(xy)
         local = np.column_stack([-slopes, np.ones(len(xy))])
         normals: Array = local @ self.R_patch_map
@@ -126,14 +126,14 @@ class Surface(Plane):
 @dataclass(frozen=True, slots=True, eq=False)
 class Gaussians:
     """
-    What is neither plane nor surface, G rows.
+    Gaussians of the points on neither plane nor surface, G rows.
 
     Attributes
     ----------
     id : (G,) int64
-        What labels call them.
+        Their labels.
     num_points : (G,) int64
-        Of the thinned cloud.
+        Points of the thinned cloud.
     mean : (G, 3) float64, m
     covariance : (G, 3, 3) float64, m^2
 
@@ -145,12 +145,12 @@ class Gaussians:
     covariance: Array
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of Gaussians."""
         return len(self.id)
 
     def samples(self, seed: int = 0, sigmas: float = SIGMAS) -> Array:
         """
-        Draw as many points (M, 3) as they were made of, none farther out than some sigmas.
+        Draw num_points points of each, (M, 3), none farther out than `sigmas`.
 
         Without that limit the tails alone make the samples a tenth less precise.
         """
@@ -184,13 +184,13 @@ class MultiModel:
     gaussians : Gaussians
         Together they hold every point once.
     labels : (N,) int32
-        The id of what each given point belongs to; -1 for points that are not finite.
+        The id of the primitive of each given point; -1 if the point is not finite.
     voxel_size_m : float
-        What the cloud was thinned with.
+        Edge of the voxels for thinning.
     num_thinned : int
         Points of the thinned cloud.
     milliseconds : dict of str to float
-        What each stage took.
+        Duration of each stage.
 
     """
 
@@ -214,14 +214,14 @@ class MultiModel:
 
     def resample(self, step_m: float | None = None, seed: int = 0) -> Array:
         """
-        Return a cloud (M, 3) that the models stand for, m.
+        Return a cloud (M, 3) sampled from the models, m.
 
         Parameters
         ----------
         step_m : float, optional
-            Distance of points on planes and surfaces; the voxel size without it.
+            Spacing of points on planes and surfaces; the voxel size if omitted.
         seed : int
-            Of what is drawn from the Gaussians.
+            Seed of the samples of Gaussians.
 
         """
         step_m = self.voxel_size_m if step_m is None else step_m
@@ -229,5 +229,27 @@ class MultiModel:
         return np.concatenate([*parts, self.gaussians.samples(seed)])
 
     def evaluate(self, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
-        """Compare what the models generate with a cloud; see models.evaluate."""
-        return evaluate(self, reference, seed)
+        """
+        Compare samples of the models with a cloud.
+
+        Parameters
+        ----------
+        reference : (..., 3) float, m
+            The cloud as it came from the sensor, not thinned; points that are not finite are left
+            out.
+        seed : int
+            Seed of the samples of Gaussians.
+
+        """
+        return compare(
+            self.resample(seed=seed),
+            reference,
+            near_m=self.voxel_size_m,
+            counts=(len(self.planes), len(self.surfaces), len(self.gaussians)),
+            size_bytes=self.size_bytes,
+        )
+
+
+def evaluate(model: MultiModel, reference: npt.NDArray[Any], seed: int = 0) -> Evaluation:
+    """Compare samples of models with a cloud; see MultiModel.evaluate."""
+    return model.evaluate(reference, seed)

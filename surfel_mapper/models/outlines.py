@@ -1,46 +1,56 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Outlines and triangles of patches, for those who draw or measure them.
+Outlines and triangles of patches.
 
-Both come from masks of what is covered, cells cut into smaller squares: the rim of one, with the
-steps taken off, and two triangles for every square of the other.
+Both come from masks of the covered area, cells divided into smaller squares: the outline is the
+boundary of one mask, smoothed and simplified; surfaces get two triangles for every square of the
+other. Planes are triangulated from their outline; the sweep handles holes, separate parts and
+rings that touch.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.rims import follow_sides, lay_sides, mark_corners
+from surfel_mapper.geometry import face_normals
+from surfel_mapper.models.kernels.outlines import (
+    mark_sides,
+    simplify_loop,
+    trace_loops,
+    triangulate_rings,
+)
 from surfel_mapper.models.multi_model import Plane
 
 Array = npt.NDArray[np.float64]
 
 PARTS = 4
-"""A cell is cut into so many squares along either side for its outline."""
+"""Squares along either side of a cell, for outlines."""
 
 PARTS_OF_SURFACE = 2
-"""And so many for its triangles: a spline bends little within half a cell."""
+"""Squares along either side of a cell, for triangles: a spline bends little within half a cell."""
 
 TOLERANCE = 0.75
-"""An outline is this near to the rim of the mask, in squares."""
+"""Tolerance of the simplification of outlines, in squares."""
 
 
 def outline(patch: Plane) -> list[Array]:
     """
-    Return the rings around what a patch covers, (M, 3) m each, not closed.
+    Return the rings around the covered area of a patch, (M, 3) m each, not closed.
 
-    Outer ones run against the clock seen from the side that the normal points to, holes with it.
+    Outer rings run counter-clockwise seen from the side of the normal, holes clockwise.
     """
     return [patch.lifted(ring) for ring in local_outline(patch)]
 
 
 def local_outline(patch: Plane) -> list[Array]:
-    """Return the same as places (M, 2) in the frame of the patch, m."""
+    """Return the outline as locations (M, 2) in the frame of the patch, m."""
     side_m = patch.grid.pitch_m / PARTS
     return [
-        patch.grid.origin + side_m * simplified(middles(ring))
+        patch.grid.origin + side_m * simplified(midpoints(ring))
         for ring in rings(patch.grid.mask(PARTS))
     ]
 
@@ -62,30 +72,78 @@ def triangles(patch: Plane) -> tuple[Array, npt.NDArray[np.int64]]:
 
 def rings(mask: npt.NDArray[np.bool_]) -> list[Array]:
     """
-    Return the corners (M, 2) along every rim of a mask, what is covered on the left.
+    Return the corners (M, 2) of every boundary loop of a mask, with the covered side on the left.
 
-    Squares that touch at a corner only do not hang together there.
+    Squares that touch at a corner only are not connected there.
     """
     ways = np.zeros(np.array(mask.shape) + 1, np.uint8)
-    num = lay_sides(mask, ways)
+    num = mark_sides(mask, ways)
     corners, ends = np.empty((num, 2)), np.empty(num, np.int64)
-    num_rings = follow_sides(mask, ways, corners, ends)
+    num_rings = trace_loops(mask, ways, corners, ends)
     return np.split(corners, ends[: num_rings - 1]) if num else []
 
 
-def middles(ring: Array) -> Array:
-    """Return the middles of the sides of a ring: steps become slopes."""
+def midpoints(ring: Array) -> Array:
+    """Return the midpoints of the sides of a ring: steps become slopes."""
     return 0.5 * (ring + next_corners(ring))
 
 
 def next_corners(ring: Array) -> Array:
-    """Return for each corner of a ring (M, D) the one after it; np.roll takes longer."""
+    """Return for each corner of a ring (M, D) the next one; faster than np.roll."""
     return np.concatenate([ring[1:], ring[:1]])
 
 
 def simplified(ring: Array) -> Array:
-    """Return the corners of a ring (M, 2) that matter, by Douglas and Peucker; at least three."""
+    """Return the corners of a ring (M, 2) that Douglas-Peucker keeps; at least three."""
     kept = np.zeros(len(ring), np.bool_)
-    mark_corners(ring, TOLERANCE, kept)
+    simplify_loop(ring, TOLERANCE, kept)
     chosen = ring[kept]
     return chosen if len(chosen) >= 3 else ring
+
+
+def triangulated(rings: Sequence[Array]) -> Array:
+    """
+    Return counter-clockwise triangles (T, 3, 2) that cover the inside of rings.
+
+    Parameters
+    ----------
+    rings : sequence of (M, 2) float64
+        Their corners, not closed. Even-odd rule: points inside an odd number of rings are covered,
+        whatever the direction of the rings.
+
+    """
+    corners = np.concatenate([np.empty((0, 2)), *rings])
+    found: Array = triangulate_rings(
+        corners, np.cumsum([len(ring) for ring in rings], dtype=np.int64)
+    )
+    return found
+
+
+def areas(triangles: Array) -> Array:
+    """Return the areas, (T,), of triangles (T, 3, 2) or (T, 3, 3); 2D: signed."""
+    if triangles.shape[2] == 2:
+        a, b = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+        across: Array = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+        return 0.5 * across
+    length: Array = np.linalg.norm(face_normals(triangles), axis=1)
+    return 0.5 * length
+
+
+def bridged(rings: Sequence[Array]) -> Array:
+    """
+    Return one ring (M, D) of all rings, connected by bridges between their nearest corners.
+
+    A bridge is traversed both ways and encloses nothing, so the signed area is the sum of those of
+    the rings, and the even-odd rule gives the same inside.
+    """
+    if not rings:
+        return np.empty((0, 3))
+    ordered = sorted(rings, key=len, reverse=True)
+    whole = ordered[0]
+    for ring in ordered[1:]:
+        apart = ((whole[:, None] - ring[None]) ** 2).sum(axis=2)
+        here, there = np.unravel_index(int(apart.argmin()), apart.shape)
+        way = np.roll(ring, -int(there), axis=0)
+        parts = [whole[: here + 1], way, way[:1], whole[here:]]
+        whole = np.concatenate(parts)
+    return whole

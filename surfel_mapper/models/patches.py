@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Patches from groups of points: their frames, what they cover, and their splines.
+Fit planes and surfaces to groups of points: frames, coverage, splines.
 
-All patches of a cloud go through each kernel together; a call for each would take longer than
+All patches of a cloud go through each kernel together; one call for each would take longer than
 the work.
 """
 
@@ -17,25 +17,28 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
-from surfel_mapper.models.clusters import is_paper
 from surfel_mapper.models.grid import Grid
-from surfel_mapper.models.kernels.cells import fill_cells, lay_grids
-from surfel_mapper.models.kernels.patches import describe
+from surfel_mapper.models.kernels.grid import fill_cells, place_grids
+from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.multi_model import Plane, Surface
+from surfel_mapper.models.segmentation import is_paper
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 PAPER_PLANE_PITCH_VOXELS = 5.0
+"""Edge of the cells of planes in profile paper."""
 SURFACE_PITCH_VOXELS = 3.0
+"""Edge of the cells of surfaces."""
 MARGIN_VOXELS = 0.5
+"""Distance between a cut and the points."""
 
 FAR_VOXELS, FAR_SHARE = 1.5, 0.05
-"""A surface has several heights in one place where more points than this are so far from it."""
+"""A surface is multi-valued if a larger share of its points is farther than FAR_VOXELS."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Groups:
+class PatchPoints:
     """
     Points of K patches, one patch after the other.
 
@@ -47,7 +50,7 @@ class Groups:
     normals : (K, 3) float64
         Mean normals.
     thickness : (K,) float64, m
-        How thick, 6 sigma, a plane may be.
+        Largest thickness, 6 sigma, of a plane.
 
     """
 
@@ -59,7 +62,7 @@ class Groups:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cells:
-    """The cells of all patches, one row each; see models/kernels/cells.py."""
+    """The cells of all patches, one row each; see models/kernels/grid.py."""
 
     pitches: Array
     origins: Array
@@ -76,7 +79,7 @@ class Cells:
         return slice(begin, begin + x * y)
 
     def grid(self, patch: int) -> Grid:
-        """Return what a patch covers."""
+        """Return the coverage of a patch."""
         rows, shape = self.of(patch), tuple(self.sizes[patch].tolist())
         return Grid(
             pitch_m=float(self.pitches[patch]),
@@ -88,14 +91,14 @@ class Cells:
         )
 
 
-def patches_of(groups: Groups, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
-    """Return a Plane or Surface for every group, numbered in order; None where neither fits."""
+def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
+    """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
     number, by_paper = len(groups.thickness), is_paper(config)
     a = config.voxel_size_m
     means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
     covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
     rules = (groups.thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
-    describe(
+    describe_patches(
         groups.points,
         groups.starts,
         groups.normals,
@@ -127,12 +130,12 @@ def patches_of(groups: Groups, config: ModelsConfig, viewpoint: Array) -> list[P
 
 
 def cells_of(
-    groups: Groups, frames: tuple[Array, Array, Array, Array], a: float, *, snapped: bool
+    groups: PatchPoints, frames: tuple[Array, Array, Array, Array], a: float, *, snapped: bool
 ) -> Cells:
     """Return the cells of all patches; frames: means, rotations, pitches, local coordinates."""
     means, rotations, pitches, local = frames
     origins, sizes = np.empty((len(means), 2)), np.empty((len(means), 2), np.int64)
-    lay_grids(
+    place_grids(
         groups.points, groups.starts, means, rotations, pitches, snapped, local, origins, sizes
     )
     ends = np.cumsum(sizes.prod(axis=1))
@@ -164,7 +167,7 @@ def cells_of(
 
 
 def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) -> Surface | None:
-    """Return the surface through (n, 3) points in a frame; None where it has several heights."""
+    """Return the surface of (n, 3) points in a frame; None if it is multi-valued."""
     sums = cells.sums[cells.of(plane.id)]
     used = sums[:, 3] > 0.0
     means = np.zeros((len(sums), 3))
@@ -189,13 +192,13 @@ def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) 
 
 
 def rms_across(covariance: Array, normal: Array, number: int) -> float:
-    """Return the root mean square of what points are off their mean along a direction."""
+    """Return the root mean square distance of points from their mean along a direction."""
     variance = max(float(normal @ covariance @ normal), 0.0)
     return math.sqrt(variance * (number - 1) / number)
 
 
 def fitted(start: HeightField, means: Array, number: Array, config: ModelsConfig) -> HeightField:
-    """Return the spline through (C, 3) means of cells that hold (C,) points."""
+    """Return the spline that fits the (C, 3) means of cells with (C,) points."""
     if is_paper(config) or config.solver == 'lsqr':
         return fit_lsqr(start, means[:, :2], means[:, 2])
     return fit_pspline(start, means[:, :2], means[:, 2], number, config.smoothing)

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What primitives look like: outlines, triangles and boxes of patches, ellipsoids of Gaussians.
+Shapes of primitives for drawing and export: outlines, triangles, boxes, ellipsoids.
 
 An outline takes a quarter of a millisecond, that of a large floor several, and there are hundreds:
-Shapes keeps what has not changed.
+Shapes caches them by version.
 """
 
 from __future__ import annotations
@@ -16,9 +16,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters.shapes import eigen
-from surfel_mapper.models.filling import areas, filled
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
-from surfel_mapper.models.outlines import local_outline, triangles
+from surfel_mapper.models.outlines import areas, local_outline, triangles, triangulated
 
 Array = npt.NDArray[np.float64]
 
@@ -26,6 +25,7 @@ SIGMAS = 2.0
 """Half axes of an ellipsoid, in standard deviations."""
 
 GOLDEN = 0.5 * (1.0 + 5.0**0.5)
+"""The golden ratio."""
 
 CORNERS = np.array(
     [
@@ -35,11 +35,11 @@ CORNERS = np.array(
         for y in (-1.0, 1.0)
     ]
 ) / np.hypot(1.0, GOLDEN)
-"""Of an icosahedron within the unit sphere, (12, 3)."""
+"""Corners of an icosahedron in the unit sphere, (12, 3)."""
 
 
 def faces_of_icosahedron() -> npt.NDArray[np.int64]:
-    """Return the 20 faces (20, 3): three corners that are all as near as can be, facing out."""
+    """Return the 20 faces (20, 3), facing out: triples of mutually nearest corners."""
     near = np.linalg.norm(CORNERS[:, None] - CORNERS, axis=2) < 1.1
     return np.array(
         [
@@ -62,22 +62,22 @@ FACES = faces_of_icosahedron()
 @dataclass(frozen=True, slots=True, eq=False)
 class PatchShape:
     """
-    What a plane or surface looks like.
+    Shape of a plane or surface.
 
     Attributes
     ----------
     patch : Plane
-        Whose shape it is.
+        The patch.
     rings : list of (M, 3) float64, m
         Its outline; see outlines.outline.
     vertices : (V, 3) float64, m
     faces : (T, 3) int64
-        Its triangles, facing along the normal; those of a plane cover exactly what the rings
-        enclose.
+        Its triangles, facing along the normal; those of a plane cover exactly the inside of the
+        rings.
     low, high : (3,) float64, m
-        Of the box around them in the frame of the patch.
+        Bounding box in the frame of the patch.
     area_m2 : float
-        Of the triangles.
+        Area of the triangles.
 
     """
 
@@ -107,18 +107,18 @@ class PatchShape:
 
 
 def shape_of(patch: Plane) -> PatchShape:
-    """Return what a patch looks like."""
-    rims = local_outline(patch)
+    """Return the shape of a patch."""
+    local_rings = local_outline(patch)
     if isinstance(patch, Surface):
         vertices, faces = triangles(patch)
     else:
-        places, faces = indexed(filled(rims))
+        places, faces = indexed(triangulated(local_rings))
         vertices = patch.lifted(places)
-    rings = [patch.lifted(rim) for rim in rims]
+    rings = [patch.lifted(rim) for rim in local_rings]
     local = np.concatenate([patch.to_local(vertices), *map(patch.to_local, rings)])
     low, high = local.min(axis=0), local.max(axis=0)
     if not isinstance(patch, Surface):
-        low[2] = high[2] = 0.0  # but for rounding it is
+        low[2] = high[2] = 0.0  # exact up to rounding
     return PatchShape(
         patch=patch,
         rings=rings,
@@ -131,7 +131,7 @@ def shape_of(patch: Plane) -> PatchShape:
 
 
 def indexed(triangles: Array) -> tuple[Array, npt.NDArray[np.int64]]:
-    """Return the different corners of triangles (T, 3, 2), (V, 2) by x and y, and faces (T, 3)."""
+    """Return the distinct corners of triangles (T, 3, 2), (V, 2) by x and y, and faces (T, 3)."""
     corners = triangles.reshape(-1, 2)
     order = np.lexsort(corners.T[::-1])
     ordered = corners[order]
@@ -143,16 +143,15 @@ def indexed(triangles: Array) -> tuple[Array, npt.NDArray[np.int64]]:
 
 
 class Shapes:
-    """Shapes of patches, each made once and kept while its version stays."""
+    """Cache of the shapes of patches, by id and version."""
 
     def __init__(self) -> None:
-        """Begin with none."""
         self._kept: dict[int, tuple[int, PatchShape]] = {}
 
     def make(
         self, model: MultiModel, versions: Mapping[int, int], at_most: int | None = None
     ) -> bool:
-        """Make shapes that are missing, so many now; return whether all are there."""
+        """Compute up to `at_most` missing shapes; return whether all are cached."""
         missing = [
             patch
             for patch in model.patches
@@ -174,7 +173,7 @@ def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
     """Return axes (G, 3, 3) as columns, right-handed, and half axes (G, 3), m, ascending."""
     rows, columns = np.triu_indices(3)
     values, axes = eigen(gaussians.covariance[:, rows, columns].T)
-    axes[values[:, 2] == 0.0] = np.eye(3)  # without extent any axes will do
+    axes[values[:, 2] == 0.0] = np.eye(3)  # axes of a point are arbitrary
     x, y, z = axes.transpose(1, 2, 0)
     is_left = (
         (x[1] * y[2] - x[2] * y[1]) * z[0]
@@ -186,7 +185,7 @@ def ellipsoid_frames(gaussians: Gaussians) -> tuple[Array, Array]:
 
 
 def ellipsoid_corners(gaussians: Gaussians) -> Array:
-    """Return places (G, 12, 3) on the ellipsoids of Gaussians, m: the corners of FACES."""
+    """Return points (G, 12, 3) on the ellipsoids of Gaussians, m: the corners of FACES."""
     R_map_axes, half = ellipsoid_frames(gaussians)
     corners: Array = CORNERS * half[:, None] @ np.swapaxes(R_map_axes, 1, 2)
     return corners + gaussians.mean[:, None]

@@ -187,7 +187,7 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
 def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) -> None:
     """Write models as JSON, OBJ and further formats that were asked for, and their picture."""
     from surfel_mapper.files.model_files import write_models
-    from surfel_mapper.models.surfel_points import above, surfel_points
+    from surfel_mapper.models.fitting import above, surfel_points
     from surfel_mapper.viz.models import draw_models
 
     wanted = ['json', 'obj', *(name for name in ('parquet', DXF) if name in formats)]

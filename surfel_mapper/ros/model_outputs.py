@@ -31,8 +31,8 @@ from surfel_mapper.messages.model_messages import (
     surfel_primitive_columns,
 )
 from surfel_mapper.messages.pointcloud2 import from_columns
-from surfel_mapper.models.filling import joined
 from surfel_mapper.models.live import LiveModels
+from surfel_mapper.models.outlines import bridged
 from surfel_mapper.models.shapes import PatchShape, Shapes
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.base_node import LATCHED
@@ -168,7 +168,7 @@ class ModelOutputs:
             self._publish_outline(number, np.empty((0, 3)))
         for number, version in versions.items():
             if self._told.get(number) != version:
-                self._publish_outline(number, joined(shapes[number].rings))
+                self._publish_outline(number, bridged(shapes[number].rings))
         self._told = versions
 
     def _publish_outline(self, number: int, ring: npt.NDArray[np.float64]) -> None:

@@ -21,7 +21,7 @@ from surfel_mapper.files.model_files import (
     write_parquet,
 )
 from surfel_mapper.models import fit
-from surfel_mapper.models.filling import areas
+from surfel_mapper.models.outlines import areas
 from surfel_mapper.models.shapes import shape_of
 from test.models.scenes import A, room, VIEW
 

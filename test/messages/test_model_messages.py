@@ -36,10 +36,10 @@ from surfel_mapper.messages.model_messages import (
 )
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.models import fit
-from surfel_mapper.models.filling import areas
+from surfel_mapper.models.fitting import surfel_points
 from surfel_mapper.models.multi_model import Gaussians
+from surfel_mapper.models.outlines import areas
 from surfel_mapper.models.shapes import Shapes
-from surfel_mapper.models.surfel_points import surfel_points
 from test.models.scenes import A, room, VIEW
 
 

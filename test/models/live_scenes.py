@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What live models are compared by: which voxels belong together, whatever they are called."""
+"""Scenes of live models, and their voxels by primitive, for comparison regardless of ids."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SETTINGS = ModelsLayerConfig(min_points=4, noise_m=0.005)
 
 
 def live(surfel_map, settings=SETTINGS):
-    """Return models that have read a map once: those of a batch."""
+    """Return models that have read a map once (a batch)."""
     models = LiveModels(settings, surfel_map)
     models.update()
     return models
@@ -29,7 +29,7 @@ def of_points(points, origin=(0.0, 0.0, 5.0), settings=SETTINGS, voxel_size_m=VO
 
 
 def groups(models):
-    """Return which voxels each primitive has, by kind: a set of (kind, voxels)."""
+    """Return the voxels of each primitive, by kind: a set of (kind, voxels)."""
     model = models.model
     kind = {patch.id: 'patch' for patch in model.patches}
     kind.update({int(number): 'gaussian' for number in model.gaussians.id})
@@ -46,7 +46,7 @@ def ids(models):
 
 
 def id_at(models, place):
-    """Return the id of what the voxel at a place belongs to; -1 for none."""
+    """Return the id of the primitive at a location; -1 for none."""
     voxel = np.floor(np.array(place) / models.map.voxel_size_m)
     found = np.flatnonzero((models.surfels.voxel_index == voxel).all(axis=1))
     return int(models.model.labels[found[0]]) if len(found) else -1

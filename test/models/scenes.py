@@ -15,7 +15,7 @@ A = 0.03
 
 VIEW = np.array([0.0, -0.2, 1.5])
 FLOOR, LEFT, BACK, TOP, FRONT, SIDE, CYLINDER, BALL = range(8)
-"""What a point of the room lies on: floor, two walls, three faces of the box, and the rest."""
+"""Objects of the room: floor, two walls, three faces of the box, and round ones."""
 
 FLAT = (FLOOR, LEFT, BACK, TOP, FRONT, SIDE)
 
@@ -54,7 +54,7 @@ def rays(columns=640, rows=480):
 
 
 def room(columns=640, rows=480, noise_per_range_sq=0.0, seed=3):
-    """Return points (N, 3) float32 of a room and what each lies on (N,)."""
+    """Return points (N, 3) float32 of a room and the object of each (N,)."""
     d = rays(columns, rows)
     with np.errstate(divide='ignore', invalid='ignore'):
         ranges = [
@@ -85,7 +85,7 @@ def room(columns=640, rows=480, noise_per_range_sq=0.0, seed=3):
 
 
 def round_hit(d, start, radius):
-    """Return how far along rays a cylinder or ball about the origin is met, inf where not."""
+    """Return the distance along rays to a cylinder or ball about the origin, inf for a miss."""
     a, b, c = (d * d).sum(axis=1), d @ start, start @ start - radius**2
     under_root = b * b - a * c
     t = (-b - np.sqrt(np.maximum(under_root, 0.0))) / a

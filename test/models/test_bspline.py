@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""B-spline height fields: knots, what they reproduce, the limits of their fits, NURBS export."""
+"""B-spline height fields: knots, reproduction, limits of their fits, NURBS export, band solver."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from surfel_mapper.models.bspline import (
     initial_field,
     knots,
 )
+from surfel_mapper.models.kernels.bspline import solve_band
 
 SIZES = [1, 2, 3, 4, 5, 30]
 PITCH, ORIGIN = 0.3, np.array([-1.2, 0.6])
@@ -24,7 +25,7 @@ PITCH, ORIGIN = 0.3, np.array([-1.2, 0.6])
 
 @pytest.mark.parametrize('cells', SIZES)
 @pytest.mark.parametrize('degree', [1, 2, 3])
-def test_knots_are_clamped_ascending_and_as_many_as_needed(cells, degree):
+def test_knots_are_clamped_ascending_and_of_the_right_number(cells, degree):
     degree = axis_degree(cells, degree)
     knot = knots(cells, degree)
     assert len(knot) == cells + degree + 3
@@ -35,7 +36,7 @@ def test_knots_are_clamped_ascending_and_as_many_as_needed(cells, degree):
 
 
 @pytest.mark.parametrize('cells', SIZES)
-def test_the_splines_are_those_of_scipy_and_sum_to_one(cells):
+def test_basis_functions_equal_scipy_and_sum_to_one(cells):
     degree = axis_degree(cells, 3)
     knot, u = knots(cells, degree), np.linspace(0.0, 1.0, 57)
     first, values, slopes = basis(u, knot, degree)
@@ -71,7 +72,7 @@ def test_planes_are_reproduced(cells, solver):
     assert np.abs(field.heights(xy) - z).max() < 1e-4 * scale
 
 
-def test_quadrics_are_reproduced_with_little_smoothing_and_holes_are_filled():
+def test_quadrics_are_reproduced_and_holes_are_filled():
     def bowl(x, y):
         return 0.4 * x**2 - 0.1 * x * y + 0.2 * y**2
 
@@ -84,7 +85,7 @@ def test_quadrics_are_reproduced_with_little_smoothing_and_holes_are_filled():
     np.testing.assert_allclose(usual.heights(hole), expected, atol=0.05 * np.ptp(z))
 
 
-def test_lsqr_ends_where_gradient_descent_does():
+def test_lsqr_equals_the_limit_of_gradient_descent():
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, (4, 3))
     rows, weights, _ = design(start, xy)
     matrix = np.zeros((len(z), start.control.size))
@@ -100,7 +101,7 @@ def test_lsqr_ends_where_gradient_descent_does():
     np.testing.assert_allclose(found, control, atol=1e-6)
 
 
-def test_pspline_is_the_least_of_its_own_sum():
+def test_pspline_minimises_its_cost():
     start, xy, z = scene(lambda x, y: np.sin(2 * x) + y**2, (3, 7))
     weight = np.linspace(0.5, 1.5, len(z))
     weight /= weight.mean()
@@ -143,3 +144,17 @@ def test_greville_points_make_the_same_surface_a_nurbs_patch(cells):
         assert ((u >= 0.0) & (u <= 1.0)).all()
         place = BSpline(knots(cells[axis], degree), control[axis], degree)(u)
         np.testing.assert_allclose(place, xy[:, axis], atol=1e-12)
+
+
+@pytest.mark.parametrize(('number', 'width'), [(1, 1), (3, 8), (40, 1), (40, 7), (40, 40)])
+def test_band_solver_equals_numpy(number, width):
+    rng = np.random.default_rng(number + width)
+    band, right = rng.uniform(-1.0, 1.0, (number, width)), rng.normal(size=number)
+    band[:, 0] = 2.0 * width + 1.0  # more than the rest of its row and column together
+    full = np.zeros((number, number))
+    for i in range(number):
+        for k in range(min(width, number - i)):
+            full[i, i + k] = full[i + k, i] = band[i, k]
+    expected = np.linalg.solve(full, right)
+    solve_band(band, right)
+    np.testing.assert_allclose(right, expected, rtol=1e-12, atol=1e-12)

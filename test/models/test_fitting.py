@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models of whole clouds: what is found in a room, how well it stands for it, what is refused."""
+"""Models of whole clouds: objects found in a room, accuracy, invalid input."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.models.clusters import clusters_of, folded, surfaces_of
 from surfel_mapper.models.fitting import thin
+from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
 from test.models.scenes import (
     A,
     BALL,
@@ -35,7 +35,7 @@ def seen():
 
 
 def owner(model, patch, lies_on):
-    """Return what most points of a patch lie on, and the share of them."""
+    """Return the object that most points of a patch lie on, and their share."""
     counts = np.bincount(lies_on[model.labels == patch.id], minlength=8)
     return counts.argmax(), counts.max() / counts.sum()
 
@@ -51,7 +51,7 @@ def test_floor_walls_and_faces_are_one_plane_each(seen):
 
 
 @pytest.mark.parametrize(('which', 'most'), [(CYLINDER, 2), (BALL, 4)])
-def test_what_is_round_is_few_surfaces_within_7_mm(seen, which, most):
+def test_round_objects_are_few_surfaces_within_7_mm(seen, which, most):
     _, lies_on, model = seen
     own = [s for s in model.surfaces if owner(model, s, lies_on)[0] == which]
     assert 1 <= len(own) <= most
@@ -69,13 +69,13 @@ def test_surfaces_lie_on_the_ball_and_their_normals_point_out(seen):
             assert np.median((surface.normals(xy) * out).sum(axis=1) / radius) > 0.99
 
 
-def test_every_chart_of_a_closed_cylinder_has_one_height_everywhere():
+def test_every_chart_of_a_closed_cylinder_is_a_height_field():
     angle, z = np.meshgrid(np.linspace(0, 2 * np.pi, 400), np.arange(0, 1.5, A / 2))
     tube = np.stack([0.35 * np.cos(angle), 0.35 * np.sin(angle), z], -1).reshape(-1, 3)
     config = ModelsConfig(voxel_size_m=A)
     inside = np.array([0.0, 0.0, 0.75])  # sees all of it, its normals point inwards
-    clusters = clusters_of(thin(tube, A).means, config, inside)
-    charts = surfaces_of(clusters, config, inside)
+    clusters = segment_cloud(thin(tube, A).means, config, inside)
+    charts = merge_clusters(clusters, config, inside)
     assert len(charts) >= 2
     assert all(folded(clusters, chart, config) is None for chart in charts)
     model = fit(tube, config, inside)
@@ -86,7 +86,7 @@ def test_every_chart_of_a_closed_cylinder_has_one_height_everywhere():
         assert math.sqrt(np.mean((radius - 0.35) ** 2)) < 0.007
 
 
-def test_an_exact_plane_comes_back_to_half_a_voxel():
+def test_exact_plane_is_recovered():
     cloud = sheet(1.5, 1.0, A / 4, (1.0, 2.0, 3.0), (5.0, -2.0, 1.0))
     model = fit(cloud, ModelsConfig(voxel_size_m=A), (5.0, 5.0, 20.0))
     (plane,) = model.planes
@@ -111,7 +111,7 @@ def test_the_models_are_twice_as_precise_as_gaussians_alone(seen):
 
 
 @pytest.mark.parametrize('voxel_size_m', [0.01, 0.02])
-def test_on_real_frames_precision_is_half_that_of_gaussians(data_folder, voxel_size_m):
+def test_real_frames_are_twice_as_precise_as_gaussians(data_folder, voxel_size_m):
     found = []
     for file in sorted((data_folder / 'data' / 'osd').glob('*.pcd')):
         points, _ = read_scan(file)
@@ -157,7 +157,7 @@ def test_samples_of_gaussians_end_at_three_sigma_and_have_their_moments():
         (np.zeros((4, 3)), (0, 0, math.nan)),
     ],
 )
-def test_what_is_no_cloud_is_refused(points, viewpoint):
+def test_invalid_clouds_are_refused(points, viewpoint):
     with pytest.raises(ModelError, match='expected'):
         fit(points, None, viewpoint)
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What patches cover: cells, rims and cuts, against slow loops and true areas."""
+"""Coverage of patches: cells, boundary and cuts against slow twins and true areas."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.cells import fill_cells
-from surfel_mapper.models.kernels.coverage import cover_parts, cover_places
+from surfel_mapper.models.kernels.grid import fill_cells, find_covered, find_covered_squares
 from test.kernels.modes import compiled, interpreted
 from test.models.scenes import A, room, sheet, VIEW
 
@@ -32,14 +31,14 @@ SHAPES = {
 
 
 @pytest.mark.parametrize('name', SHAPES)
-def test_the_area_is_that_of_the_shape_but_for_a_cell_and_a_half_along_its_rim(name):
+def test_area_equals_the_shape_within_one_and_a_half_cells_of_boundary(name):
     inside, area, perimeter = SHAPES[name]
     (plane,) = fit(shape(inside), ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
     assert plane.grid.area_m2() == pytest.approx(area, abs=0.75 * perimeter * PITCH)
 
 
 @pytest.mark.parametrize('profile', ['robust', 'paper'])
-def test_no_point_is_outside_the_patch_that_it_made(profile):
+def test_patch_covers_all_its_points(profile):
     points, _ = room(160, 120)
     config = ModelsConfig(voxel_size_m=A, profile=profile)
     model = fit(points, config, VIEW)
@@ -57,7 +56,7 @@ def fitted_points(points):
     return np.unique(np.floor(points.astype(np.float64) / A), axis=0) * A + A / 2
 
 
-def test_cells_and_rims_are_those_of_a_slow_loop():
+def test_cells_and_boundary_equal_the_slow_twin():
     cloud = fitted_points(shape(SHAPES['annulus'][0]))
     (plane,) = fit(cloud, ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
     grid, xy = plane.grid, plane.to_local(cloud)[:, :2]
@@ -93,17 +92,17 @@ def slow_contains(grid, xy):
 
 
 @pytest.mark.parametrize('call', [compiled, interpreted])
-def test_places_and_parts_are_covered_as_a_slow_twin_says(call):
+def test_coverage_queries_equal_the_slow_twin(call):
     (plane,) = fit(shape(SHAPES['triangle'][0]), ModelsConfig(voxel_size_m=A), (0, 0, 5)).planes
     grid, end = plane.grid, np.array(plane.grid.filled.shape) * plane.grid.pitch_m
     places = np.random.default_rng(2).uniform(-0.1, 1.1, (3000, 2)) * end
     places = grid.origin + np.concatenate([places, end * [[1, 1], [1, 0.5], [0, 0]]])
     cells = grid.filled, grid.rim, grid.corner, grid.cuts
     inside = np.empty(len(places), bool)
-    call(cover_places, places, cells, grid.pitch_m, grid.origin, inside)
+    call(find_covered, places, cells, grid.pitch_m, grid.origin, inside)
     assert np.array_equal(inside, slow_contains(grid, places))
     parts = np.empty((3 * grid.filled.shape[0], 3 * grid.filled.shape[1]), bool)
-    call(cover_parts, 3, cells, grid.pitch_m, grid.origin, parts)
+    call(find_covered_squares, 3, cells, grid.pitch_m, grid.origin, parts)
     middles = grid.origin + (np.argwhere(np.ones_like(parts)) + 0.5) * (grid.pitch_m / 3)
     assert np.array_equal(parts.reshape(-1), slow_contains(grid, middles))
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models that follow a map: the same as those of the map as it is, whatever happened before.
+Models that follow a map equal those of the present map, whatever its history.
 
-Fixed seeds; the random sequences add and remove scans, clear the map, and ask in between.
+Fixed seeds; the random sequences add and remove scans, clear the map, and update in between.
 
 (Longer than other files: every test drives the same scenes.)
 """
@@ -85,7 +85,7 @@ def test_cylinder_and_ball_are_surfaces_within_millimetres(camera):
 
 
 @pytest.mark.parametrize('seed', range(6))
-def test_after_any_sequence_models_are_those_of_the_map_as_it_is(noisy, seed):
+def test_incremental_models_equal_a_batch_after_random_changes(noisy, seed):
     rng = np.random.default_rng(seed)
     settings = ModelsLayerConfig(
         min_points=4,
@@ -120,7 +120,7 @@ def test_after_any_sequence_models_are_those_of_the_map_as_it_is(noisy, seed):
         assert groups(models) == groups(live(surfel_map.copy(), settings))
 
 
-def test_the_order_of_scans_does_not_matter(noisy):
+def test_result_is_independent_of_scan_order(noisy):
     parts = np.array_split(np.random.default_rng(2).permutation(noisy), 5)
     found = []
     for order in ([0, 1, 2, 3, 4], [4, 2, 0, 3, 1]):
@@ -133,7 +133,7 @@ def test_the_order_of_scans_does_not_matter(noisy):
     assert found[0] == found[1]
 
 
-def test_two_runs_give_the_same_ids_and_the_same_numbers(noisy):
+def test_two_runs_give_the_same_ids_and_numbers(noisy):
     runs = []
     for _ in range(2):
         surfel_map = SurfelMap(VOXEL_M)
@@ -149,7 +149,7 @@ def test_two_runs_give_the_same_ids_and_the_same_numbers(noisy):
         np.testing.assert_array_equal(one.grid.cuts, other.grid.cuts)
 
 
-def test_geometry_after_many_updates_is_that_of_a_batch(noisy):
+def test_geometry_after_many_updates_equals_a_batch(noisy):
     surfel_map = SurfelMap(VOXEL_M)
     models = LiveModels(SETTINGS, surfel_map)
     for part in np.array_split(np.random.default_rng(5).permutation(noisy), 12):
@@ -195,7 +195,7 @@ def test_ids_stay_while_little_changes(camera):
         assert surface.normal @ frames[surface.id][2] > 0.999
 
 
-def test_what_has_not_changed_is_not_told():
+def test_immaterial_changes_are_not_reported():
     surfel_map, models = of_points(cells((0, 2), (0, 2)))
     versions = dict(models.versions)
     assert models.update().num_changed == 0
@@ -303,7 +303,7 @@ def test_degenerate_input_has_a_result(points, gaussians, planes):
 def test_a_sheet_whose_normals_have_either_sign_is_one_plane():
     points = sheet(3.0, 3.0, 0.02, normal=(1.0, -1.0, 0.0), centre=(0.3, 0.2, 0.1), sigma=2e-3)
     surfel_map = SurfelMap(VOXEL_M)
-    surfel_map.add(points)  # nobody says from where
+    surfel_map.add(points)  # without a viewpoint
     models = live(surfel_map)
     signs = np.sign(models.surfels.normal @ (1.0, -1.0, 0.0))
     assert set(signs[np.isfinite(signs)].tolist()) >= {-1.0, 1.0}
@@ -311,7 +311,7 @@ def test_a_sheet_whose_normals_have_either_sign_is_one_plane():
     assert models.model.planes[0].grid.area_m2() == pytest.approx(9.0, rel=0.1)
 
 
-def test_a_bent_sheet_that_nobody_is_known_to_have_seen_is_one_surface():
+def test_bent_sheet_without_viewpoint_is_one_surface():
     x, y = np.meshgrid(np.arange(-1.5, 1.5, 0.02), np.arange(-1.5, 1.5, 0.02), indexing='ij')
     z = 0.12 * x**2
     along = (x + z) / np.sqrt(2.0)  # turned so that its normals change sign somewhere
@@ -344,7 +344,7 @@ def test_a_ramp_over_itself_is_cut():
             assert heights.max() - heights.min() < 0.9  # the next turn is 1.57 m higher
 
 
-def test_voxels_of_few_points_join_what_they_lie_on():
+def test_sparse_voxels_join_the_plane_that_they_lie_on():
     rng = np.random.default_rng(1)
     few = np.array([[1.26, 0.5, 0.002], [1.3, 0.55, 0.0]]) + 1e-3
     _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), few]))

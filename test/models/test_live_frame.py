@@ -3,8 +3,8 @@
 """
 Voxels of a map against the points of one scan: same classes, same primitives.
 
-The twin below knows points only. It groups them by voxel, takes numpy's covariances and walks
-from neighbour to neighbour; of the single-cloud fit it has the tests, not the code.
+The twin uses points only: it groups them by voxel, takes numpy's covariances and walks from
+neighbour to neighbour. It shares the tests with the single-cloud fit, not the code.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def frame():
     return points[flat].astype(np.float64)
 
 
-def pieces_of(points):
+def surfels_of(points):
     """Return (class, mean, normal, covariance) of every voxel by its index."""
     number, found = np.floor(points / VOXEL_M).astype(int), {}
     order = np.lexsort(number.T)
@@ -52,7 +52,7 @@ def pieces_of(points):
     return found
 
 
-def go_on(one, other):
+def same_surface_products(one, other):
     """Return whether two neighbours are of one plane or one arc."""
     delta, cosine = one[1] - other[1], one[2] @ other[2]
     first, second = one[2] @ delta, other[2] @ delta
@@ -72,7 +72,7 @@ def neighbours(voxel, pieces):
 
 
 def components(pieces):
-    """Return the sets of flat voxels that hang together."""
+    """Return the connected components of flat voxels."""
     left, found = {v for v, piece in pieces.items() if piece[0] == 'flat'}, []
     while left:
         waiting, members = [left.pop()], set()
@@ -80,7 +80,7 @@ def components(pieces):
             voxel = waiting.pop()
             members.add(voxel)
             for other in neighbours(voxel, pieces):
-                if other in left and go_on(pieces[voxel], pieces[other]):
+                if other in left and same_surface_products(pieces[voxel], pieces[other]):
                     left.remove(other)
                     waiting.append(other)
         found.append(members)
@@ -88,8 +88,8 @@ def components(pieces):
 
 
 def twin(points):
-    """Return what groups() says, from points alone."""
-    pieces = pieces_of(points)
+    """Return the result of groups() from points alone."""
+    pieces = surfels_of(points)
     owner = {}
     for members in components(pieces):
         for voxel in members:
@@ -115,7 +115,7 @@ def twin(points):
     return result | ({('none', young)} if young else set())
 
 
-def test_the_map_of_one_scan_gives_what_its_points_give(frame):
+def test_map_of_one_scan_equals_the_twin_on_its_points(frame):
     _, models = of_points(frame, VIEW, SETTINGS, VOXEL_M)
     expected = twin(frame)
     kinds = [kind for kind, _ in expected]
@@ -124,7 +124,7 @@ def test_the_map_of_one_scan_gives_what_its_points_give(frame):
     assert groups(models) == expected
 
 
-def test_large_planes_are_those_of_the_single_cloud_fit():
+def test_large_planes_equal_the_single_cloud_fit():
     points, _ = room(320, 240)
     cloud = points.astype(np.float64)
     _, models = of_points(cloud, VIEW, ModelsLayerConfig(), VOXEL_M)

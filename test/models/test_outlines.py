@@ -1,16 +1,33 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Outlines and triangles of patches: rings around masks, their direction and their areas."""
+"""Outlines and triangles of patches: rings around masks, direction, areas, even-odd rule."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import fit
-from surfel_mapper.models.kernels.rims import follow_sides, lay_sides, mark_corners
-from surfel_mapper.models.outlines import middles, outline, rings, simplified, TOLERANCE, triangles
+from surfel_mapper.models.kernels.outlines import (
+    mark_sides,
+    simplify_loop,
+    trace_loops,
+    triangulate_rings,
+)
+from surfel_mapper.models.outlines import (
+    areas,
+    bridged,
+    midpoints,
+    outline,
+    rings,
+    simplified,
+    TOLERANCE,
+    triangles,
+    triangulated,
+)
 from test.kernels.modes import both
 from test.models.scenes import A, room, sheet, VIEW
 
@@ -22,7 +39,7 @@ def area(ring):
 
 
 def slow_rings(mask):
-    """Return the same by a dictionary of the sides that leave each corner."""
+    """Return the rings by a dictionary of the sides that leave each corner."""
     padded = np.pad(mask, 1)
     inner = padded[1:-1, 1:-1]
     after = {}
@@ -43,7 +60,7 @@ def slow_rings(mask):
 
 
 def followed(after, start):
-    """Return one ring from a corner on, taking its sides out of what is left."""
+    """Return one ring from a corner on, and remove its sides."""
     ring, at, before = [start], start, start
     while True:
         ways = after[at]
@@ -60,7 +77,7 @@ def followed(after, start):
 
 
 def slow_simplified(ring):
-    """Return the same, a stretch of the ring at a time."""
+    """Return the simplified ring, one stretch at a time."""
     far = int(np.argmax(((ring - ring[0]) ** 2).sum(axis=1)))
     closed = np.concatenate([ring, ring[:1]])
     kept = np.zeros(len(closed), bool)
@@ -84,13 +101,13 @@ def slow_simplified(ring):
     return chosen if len(chosen) >= 3 else ring
 
 
-def test_a_square_is_one_ring_against_the_clock():
+def test_square_is_one_counter_clockwise_ring():
     (ring,) = rings(np.ones((1, 1), bool))
     assert area(ring) == 1.0
     assert {tuple(corner) for corner in ring} == {(0, 0), (1, 0), (1, 1), (0, 1)}
 
 
-def test_a_hole_is_a_ring_of_its_own_with_the_clock():
+def test_hole_is_a_clockwise_ring():
     mask = np.ones((5, 4), bool)
     mask[2, 1:3] = False
     assert sorted(area(ring) for ring in rings(mask)) == [-2.0, 20.0]
@@ -102,7 +119,7 @@ def test_squares_that_touch_at_a_corner_are_two_rings(flip):
     assert [area(ring) for ring in rings(mask[::-1] if flip else mask)] == [1.0, 1.0]
 
 
-def test_the_rings_of_any_mask_enclose_what_is_covered():
+def test_rings_of_random_masks_enclose_the_covered_area():
     rng = np.random.default_rng(9)
     for _ in range(50):
         mask = rng.random((7, 9)) < 0.6
@@ -111,13 +128,13 @@ def test_the_rings_of_any_mask_enclose_what_is_covered():
 
 
 @pytest.mark.parametrize('seed', range(40))
-def test_rings_and_their_corners_that_matter_are_those_of_a_slow_walk(seed):
+def test_rings_and_simplification_equal_the_slow_twins(seed):
     rng = np.random.default_rng(seed)
     mask = rng.random(rng.integers(1, 15, 2)) < rng.uniform(0.2, 0.9)
     found = rings(mask)
     assert_same(found, slow_rings(mask))
     curved = [rng.uniform(0.0, 5.0, (rng.integers(1, 60), 2)), np.zeros((4, 2))]
-    for ring in [*map(middles, found), *curved]:
+    for ring in [*map(midpoints, found), *curved]:
         assert_same([simplified(ring)], [slow_simplified(ring)])
 
 
@@ -126,20 +143,20 @@ def assert_same(found, expected):
 
 
 @both
-def test_the_kernels_follow_an_eight_and_leave_out_what_is_straight(call):
+def test_kernels_trace_an_eight_and_drop_collinear_corners(call):
     mask = np.array([[1, 1, 0], [0, 0, 1]], bool)
     ways = np.zeros((3, 4), np.uint8)
-    assert call(lay_sides, mask, ways) == 10
+    assert call(mark_sides, mask, ways) == 10
     corners, ends = np.empty((10, 2)), np.empty(10, np.int64)
-    assert call(follow_sides, mask, ways, corners, ends) == 2
+    assert call(trace_loops, mask, ways, corners, ends) == 2
     assert ends[:2].tolist() == [6, 10]
     assert not ways.any()
     kept = np.zeros(6, bool)
-    call(mark_corners, corners[:6], 0.75, kept)
+    call(simplify_loop, corners[:6], 0.75, kept)
     assert corners[:6][kept].tolist() == [[0, 0], [1, 0], [1, 2], [0, 2]]
 
 
-def test_points_on_a_side_of_a_ring_go_and_its_corners_stay():
+def test_simplification_keeps_corners_and_drops_side_points():
     side = np.arange(10.0)
     square = np.concatenate(
         [
@@ -177,3 +194,108 @@ def test_triangles_of_surfaces_face_along_their_normals():
         vertices, faces = triangles(surface)
         sides = vertices[faces[:, 1:]] - vertices[faces[:, :1]]
         assert (np.cross(sides[:, 0], sides[:, 1]) @ surface.normal > 0.0).all()
+
+
+SQUARE = np.array([[0.0, 0], [4, 0], [4, 4], [0, 4]])
+HOLE = np.array([[1.0, 1], [1, 3], [3, 3], [3, 1]])
+
+
+def polygon(num, radius, middle=(0.0, 0.0), turn=0.0):
+    angles = turn + 2 * np.pi * np.arange(num) / num
+    return middle + radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+
+def star(num, seed):
+    rng = np.random.default_rng(seed)
+    angles = np.sort(rng.uniform(0, 2 * np.pi, num))
+    return rng.uniform(0.3, 1.0, num)[:, None] * np.stack([np.cos(angles), np.sin(angles)], 1)
+
+
+def crossings(points, around):
+    """Return how many sides of rings a ray to the right of each point crosses, one by one."""
+    found = np.zeros(len(points), int)
+    for ring in around:
+        for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            if y0 == y1:
+                continue
+            x = x0 + (points[:, 1] - y0) / (y1 - y0) * (x1 - x0)
+            found += ((y0 <= points[:, 1]) != (y1 <= points[:, 1])) & (x > points[:, 0])
+    return found
+
+
+def num_covering(points, triangles):
+    """Return in how many triangles each point is."""
+    found = np.zeros(len(points), int)
+    for a, b, c in triangles:
+        sides = ((a, b), (b, c), (c, a))
+        found += np.all([area_of(p, q, points) > 0 for p, q in sides], axis=0)
+    return found
+
+
+def area_of(p, q, points):
+    return (q[0] - p[0]) * (points[:, 1] - p[1]) - (q[1] - p[1]) * (points[:, 0] - p[0])
+
+
+@pytest.mark.parametrize(
+    ('around', 'expected'),
+    [
+        ([SQUARE], 16.0),
+        ([SQUARE, HOLE], 12.0),
+        ([SQUARE[::-1], HOLE], 12.0),
+        ([SQUARE, HOLE, 0.25 * HOLE + 1.75], 12.25),  # an island in the hole
+        ([SQUARE, np.array([9.0, 2.0]) + HOLE], 20.0),
+        (
+            [polygon(100, 2.0), polygon(50, 1.0, (0.3, 0.2), 0.1)],
+            0.5 * (100 * 4 * math.sin(2 * math.pi / 100) - 50 * math.sin(2 * math.pi / 50)),
+        ),
+    ],
+)
+def test_area_of_triangles_equals_the_enclosed_area_less_holes(around, expected):
+    assert areas(triangulated(around)).sum() == pytest.approx(expected, rel=1e-12)
+    assert (areas(triangulated(around)) > 0.0).all()
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_points_lie_in_one_triangle_if_inside_and_in_none_outside(seed):
+    around = [star(40, seed), 0.25 * star(15, seed + 50), 3.0 * polygon(7, 1.0)[::-1]]
+    points = np.random.default_rng(seed).uniform(-3.0, 3.0, (2000, 2))
+    found = num_covering(points, triangulated(around))
+    assert np.array_equal(found, crossings(points, around) % 2)
+    assert set(found) == {0, 1}
+
+
+def test_triangles_of_random_masks_have_the_covered_area():
+    rng = np.random.default_rng(4)
+    for _ in range(30):
+        mask = rng.random((8, 6)) < 0.6
+        assert areas(triangulated(rings(mask))).sum() == pytest.approx(mask.sum(), rel=1e-12)
+
+
+@both
+def test_triangulation_of_a_concave_ring_and_a_second_one(call):
+    arrow = np.array([[0.0, 0], [4, 0], [4, 4], [2, 1], [0, 3]])
+    corners, ends = np.concatenate([arrow, HOLE[::-1] + 9.0]), np.array([5, 9])
+    found = call(triangulate_rings, corners, ends)
+    assert np.array_equal(found, triangulated([arrow, HOLE[::-1] + 9.0]))
+    assert sorted(areas(found)) == [2.0, 2.0, 2.0, 2.0, 2.0, 3.0]
+
+
+def test_rectangle_is_two_triangles_beside_other_rings():
+    ladder = [np.array([[9.0, y], [10, y], [10, y + 0.3], [9, y + 0.3]]) for y in (0.1, 1.2, 2.5)]
+    assert len(triangulated([SQUARE])) == 2
+    assert len(triangulated([SQUARE, *ladder])) == 8
+
+
+def test_empty_and_degenerate_rings_give_no_triangles():
+    assert triangulated([]).shape == (0, 3, 2)
+    assert triangulated([np.array([[0.0, 0], [1, 0], [2, 0]])]).shape == (0, 3, 2)
+    assert bridged([]).shape == (0, 3)
+
+
+def test_bridged_ring_encloses_the_same_area_and_points():
+    around = [polygon(30, 3.0), polygon(9, 1.0, (1.0, 0.4))[::-1], polygon(5, 0.5, (-9.0, 0.0))]
+    whole = bridged(around)
+    assert area(whole) == pytest.approx(sum(area(ring) for ring in around), rel=1e-12)
+    assert len(whole) == 30 + 9 + 5 + 4  # there and back: two corners more for each ring bridged
+    points = np.random.default_rng(3).uniform(-4.0, 4.0, (3000, 2))
+    assert np.array_equal(crossings(points, [whole]) % 2, crossings(points, around) % 2)

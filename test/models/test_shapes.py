@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Shapes of primitives: areas, boxes and ellipsoids against what is known of the scene."""
+"""Shapes of primitives: areas, boxes and ellipsoids against the true scene."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def frame():
     return plane, R
 
 
-def test_the_fill_of_a_plane_with_a_hole_has_the_area_that_it_covers(frame):
+def test_triangles_of_a_plane_with_a_hole_have_its_area(frame):
     shape = shape_of(frame[0])
     # no point is outside: cells are cut half a voxel beyond them, along 4 * 2 m + 4 * 1 m of rim
     assert 3.0 < shape.area_m2 < 3.0 + 12.0 * A
@@ -60,7 +60,7 @@ def test_no_triangle_of_a_plane_is_in_its_hole_or_beyond_its_rim(frame):
     assert np.abs(corners[:, 2]).max() < 1e-3 + A / 10
 
 
-def test_the_mask_of_a_grid_says_of_the_middle_of_every_part_whether_it_is_covered(frame):
+def test_mask_equals_coverage_of_square_centres(frame):
     grid = frame[0].grid
     mask = grid.mask(3)
     assert mask.shape == (3 * grid.filled.shape[0], 3 * grid.filled.shape[1])
@@ -69,7 +69,7 @@ def test_the_mask_of_a_grid_says_of_the_middle_of_every_part_whether_it_is_cover
         assert grid.contains(middle)[0] == covered
 
 
-def test_the_box_of_a_plane_lies_around_it(frame):
+def test_box_of_a_plane_encloses_it(frame):
     shape = shape_of(frame[0])
     assert shape.middle == pytest.approx([5.0, 1.0, 2.0], abs=A)
     length_x, length_y, thickness = shape.high - shape.low
@@ -79,7 +79,7 @@ def test_the_box_of_a_plane_lies_around_it(frame):
     assert max(length_x, length_y) < 2.0 * 2**0.5 + 4 * A
 
 
-def test_surfaces_keep_their_bend():
+def test_shapes_of_surfaces_are_curved():
     model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
     for surface in model.surfaces:
         shape = shape_of(surface)
@@ -90,7 +90,7 @@ def test_surfaces_keep_their_bend():
         assert local[:, 2] == pytest.approx(surface.heights(local[:, :2]), abs=1e-9)
 
 
-def test_shapes_are_made_anew_for_another_version_only():
+def test_shapes_are_recomputed_for_new_versions_only():
     model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
     shapes, versions = Shapes(), {patch.id: 1 for patch in model.patches}
     before = shapes.of(model, versions)
@@ -101,7 +101,7 @@ def test_shapes_are_made_anew_for_another_version_only():
     ]
 
 
-def test_shapes_may_be_made_a_few_at_a_time():
+def test_shapes_can_be_computed_in_portions():
     model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
     shapes, versions = Shapes(), {patch.id: 1 for patch in model.patches}
     steps = [shapes.make(model, versions, 2) for _ in range(-(-len(model.patches) // 2))]
@@ -149,7 +149,7 @@ def test_axes_of_an_ellipsoid_are_those_of_its_covariance():
     assert np.linalg.det(R[0]) == pytest.approx(1.0)
 
 
-def test_gaussians_without_extent_and_none_at_all_have_ellipsoids_too():
+def test_degenerate_gaussians_have_ellipsoids():
     found = ellipsoid_corners(gaussians(np.zeros((3, 3)), np.diag([0.0, 0.0, 4.0])))
     assert np.array_equal(found[0], np.tile([0.0, 1.0, 2.0], (12, 1)))
     # the corners of the icosahedron nearest to an axis are 0.851 of it away from the middle

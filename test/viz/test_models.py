@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models import fit
-from surfel_mapper.models.filling import areas
+from surfel_mapper.models.outlines import areas
 from surfel_mapper.models.shapes import shape_of
 from surfel_mapper.viz import models as viz_models
 from surfel_mapper.viz.models import draw_models, models_mesh, models_section, MOST_ROWS, page_mesh

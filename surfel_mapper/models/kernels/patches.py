@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Patches of planes and surfaces: frame and kind.
+Frame and kind (plane or curved) of patches.
 
 The points of patch k are rows starts[k] to starts[k + 1] - 1.
 """
@@ -15,20 +15,23 @@ from surfel_mapper.kernels.symmetric3 import eigen_frame
 from surfel_mapper.models.kernels.frames import orient, range_moments
 
 LEAST_CELLS = 8
-"""With fewer cells the bend of a patch is not looked at."""
+"""The curvature of a patch is not tested with fewer cells."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def describe(points, starts, normals, viewpoint, rules, means, covariances, frames, curved):
+def describe_patches(
+    points, starts, normals, viewpoint, rules, means, covariances, frames, curved
+):
     """
-    Find mean, covariance, frame and kind of every patch.
+    Compute mean, covariance, frame and kind of every patch.
 
     points       (N, 3) float64, m
     starts       (K + 1,) int64
     normals      (K, 3) float64, mean normals of the clusters in each
-    viewpoint    (3,) float64
-    rules        thickness (K,) float64, m: of a plane; pitch, m: of the cells that a bend is
-                 sought in; bent: whether it is; mean_normal: whether surfaces face along it
+    viewpoint    (3,) float64, m
+    rules        thickness (K,) float64, m: of a plane; pitch, m: of the cells for the test of
+                 curvature; bent: whether it is tested; mean_normal: whether the z of surfaces is
+                 their mean normal
     means        (K, 3) float64, out
     covariances  (K, 3, 3) float64, out
     frames       (K, 3, 3) float64, out: rows x, y, normal
@@ -46,10 +49,10 @@ def describe(points, starts, normals, viewpoint, rules, means, covariances, fram
         orient(frame, mean, viewpoint)
         frames[k] = frame
         thick = 6.0 * math.sqrt(value[0])
-        turn(frame, normals[k])
+        align_frame(frame, normals[k])
         curved[k] = thick >= thickness[k]
         if bent and curved[k]:  # what bends by a thickness is thicker than that
-            bend = bend_of(points, low, high, mean, frame, pitch)
+            bend = bend_height(points, low, high, mean, frame, pitch)
             if bend >= 0.0:
                 curved[k] = bend > thickness[k] or thick >= 2.0 * thickness[k]
         if curved[k] and mean_normal:
@@ -57,8 +60,8 @@ def describe(points, starts, normals, viewpoint, rules, means, covariances, fram
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def turn(frame, normal):
-    """Give a frame another normal, keeping x as near as it can be."""
+def align_frame(frame, normal):
+    """Rotate a frame so that its z is a normal, and its x changes least."""
     along = 0.0
     for j in range(3):
         along += frame[0, j] * normal[j]
@@ -78,11 +81,11 @@ def turn(frame, normal):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def bend_of(points, low, high, mean, frame, pitch):
+def bend_height(points, low, high, mean, frame, pitch):
     """
-    Return how high the curved part of a patch rises, m, 5th to 95th of 100 cells.
+    Return the 5th to 95th percentile range of the curved part of a patch, m.
 
-    0 where a quadric does not fit twice as well as a plane; -1 where there are too few cells.
+    0 if a quadric does not fit twice as well as a plane; -1 if there are too few cells.
     """
     local = np.empty((high - low, 3))
     ends = np.empty((2, 2))
@@ -123,12 +126,12 @@ def bend_of(points, low, high, mean, frame, pitch):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fit_quadric(cells, terms, found):
+def fit_quadric(cells, terms, coefficients):
     """
-    Fit z as 1, x, y and with six terms x^2, x y, y^2 too; return the weighted sum of squares.
+    Fit z by 1, x, y and with six terms also x^2, x y, y^2; return the weighted sum of squares.
 
-    cells  (C, 4) float64: x, y, z, weight
-    found  (6,) float64, out
+    cells         (C, 4) float64: x, y, z, weight
+    coefficients  (6,) float64, out
     """
     normal, right = np.zeros((6, 6)), np.zeros(6)
     basis = np.empty(6)
@@ -160,12 +163,12 @@ def fit_quadric(cells, terms, found):
         right[p] /= normal[p, p]
     error = 0.0
     for p in range(terms):
-        found[p] = right[p]
+        coefficients[p] = right[p]
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
-        z -= found[0] + found[1] * x + found[2] * y
+        z -= coefficients[0] + coefficients[1] * x + coefficients[2] * y
         if terms == 6:
-            z -= found[3] * x * x + found[4] * x * y + found[5] * y * y
+            z -= coefficients[3] * x * x + coefficients[4] * x * y + coefficients[5] * y * y
         error += cells[i, 3] * z * z
     return error
 
@@ -173,7 +176,7 @@ def fit_quadric(cells, terms, found):
 @njit(cache=True, nogil=True, error_model='numpy')
 def to_local(points, low, high, mean, frame, local, ends):
     """
-    Bring points into the frame of their patch.
+    Transform points into the frame of their patch.
 
     local  (high - low, 3) float64, out
     ends   (2, 2) float64, out: least and largest x, y

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The means of a cloud's points by voxel, in the order of the voxels, and labels back to the points.
+Mean point of each voxel of a cloud, in the order of the voxels, and labels back to the points.
 
-Runs of consecutive points in one voxel are sorted by its key, by radix and stably, and summed in
-that order. Nothing is looked up in a table of hashes, which with noise misses the caches for
-every point: 300,000 points in 96,000 voxels take 6 ms instead of 15. The points of a voxel are
-summed in the order that they have, so the means are the same to the bit.
+Runs of consecutive points in one voxel are sorted by voxel key, by a stable radix sort, and
+summed in that order. This avoids a hash table, which with noise misses the caches for every
+point: 300,000 points in 96,000 voxels take 6 ms instead of 15. The points of a voxel are summed
+in their given order, so the means are reproducible to the bit.
 
 A run is one int64: the key of its voxel, its first row, and its length less one in LENGTH_BITS.
 """
@@ -21,20 +21,21 @@ from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.voxel_grid import find_keys
 
 DIGIT_BITS = 11
-"""Most bits that are sorted by in one pass: so many counts stay in the nearest cache."""
+"""Largest digit of the radix sort, bits: its counters stay in the first-level cache."""
 
 LENGTH_BITS = 7
+"""Bits of the length of a run."""
 CHUNK = 1 << LENGTH_BITS
-"""Points worked on at once, in which runs end."""
+"""Points processed at once; runs end at the end of a chunk."""
 
 AHEAD = 16
-"""So many runs ahead their points are asked for."""
+"""Runs by which points are prefetched."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def finite_ends(points, ends):
     """
-    Find between which corners the finite points lie; return whether there are any.
+    Compute the bounding box of the finite points; return whether there are any.
 
     points  (N, 3) float32 or float64
     ends    (2, 3) float64, out: least and largest x, y, z
@@ -57,11 +58,11 @@ def finite_ends(points, ends):
 @njit(cache=True, nogil=True, error_model='numpy')
 def voxel_keys(points, size, shift, base, bits, keys):
     """
-    Find the voxel of every point.
+    Compute the voxel key of every point.
 
     points                   (N, 3) float32 or float64, m
     size, shift, base, bits  see group_points
-    keys                     (N,) int64, out; -1 for what is not finite
+    keys                     (N,) int64, out; -1 if not finite
     """
     xyz = np.empty((3, CHUNK))
     for start in range(0, len(points), CHUNK):
@@ -78,10 +79,10 @@ def voxel_keys(points, size, shift, base, bits, keys):
 @njit(cache=True, nogil=True)
 def voxel_runs(keys, to_key):
     """
-    Turn keys into runs, in place; return how many.
+    Turn keys into runs, in place; return how many there are.
 
     keys    (N,) int64, -1 leaves a point out; out: runs, (R,) of them
-    to_key  bits of rows and lengths, as row_bits says
+    to_key  bits of row and length, see row_bits
     """
     starts = np.empty(CHUNK + 1, np.int32)
     number = 0
@@ -97,7 +98,7 @@ def voxel_runs(keys, to_key):
 
 @njit(cache=True, nogil=True)
 def row_bits(number):
-    """Return how many bits of a run the rows of so many points take, with lengths."""
+    """Return the bits of a run for row and length, for a number of points."""
     bits = LENGTH_BITS
     while number > 0:
         number >>= 1
@@ -108,11 +109,11 @@ def row_bits(number):
 @njit(cache=True, nogil=True)
 def sorted_runs(runs, key_bits, to_key):
     """
-    Return runs sorted by their keys, equal ones in order.
+    Return runs sorted by key; equal keys keep their order.
 
-    runs      (R,) int64, is used up
-    key_bits  that the largest key needs
-    to_key    bits of rows and lengths
+    runs      (R,) int64, is overwritten
+    key_bits  bits of the largest key
+    to_key    bits of row and length
     """
     passes = max(-(-key_bits // DIGIT_BITS), 1)
     width = -(-key_bits // passes)
@@ -136,13 +137,13 @@ def sorted_runs(runs, key_bits, to_key):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mean_runs(points, runs, to_key, means):
+def average_runs(points, runs, to_key, means):
     """
-    Find the mean of the points in each voxel; return how many voxels there are.
+    Compute the mean of the points in each voxel; return how many voxels there are.
 
     points  (N, 3) float32 or float64, m
     runs    (R,) int64, sorted
-    to_key  bits of rows and lengths
+    to_key  bits of row and length
     means   (R, 3) float64, out
     """
     flat = points.ravel()
@@ -173,14 +174,14 @@ def mean_runs(points, runs, to_key, means):
 
 
 @njit(cache=True, nogil=True)
-def give_labels(runs, to_key, labels, found):
+def label_points(runs, to_key, labels, found):
     """
     Give every point the label of its voxel.
 
     runs    (R,) int64, sorted
-    to_key  bits of rows and lengths
+    to_key  bits of row and length
     labels  (M,) int32, of the voxels
-    found   (N,) int32, out in these runs
+    found   (N,) int32, out for points in runs
     """
     row_mask, length_mask = (np.int64(1) << to_key) - 1, CHUNK - 1
     voxel, previous = -1, np.int64(-1)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which new patch is which old one: that with which it shares most voxels.
+Match new patches to old ids: a patch keeps the id with which it shares most voxels.
 
-The largest share is given first, of equal ones that of the lower id. A patch that gets none is
-new, and part of a split where its voxels had a patch before; an old one that gets none has been
-merged where its voxels have a patch now.
+The largest overlap is assigned first; ties go to the lower id. A patch without an old id is new,
+and part of a split if its voxels had a patch before. An old id without a patch is removed, and
+merged if its voxels have a patch now.
 """
 
 from __future__ import annotations
@@ -19,19 +19,19 @@ Ids = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
-class Matched:
+class IdMatches:
     """
-    Who is who.
+    Ids of new patches, and the fate of old ids.
 
     Attributes
     ----------
     ids : list of int
-        Of the new patches, in their order.
+        Ids of the new patches, in their order.
     created, removed : list of int
-        Ids that no old patch had, that no new patch has.
+        Ids that no old patch had; ids that no new patch has.
     merged, split : list of (int, int)
-        Removed ids and those that most of their voxels went to; old ids and the created ones
-        that have most of their voxels from them.
+        Removed ids and the id of most of their voxels; old ids and the created ones that took most
+        of their voxels from them.
 
     """
 
@@ -42,20 +42,20 @@ class Matched:
     split: list[tuple[int, int]]
 
 
-def match(old_ids: Ids, labels: Ids, starts: Ids, next_id: int) -> Matched:
+def match(old_ids: Ids, labels: Ids, starts: Ids, next_id: int) -> IdMatches:
     """
-    Give ids to patches.
+    Assign ids to patches.
 
     Parameters
     ----------
     old_ids : (O,) int64
-        Ids of the patches that may be among these, ascending.
+        Candidate ids of old patches, ascending.
     labels : (M,) int64
-        The ids that their voxels had before; other ones do not count.
+        Previous ids of their voxels; others than candidates are ignored.
     starts : (K + 1,) int64
         First voxel of each patch, and M.
     next_id : int
-        What the first one that is new is called.
+        The first unused id.
 
     """
     num = len(starts) - 1
@@ -86,4 +86,4 @@ def match(old_ids: Ids, labels: Ids, starts: Ids, next_id: int) -> Matched:
             origins[new] = old
             split[ids[new]] = old
     pairs_split = sorted((old, new) for new, old in split.items() if heirs[old] >= 0)
-    return Matched(ids, created, removed, sorted(merged.items()), pairs_split)
+    return IdMatches(ids, created, removed, sorted(merged.items()), pairs_split)

@@ -1,10 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Clusters of a cloud, and which of them form one surface that has only one height everywhere.
+Segmentation of a cloud: flat clusters, merged to regions, cut into charts.
 
-A surface that turns away from its mean normal by more than ``fold_angle_deg`` is no graph over
-one plane: it is halved by its normals until it is, so a cylinder becomes two charts.
+A chart is a height field over one plane. A region whose normals deviate from their mean by more
+than ``fold_angle_deg`` is bisected by its normals until every part is a chart; a closed cylinder
+becomes at least two.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models import folds
-from surfel_mapper.models.kernels.clustering import bisect, NOISE_SPREAD
-from surfel_mapper.models.kernels.joining import components
+from surfel_mapper.models.kernels.bisection import bisect_cloud, NOISE_SPREAD
+from surfel_mapper.models.kernels.charts import bisect_folded
+from surfel_mapper.models.kernels.region_merging import merge_regions
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 
 FAR_GAP_VOXELS = 5.0
 NEAR_GAP_VOXELS = 3.0
-"""Clusters join where their boxes are nearer than the first and their points than the second."""
+"""Linked clusters have boxes nearer than FAR_GAP_VOXELS and points nearer than this."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,9 +39,9 @@ class Clusters:
     points : (N, 3) float64, m
         Reordered, so that a cluster is a range of rows.
     order : (N,) int64
-        Where each was before.
+        The row that each point had before.
     rows : (K, 2) int64
-        First row of each cluster, and the one after its last; together all, ascending.
+        First row of each cluster and the one after its last; ascending, without gaps.
     flat : (K,) bool
         Whether it is a piece of a plane.
     mean : (K, 3) float64, m
@@ -60,7 +61,7 @@ class Clusters:
     frames: Array
 
     def __len__(self) -> int:
-        """Return how many clusters there are."""
+        """Return the number of clusters."""
         return len(self.flat)
 
     @property
@@ -81,7 +82,7 @@ def is_paper(config: ModelsConfig) -> bool:
     return config.profile == 'paper'
 
 
-def clusters_of(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
+def segment_cloud(points: Array, config: ModelsConfig, viewpoint: Array) -> Clusters:
     """Cluster (N, 3) points; normals face the viewpoint (3,), m."""
     number = len(points)
     moved, order = np.empty((number, 3)), np.empty(number, np.int64)
@@ -99,13 +100,13 @@ def clusters_of(points: Array, config: ModelsConfig, viewpoint: Array) -> Cluste
         0.0 if by_paper else config.noise_per_range_sq,
         0.0 if by_paper else 1.0,
     )
-    num = bisect(points, viewpoint, rules, moved, order, rows, flat, means, values, frames)
+    num = bisect_cloud(points, viewpoint, rules, moved, order, rows, flat, means, values, frames)
     at = np.argsort(rows[:num, 0])
     return Clusters(moved, order, rows[at], flat[at], means[at], values[at], frames[at])
 
 
 def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:
-    """Return how thick, 6 sigma, a plane may be at (K, 3) places, m: a voxel, and noise."""
+    """Return the largest thickness, 6 sigma, of a plane at (K, 3) locations, m."""
     if is_paper(config):
         return np.full(len(means), config.voxel_size_m)
     range_sq = ((means - viewpoint) ** 2).sum(axis=1)
@@ -114,12 +115,12 @@ def thickness(means: Array, config: ModelsConfig, viewpoint: Array) -> Array:
     return result
 
 
-def surfaces_of(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -> list[Indices]:
-    """Return the flat clusters of each surface: their rows, (n,) int64, lowest first."""
+def merge_clusters(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -> list[Indices]:
+    """Return the flat clusters of each chart: their rows, (n,) int64, lowest first."""
     flat = np.flatnonzero(clusters.flat)
     scales = thickness(clusters.mean, config, viewpoint) / config.voxel_size_m
     found: list[Indices] = []
-    waiting = joined(clusters, flat, scales, config)[::-1]
+    waiting = merged(clusters, flat, scales, config)[::-1]
     while waiting:
         members = waiting.pop()
         side = folded(clusters, members, config)
@@ -127,14 +128,14 @@ def surfaces_of(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -> l
             found.append(members)
         else:
             for half in (members[side], members[~side]):
-                waiting += joined(clusters, half, scales, config)[::-1]
+                waiting += merged(clusters, half, scales, config)[::-1]
     return found
 
 
-def joined(
+def merged(
     clusters: Clusters, members: Indices, scales: Array, config: ModelsConfig
 ) -> list[Indices]:
-    """Return the connected components among some clusters."""
+    """Return the connected components of some clusters."""
     a, by_paper = config.voxel_size_m, is_paper(config)
     rules = (
         math.cos(math.radians(config.max_angle_deg)),
@@ -145,7 +146,7 @@ def joined(
         NEAR_GAP_VOXELS * a,
     )
     parent = np.empty(len(members), np.int64)
-    components(
+    merge_regions(
         clusters.points,
         clusters.rows[members],
         clusters.mean[members],
@@ -161,7 +162,7 @@ def joined(
 
 
 def mean_normal(clusters: Clusters, members: Indices) -> Array:
-    """Return the mean unit normal (3,) of clusters by their points; 0 where they cancel."""
+    """Return the mean unit normal (3,) of clusters, weighted by points; 0 if they cancel."""
     total = clusters.num_points[members] @ clusters.frames[members, 2]
     length = float(np.linalg.norm(total))
     unit: Array = total / length if length > 0.0 else total
@@ -171,6 +172,24 @@ def mean_normal(clusters: Clusters, members: Indices) -> Array:
 def folded(
     clusters: Clusters, members: Indices, config: ModelsConfig
 ) -> npt.NDArray[np.bool_] | None:
-    """Return how to halve a surface (n,) bool, or None where it has one height everywhere."""
+    """Return how to bisect a region (n,) bool, or None if it is a chart."""
     limit = math.cos(math.radians(config.fold_angle_deg))
-    return folds.folded(clusters.frames[members, 2], mean_normal(clusters, members), limit)
+    return bisected(clusters.frames[members, 2], mean_normal(clusters, members), limit)
+
+
+def bisected(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
+    """
+    Return how to bisect a region (n,) bool, or None if it is a chart.
+
+    Parameters
+    ----------
+    normals : (n, 3) float64
+        Unit normals of its clusters.
+    mean : (3,) float64
+        Their mean.
+    limit : float
+        Least cosine to the mean, for nearly all clusters.
+
+    """
+    side = np.empty(len(normals), np.bool_)
+    return side if bisect_folded(normals, mean, limit, side) else None

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Folds: which surfaces turn too far, and how their pieces are halved."""
+"""Bisection of bisected and overlapping surfaces: which are bisected, and where."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.folds import folded
-from surfel_mapper.models.kernels.folds import halve_part, percentile
+from surfel_mapper.models.kernels.charts import bisect_chart, percentile
+from surfel_mapper.models.segmentation import bisected
 from test.kernels.modes import both
 
 LIMIT = math.cos(math.radians(60.0))
@@ -27,16 +27,16 @@ def mean_of(normals):
     return mean / np.linalg.norm(mean)
 
 
-def test_a_fan_is_halved_in_its_middle():
+def test_fan_of_normals_is_bisected_in_its_middle():
     normals = fan(-85.0, 85.0, 40)
-    side = folded(normals, mean_of(normals), LIMIT)
+    side = bisected(normals, mean_of(normals), LIMIT)
     assert side is not None
     assert side.tolist() in ([True] * 20 + [False] * 20, [False] * 20 + [True] * 20)
 
 
-def test_two_unequal_bundles_are_parted_where_the_gap_is():
+def test_two_bundles_of_normals_are_bisected_at_the_gap():
     normals = np.concatenate([fan(-90.0, -70.0, 9), fan(50.0, 90.0, 15)])
-    side = folded(normals, np.array([0.0, 0.0, 1.0]), LIMIT)
+    side = bisected(normals, np.array([0.0, 0.0, 1.0]), LIMIT)
     assert side is not None
     assert len(set(side[:9])) == 1
     assert len(set(side[9:])) == 1
@@ -46,18 +46,18 @@ def test_two_unequal_bundles_are_parted_where_the_gap_is():
 @pytest.mark.parametrize(
     'normals', [fan(-50.0, 50.0, 30), fan(80.0, 80.0, 1), np.repeat(fan(80.0, 80.0, 1), 5, 0)]
 )
-def test_what_turns_less_or_cannot_be_halved_stays_whole(normals):
-    assert folded(normals, np.array([0.0, 0.0, 1.0]), LIMIT) is None
+def test_slightly_bent_or_inseparable_normals_stay_whole(normals):
+    assert bisected(normals, np.array([0.0, 0.0, 1.0]), LIMIT) is None
 
 
 def halved(call, normals, points):
     """Return one half of a part, of columns of 1 m in which 4 m are high; None for a whole one."""
     side = np.empty(len(normals), bool)
-    return side if call(halve_part, normals, points, LIMIT, 4.0, 1.0, side) else None
+    return side if call(bisect_chart, normals, points, LIMIT, 4.0, 1.0, side) else None
 
 
 @both
-def test_a_part_is_halved_where_its_normals_turn_or_it_lies_over_itself(call):
+def test_chart_is_bisected_if_folded_or_overlapping(call):
     level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
     up = np.tile([0.0, 0.0, 1.0], (48, 1))
     ramps = np.concatenate([level, np.add(level, [0.0, 0.0, 5.0])])
@@ -72,7 +72,7 @@ def test_a_part_is_halved_where_its_normals_turn_or_it_lies_over_itself(call):
 
 
 @both
-def test_normals_that_differ_in_their_signs_alone_are_no_fold(call):
+def test_normals_equal_up_to_sign_are_no_fold(call):
     normals = np.tile([0.0, 0.0, 1.0], (24, 1))
     normals[::3] *= -1.0
     level = np.stack([*np.mgrid[0:6, 0:4].reshape(2, -1) + 0.5, np.zeros(24)], axis=1)
@@ -84,7 +84,7 @@ def test_normals_that_differ_in_their_signs_alone_are_no_fold(call):
 
 
 @pytest.mark.parametrize('number', [1, 2, 3, 50, 51, 52, 200])
-def test_percentiles_are_those_of_numpy(number):
+def test_percentile_equals_numpy(number):
     values = np.random.default_rng(number).normal(size=number)
     for share in (0.0, 2.0, 50.0, 100.0):
         assert percentile(values, share) == pytest.approx(np.percentile(values, share))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How a cluster is halved: 2-means and the mixture of two Gaussians against slow twins."""
+"""Bisection of a cluster: moments, 2-means and the mixture against slow twins."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from surfel_mapper.models.kernels.halving import (
+from surfel_mapper.models.kernels.bisection import (
     cluster_moments,
     MEANS_ITERATIONS,
     MEANS_SAMPLE,
     num_outliers,
     SETTLED_SHARE,
-    split_means,
+    split_two_means,
 )
-from surfel_mapper.models.kernels.mixture import ITERATIONS, SETTLED, split_mixture
+from surfel_mapper.models.kernels.gaussian_mixture import ITERATIONS, SETTLED, split_mixture
 
 
 def two_sheets(number, seed):
@@ -34,7 +34,7 @@ def frame_of(points):
 
 
 @pytest.mark.parametrize('number', [1, 4, 150, 1001])
-def test_moments_are_those_of_numpy(number):
+def test_moments_equal_numpy(number):
     points = two_sheets(number, 1)
     mean, scatter = np.empty(3), np.empty((3, 3))
     cluster_moments(*points, mean, scatter)
@@ -52,11 +52,11 @@ def test_outliers_are_beyond_three_sigma():
 
 
 @pytest.mark.parametrize('number', [40, 700, 5 * MEANS_SAMPLE + 3])
-def test_two_means_are_those_of_lloyd_begun_on_the_long_axis(number):
+def test_two_means_equal_lloyd_from_the_principal_axis(number):
     points = two_sheets(number, 3)
     mean, values, frame = frame_of(points)
     share = np.empty(number)
-    second = split_means(*points, mean, values, frame, share, np.empty((4, MEANS_SAMPLE)))
+    second = split_two_means(*points, mean, values, frame, share, np.empty((4, MEANS_SAMPLE)))
 
     sample = (points - mean[:, None])[:, :: 1 + number // MEANS_SAMPLE]
     reach = np.sqrt(2.0 * values[2] / np.pi) * frame[0]
@@ -77,7 +77,7 @@ def nearer_second(points, centres):
     return second < first
 
 
-def test_the_mixture_is_that_of_expectation_maximisation():
+def test_mixture_equals_textbook_expectation_maximisation():
     points = two_sheets(180, 4)
     mean = points.mean(axis=1)
     share = (points[0] > np.median(points[0])).astype(np.float64)

@@ -1,11 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Which flat clusters belong to one surface: pair tests and connected components.
+Region merging: which flat clusters belong to one surface, by pair tests and union-find.
 
-The cheap tests on means and normals run for all pairs; only what passes them is looked at point
-by point, nearest pairs first, and not at all where two clusters hang together already, as only
-the components count. A point is compared with a cluster only inside its box, widened.
+The cheap tests on means and normals run for all pairs. Pairs that pass are compared point by
+point, nearest pairs first, and skipped if they already are in one region, as only the regions
+matter. A point is compared with a cluster only inside its widened bounding box.
+
+Source: Gao and Dong 2025; the test for arcs is our own.
 """
 
 from numba import njit
@@ -30,27 +32,27 @@ def gap(delta, distance, value_i, frame_i, value_j, frame_j):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def agree(normal_i, normal_j, delta, scale, rules):
+def same_surface(normal_i, normal_j, delta, scale, rules):
     """
-    Return whether two pieces lie on one plane, or on one arc.
+    Return whether two pieces lie on one plane or on one arc.
 
-    scale  what lengths are multiplied by: 1 without noise
+    scale  factor on lengths: 1 without noise
     rules  (cos_plane, offset, cos_arc, arc_offset, gap, near)
 
     Tangents of an arc make equal and opposite angles with its chord, so the sum of the normals
-    is across it; for parallel pieces the same expression is their step.
+    is perpendicular to it; for parallel pieces the same expression is the step between them.
     """
     cosine = n_i = n_j = 0.0
     for j in range(3):
         cosine += normal_i[j] * normal_j[j]
         n_i += normal_i[j] * delta[j]
         n_j += normal_j[j] * delta[j]
-    return go_on(cosine, n_i, n_j, scale, rules)
+    return same_surface_products(cosine, n_i, n_j, scale, rules)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def go_on(cosine, n_i, n_j, scale, rules):
-    """Return what agree does, from the products of the normals and of each with the step."""
+def same_surface_products(cosine, n_i, n_j, scale, rules):
+    """Evaluate same_surface from n_i . n_j, n_i . delta and n_j . delta."""
     if abs(cosine) > rules[0] and 0.5 * (abs(n_i) + abs(n_j)) < rules[1] * scale:
         return True
     return cosine > rules[2] and 0.5 * abs(n_i + n_j) < rules[3] * scale
@@ -58,7 +60,7 @@ def go_on(cosine, n_i, n_j, scale, rules):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def find_root(parent, i):
-    """Return the lowest cluster that one hangs together with, shortening the way."""
+    """Return the root of a union-find tree, with path halving."""
     while parent[i] != i:
         parent[i] = parent[parent[i]]
         i = parent[i]
@@ -66,16 +68,16 @@ def find_root(parent, i):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def components(points, starts, means, values, frames, scales, rules, parent):
+def merge_regions(points, starts, means, values, frames, scales, rules, parent):
     """
     Find the connected components of flat clusters.
 
     points  (N, 3) float64; cluster k has the rows starts[k, 0] to starts[k, 1] - 1
     starts  (K, 2) int64
-    means   (K, 3), values (K, 3), frames (K, 3, 3): of bisect
-    scales  (K,) float64, see agree
-    rules   (cos_plane, offset, cos_arc, arc_offset, gap, near), lengths in m; see agree; pairs
-            are further apart than gap by their boxes, or than near by their points, or joined
+    means   (K, 3), values (K, 3), frames (K, 3, 3): of bisect_cloud
+    scales  (K,) float64, see same_surface
+    rules   (cos_plane, offset, cos_arc, arc_offset, gap, near), lengths in m; see same_surface; a
+            pair is linked if its boxes are nearer than gap and its points than near
     parent  (K,) int64, out: lowest cluster of the component
     """
     number = len(means)
@@ -89,7 +91,7 @@ def components(points, starts, means, values, frames, scales, rules, parent):
         nx, ny, nz = frames[i, 2, 0], frames[i, 2, 1], frames[i, 2, 2]
         for j in range(i):
             cosine = nx * frames[j, 2, 0] + ny * frames[j, 2, 1] + nz * frames[j, 2, 2]
-            if abs(cosine) <= least_plane and cosine <= least_arc:  # most pairs: no need of more
+            if abs(cosine) <= least_plane and cosine <= least_arc:  # most pairs end here
                 continue
             length = 0.0
             for k in range(3):
@@ -97,7 +99,7 @@ def components(points, starts, means, values, frames, scales, rules, parent):
                 length += delta[k] * delta[k]
             length = np.sqrt(length)
             scale = 0.5 * (scales[i] + scales[j])
-            if not agree(frames[i, 2], frames[j, 2], delta, scale, rules):
+            if not same_surface(frames[i, 2], frames[j, 2], delta, scale, rules):
                 continue
             if length > 0.0 and not (
                 gap(delta, length, values[i], frames[i], values[j], frames[j]) < rules[4]
@@ -126,7 +128,7 @@ def components(points, starts, means, values, frames, scales, rules, parent):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def touch(points, rows_i, rows_j, box_i, box_j, near):
-    """Return whether some point of one range of rows is nearer than that to one of another."""
+    """Return whether two ranges of rows hold points nearer to each other than a distance."""
     for j in range(3):
         if box_i[0, j] - near > box_j[1, j] or box_j[0, j] - near > box_i[1, j]:
             return False

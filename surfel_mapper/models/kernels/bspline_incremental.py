@@ -1,21 +1,22 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Large height fields fitted only where something has changed, from what they were.
+Incremental least squares of large height fields, by conjugate gradients from the previous fit.
 
-A banded solve of a street's ground, 26,000 control points, takes seconds; from the field before,
-conjugate gradients take a few steps. Control points on which nothing that is covered depends are
-left out: there the equations are bad and nobody looks.
+A banded solve for a street's ground, 26,000 control points, takes seconds; from the previous
+field, conjugate gradients take a few steps. Control points on which no covered cell depends are
+excluded: their equations are ill-conditioned, and they are never evaluated.
 
-Source: Golub and Van Loan, Matrix Computations, section 11.5 (preconditioned by the diagonal).
+Source: Golub and Van Loan, Matrix Computations, section 11.5 (Jacobi preconditioner).
 """
 
 from numba import njit
 import numpy as np
 
-from surfel_mapper.models.kernels.splines import nonzero, parameter
+from surfel_mapper.models.kernels.bspline import nonzero, parameter
 
 MOST_STEPS = 200
+"""Most conjugate gradient steps of one fit."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -24,7 +25,7 @@ def mark_active(filled, field, active):
     Mark the control points on which heights in filled cells depend.
 
     filled  (Nx, Ny) bool
-    field   see heights_at
+    field   see evaluate_field
     active  (Nx + 2, Ny + 2) bool, all False; out
     """
     _, pitch, degrees, knots, control = field
@@ -53,6 +54,7 @@ def mark_near(touched, margin, active, free):
 
     touched  (Nx, Ny) bool
     margin   cells
+    active   (Nx + 2, Ny + 2) bool
     free     (Nx + 2, Ny + 2) bool, all False; out
     """
     for i in range(touched.shape[0]):
@@ -64,12 +66,13 @@ def mark_near(touched, margin, active, free):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def guess(control, known, active):
+def extrapolate(control, known, active):
     """
-    Give active control points of unknown height that of their neighbours, from the known ones on.
+    Set active control points of unknown height to the mean of known neighbours, outwards.
 
-    control  (Nx + 2, Ny + 2) float64, in place
-    known    bool, in place; all that are active become so
+    control  (Nx + 2, Ny + 2) float64, m, in place
+    known    (Nx + 2, Ny + 2) bool, in place; all that are active become known
+    active   (Nx + 2, Ny + 2) bool
     """
     num_x, num_y = control.shape
     found = True
@@ -94,15 +97,13 @@ def guess(control, known, active):
 @njit(cache=True, nogil=True, error_model='numpy')
 def equations(xyz, field, free, first, values):
     """
-    List the heights that depend on free control points.
+    List the samples that depend on free control points; return how many there are.
 
     xyz     (M, 3) float64, m
-    field   see heights_at; degrees are 3
+    field   see evaluate_field; degrees are 3
     free    (Nx + 2, Ny + 2) bool
     first   (M, 2) int64, out: first control point, counted y within x; row of xyz
-    values  (M, 2, 4) float64, out: the splines along x and y
-
-    Returns how many there are.
+    values  (M, 2, 4) float64, out: the basis functions along x and y
     """
     origin, pitch, _, knots, control = field
     lower = np.empty(4)
@@ -125,13 +126,13 @@ def equations(xyz, field, free, first, values):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def bends(places, axis, active, free, at, second):
+def second_differences(places, axis, active, free, at, second):
     """
-    List the second differences along an axis among active control points, some of them free.
+    List the second differences along an axis of active control points, with at least one free.
 
-    places  (N,) float64, where the control points stand along the axis
+    places  (N,) float64, Greville abscissae along the axis
     at      (T, 2) int64, out: first of three control points, and the step to the next
-    second  (T, 3) float64, out: what they are multiplied by
+    second  (T, 3) float64, out: their coefficients
 
     Returns how many there are.
     """
@@ -161,13 +162,13 @@ def multiply(first, values, num_y, at, second, smoothing, ridge, x, result):
     """
     Multiply by the matrix of the normal equations.
 
-    first, values, at, second: of equations and bends
-    num_y      control points along y
-    x, result  (n,) float64, of all control points
+    first, values, at, second  of equations and second_differences
+    num_y                      control points along y
+    x, result                  (n,) float64, of all control points
     """
     for i in range(len(x)):
         result[i] = ridge * x[i]
-    one, step = np.uint64(1), np.uint64(num_y)  # places without a sign: none is from the end
+    one, step = np.uint64(1), np.uint64(num_y)  # unsigned indices: no wrap-around checks
     two, three = one + one, one + one + one
     for i in range(len(first)):
         row, height = np.uint64(first[i, 0]), 0.0
@@ -196,7 +197,7 @@ def multiply(first, values, num_y, at, second, smoothing, ridge, x, result):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal):
-    """Write one over the diagonal (n,) of the matrix of multiply."""
+    """Write the inverse of the diagonal (n,) of the matrix of multiply."""
     for i in range(len(diagonal)):
         diagonal[i] = ridge
     for i in range(len(first)):
@@ -212,17 +213,17 @@ def preconditioner(first, values, num_y, at, second, smoothing, ridge, diagonal)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def relax(first, values, z, num_y, at, second, rules, free, control):
+def conjugate_gradients(first, values, z, num_y, at, second, rules, free, control):
     """
-    Bring free control points to the least of the squares, by conjugate gradients.
+    Minimise the sum of squares over the free control points.
 
-    first, values, num_y, at, second: see multiply
-    z        (M,) float64, m, of the equations
-    rules    smoothing; ridge; m: the last step is shorter than that everywhere
-    free     (F,) int64, numbers of the free control points
-    control  (n,) float64, m, in place
+    first, values, num_y, at, second  see multiply
+    z                                 (M,) float64, m, of the equations
+    rules                             smoothing; ridge; tolerance: the last step is shorter, m
+    free                              (F,) int64, indices of the free control points
+    control                           (n,) float64, m, in place
 
-    Returns how many steps that took.
+    Returns the number of steps taken.
     """
     smoothing, ridge, tolerance = rules
     product, inverse = np.empty(len(control)), np.empty(len(control))

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Height fields that are fitted again and again: small ones at once, large ones where they changed.
+Height fields of a map that changes: small ones are refitted, large ones only near changes.
 
-A cell whose mean height has moved by less than ``STILL_M`` keeps the one that it was fitted with.
-Control points farther than ``MARGIN`` cells from all others stay: a change dies out sooner. Where
-the knots lie depends on how many cells there are, so large grids grow by blocks.
+A cell whose mean height changed by less than ``STILL_M`` keeps the height that it was fitted
+with. Control points farther than ``MARGIN`` cells from a change stay as they are: its influence
+decays within that distance. The knots depend on the number of cells, so large grids
+grow by blocks.
 """
 
 from __future__ import annotations
@@ -16,43 +17,47 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.models.bspline import fit_pspline, HeightField, initial_field, RIDGE
-from surfel_mapper.models.kernels.relaxing import (
-    bends,
+from surfel_mapper.models.kernels.bspline_incremental import (
+    conjugate_gradients,
     equations,
-    guess,
+    extrapolate,
     mark_active,
     mark_near,
-    relax,
+    second_differences,
 )
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MOST_AT_ONCE = 2e6
-"""Multiplications of a banded solve, about 1 ms, beyond which a field counts as large."""
+"""Multiplications of a banded solve, about 1 ms, above which a field is large."""
 
 SMOOTHING = 1e-2
 """Weight of the second differences."""
 
 STILL_M = 2e-4
+"""Smallest change of the mean height of a cell that is refitted, m."""
 TOLERANCE_M = 2e-4
+"""Conjugate gradients stop when no control point moves farther, m."""
 MARGIN = 5
+"""Cells around a change whose control points are refitted."""
 DEGREE = 3
+"""Degree of the splines."""
 BLOCK = 16
-"""Cells along either side by which large grids grow."""
+"""Large grids start and end at multiples of this number of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Fitted:
+class FittedField:
     """
-    A field and what it was fitted to.
+    A field and its input.
 
     Attributes
     ----------
     field : HeightField
-        The result.
+        Result of the fit.
     heights : (Nx, Ny) float64, m
-        Mean heights of the cells, nan where there was nothing.
+        Mean heights of the cells, nan for empty cells.
 
     """
 
@@ -60,9 +65,11 @@ class Fitted:
     heights: Array
 
 
-def fit_field(pitch_m: float, origin: Array, sums: Array, before: Fitted | None) -> Fitted:
+def fit_field(
+    pitch_m: float, origin: Array, sums: Array, before: FittedField | None
+) -> FittedField:
     """
-    Return the field through cells.
+    Return the field that fits the mean heights of cells.
 
     Parameters
     ----------
@@ -71,9 +78,9 @@ def fit_field(pitch_m: float, origin: Array, sums: Array, before: Fitted | None)
     origin : (2,) float64, m
         Lowest corner of the grid.
     sums : (Nx, Ny, 4) float64
-        Of x, y, z and number of the points in every cell.
-    before : Fitted, optional
-        The field as it was, over cells of the same lattice.
+        Sums of x, y, z and number of the points in every cell.
+    before : FittedField, optional
+        The previous field, over cells of the same lattice.
 
     """
     size = (sums.shape[0] + 2) * (sums.shape[1] + 2)
@@ -86,17 +93,17 @@ def fit_field(pitch_m: float, origin: Array, sums: Array, before: Fitted | None)
     start = initial_field(pitch_m, origin, means[..., 2], filled, DEGREE)
     if not is_large:
         xyz, number = means[filled], sums[..., 3][filled]
-        return Fitted(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, SMOOTHING), heights)
+        return FittedField(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, SMOOTHING), heights)
     known = np.zeros(start.control.shape, np.bool_)
     known[1:-1, 1:-1] = touched = filled
     if before is not None:
         touched = taken_over(before, start, heights, known)
         means[..., 2] = np.where(filled, heights, 0.0)
-    return Fitted(relaxed(start, means, filled, touched, known), heights)
+    return FittedField(relaxed(start, means, filled, touched, known), heights)
 
 
 def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]:
-    """Return origin and cells of a grid that begins and ends at a multiple of BLOCK cells."""
+    """Return origin and cells of the grid, extended to multiples of BLOCK cells."""
     first = np.rint(origin / pitch_m).astype(np.int64)
     low = first % BLOCK
     high = -(first + sums.shape[:2]) % BLOCK
@@ -105,20 +112,20 @@ def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]
     return lowest, np.pad(sums, padding)
 
 
-def taken_over(before: Fitted, start: HeightField, heights: Array, known: Mask) -> Mask:
+def taken_over(before: FittedField, start: HeightField, heights: Array, known: Mask) -> Mask:
     """
-    Copy what a field was into one to start from, and keep the heights that are still.
+    Copy the previous field into the initial one, and restore heights that hardly changed.
 
     Returns
     -------
     (Nx, Ny) bool
-        Cells in which it cannot stay.
+        Cells that have to be refitted.
 
     """
     old = before.field
     step = np.rint((old.origin - start.origin) / start.pitch_m).astype(np.int64)
     new, was = overlap(start.control.shape, old.control.shape, step)
-    # beyond the cells that held something nothing was fitted
+    # control points away from filled cells were not fitted
     start.control[new] = np.where(known[new], start.control[new], 0.0)
     valid = np.zeros(old.control.shape, np.bool_)
     mark_active(~np.isnan(before.heights), old.parts(), valid)
@@ -138,7 +145,7 @@ def taken_over(before: Fitted, start: HeightField, heights: Array, known: Mask) 
 def overlap(
     new: tuple[int, ...], old: tuple[int, ...], step: npt.NDArray[np.int64]
 ) -> tuple[tuple[slice, ...], tuple[slice, ...]]:
-    """Return where two grids overlap, the old one so many cells further on, in either."""
+    """Return the slices where two grids overlap; the old one starts `step` cells into the new."""
     low = [max(int(s), 0) for s in step]
     high = [max(min(int(s) + o, n), a) for s, o, n, a in zip(step, old, new, low, strict=True)]
     here = tuple(slice(a, b) for a, b in zip(low, high, strict=True))
@@ -149,11 +156,11 @@ def overlap(
 def relaxed(
     start: HeightField, means: Array, filled: Mask, touched: Mask, known: Mask
 ) -> HeightField:
-    """Return a large field, fitted near touched cells, from the one to start from."""
+    """Return a large field, refitted near touched cells."""
     control = start.control
     active, free = np.zeros(control.shape, np.bool_), np.zeros(control.shape, np.bool_)
     mark_active(filled, start.parts(), active)
-    guess(control, known, active)
+    extrapolate(control, known, active)
     mark_near(touched, MARGIN, active, free)
     xyz = means[filled]
     first, values = np.empty((len(xyz), 2), np.int64), np.empty((len(xyz), 2, DEGREE + 1))
@@ -161,11 +168,11 @@ def relaxed(
     ats, seconds = [], []
     for axis, places in enumerate(start.greville()):
         at, second = np.empty((control.size, 2), np.int64), np.empty((control.size, 3))
-        bent = bends(places, axis, active, free, at, second)
+        bent = second_differences(places, axis, active, free, at, second)
         ats.append(at[:bent])
         seconds.append(second[:bent])
     flat = control.ravel()
-    relax(
+    conjugate_gradients(
         first[:num],
         values[:num],
         xyz[first[:num, 1], 2],

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Clusters: what is flat, how clouds are split, and which clusters belong together."""
+"""Thinning, flat clusters, and merging of clusters, against slow twins."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from scipy.spatial.distance import cdist
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.kernels.symmetric3 import eigen_frame
 from surfel_mapper.models import fit
-from surfel_mapper.models.clusters import clusters_of, surfaces_of
 from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.kernels.frames import orient, range_moments
-from surfel_mapper.models.kernels.joining import agree, gap
+from surfel_mapper.models.kernels.region_merging import gap, same_surface
+from surfel_mapper.models.segmentation import merge_clusters, segment_cloud
 from test.models.scenes import A, room, sheet, VIEW
 
 OFF_GRID = (0.011, 0.004, 0.007)
@@ -28,7 +28,7 @@ ABOVE = np.array([0.0, 0.0, 5.0])
 
 def clustered(points, viewpoint=ABOVE, **settings):
     config = ModelsConfig(**{'voxel_size_m': A, **settings})
-    return clusters_of(thin(points, config.voxel_size_m).means, config, viewpoint), config
+    return segment_cloud(thin(points, config.voxel_size_m).means, config, viewpoint), config
 
 
 def flat_share(clusters):
@@ -45,17 +45,17 @@ def flat_share(clusters):
         (sheet(0.9, A / 2, A / 2), False),  # a line
     ],
 )
-def test_a_cluster_is_flat_where_it_is_thin_dense_and_wide(cloud, is_flat):
-    clusters = clusters_of(cloud, ModelsConfig(voxel_size_m=A, min_points=100_000), ABOVE)
+def test_cluster_is_flat_if_thin_dense_and_wide(cloud, is_flat):
+    clusters = segment_cloud(cloud, ModelsConfig(voxel_size_m=A, min_points=100_000), ABOVE)
     assert clusters.flat.tolist() == [is_flat]
 
 
-def test_a_share_of_outliers_is_allowed_and_by_the_paper_none():
+def test_outlier_share_is_allowed_but_not_in_strict_mode():
     cloud = np.concatenate([sheet(0.9, 0.9, A), [[0.0, 0.0, 0.05]] * 5])
     strict = ModelsConfig(voxel_size_m=A, min_points=100_000, outlier_share=0.0)
     allowed = ModelsConfig(voxel_size_m=A, min_points=100_000, outlier_share=0.02)
-    assert not clusters_of(cloud, strict, ABOVE).flat[0]
-    assert clusters_of(cloud, allowed, ABOVE).flat[0]
+    assert not segment_cloud(cloud, strict, ABOVE).flat[0]
+    assert segment_cloud(cloud, allowed, ABOVE).flat[0]
 
 
 @pytest.mark.filterwarnings('error')
@@ -85,7 +85,7 @@ def test_degenerate_clouds_give_a_result_that_holds_every_point_once(cloud, prof
     assert np.isfinite(model.resample()).all()
 
 
-def test_clusters_hold_every_point_once_and_know_their_moments():
+def test_clusters_partition_the_points_and_have_exact_moments():
     points, _ = room(160, 120)
     clusters, _ = clustered(points, VIEW)
     assert sorted(clusters.order) == list(range(len(clusters.points)))
@@ -100,7 +100,7 @@ def test_clusters_hold_every_point_once_and_know_their_moments():
             np.testing.assert_allclose(covariances[k], np.cov(own.T), atol=1e-12)
 
 
-def test_the_order_of_the_points_does_not_matter_and_runs_agree():
+def test_result_is_reproducible_and_independent_of_point_order():
     points, _ = room(160, 120)
     config = ModelsConfig(voxel_size_m=A)
     order = np.random.default_rng(5).permutation(len(points))
@@ -115,14 +115,14 @@ def test_full_sheets_of_any_direction_are_flat(normal):
     assert flat_share(clusters) >= 0.97
 
 
-def test_by_the_paper_a_floor_is_not_dense_enough_to_be_flat():
-    """Its least density of 2 is just above that of an axis-aligned sheet, a point a voxel."""
+def test_paper_profile_rejects_an_axis_aligned_floor():
+    """The least density of 2 is just above that of an axis-aligned sheet, a point a voxel."""
     floor, diagonal = sheet(2.0, 1.5, A / 6), sheet(2.0, 1.5, A / 6, (1, 1, 1), OFF_GRID)
     assert flat_share(clustered(floor, profile='paper')[0]) < 0.6
     assert flat_share(clustered(diagonal, profile='paper')[0]) > 0.95
 
 
-def test_a_noisy_room_is_mostly_flat_where_the_noise_is_known():
+def test_noisy_room_is_mostly_flat_if_the_noise_is_known():
     points, _ = room(320, 240, noise_per_range_sq=1.425e-3)
     assert flat_share(clustered(points, VIEW, noise_per_range_sq=1.425e-3)[0]) >= 0.8
 
@@ -153,7 +153,7 @@ def gap_of(clusters, i, j):
     return gap(delta, np.linalg.norm(delta), value[i], frame[i], value[j], frame[j])
 
 
-def test_the_gap_of_boxes_is_symmetric_and_rejects_no_pair_whose_points_touch():
+def test_box_gap_is_symmetric_and_rejects_no_touching_pair():
     points, _ = room(160, 120)
     clusters, _ = clustered(points, VIEW)
     for i, j in pairs(clusters):
@@ -164,7 +164,7 @@ def test_the_gap_of_boxes_is_symmetric_and_rejects_no_pair_whose_points_touch():
             assert cdist(one, other).min() >= 3.0 * A
 
 
-def test_components_are_those_of_the_whole_graph():
+def test_merged_regions_equal_components_of_the_full_graph():
     points, _ = room(160, 120)
     clusters, config = clustered(points, VIEW, fold_angle_deg=89.0)
     label = np.arange(len(clusters))
@@ -173,11 +173,11 @@ def test_components_are_those_of_the_whole_graph():
         delta = clusters.mean[i] - clusters.mean[j]
         normals = clusters.frames[i, 2], clusters.frames[j, 2]
         one, other = (clusters.points[slice(*clusters.rows[k])] for k in (i, j))
-        cheap = agree(*normals, delta, 1.0, rules) and gap_of(clusters, i, j) < 5.0 * A
+        cheap = same_surface(*normals, delta, 1.0, rules) and gap_of(clusters, i, j) < 5.0 * A
         if cheap and cdist(one, other).min() < 3.0 * A:
             label[label == label[i]] = label[j]
     expected = {frozenset(np.flatnonzero(label == x)) for x in label[clusters.flat]}
-    found = {frozenset(members) for members in surfaces_of(clusters, config, VIEW)}
+    found = {frozenset(members) for members in merge_clusters(clusters, config, VIEW)}
     # charts only cut further; at 89 deg nothing here is cut
     assert found == expected
 
@@ -205,3 +205,47 @@ def test_two_sheets_that_meet_at_an_angle_are_two_planes(angle_deg):
     assert len(large) == 2
     between = math.degrees(math.acos(abs(large[0].normal @ large[1].normal)))
     assert between == pytest.approx(angle_deg, abs=2.0)
+
+
+SIZE = 0.02
+
+
+def cloud(reach, dtype):
+    """Return points near and far with repeated ones in a row, and some that are not finite."""
+    rng = np.random.default_rng(2)
+    near = np.repeat(rng.normal(scale=0.3, size=(700, 3)), rng.integers(1, 300, 700), axis=0)
+    points = np.concatenate([near, rng.uniform(-reach, reach, (300, 3))]).astype(dtype)
+    points[::97] = np.nan
+    points[5], points[6, 1] = np.inf, -np.inf
+    return points
+
+
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+@pytest.mark.parametrize('reach', [1.0, 1e4])  # with 1e4 m keys have 60 bits
+def test_voxel_means_equal_numpy_sums_in_point_order(reach, dtype):
+    points = cloud(reach, dtype)
+    thinned = thin(points, SIZE)
+    finite = np.isfinite(points).all(axis=1)
+    index = np.floor(points[finite].astype(np.float64) / SIZE)
+    voxels, which = np.unique(index[:, ::-1], axis=0, return_inverse=True)
+    which = which.ravel()
+    counts = np.bincount(which)
+    expected = np.zeros((len(voxels), 3))
+    np.add.at(expected, which, points[finite])
+    np.testing.assert_array_equal(thinned.means, expected / counts[:, None])
+    labels = thinned.point_labels(np.arange(len(voxels), dtype=np.int32))
+    np.testing.assert_array_equal(labels[finite], which)
+    assert (labels[~finite] == -1).all()
+
+
+def test_strided_points_are_thinned_like_a_copy():
+    points = cloud(1.0, np.float32)
+    strided, copied = thin(points[::2], SIZE), thin(points[::2].copy(), SIZE)
+    np.testing.assert_array_equal(strided.means, copied.means)
+
+
+@pytest.mark.parametrize('points', [np.empty((0, 3)), np.full((4, 3), np.nan)])
+def test_thinning_no_points_gives_no_means(points):
+    thinned = thin(points, SIZE)
+    assert thinned.means.shape == (0, 3)
+    assert (thinned.point_labels(np.empty(0, np.int32)) == [-1] * len(points)).all()

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Large height fields: near the field solved at once, and still where nothing has changed."""
+"""Large height fields: close to the direct solution, and constant away from changes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.bspline import fit_pspline, initial_field
-from surfel_mapper.models.large_fields import DEGREE, fit_field, SMOOTHING
+from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, SMOOTHING
 
 PITCH_M = 0.25
 HOLE = (slice(30, 34), slice(20, 25))
@@ -36,7 +36,7 @@ def places(number=2000):
     return xy[sums()[cell[:, 0], cell[:, 1], 3] > 0.0]
 
 
-def test_it_passes_where_the_field_solved_at_once_does():
+def test_large_field_equals_the_direct_solution():
     data = sums()
     large = fit_field(PITCH_M, np.zeros(2), data, None)
     filled = data[..., 3] > 0.0
@@ -50,7 +50,7 @@ def test_it_passes_where_the_field_solved_at_once_does():
     np.testing.assert_allclose(large.field.heights(xy), surface(*xy.T), atol=5e-3)
 
 
-def test_what_is_far_from_a_change_stays_to_the_bit():
+def test_field_far_from_a_change_is_bitwise_constant():
     before = fit_field(PITCH_M, np.zeros(2), sums(), None)
     after = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), before)
     xy = places()
@@ -61,14 +61,14 @@ def test_what_is_far_from_a_change_stays_to_the_bit():
     np.testing.assert_allclose(after.field.heights(xy), fresh.field.heights(xy), atol=2e-3)
 
 
-def test_nothing_changes_where_nothing_has_changed():
+def test_unchanged_input_keeps_the_field():
     before = fit_field(PITCH_M, np.zeros(2), sums(), None)
     after = fit_field(PITCH_M, np.zeros(2), sums(), before)
     np.testing.assert_array_equal(after.field.control, before.field.control)
 
 
 @pytest.mark.parametrize('first', [(-3, 0), (-20, -20), (0, 0)])
-def test_a_grid_that_grows_goes_on_from_what_it_was(first):
+def test_growing_grid_continues_the_previous_field(first):
     before = fit_field(PITCH_M, np.zeros(2), sums(), None)
     origin = PITCH_M * np.array(first, float)
     data = sums(60 - first[0] + 5, 44 - first[1], first=first)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Split points by a mixture of two Gaussians, by expectation maximisation.
+Split points by a mixture of two Gaussians, by expectation maximisation (EM).
 
-One pass over the points an iteration: the logarithm of the ratio of two Gaussians is one quadric,
-and the moments of the second component leave those of the first. Coordinates are three arrays,
-sums may be taken in any order (reassoc) and the exponential is a polynomial, so that the compiler
-works on four points at once: 6 ns a point and iteration.
+Each iteration is one pass over the points: the logarithm of the ratio of two Gaussians is one
+quadric, and the moments of the first component are the total less those of the second.
+Coordinates are three arrays, sums may be taken in any order (reassoc) and the exponential is a
+polynomial, so that the compiler vectorises over four points: 6 ns a point and iteration.
 
 Source: Dempster, Laird and Rubin 1977; covariances are regularised, as those of few points are
 singular.
@@ -18,14 +18,15 @@ from numba import njit
 import numpy as np
 
 ITERATIONS = 10
+"""Most EM iterations."""
 SETTLED = 1e-2
-"""It ends when no responsibility changes by more than this."""
+"""EM stops when no responsibility changes by more than this."""
 
 LEAST_WEIGHT = 1e-6
-"""A component of fewer points is empty."""
+"""A component with a smaller sum of responsibilities is empty."""
 
 C2, C3, C4, C5, C6, C7, C8 = (1.0 / math.factorial(k) for k in range(2, 9))
-"""Of the exponential: to 1e-10."""
+"""Taylor coefficients of the exponential; the error is 1e-10."""
 
 TERMS = 10
 """1, x, y, z, xx, xy, xz, yy, yz, zz: moments, and coefficients of a quadric."""
@@ -34,29 +35,29 @@ TERMS = 10
 @njit(cache=True, nogil=True, error_model='numpy')
 def split_mixture(x, y, z, mean, share):
     """
-    Put each point on the side of the likelier of two Gaussians.
+    Compute for each point the responsibility of the second of two Gaussians.
 
-    x, y, z  (n,) float64
-    mean     (3,) float64, of these
-    share    (n,) float64, of the second Gaussian: 0 or 1 where they begin; out: where they end
+    x, y, z  (n,) float64, m
+    mean     (3,) float64, of the points
+    share    (n,) float64, in place: responsibility of the second Gaussian; 0 or 1 at the start
     """
     total, second, quadric = np.empty(TERMS), np.empty(TERMS), np.empty(TERMS)
     sum_moments(x, y, z, mean, share, total, second)
     for _ in range(ITERATIONS):
         quadric[:] = 0.0
-        if not subtract_score(second, total[0], quadric, 1.0):
+        if not subtract_log_density(second, total[0], quadric, 1.0):
             break
         for k in range(TERMS):
             second[k] = total[k] - second[k]
-        if not subtract_score(second, total[0], quadric, -1.0):
+        if not subtract_log_density(second, total[0], quadric, -1.0):
             break
-        if iterate(x, y, z, mean, share, quadric, second) == 0.0:
+        if em_step(x, y, z, mean, share, quadric, second) == 0.0:
             break
 
 
 @njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
-def iterate(x, y, z, mean, share, quadric, second):
-    """Find the shares of the second component and its moments; return how many still change."""
+def em_step(x, y, z, mean, share, quadric, second):
+    """Update responsibilities and moments of the second component; return how many change."""
     mx, my, mz = mean[0], mean[1], mean[2]
     q0, qx, qy, qz = quadric[0], quadric[1], quadric[2], quadric[3]
     qxx, qxy, qxz = quadric[4], quadric[5], quadric[6]
@@ -107,7 +108,7 @@ def iterate(x, y, z, mean, share, quadric, second):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def sum_moments(x, y, z, mean, share, total, second):
-    """Sum the moments (TERMS,) about the mean of all points, and of their shares."""
+    """Sum the moments (TERMS,) about the mean, of all points and of the second component."""
     total[:] = 0.0
     second[:] = 0.0
     for i in range(len(x)):
@@ -118,7 +119,7 @@ def sum_moments(x, y, z, mean, share, total, second):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_moments(moments, weight, x, y, z):
-    """Add a weighted point."""
+    """Add a weighted point to moments (TERMS,)."""
     moments[0] += weight
     moments[1] += weight * x
     moments[2] += weight * y
@@ -132,7 +133,7 @@ def add_moments(moments, weight, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def subtract_score(moments, number, quadric, factor):
+def subtract_log_density(moments, number, quadric, factor):
     """
     Subtract factor times the logarithm of a Gaussian's weighted density; False if it is empty.
 

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What voxels are to the models, how far they reach, and which changes of them matter.
+Classes of voxels, the extent of their surfels, and which changes of them are material.
 
 All arrays have a row for each row of the map's slab.
 
-Source: Duff et al. 2017 for the basis across a unit vector.
+Source: Duff et al. 2017 for the orthonormal basis.
 """
 
 import math
@@ -13,26 +13,26 @@ import math
 from numba import njit
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
-"""What a voxel is: no points, too few, a piece of a surface, none."""
+"""Class of a voxel: empty, too few points, flat surfel, not flat."""
 
 LEAST_WIDTH = 0.04
-"""Of less variance across than along it is a line, whose normal says little."""
+"""A surfel with a smaller ratio of the tangential variances is a line: no reliable normal."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def classify(chosen, count, normal, covariance, rules, kind, axes):
     """
-    Say what voxels are, and how far their points reach across the normal.
+    Classify voxels, and compute their tangential extent.
 
     chosen      (K,) int32, rows; each holds points
     count       (R,) int64
-    normal      (R, 3) float64, nan where all points are equal
+    normal      (R, 3) float64, nan if all points are equal
     covariance  (R, 6) float64, m^2
-    rules       least points, most variance along the normal m^2, voxel size m
+    rules       least points, largest variance along the normal m^2, voxel size m
     kind        (R,) uint8, out
-    axes        (R, 2, 3) float64, out: half edges of a square that has the same variance, m
+    axes        (R, 2, 3) float64, out: half edges of a rectangle of equal variance, m
 
-    With the normal known there are two axes left, across it: no iterations.
+    With the normal known, the two tangential axes follow in closed form.
     """
     longest = rules[2] * math.sqrt(0.5)
     for row in chosen:
@@ -69,7 +69,7 @@ def classify(chosen, count, normal, covariance, rules, kind, axes):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def across(x, y, z):
-    """Return two unit vectors across a third and each other."""
+    """Return two unit vectors that are orthogonal to a third and to each other."""
     sign = 1.0 if z >= 0.0 else -1.0
     a = -1.0 / (sign + z)
     b = x * y * a
@@ -84,25 +84,25 @@ def variance(c, x, y, z):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def tell(rows, before, count, position, normal, kind, told, rules, material):
+def mark_material(rows, before, count, position, normal, kind, reported, rules, material):
     """
-    See which changes matter since they were told last, and take note of those.
+    Mark the rows whose change since the last report is material, and update the report.
 
     rows      (K,) int32
-    before    (K,) uint8, the kinds that they were
-    told      count (R,), position (R, 3), normal (R, 3) as last told, in place
+    before    (K,) uint8, their previous classes
+    reported  count (R,), position (R, 3), normal (R, 3) as last reported, in place
     rules     square of the distance m^2, cosine, factor of the count
     material  (R,) bool, all False; out
     """
-    told_count, told_position, told_normal = told
+    reported_count, reported_position, reported_normal = reported
     for i in range(len(rows)):
         row = rows[i]
         away = cosine = 0.0
         for j in range(3):
-            delta = position[row, j] - told_position[row, j]
+            delta = position[row, j] - reported_position[row, j]
             away += delta * delta
-            cosine += normal[row, j] * told_normal[row, j]
-        more, less = count[row], told_count[row]
+            cosine += normal[row, j] * reported_normal[row, j]
+        more, less = count[row], reported_count[row]
         if more < less:
             more, less = less, more
         if (
@@ -112,6 +112,9 @@ def tell(rows, before, count, position, normal, kind, told, rules, material):
             or more >= rules[2] * less
         ):
             material[row] = True
-            told_count[row] = count[row]
+            reported_count[row] = count[row]
             for j in range(3):
-                told_position[row, j], told_normal[row, j] = position[row, j], normal[row, j]
+                reported_position[row, j], reported_normal[row, j] = (
+                    position[row, j],
+                    normal[row, j],
+                )

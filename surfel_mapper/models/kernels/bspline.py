@@ -1,15 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-B-splines that are not zero at a parameter, and height fields of them: heights, normal equations.
+B-spline basis functions, height fields of them, and the banded solve of their normal equations.
 
-A place is worked on from its parameters to what it adds to a height or to the equations, in
-registers: the sixteen weights of each in arrays of numpy take three times as long.
+Each sample is processed in registers: temporary arrays of its sixteen weights take three times as
+long. For a field of a hundred control points, LAPACK's argument checks take longer than the solve.
 
-A band is symmetric and kept by rows: band[i, k] is the entry of row i and column i + k.
+A band matrix is symmetric and stored by rows: band[i, k] is the entry of row i and column i + k.
 
-Source: de Boor 1972 for the recurrence.
+Source: de Boor 1972 (recurrence); Golub and Van Loan, Matrix Computations, section 4.3 (banded
+Cholesky factorisation).
 """
+
+import math
 
 from numba import njit
 import numpy as np
@@ -18,11 +21,12 @@ import numpy as np
 @njit(cache=True, nogil=True, error_model='numpy')
 def nonzero(t, knot, degree, values, lower):
     """
-    Evaluate the splines that are not zero at a parameter in [0, 1]; return the first of them.
+    Evaluate the basis functions that are non-zero at a parameter; return the index of the first.
 
-    knot    (n,) float64, clamped, even in between
+    t       parameter in [0, 1]
+    knot    (n,) float64, clamped, uniform in between
     values  (degree + 1,) float64, out
-    lower   (degree + 1,) float64, out: those of one degree less
+    lower   (degree + 1,) float64, out: the basis functions of one degree less
     """
     last = len(knot) - degree - 2
     span = min(degree + np.int64(t * (last + 1 - degree)), last)
@@ -44,14 +48,14 @@ def nonzero(t, knot, degree, values, lower):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def basis_at(u, knot, degree, first, values, slopes):
+def evaluate_basis(u, knot, degree, first, values, slopes):
     """
-    Evaluate the splines that are not zero at each parameter.
+    Evaluate the non-zero basis functions at each parameter.
 
     u       (M,) float64, in [0, 1]
-    knot    (n,) float64, clamped, even in between
+    knot    (n,) float64, clamped, uniform in between
     degree  at least 1
-    first   (M,) int64, out: the first that is not zero
+    first   (M,) int64, out: index of the first non-zero one
     values  (M, degree + 1) float64, out
     slopes  (M, degree + 1) float64, out: derivatives
     """
@@ -68,19 +72,19 @@ def basis_at(u, knot, degree, first, values, slopes):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def parameter(x, origin, pitch, width):
-    """Return the parameter of a coordinate, that of the end beyond it."""
+    """Return the parameter of a coordinate, clamped to the ends of the field."""
     return min(max((x - origin + 0.5 * pitch) / width, 0.0), 1.0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def heights_at(xy, field, found):
+def evaluate_field(xy, field, height):
     """
     Evaluate a height field.
 
-    xy     (M, 2) float64, m
-    field  origin (2,) float64, m; pitch, m; degrees: two; knots: two (n,) float64;
-           control (Nx + 2, Ny + 2) float64, m
-    found  (M,) float64, out, m
+    xy      (M, 2) float64, m
+    field   origin (2,) float64, m; pitch, m; degrees: two; knots: two (n,) float64;
+            control (Nx + 2, Ny + 2) float64, m
+    height  (M,) float64, out, m
     """
     origin, pitch, degrees, knots, control = field
     knot_x, knot_y = knots
@@ -93,23 +97,23 @@ def heights_at(xy, field, found):
         v = parameter(xy[i, 1], origin[1], pitch, width_y)
         first_x = nonzero(u, knot_x, degree_x, x_values, lower)
         first_y = nonzero(v, knot_y, degree_y, y_values, lower)
-        height = 0.0
+        total = 0.0
         for j in range(degree_x + 1):
             along = 0.0
             for k in range(degree_y + 1):
                 along += y_values[k] * control[first_x + j, first_y + k]
-            height += x_values[j] * along
-        found[i] = height
+            total += x_values[j] * along
+        height[i] = total
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_equations(xyz, weight, field, band, right):
     """
-    Add the normal equations of weighted least squares at places to a band, in place.
+    Add the normal equations of weighted least squares for samples to a band matrix, in place.
 
     xyz     (M, 3) float64, m
     weight  (M,) float64
-    field   see heights_at
+    field   see evaluate_field
     band    (n, W) float64, n control points, y within x
     right   (n,) float64
     """
@@ -142,10 +146,10 @@ def add_equations(xyz, weight, field, band, right):
 @njit(cache=True, nogil=True, error_model='numpy')
 def add_differences(places_x, places_y, smoothing, band):
     """
-    Add the squares of the second differences along both axes to a band, in place.
+    Add the squared second differences along both axes to a band matrix, in place.
 
-    places_x   (Nx + 2,) float64, where the control points stand along x; places_y likewise
-    smoothing  what they are multiplied by
+    places_x   (Nx + 2,) float64, Greville abscissae along x; places_y: along y
+    smoothing  weight of the squares
     band       (n, W) float64, n control points, y within x
     """
     num_x, num_y = len(places_x), len(places_y)
@@ -164,3 +168,58 @@ def add_differences(places_x, places_y, smoothing, band):
                     for k in range(j, 3):
                         product = smoothing * second[j] * second[k]
                         band[first + j * step, (k - j) * step] += product
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def solve_band(band, right):
+    """
+    Solve a positive definite system, in place.
+
+    band   (n, W) float64, stored by rows; becomes the upper Cholesky factor
+    right  (n,) float64; becomes the solution
+    """
+    number, width = band.shape
+    for i in range(number):
+        inverse = 1.0 / math.sqrt(band[i, 0])
+        reach = min(width, number - i)
+        for k in range(reach):
+            band[i, k] *= inverse
+        right[i] *= inverse
+        for k in range(1, reach):
+            factor = band[i, k]
+            if factor != 0.0:
+                right[i + k] -= factor * right[i]
+                for m in range(reach - k):
+                    band[i + k, m] -= factor * band[i, k + m]
+    for i in range(number - 1, -1, -1):
+        value = right[i]
+        for k in range(1, min(width, number - i)):
+            value -= band[i, k] * right[i + k]
+        right[i] = value / band[i, 0]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def rms_off_field(rows, surfel, frame, origin, field):
+    """
+    Return the root mean square distance of the points of voxels from a field, m.
+
+    rows    (n,) int32
+    surfel  count (R,) int64; position (R, 3) m; eigenvalues (R, 3) m^2, ascending
+    frame   (3, 3) float64, rows x, y, z of the field
+    origin  (3,) float64, m, of the frame
+    field   see evaluate_field
+    """
+    count, position, eigenvalues = surfel
+    local, found = np.empty((len(rows), 3)), np.empty(len(rows))
+    for i in range(len(rows)):
+        for k in range(3):
+            local[i, k] = 0.0
+            for j in range(3):
+                local[i, k] += frame[k, j] * (position[rows[i], j] - origin[j])
+    evaluate_field(local, field, found)
+    total = points = 0.0
+    for i in range(len(rows)):
+        number, away = np.float64(count[rows[i]]), local[i, 2] - found[i]
+        points += number
+        total += number * (away * away + eigenvalues[rows[i], 0])
+    return math.sqrt(total / points)

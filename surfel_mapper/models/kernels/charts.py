@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Halve a surface that is no graph over one plane, by the normals of its pieces or by their heights.
+Bisection of surfaces that are no height field, by their normals or by their heights.
 
-A surface has some dozen pieces, for which the calls of numpy take ten times as long.
+A surface has a few dozen surfels, for which numpy calls take ten times as long.
 """
 
 import math
@@ -14,18 +14,19 @@ import numpy as np
 from surfel_mapper.kernels.symmetric3 import eigen_frame
 
 MEANS_ITERATIONS = 20
+"""Most iterations of 2-means on normals."""
 
 FOLD_PERCENTILE = 98.0
-"""So many pieces have normals near the mean, else a surface is folded."""
+"""A surface is folded unless this percentage of normals is near the mean."""
 
 STACKED_SHARE = 0.05
-"""A part lies over itself where it is high in more than this share of its columns."""
+"""A chart overlaps itself if more than this share of its columns is too high."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def halve_normals(normals, side):
+def bisect_normals(normals, side):
     """
-    Find the halves of normals; return whether both hold some.
+    Bisect normals by 2-means; return whether both halves hold some.
 
     normals  (n, 3) float64
     side     (n,) bool, out
@@ -50,10 +51,10 @@ def halve_normals(normals, side):
         counts[:] = 0.0
         changed = False
         for i in range(number):
-            along = 0.0
+            dot_products = 0.0
             for j in range(3):
-                along += normals[i, j] * plane[j]
-            beyond = along > plane[3]
+                dot_products += normals[i, j] * plane[j]
+            beyond = dot_products > plane[3]
             changed = changed or beyond != side[i]
             side[i] = beyond
             half = 1 if beyond else 0
@@ -73,14 +74,14 @@ def halve_normals(normals, side):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def halve_part(normals, points, limit, height, size, side):
+def bisect_chart(normals, points, limit, height, size, side):
     """
-    Halve a chart that has several heights over one plane; return whether it has.
+    Bisect a chart that has several heights over one plane; return whether it has.
 
     normals  (n, 3) float64, unit
-    points   (n, 3) float64, m, of the pieces
-    limit    least cosine to their mean that nearly all normals have
-    height   m, of a column in which pieces lie over one another
+    points   (n, 3) float64, m
+    limit    least cosine to the mean normal for nearly all normals
+    height   m, of a column that overlaps itself
     size     m, width of a column
     side     (n,) bool, out: one half
     """
@@ -91,42 +92,42 @@ def halve_part(normals, points, limit, height, size, side):
     length = math.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2])
     if length > 0.0:
         mean /= length
-    if fold(normals, mean, limit, side):
-        axis = longest_axis(normals)
-        cosines = along(normals, axis)
+    if bisect_folded(normals, mean, limit, side):
+        axis = dominant_axis(normals)
+        cosines = dot_products(normals, axis)
         if percentile(np.abs(cosines), 100.0 - FOLD_PERCENTILE) < limit:
             return True
-        mean = axis  # they are alike but for their signs: nobody saw these voxels from one side
-    return stack(points, mean, height, size, side)
+        mean = axis  # equal up to sign: the voxels have no common viewpoint
+    return bisect_stacked(points, mean, height, size, side)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fold(normals, mean, limit, side):
+def bisect_folded(normals, mean, limit, side):
     """
-    Halve a surface that turns too far from its mean normal; return whether it does.
+    Bisect a surface whose normals deviate too far from their mean; return whether they do.
 
     normals  (n, 3) float64, unit
     mean     (3,) float64
-    limit    least cosine between these that nearly all have
+    limit    least cosine to the mean normal for nearly all normals
     side     (n,) bool, out: one half
     """
-    cosines = along(normals, mean)
+    cosines = dot_products(normals, mean)
     if len(normals) < 2 or cosines.min() >= limit:
         return False
     if percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
         return False
-    return halve_normals(normals, side)
+    return bisect_normals(normals, side)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def stack(points, normal, height, size, side):
+def bisect_stacked(points, normal, height, size, side):
     """
-    Find the upper half of what lies over itself; return whether it does.
+    Find the upper half of a surface that overlaps itself; return whether it does.
 
-    points, height, size, side  of halve_part
+    points, height, size, side  of bisect_chart
     normal                      (3,) float64, unit or 0
     """
-    heights = along(points, normal)
+    heights = dot_products(points, normal)
     low, high = heights.min(), heights.max()
     if high - low <= height:
         return False
@@ -138,8 +139,9 @@ def stack(points, normal, height, size, side):
     for axis in range(3):
         j, k = (axis + 1) % 3, (axis + 2) % 3
         y[axis] = normal[j] * x[k] - normal[k] * x[j]
-    # voxel indices have 21 bits, so no two columns have one number
-    column = np.floor(along(points, x) / size) * 2.0**26 + np.floor(along(points, y) / size)
+    # voxel indices have 21 bits, so column numbers are unique
+    row, place = dot_products(points, x) / size, dot_products(points, y) / size
+    column = np.floor(row) * 2.0**26 + np.floor(place)
     order = np.argsort(column, kind='mergesort')
     columns = stacked = begin = 0
     for end in range(1, len(order) + 1):
@@ -155,8 +157,8 @@ def stack(points, normal, height, size, side):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def along(vectors, direction):
-    """Return how far vectors (n, 3) go along a direction (3,)."""
+def dot_products(vectors, direction):
+    """Return the products of vectors (n, 3) with a direction (3,)."""
     found = np.empty(len(vectors))
     for i in range(len(vectors)):
         found[i] = (
@@ -168,8 +170,8 @@ def along(vectors, direction):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def longest_axis(normals):
-    """Return the direction (3,) that normals (n, 3), whatever their signs, are nearest to."""
+def dominant_axis(normals):
+    """Return the axis (3,) that normals (n, 3) are nearest to, regardless of their sign."""
     products, values, axes = np.zeros((3, 3)), np.empty(3), np.empty((3, 3))
     for i in range(len(normals)):
         for j in range(3):
@@ -181,7 +183,7 @@ def longest_axis(normals):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def percentile(values, share):
-    """Return a percentile as numpy does."""
+    """Return a percentile with linear interpolation, as numpy does."""
     ordered, place = np.sort(values), 0.01 * share * (len(values) - 1)
     low = int(place)
     high = min(low + 1, len(values) - 1)

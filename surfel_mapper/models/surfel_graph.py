@@ -1,0 +1,379 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+SurfelGraph: class, links, components and labels of the voxels of a map, updated incrementally.
+
+The arrays have a row for each row of the map's slab, so voxels are found by the map's own hash
+table. Class, links and host of a voxel depend on the moments of it and its neighbours only, and
+are recomputed whenever these change, so they do not depend on the map's history. Whether a change
+is worth reporting is a separate question: see ``is_material``.
+
+A voxel may move to another row when a map is cleared and restored; it keeps its label.
+
+(Longer than other modules: all arrays of the graph change together.)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import ModelsLayerConfig
+from surfel_mapper.kernels.layout import INDEX_BITS
+from surfel_mapper.mapping.moments import unpack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.kernels.surfel_classes import classify, FLAT, mark_material, NONE
+from surfel_mapper.models.kernels.surfel_links import (
+    find_hosts,
+    link_neighbours,
+    unlink,
+    update_links,
+)
+
+Array = npt.NDArray[np.float64]
+Rows = npt.NDArray[np.int32]
+
+LEAST_THICKNESS_M, THICKNESS_VOXELS = 0.02, 0.2
+"""Default thickness of a flat voxel, 6 sigma: a share of its size, at least LEAST_THICKNESS_M."""
+MOVED, TURNED, GREW = 0.1, math.cos(math.radians(2.0)), 1.2
+"""
+A change is material if the mean moves by more than MOVED thicknesses, the cosine between the
+normals falls below TURNED, or the number of points changes by the factor GREW.
+"""
+
+
+class SurfelGraph:
+    """
+    The voxels of a map as nodes of a graph of surfaces.
+
+    Parameters
+    ----------
+    config : ModelsLayerConfig
+        Settings.
+    surfel_map : SurfelMap
+        The map to follow.
+
+    Attributes
+    ----------
+    key : (R,) int64
+        Key of the voxel in each row, -1 for none.
+    count, position, normal, eigenvalues, covariance, axes
+        Its surfel; covariance xx xy xz yy yz zz; axes as in models/kernels/surfel_classes.py.
+    kind, links, neighbours
+        See models/kernels/surfel_classes.py and models/kernels/surfel_links.py.
+    host : (R,) int32
+        The flat neighbour on whose plane a voxel that is not flat lies, -1 for none.
+    component : (R,) int32
+        Connected component, by the row of its voxel of least key; -1 if not flat.
+    label : (R,) int32
+        Id of its primitive, -1 for none.
+    is_gaussian : (R,) bool
+        Whether that is a Gaussian of this voxel.
+    is_material : (R,) bool
+        Whether its last change is worth reporting.
+    places : (R,) int32
+        All -1; scratch for kernels.
+
+    """
+
+    def __init__(self, config: ModelsLayerConfig, surfel_map: SurfelMap) -> None:
+        size_m = surfel_map.voxel_size_m
+        self.map = surfel_map
+        self.thickness_m = config.flat_thickness_m or max(
+            LEAST_THICKNESS_M, THICKNESS_VOXELS * size_m
+        )
+        offset_m = max(self.thickness_m, 3.0 * config.noise_m)
+        self.limit_m = math.hypot(self.thickness_m, 6.0 * config.noise_m)
+        variance = (self.limit_m / 6.0) ** 2
+        far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # twice the diagonal, and some
+        self._class_rules = (float(config.min_points), variance, size_m)
+        self._link_rules = (
+            math.cos(math.radians(config.max_angle_deg)),
+            offset_m,
+            math.cos(math.radians(config.arc_angle_deg)),
+            0.5 * offset_m,
+            far_sq,
+        )
+        self._host_rules = (offset_m, variance, far_sq)
+        self._report_rules = ((MOVED * self.thickness_m) ** 2, TURNED, GREW)
+        self._absorbs = config.absorb
+        steps = half_neighbourhood(config.reach_voxels)
+        self._neighbour_steps = np.concatenate([steps, -steps])
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove all voxels; the next update reads the whole map."""
+        self._version = -1
+        none = np.empty(0, np.int32)
+        self.key = np.empty(0, np.int64)
+        self.count = np.empty(0, np.int64)
+        self.position, self.normal, self.eigenvalues = np.empty((3, 0, 3))
+        self.covariance, self.axes = np.empty((0, 6)), np.empty((0, 2, 3))
+        self.kind = np.empty(0, np.uint8)
+        self.links = np.empty(0, np.uint64)
+        self.neighbours = np.empty((0, len(self._neighbour_steps)), np.int32)
+        self.host, self.component, self.label, self.places = (none,) * 4
+        self.is_gaussian = self.is_material = np.empty(0, np.bool_)
+        self._marks = self._is_here = np.empty(0, np.bool_)
+        self._reported_position, self._reported_normal = np.empty((2, 0, 3))
+        self._reported_count = np.empty(0, np.int64)
+
+    def update(self) -> GraphChange:
+        """Read the changes of the map since the last call."""
+        forgotten = self._forgotten()
+        changed = self.map.rows_changed(self._version)
+        self._version = self.map.version
+        self._make_room(int(changed.max(initial=-1)) + 1)
+        new, old = self.map.keys_of(changed), self.key[changed]
+        left, here = changed[(old >= 0) & (old != new)], changed[new >= 0]
+        gone = forgotten.joined(self._gone(left))
+        relinked = [gone.component]
+        near = self.neighbours[left]
+        marked = np.empty(len(self.key), np.int32)
+        num = unlink(left, self.neighbours, self.links, self._marks, marked)
+        self._blank(left)
+        came = here[self.key[here] < 0]
+        self.key[here] = new[new >= 0]
+        gone.return_to(came, self.key, self.label, self.is_gaussian)
+        keys = (self.key[came][:, None] + self._neighbour_steps).ravel()
+        link_neighbours(
+            came,
+            self.map.find(keys).reshape(len(came), len(self._neighbour_steps)),
+            self.neighbours,
+        )
+        was_flat = self.kind[here] == FLAT
+        self._measure(here)
+        is_flat = self.kind[here] == FLAT
+        relinked.append(self.component[here[was_flat != is_flat]])
+        touched = self.component[here]
+        self.component[here[~is_flat]] = -1
+        self._is_here[here] = True
+        state = (self.kind, self.position, self.normal)
+        num = update_links(
+            here,
+            self._is_here,
+            self.neighbours,
+            state,
+            self._link_rules,
+            self.links,
+            self._marks,
+            marked,
+            num,
+        )
+        self._is_here[here] = self._marks[marked[:num]] = False
+        relinked.append(self.component[marked[:num]])
+        rehosted, old_hosts, new_hosts = self._rehosted(here, near)
+        return GraphChange(
+            num_voxels=len(here) + len(gone.key),
+            rows=np.concatenate([here, rehosted]),
+            relinked=unique_components(relinked),
+            touched=unique_components([touched, self.component[old_hosts[old_hosts >= 0]]]),
+            hosts=new_hosts[new_hosts >= 0],
+            gone=gone.remaining,
+        )
+
+    def surfels(self) -> Surfels:
+        """Return all voxels as surfels, in the order of their rows."""
+        held = np.flatnonzero(self.key >= 0)
+        eigenvalues = self.eigenvalues[held]
+        e0, e1, e2 = eigenvalues.T
+        total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
+        return Surfels(
+            position=self.position[held],
+            normal=self.normal[held],
+            planarity=2.0 * (e1 - e0) / total,
+            curvature=e0 / total,
+            eigenvalues=eigenvalues,
+            num_points=self.count[held],
+            voxel_index=unpack_keys(self.key[held]),
+        )
+
+    def _forgotten(self) -> RemovedVoxels:
+        """Remove and return all voxels if the map was cleared since the last update."""
+        rows = np.flatnonzero(self.key >= 0)
+        if self.map.cleared_at <= self._version:
+            rows = rows[:0]
+        forgotten = self._gone(rows)
+        if len(rows):
+            self._blank(rows)
+            self.links[:] = 0
+            self.neighbours[:] = -1
+        return forgotten
+
+    def _gone(self, rows: npt.NDArray[Any]) -> RemovedVoxels:
+        return RemovedVoxels(
+            self.key[rows], self.label[rows], self.is_gaussian[rows], self.component[rows]
+        )
+
+    def _make_room(self, num_rows: int) -> None:
+        """Grow the arrays to at least this number of rows."""
+        more = max(num_rows, 2 * len(self.key)) - len(self.key)
+        if num_rows <= len(self.key):
+            return
+        empty = dict.fromkeys(('key', 'host', 'component', 'label', 'places', 'neighbours'), -1)
+        for name, values in vars(self).items():
+            if isinstance(values, np.ndarray) and name != '_neighbour_steps':
+                added = np.full((more, *values.shape[1:]), empty.get(name, 0), values.dtype)
+                setattr(self, name, np.concatenate([values, added]))
+
+    def _blank(self, rows: npt.NDArray[Any]) -> None:
+        """Reset rows whose voxels are gone."""
+        self.key[rows] = self.host[rows] = self.component[rows] = self.label[rows] = -1
+        self.kind[rows] = NONE
+        self.is_gaussian[rows] = False
+        self._reported_count[rows] = 0
+
+    def _measure(self, rows: Rows) -> None:
+        """Copy surfels from the map, classify them, and mark material changes."""
+        before = self.kind[rows]
+        surfels = self.map.surfels_of(rows)
+        self.count[rows], self.position[rows] = surfels.num_points, surfels.position
+        self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
+        self.covariance[rows] = self.map.covariances_of(rows)
+        classify(
+            rows,
+            self.count,
+            self.normal,
+            self.covariance,
+            self._class_rules,
+            self.kind,
+            self.axes,
+        )
+        self.is_material[:] = False
+        reported = (self._reported_count, self._reported_position, self._reported_normal)
+        mark_material(
+            rows,
+            before,
+            self.count,
+            self.position,
+            self.normal,
+            self.kind,
+            reported,
+            self._report_rules,
+            self.is_material,
+        )
+
+    def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows]:
+        """Recompute hosts: rows, hosts before and now."""
+        if not self._absorbs:
+            none = np.empty(0, np.int32)
+            return none, none, none
+        near = np.zeros(len(self.key) + 1, np.bool_)
+        near[emptied] = near[self.neighbours[here]] = True  # -1 wraps to the last
+        near[here] = True
+        rows = np.flatnonzero(near[:-1] & (self.kind != FLAT) & (self.kind != NONE))
+        rows = rows.astype(np.int32)
+        before = self.host[rows]
+        hosts = np.empty(len(rows), np.int32)
+        state = (self.kind, self.position, self.normal)
+        find_hosts(rows, self.neighbours, state, self.covariance, self._host_rules, hosts)
+        flat = here[self.kind[here] == FLAT]
+        changed = (before != hosts) | self.is_material[rows]
+        once = np.concatenate([self.host[flat], before[changed]])
+        self.host[flat] = -1
+        self.host[rows] = hosts
+        return rows[changed], once, hosts[changed]
+
+
+def half_neighbourhood(reach: int) -> npt.NDArray[np.int64]:
+    """Return the key differences (H,) to neighbours of greater key within a reach."""
+    offsets = [step for step in product(range(-reach, reach + 1), repeat=3) if step > (0, 0, 0)]
+    x, y, z = np.array(offsets, np.int64).T
+    steps: npt.NDArray[np.int64] = (x << (2 * INDEX_BITS)) + (y << INDEX_BITS) + z
+    return steps
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GraphChange:
+    """
+    Changes of a SurfelGraph.
+
+    Attributes
+    ----------
+    num_voxels : int
+        Voxels that appeared, changed or disappeared.
+    rows : (N,) int32
+        Rows whose label may change, apart from those of relinked components.
+    relinked : (C,) int32
+        Components whose connectivity may have changed.
+    touched : (C,) int32
+        Components with any change of their voxels or of voxels that they host.
+    hosts : (H,) int32
+        Rows that host other voxels now.
+    gone : (G,) int32
+        Labels of Gaussians whose voxels disappeared, without those that moved to another row.
+
+    """
+
+    num_voxels: int
+    rows: Rows
+    relinked: Rows
+    touched: Rows
+    hosts: Rows
+    gone: Rows
+
+
+@dataclass(slots=True, eq=False)
+class RemovedVoxels:
+    """Voxels that left their rows: keys, labels, whether Gaussian, components."""
+
+    key: npt.NDArray[np.int64]
+    label: Rows
+    is_gaussian: npt.NDArray[np.bool_]
+    component: Rows
+
+    def joined(self, other: RemovedVoxels) -> RemovedVoxels:
+        """Return these and others."""
+        names = ('key', 'label', 'is_gaussian', 'component')
+        return RemovedVoxels(
+            *(np.concatenate([getattr(self, n), getattr(other, n)]) for n in names)
+        )
+
+    def return_to(
+        self,
+        came: Rows,
+        keys: npt.NDArray[np.int64],
+        labels: Rows,
+        is_gaussian: npt.NDArray[np.bool_],
+    ) -> None:
+        """
+        Move the labels of voxels that are in another row now to that row.
+
+        Parameters
+        ----------
+        came : (C,) int32
+            Rows with a new voxel.
+        keys : (R,) int64
+            Keys of all rows.
+        labels, is_gaussian : (R,) int32, (R,) bool
+            Changed in place.
+
+        """
+        if not len(self.key) or not len(came):
+            return
+        order = np.argsort(self.key)
+        place = np.minimum(np.searchsorted(self.key[order], keys[came]), len(order) - 1)
+        back = order[place]
+        same = self.key[back] == keys[came]
+        labels[came[same]] = self.label[back[same]]
+        is_gaussian[came[same]] = self.is_gaussian[back[same]]
+        kept = np.ones(len(self.key), np.bool_)
+        kept[back[same]] = False
+        self.label, self.is_gaussian = self.label[kept], self.is_gaussian[kept]
+
+    @property
+    def remaining(self) -> Rows:
+        """Labels of Gaussians whose voxels are gone."""
+        return self.label[self.is_gaussian]
+
+
+def unique_components(components: list[Rows]) -> Rows:
+    """Return the sorted distinct components, without -1."""
+    every = np.unique(np.concatenate(components))
+    return every[every >= 0]

@@ -1,0 +1,86 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Frame and kind of patches, and touching point sets, against numpy and analytic surfaces."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from surfel_mapper.models.kernels.patches import bend_height, describe_patches, fit_quadric
+from surfel_mapper.models.kernels.region_merging import touch
+from test.kernels.modes import both
+
+
+def bowl(radius_m, half_m=0.5, number=4000):
+    """Return points on a paraboloid whose radius of curvature at its vertex is given."""
+    xy = np.random.default_rng(1).uniform(-half_m, half_m, (number, 2))
+    return np.column_stack([xy, 0.5 / radius_m * (xy**2).sum(axis=1)])
+
+
+@both
+def test_quadric_equals_weighted_least_squares(call):
+    rng = np.random.default_rng(2)
+    cells = np.column_stack([rng.normal(size=(50, 3)), rng.uniform(0.5, 2.0, 50)])
+    x, y, z, weight = cells.T
+    basis = np.stack([np.ones(50), x, y, x * x, x * y, y * y], axis=1)
+    for terms in (3, 6):
+        found = np.zeros(6)
+        error = call(fit_quadric, cells, terms, found)
+        root = np.sqrt(weight)[:, None]
+        expected = np.linalg.lstsq(root * basis[:, :terms], root[:, 0] * z, rcond=None)[0]
+        np.testing.assert_allclose(found[:terms], expected, atol=1e-9)
+        residual = z - basis[:, :terms] @ expected
+        assert error == pytest.approx(weight @ residual**2)
+
+
+@both
+def test_bend_of_a_paraboloid_is_its_rise_and_that_of_a_plane_is_zero(call):
+    points = bowl(1.0)
+    bend = call(bend_height, points, 0, len(points), np.zeros(3), np.eye(3), 0.05)
+    rise = np.percentile(points[:, 2], [5.0, 95.0])
+    assert bend == pytest.approx(rise[1] - rise[0], rel=0.05)
+    level = points * [1.0, 1.0, 0.0]
+    assert call(bend_height, level, 0, len(level), np.zeros(3), np.eye(3), 0.05) == 0.0
+    assert call(bend_height, level, 0, 3, np.zeros(3), np.eye(3), 0.5) == -1.0
+
+
+@both
+def test_kind_and_moments_of_patches(call):
+    flat = bowl(1.0) * [1.0, 1.0, 0.0] + [0.0, 0.0, 1.0]
+    points, starts = np.concatenate([flat, bowl(1.0)]), np.array([0, 4000, 8000])
+    means, covariances, frames = np.empty((2, 3)), np.empty((2, 3, 3)), np.empty((2, 3, 3))
+    curved, normals = np.empty(2, bool), np.tile([0.0, 0.0, 1.0], (2, 1))
+    rules = (np.full(2, 0.04), 0.05, True, True)
+    call(
+        describe_patches,
+        points,
+        starts,
+        normals,
+        np.array([0.0, 0.0, 9.0]),
+        rules,
+        means,
+        covariances,
+        frames,
+        curved,
+    )
+    assert curved.tolist() == [False, True]
+    for k in range(2):
+        own = points[starts[k] : starts[k + 1]]
+        np.testing.assert_allclose(means[k], own.mean(axis=0), atol=1e-12)
+        np.testing.assert_allclose(covariances[k], np.cov(own.T), atol=1e-12)
+        np.testing.assert_allclose(frames[k] @ frames[k].T, np.eye(3), atol=1e-9)
+        assert frames[k, 2, 2] > 0.999
+
+
+@both
+@pytest.mark.parametrize('seed', range(8))
+def test_touch_equals_the_least_of_all_distances(call, seed):
+    rng = np.random.default_rng(seed)
+    one, other = rng.uniform(0.0, 1.0, (2, 40, 3)) + np.array([[[0.0]], [[0.9]]])
+    points = np.concatenate([one, other])
+    boxes = [np.stack([part.min(axis=0), part.max(axis=0)]) for part in (one, other)]
+    for near in (0.05, 0.2, 0.4, 0.8):
+        found = call(touch, points, np.array([0, 40]), np.array([40, 80]), *boxes, near)
+        assert found == (cdist(one, other).min() < near)
