@@ -4,10 +4,11 @@
 Start the node: ``ros2 launch surfel_mapper mapper.launch.py points:=/lidar/points rviz:=true``.
 
 Settings come from one file: a preset of this package, or your own with ``config``. An argument
-overrides the file only if it is given.
+overrides the file only if it is given. With ``namespace`` the views show the topics of that node.
 """
 
 from pathlib import Path
+import tempfile
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
@@ -20,6 +21,8 @@ PRESETS = ('default', 'spinning_lidar', 'solid_state_lidar', 'indoor_depth_camer
 
 BOOLEAN = ['true', 'false']
 
+SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
+
 ARGUMENTS = [
     DeclareLaunchArgument(
         'preset',
@@ -29,6 +32,23 @@ ARGUMENTS = [
     ),
     DeclareLaunchArgument(
         'config', default_value='', description='YAML file of the settings, instead of a preset.'
+    ),
+    DeclareLaunchArgument(
+        'pose_source',
+        default_value='',
+        choices=['', *SOURCES],
+        description='Source of poses; empty: pose.source of the file.',
+    ),
+    DeclareLaunchArgument(
+        'input_kind',
+        default_value='',
+        choices=['', 'cloud', 'depth'],
+        description='Clouds or depth images; empty: input.kind of the file.',
+    ),
+    DeclareLaunchArgument(
+        'voxel_size',
+        default_value='',
+        description='Edge of a voxel, m; empty: map.voxel_size_m of the file.',
     ),
     DeclareLaunchArgument(
         'points', default_value='points', description='Topic of the clouds, PointCloud2.'
@@ -79,18 +99,53 @@ TOPICS = {'points': 'points', 'depth': 'depth/image', 'odom': 'odom', 'pose': 'p
 """Relative names of the topics that the node reads, by launch argument."""
 
 
+SETTINGS = {
+    'pose_source': ('pose.source', str),
+    'input_kind': ('input.kind', str),
+    'voxel_size': ('map.voxel_size_m', float),
+    'fixed_frame': ('frames.fixed', str),
+}
+"""Settings that a launch argument overrides if it is not empty, and their types."""
+
+
+def settings_file(values: dict[str, str]) -> str:
+    """Return the path of the settings; a file that does not exist ends the launch."""
+    path = Path(values['config'] or HERE / f'{values["preset"]}.yaml').expanduser()
+    if not path.is_file():
+        raise FileNotFoundError(f'config:={path}: no such file of settings')
+    return str(path)
+
+
+def overrides(values: dict[str, str]) -> dict[str, object]:
+    """Return the parameters that the launch arguments set."""
+    found: dict[str, object] = {'use_sim_time': values['use_sim_time'] == 'true'}
+    if values['autostart'] == 'false':
+        found['autostart'] = False
+    for argument, (name, kind) in SETTINGS.items():
+        if values[argument]:
+            found[name] = kind(values[argument])
+    return found
+
+
+def view(values: dict[str, str]) -> str:
+    """Return the path of the RViz view; in a namespace, of a copy with its topics."""
+    path, namespace = HERE / 'mapper.rviz', values['namespace'].strip('/')
+    if not namespace:
+        return str(path)
+    text = path.read_text(encoding='utf-8')
+    for name in ('surfel_mapper/', 'points', 'initialpose'):
+        text = text.replace(f'Value: /{name}', f'Value: /{namespace}/{name}')
+    with tempfile.NamedTemporaryFile('w', suffix='.rviz', delete=False) as file:
+        file.write(text)
+    return file.name
+
+
 def nodes(context: LaunchContext) -> list[Node]:
     """Return the nodes, once the values of the arguments are known."""
     values = {
         argument.name: LaunchConfiguration(argument.name).perform(context)
         for argument in ARGUMENTS
     }
-    use_sim_time = {'use_sim_time': values['use_sim_time'] == 'true'}
-    overrides: dict[str, object] = {**use_sim_time}
-    if values['fixed_frame']:
-        overrides['frames.fixed'] = values['fixed_frame']
-    if values['autostart'] == 'false':
-        overrides['autostart'] = False
     found = [
         Node(
             package='surfel_mapper',
@@ -98,7 +153,7 @@ def nodes(context: LaunchContext) -> list[Node]:
             name='surfel_mapper',
             namespace=values['namespace'],
             output='screen',
-            parameters=[values['config'] or str(HERE / f'{values["preset"]}.yaml'), overrides],
+            parameters=[settings_file(values), overrides(values)],
             remappings=[(topic, values[argument]) for argument, topic in TOPICS.items()],
             ros_arguments=['--log-level', f'surfel_mapper:={values["log_level"]}'],
         )
@@ -112,8 +167,8 @@ def nodes(context: LaunchContext) -> list[Node]:
                 name='surfel_mapper_rviz',
                 namespace=values['namespace'],
                 output='log',
-                arguments=['-d', str(HERE / 'mapper.rviz'), *fixed],
-                parameters=[use_sim_time],
+                arguments=['-d', view(values), *fixed],
+                parameters=[{'use_sim_time': values['use_sim_time'] == 'true'}],
             )
         )
     return found

@@ -44,6 +44,7 @@ PACKAGE_LEVEL = LEVEL['offline']
 
 HOMES = {
     'backports': ('bags/',),  # zstd
+    'bond': ('ros/',),
     'builtin_interfaces': ('ros/',),
     'compression': ('bags/',),  # zstd from Python 3.14 on
     'dask': ('cluster/',),

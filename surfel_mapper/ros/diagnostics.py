@@ -93,7 +93,8 @@ class Diagnostics:
 
     def _publish(self, level: int, text: str, values: Mapping[str, Any]) -> None:
         now_ns = self._node.get_clock().now().nanoseconds
-        message = diagnostics(self._node.get_name(), now_ns, level, text, values)
+        name = self._node.get_fully_qualified_name().lstrip('/')
+        message = diagnostics(name, now_ns, level, text, values)
         self._publisher.publish(message)
 
 
@@ -125,17 +126,17 @@ class Totals:
 
     def since(self, last: Totals, node: Node, session: Session) -> Interval:
         """Return the interval since an earlier count; of several topics, the most silent one."""
-        topic, heard_s = session.inputs.most_silent
+        topic, received_s = session.inputs.most_silent
         return Interval(
             topic=topic,
             num_publishers=node.count_publishers(topic),
             ever_received=self.received > 0,
             received=self.received - last.received,
-            silent_s=max(self.time_s - heard_s, 0.0),
+            silent_s=max(self.time_s - received_s, 0.0),
             dropped=self.dropped - last.dropped,
             latency_s=latency(session, 99) if self.received > last.received else None,
             paused=session.thread.paused,
-            loss=session.inputs.loss() if self.lost > last.lost else '',
+            loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
         )
 
     def rates(self, last: Totals) -> dict[str, Any]:
@@ -160,6 +161,7 @@ def figures(session: Session) -> dict[str, Any]:
     finished = counters.mapped + counters.gated + counters.localised + counters.dropped.total()
     return {
         'clouds_lost': session.inputs.clouds_lost,
+        'qos': session.inputs.reliabilities(),
         'queue': session.thread.num_clouds,
         'waiting': counters.received - finished,
         'latency_ms': {
@@ -201,7 +203,7 @@ def diagnostics(
     Parameters
     ----------
     name : str
-        Name of the node.
+        Name of the node, with its namespace.
     stamp_ns : int
         Present time.
     level : int

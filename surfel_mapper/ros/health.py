@@ -64,7 +64,7 @@ class Interval:
 def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
     """Yield the problems, each with its level."""
     yield from _input(interval, limits)
-    if interval.loss:
+    if interval.loss and interval.received:
         yield WARN, interval.loss
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
@@ -74,7 +74,9 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
 
 def _input(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[int, str]]:
     topic = interval.topic
-    if not interval.ever_received:
+    if interval.loss and not interval.received:
+        yield ERROR, f'no cloud comes through: {interval.loss}'
+    elif not interval.ever_received:
         remedy = (
             f'publishers: {interval.num_publishers}; see fastdds_shm.xml if clouds are large'
             if interval.num_publishers

@@ -1,13 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node subscribes to: clouds or depth images, and the poses that ``pose.source`` names.
+The inputs of the node: clouds or depth images, and the poses that ``pose.source`` names.
 
-Callbacks pass messages on to the mapping thread and do nothing else, so that nothing waits in
-the middleware: where a queue of messages is full there, the oldest is overwritten and nobody is
-told. What the middleware does tell, that messages were lost on the way, is counted. Clouds and
-poses are taken as bytes and read in place: rclpy makes objects of them in ten times the time,
-and passes over those that it cannot read in silence.
+Callbacks only pass messages on to the mapping thread, so that none waits in the middleware, whose
+full queues overwrite the oldest message silently. Losses that the middleware does report are
+counted. Clouds and poses are taken as serialized bytes and parsed in place: rclpy needs ten times
+as long to build objects of them, and silently skips messages that it cannot deserialize.
 """
 
 from __future__ import annotations
@@ -19,7 +18,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
@@ -35,22 +33,28 @@ from surfel_mapper.messages.images import (
     SceneImages,
     warm_up,
 )
+<<<<<<< HEAD
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
+=======
+from surfel_mapper.messages.pose_messages import ODOMETRY, POSE, TF
+from surfel_mapper.messages.raw_cloud import parse_cloud
+from surfel_mapper.messages.raw_pose import raw_poses
+from surfel_mapper.messages.scene_image import SceneImages
+from surfel_mapper.ros.context import PROFILE
+>>>>>>> 629e1e0 (node: QoS follows the publishers, and a lossy one is named; launch arguments, namespaces, bond)
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
 DEFAULT_TOPICS = {'cloud': 'points', 'depth': 'depth/image'}
-"""Where clouds or images come in unless ``input.topics`` says so."""
+"""Topics of clouds or depth images if ``input.topics`` is empty."""
 
-CLOUDS = QoSProfile(depth=20, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Matches every publisher; holds 2 s of a lidar at 10 Hz, should a service take as long."""
+CLOUDS = QoSProfile(depth=20, reliability=ReliabilityPolicy.RELIABLE)
+"""Holds 2 s of a lidar at 10 Hz. Here and below, best effort if a publisher offers no more."""
 
-POSES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-
-TRANSFORMS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+POSES = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 
 STATIC_TRANSFORMS = QoSProfile(
     depth=100,
@@ -61,7 +65,7 @@ STATIC_TRANSFORMS = QoSProfile(
 STATIC_TOPIC = '/tf_static'
 
 LARGE_BYTES = 500_000
-"""Messages from here on do not fit into the shared memory that Fast DDS has by default."""
+"""Larger messages do not fit into the default shared memory of Fast DDS, 512 KiB."""
 
 
 class Inputs:
@@ -71,20 +75,25 @@ class Inputs:
     Parameters
     ----------
     node : Node
-        Whose subscriptions they are.
+        The node that subscribes.
     config : Config
-        Its stages input, pose and frames.
+        Its stages input, pose and frames are used.
     thread : MappingThread
-        Takes what comes in.
+        Takes the messages.
     on_failure : callable
-        Called in the thread that takes messages with an error that nobody foresaw.
+        Called in the thread of the subscriptions with an unexpected error.
 
     Attributes
     ----------
     cloud_topics : list of str
         The full names of the topics of clouds, or of depth images.
     lost : dict of str to int
-        Clouds that were published but never came, by topic, as far as the middleware knows.
+        Clouds lost on the way, by topic, as far as the middleware reports them.
+
+    Raises
+    ------
+    DependencyError
+        If ``pose.source`` is tf and tf2_msgs is not installed.
 
     """
 
@@ -95,14 +104,15 @@ class Inputs:
         thread: MappingThread,
         on_failure: Callable[[BaseException], None],
     ) -> None:
-        """Prepare; ``subscribe`` subscribes."""
+        if config.pose.source == TF:
+            transform_message()
         names = config.input.topics or (DEFAULT_TOPICS[config.input.kind],)
         self.cloud_topics: list[str] = [node.resolve_topic_name(name) for name in names]
         self.lost: dict[str, int] = {}
-        self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
+        self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
+        self._largest_bytes = dict.fromkeys(self.cloud_topics, 0)
         self._images = DepthImages()
         self._scenes = SceneImages(config)
-        self._largest_bytes = 0
         self._node = node
         self._config = config
         self._thread = thread
@@ -110,26 +120,24 @@ class Inputs:
 
     def subscribe(self) -> None:
         """
-        Subscribe to everything.
+        Subscribe to all topics.
 
         Raises
         ------
         ConfigError
             If a parameter of qos_overrides is refused.
-        DependencyError
-            If a package of messages is missing.
 
         """
-        self._heard_s = dict.fromkeys(self.cloud_topics, time.monotonic())
+        self._received_s = dict.fromkeys(self.cloud_topics, time.monotonic())
         source = self._config.pose.source
         if source == ODOMETRY:
-            self._subscribe_poses(Odometry, 'odom', POSES)
+            self._subscribe_poses(ODOMETRY, Odometry, 'odom', POSES)
         elif source == POSE:
-            self._subscribe_poses(PoseStamped, 'pose', POSES)
+            self._subscribe_poses(POSE, PoseStamped, 'pose', POSES)
         elif source == TF:
             message = transform_message()
-            self._subscribe_poses(message, STATIC_TOPIC, STATIC_TRANSFORMS)
-            self._subscribe_poses(message, '/tf', TRANSFORMS)
+            self._subscribe_poses(TF, message, STATIC_TOPIC, STATIC_TRANSFORMS)
+            self._subscribe_poses(TF, message, '/tf', POSES)
         if source in (ODOMETRY, POSE, 'registration') and not self._config.frames.base_to_sensor:
             self._subscribe_static()
         if self._config.input.kind == 'depth':
@@ -141,51 +149,67 @@ class Inputs:
         self._subscriptions.start()
 
     def unsubscribe(self) -> None:
-        """Take no more messages."""
+        """Take the messages received so far, and unsubscribe."""
         self._subscriptions.stop()
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
         return self._subscriptions.topics()
 
+    def reliabilities(self) -> dict[str, str]:
+        """Return the reliability of each subscription, by topic."""
+        return self._subscriptions.reliabilities()
+
     def loss(self) -> str:
-        """Return how many clouds were lost on the way and what to do about it, or nothing."""
-        if not self.lost:
-            return ''
-        which = ', '.join(f'{number} of {topic}' for topic, number in self.lost.items())
-        if 0 < self._largest_bytes <= LARGE_BYTES:
-            remedy = 'they come faster than they are taken; is the machine overloaded?'
-        else:
-            remedy = (
-                'best-effort messages above 0.5 MB need more shared memory than Fast DDS has by '
-                'default; start their publisher with the profile fastdds_shm.xml, see '
-                'docs/inputs.md'
+        """Return how many clouds were lost on the way and the remedy; empty if none."""
+        return '; '.join(self._loss_of(topic) for topic in self.lost)
+
+    def _loss_of(self, topic: str) -> str:
+        size = self._largest_bytes[topic]
+        text = f'clouds lost on the way ({self.lost[topic]} of {topic}'
+        text += f', up to {size / 1e6:.1f} MB each)' if size else ', none arrived)'
+        senders = self._subscriptions.publishers(topic)
+        weak = sorted(
+            f'{info.node_namespace.rstrip("/")}/{info.node_name}'
+            for info in senders
+            if info.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+        )
+        if 0 < size <= LARGE_BYTES:
+            return f'{text}: they arrive faster than they are taken; is the machine overloaded?'
+        if senders and not weak:
+            return (
+                f'{text}: their publisher is reliable; does qos_overrides say best_effort, or is '
+                'the machine overloaded?'
             )
-        return f'clouds lost on the way ({which}): {remedy}'
+        return (
+            f'{text}: {", ".join(weak) or "their publisher"} publishes best effort, and Fast DDS '
+            'loses such messages above 0.5 MB. Make it publish reliable, or put in front of its '
+            f'command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
+        )
 
     @property
     def most_silent(self) -> tuple[str, float]:
-        """The topic that was not heard of for longest, and when it was last, by time.monotonic."""
-        return min(self._heard_s.items(), key=lambda item: item[1])
+        """The cloud topic without messages for longest; time of the last, by time.monotonic."""
+        return min(self._received_s.items(), key=lambda item: item[1])
 
     @property
     def clouds_lost(self) -> int:
-        """How many clouds were lost on all topics."""
+        """Number of clouds lost on all topics."""
         return sum(self.lost.values())
 
     def _subscribe_clouds(self, topic: str) -> None:
-        """Subscribe to one sensor."""
-        lost = SubscriptionEventCallbacks(message_lost=partial(self._on_lost, topic))
+        """Subscribe to the clouds or images of one sensor."""
+        on_lost = partial(self._on_lost, topic)
         subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
         if self._config.input.kind == 'cloud':
             on_cloud = partial(self._on_cloud, topic)
-            subscribe(PointCloud2, topic, on_cloud, events=lost, raw=True)
+            subscribe(PointCloud2, topic, on_cloud, on_lost=on_lost, raw=True)
             return
         subscribe(CameraInfo, camera_info_topic(topic), partial(self._on_camera_info, topic))
-        subscribe(image_message(topic), topic, partial(self._on_image, topic), events=lost)
+        subscribe(image_message(topic), topic, partial(self._on_image, topic), on_lost=on_lost)
 
     def _subscribe_images(self, kind: str, topic: str) -> None:
-        """Subscribe to images of colours or labels, and to the calibration where needed."""
+        """Subscribe to images of colours or labels, and to the calibration if needed."""
         subscribe = partial(self._subscriptions.subscribe, qos=CLOUDS)
         if self._scenes.needs_cameras:
             on_info = partial(self._on_scene, partial(self._scenes.add_info, kind, topic))
@@ -201,7 +225,7 @@ class Inputs:
             self._thread.refuse_image(str(error))
 
     def _subscribe_static(self) -> None:
-        """Subscribe to how sensors are mounted, which odometry does not say."""
+        """Subscribe to /tf_static for the mounting poses of sensors."""
         try:
             message = transform_message()
         except DependencyError:
@@ -210,28 +234,27 @@ class Inputs:
                 f'{self._config.frames.base}, or set frames.base_to_sensor'
             )
             return
-        self._subscribe_poses(message, STATIC_TOPIC, STATIC_TRANSFORMS)
+        self._subscribe_poses(TF, message, STATIC_TOPIC, STATIC_TRANSFORMS)
 
-    def _subscribe_poses(self, message: Any, topic: str, qos: QoSProfile) -> None:
+    def _subscribe_poses(self, kind: str, message: Any, topic: str, qos: QoSProfile) -> None:
         """Subscribe to poses or transforms."""
-        kind = TF if qos in (TRANSFORMS, STATIC_TRANSFORMS) else self._config.pose.source
         on_pose = partial(self._on_pose, kind, topic)
         self._subscriptions.subscribe(message, topic, on_pose, qos, eager=True, raw=True)
 
     def _on_cloud(self, topic: str, raw: bytes) -> None:
-        self._hear(topic, len(raw))
+        self._note_received(topic, len(raw))
         try:
             self._thread.put_cloud(parse_cloud(raw, topic=topic), topic)
         except CloudFormatError as error:
             self._thread.refuse_cloud(topic, str(error))
 
-    def _hear(self, topic: str, num_bytes: int) -> None:
-        """Remember that a topic lives, and how large its messages are."""
-        self._heard_s[topic] = time.monotonic()
-        self._largest_bytes = max(self._largest_bytes, num_bytes)
+    def _note_received(self, topic: str, num_bytes: int) -> None:
+        """Record the time and the size of a message."""
+        self._received_s[topic] = time.monotonic()
+        self._largest_bytes[topic] = max(self._largest_bytes[topic], num_bytes)
 
     def _on_image(self, topic: str, msg: Image | CompressedImage) -> None:
-        self._hear(topic, len(msg.data))
+        self._note_received(topic, len(msg.data))
         self._put_images(topic, self._images.add_image(topic, msg))
 
     def _on_camera_info(self, topic: str, msg: CameraInfo) -> None:
@@ -252,18 +275,18 @@ class Inputs:
         else:
             self._thread.put_poses(poses, static=topic == STATIC_TOPIC)
 
-    def _on_lost(self, topic: str, event: QoSMessageLostInfo) -> None:
-        self.lost[topic] = event.total_count
+    def _on_lost(self, topic: str, total: int) -> None:
+        self.lost[topic] = total
         self._node.get_logger().warning(self.loss(), throttle_duration_sec=10.0)
 
 
 def image_message(topic: str) -> Any:
-    """Return the class of the images of a topic: packed ones have a name that says so."""
+    """Return the message class of an image topic, which its name tells."""
     return CompressedImage if is_packed(topic) else Image
 
 
 def decode_image(image: CameraImage, _: Any, topic: str) -> Scan:
-    """Return the scan of an image, as the mapping thread asks for it."""
+    """Return the scan of an image; a decoder for ``MappingThread.put_cloud``."""
     return depth_scan(image, topic)
 
 
@@ -274,7 +297,7 @@ def transform_message() -> Any:
     Raises
     ------
     DependencyError
-        If it is not installed; says what to install, and what works without.
+        If it is not installed; the message has the command and the alternatives.
 
     """
     try:

@@ -34,6 +34,7 @@ from rclpy.parameter import Parameter
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.ros.base_node import BaseNode, result_of
+from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.parameters import as_declared, changed_config, declare_settings, refusal
@@ -76,6 +77,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         self._service_change_state.callback = self._on_change_state
         self.add_on_set_parameters_callback(self._check_parameters)
         self.add_post_set_parameters_callback(self._apply_parameters)
+        self._bond = Bond(self)
         self._diagnostics = Diagnostics(self, self._config.publish.diagnostics_rate_hz)
         self._lasting = set(self._entities())
 
@@ -147,6 +149,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         session = self._session
         assert session is not None, 'only a configured node is activated'
         session.activate()
+        self._bond.start()
         self.get_logger().info(
             f'ready: reads {", ".join(session.inputs.topics())} (pose.source '
             f'{self._config.pose.source}), maps in frame {self._config.frames.fixed} with voxels '
@@ -154,11 +157,13 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         )
 
     def _deactivate(self) -> None:
+        self._bond.stop()
         if self._session is not None:
             self._session.deactivate()
 
     def _release(self, *, save: bool) -> None:
         """End the session, if there is one."""
+        self._bond.stop()
         session, self._session = self._session, None
         self._diagnostics.watch(None)
         if session is not None:

@@ -94,8 +94,8 @@ class Outputs:
         self._grid = node.create_publisher(OccupancyGrid, '~/grid', LATCHED)
         self._stamp_ns = 0
         self._center = np.zeros(2)
-        published = (self._normals, self._markers, self._grid, *self._levels)
-        self._published: dict[Any, int] = dict.fromkeys(published, 0)  # of an empty map
+        # an empty map is published too: it replaces the latched one of a node that was killed
+        self._published: dict[Any, int] = {}
         self._timers: list[Timer] = []
         warm_up(mapper.config)
         group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on

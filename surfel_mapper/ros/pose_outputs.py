@@ -134,7 +134,7 @@ def registration_outputs(
 
 class RegistrationOutputs:
     """
-    Publishers of odometry, track and transform, and the subscription to /initialpose.
+    Publishers of odometry, track and transform, and the subscription to initialpose.
 
     Parameters
     ----------
@@ -163,7 +163,7 @@ class RegistrationOutputs:
         self._track_ns = 0
         self._transform: TransformPublisher | None = None
         node.create_subscription(
-            PoseWithCovarianceStamped, '/initialpose', self._on_initial_pose, 1
+            PoseWithCovarianceStamped, 'initialpose', self._on_initial_pose, 1
         )
         if mapper.config.registration.publish_tf:
             self._transform = TransformPublisher(node, 'registration.publish_tf', self._fixed)

@@ -51,6 +51,8 @@ class Session:
     ------
     ConfigError
         If the settings ask for a feature that is not available.
+    DependencyError
+        If ``pose.source`` is tf and tf2_msgs is not installed; before anything is compiled.
     FileFormatError, MapError
         If the map of ``map.load`` cannot be read, or is not as configured.
 
@@ -66,11 +68,11 @@ class Session:
             self.mapper.restore(
                 surfel_map, []
             )  # without its window, so these scans are never evicted
+        self.thread = MappingThread(self.mapper, tasks.fail)
+        self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, or half a minute the first time')
         self.mapper.warm_up()
-        self.thread = MappingThread(self.mapper, tasks.fail)
-        self.inputs = Inputs(node, config, self.thread, tasks.fail)
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.services = Services(node, self.mapper, self.thread, self.outputs)

@@ -1,56 +1,130 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The subscriptions of a node, and the thread that takes their messages out of the middleware.
+The executor of the node's inputs: it takes poses before clouds, and follows publishers' QoS.
 
-An executor of rclpy takes one message of each subscription a turn, and a turn costs 1.2 ms since
-all timers, services and subscriptions of the node are gathered anew: with odometry at 200 Hz a
-backlog of clouds passes its poses by and is dropped for want of them. This thread waits for its
-own subscriptions only, as ``rclpy.wait_for_message`` does, and takes all poses that are there
-before every cloud; a pose costs a sixth then. It hears what the middleware reports of them too
-(QoS that does not match, messages that were lost), because whoever waits for that is woken by
-every message. The executor keeps timers, services and parameters.
+An executor of rclpy takes one message of each subscription per turn, and a turn costs 1.2 ms,
+because it collects all timers, services and subscriptions of the node anew: with odometry at
+200 Hz a backlog of clouds is taken before its poses and dropped for want of them. This thread
+waits for its own subscriptions only, as ``rclpy.wait_for_message`` does, and takes all waiting
+poses before every cloud; a pose costs a sixth. Timers, services and parameters stay with rclpy's
+executor.
+
+A subscription is reliable while all publishers of its topic are, and best effort as soon as one is
+not, since a reliable subscription receives nothing from that one. Messages above 0.5 MB need a
+reliable subscription: Fast DDS sends them in UDP fragments, and of the best-effort ones most are
+lost. The middleware reports publishers that come and go; the subscription is then created anew.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import copy
+from dataclasses import dataclass, field
 import math
 import threading
 import time
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSPolicyKind, QoSProfile
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from surfel_mapper.errors import ConfigError
 
-OVERRIDABLE = (
-    QoSPolicyKind.HISTORY,
-    QoSPolicyKind.DEPTH,
-    QoSPolicyKind.RELIABILITY,
-    QoSPolicyKind.DURABILITY,
-)
-"""What a user may set of a subscription, in ``qos_overrides``."""
+OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
+"""Policies that a user can set for a subscription in ``qos_overrides``, beside reliability."""
 
 LAST_S = 1.0
-"""What has arrived is taken before the end, but no longer than this where more keeps coming."""
+"""Longest time to take the remaining messages at the end, if more keep arriving."""
+
+FOLLOW_S = 2.0
+"""After an event the graph is looked at for this time: it may lag behind the event."""
+
+FOLLOW_PERIOD_S = 0.05
+
+RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 
 
 class KeptFromExecutor(ReentrantCallbackGroup):
-    """Keeps subscriptions, and their events, from the executor."""
+    """Excludes subscriptions and their events from rclpy's executor."""
 
     def can_execute(self, entity: object) -> bool:
-        """Return that the executor may not."""
+        """Return False."""
         return False
+
+
+@dataclass(eq=False, kw_only=True)
+class TopicReader:
+    """
+    A topic that is read, and its present subscription.
+
+    Attributes
+    ----------
+    message : type
+        Class of the messages.
+    name, topic : str
+        Name as given, and the full name after remapping.
+    callback : callable
+        Called with each message.
+    qos : QoSProfile
+        The profile wanted; its reliability holds while the topic has no publisher.
+    on_lost : callable or None
+        Called with the total number of messages that the middleware has reported as lost.
+    raw : bool
+        Pass serialized bytes to the callback instead of messages.
+    follows : bool
+        The reliability follows the publishers; False if the user has set it.
+    subscription : Subscription
+        The present subscription.
+    retiring : Subscription or None
+        The one before it, until the new one is connected, so that no message is missed.
+    seen : set of int
+        Source timestamps of the messages taken meanwhile, which both receive.
+    reliability : ReliabilityPolicy
+        Its reliability.
+    follow_until_s : float
+        Until then, by time.monotonic, the graph is checked for publishers of other QoS.
+    lost : int
+        Messages that the middleware has reported as lost.
+
+    """
+
+    message: Any
+    name: str
+    topic: str
+    callback: Callable[[Any], None]
+    qos: QoSProfile
+    on_lost: Callable[[int], None] | None
+    raw: bool
+    follows: bool
+    subscription: Subscription | None = None
+    retiring: Subscription | None = None
+    seen: set[int] = field(default_factory=set)
+    reliability: ReliabilityPolicy = RELIABLE
+    follow_until_s: float = -math.inf
+    lost: int = 0
+
+    def subscriptions(self) -> list[Subscription]:
+        """Return the open subscriptions, oldest first."""
+        return [found for found in (self.retiring, self.subscription) if found is not None]
+
+    def on_publishers_changed(self, _: object) -> None:
+        """Check the QoS of the publishers soon."""
+        self.follow_until_s = time.monotonic() + FOLLOW_S
+
+    def on_message_lost(self, event: QoSMessageLostInfo) -> None:
+        """Add up the messages lost by the present and all earlier subscriptions."""
+        self.lost += event.total_count_change
+        if self.on_lost is not None:
+            self.on_lost(self.lost)
 
 
 class SubscriptionExecutor:
@@ -60,42 +134,43 @@ class SubscriptionExecutor:
     Parameters
     ----------
     node : Node
-        Whose subscriptions they are.
+        The node that subscribes.
     on_failure : callable
-        Called in the thread with an error that nobody foresaw; the thread ends with it.
+        Called in the thread with an unexpected error, after which the thread ends.
 
     """
 
     def __init__(self, node: Node, on_failure: Callable[[BaseException], None]) -> None:
-        """Prepare; ``subscribe`` to at least one topic, then ``start``."""
         self._node = node
         self._on_failure = on_failure
         self._group = KeptFromExecutor()
-        self._eager: list[Subscription] = []
-        self._others: list[Subscription] = []
+        self._eager: list[TopicReader] = []
+        self._others: list[TopicReader] = []
         self._end_s = math.inf
         self._thread: threading.Thread | None = None
 
     def subscribe(
         self,
         message: Any,
-        topic: str,
+        name: str,
         callback: Callable[[Any], None],
         qos: QoSProfile,
         *,
         eager: bool = False,
-        events: SubscriptionEventCallbacks | None = None,
+        on_lost: Callable[[int], None] | None = None,
         raw: bool = False,
     ) -> None:
         """
-        Subscribe, with a quality of service that the user may override.
+        Subscribe with the reliability that the publishers offer.
 
         Parameters
         ----------
-        message, topic, callback, qos, events, raw
-            As ``Node.create_subscription`` takes them.
+        message, name, callback, qos, raw
+            As ``Node.create_subscription`` takes them; see ``TopicReader``.
         eager : bool
-            Taken until nothing is left, before every message of those that are not.
+            Take all messages of this topic before each message of those that are not eager.
+        on_lost : callable, optional
+            Called with the total number of messages reported as lost.
 
         Raises
         ------
@@ -103,61 +178,149 @@ class SubscriptionExecutor:
             If a parameter of qos_overrides is refused.
 
         """
-        try:
-            subscription = self._node.create_subscription(
-                message,
-                topic,
-                callback,
-                copy.copy(qos),  # rclpy enters the overrides in what it is given
-                callback_group=self._group,
-                event_callbacks=events,
-                qos_overriding_options=QoSOverridingOptions(policy_kinds=OVERRIDABLE),
-                raw=raw,
-            )
-        except (ParameterException, InvalidQosOverridesError, RuntimeError) as error:
-            name = self._node.resolve_topic_name(topic)
-            raise ConfigError(f'qos_overrides.{name}.subscription: {error}') from error
-        (self._eager if eager else self._others).append(subscription)
+        topic = self._node.resolve_topic_name(name)
+        override = f'qos_overrides.{topic}.subscription.reliability'
+        reader = TopicReader(
+            message=message,
+            name=name,
+            topic=topic,
+            callback=callback,
+            qos=copy.copy(qos),
+            on_lost=on_lost,
+            raw=raw,
+            follows=override not in self._node._parameter_overrides,
+        )
+        if reader.follows:
+            reader.qos.reliability = self._offered(reader, default=qos.reliability)
+        self._open(reader)
+        (self._eager if eager else self._others).append(reader)
 
     def topics(self) -> list[str]:
         """Return the full names of the topics subscribed to."""
-        return [
-            self._node.resolve_topic_name(subscription.topic)
-            for subscription in (*self._eager, *self._others)
-        ]
+        return [reader.topic for reader in (*self._eager, *self._others)]
+
+    def reliabilities(self) -> dict[str, str]:
+        """Return the reliability of each subscription, by topic."""
+        return {
+            reader.topic: name_of(reader.reliability) for reader in (*self._eager, *self._others)
+        }
+
+    def publishers(self, topic: str) -> list[TopicEndpointInfo]:
+        """Return the publishers of a topic, given by its full name."""
+        return list(self._node.get_publishers_info_by_topic(topic))
 
     def start(self) -> None:
-        """Take messages from now on."""
+        """Start the thread."""
         self._end_s = math.inf
         self._stop = GuardCondition(None, None, context=self._node.context)
-        self._thread = threading.Thread(target=self._run, name='intake', daemon=True)
+        self._thread = threading.Thread(target=self._run, name='subscriptions', daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
-        """Take what has arrived and no more, and destroy the subscriptions."""
+        """Take the messages received so far, end the thread, and destroy the subscriptions."""
         if self._thread is not None:
             self._end_s = time.monotonic() + LAST_S
             self._stop.trigger()
             self._thread.join()
             self._stop.destroy()
             self._thread = None
-        for subscriptions in (self._eager, self._others):
-            for subscription in subscriptions:
-                self._node.destroy_subscription(subscription)
-            subscriptions.clear()
+        for readers in (self._eager, self._others):
+            for reader in readers:
+                self._close(reader)
+            readers.clear()
+
+    def _open(self, reader: TopicReader) -> None:
+        """Create the subscription of a reader."""
+        # a parameter of qos_overrides keeps its first value, so that of the reliability is
+        # declared only if the user has set it
+        kinds = OVERRIDABLE if reader.follows else (*OVERRIDABLE, QoSPolicyKind.RELIABILITY)
+        events = SubscriptionEventCallbacks(
+            message_lost=reader.on_message_lost,
+            matched=reader.on_publishers_changed,
+            incompatible_qos=reader.on_publishers_changed if reader.follows else None,
+        )
+        qos = copy.copy(reader.qos)  # rclpy enters the overrides in the profile given
+        try:
+            reader.subscription = self._node.create_subscription(
+                reader.message,
+                reader.name,
+                reader.callback,
+                qos,
+                callback_group=self._group,
+                event_callbacks=events,
+                qos_overriding_options=QoSOverridingOptions(policy_kinds=kinds),
+                raw=reader.raw,
+            )
+        except (ParameterException, InvalidQosOverridesError, RuntimeError) as error:
+            raise ConfigError(f'qos_overrides.{reader.topic}.subscription: {error}') from error
+        reader.reliability = ReliabilityPolicy(qos.reliability)
+        reader.on_publishers_changed(None)  # one may have come since the graph was looked at
+
+    def _close(self, reader: TopicReader) -> None:
+        """Destroy the subscriptions of a reader."""
+        self._retire(reader)
+        if reader.subscription is not None:
+            self._node.destroy_subscription(reader.subscription)
+            reader.subscription = None
+
+    def _retire(self, reader: TopicReader) -> None:
+        """Destroy the earlier of two subscriptions."""
+        if reader.retiring is not None:
+            self._node.destroy_subscription(reader.retiring)
+            reader.retiring = None
+            reader.seen.clear()
+
+    def _offered(self, reader: TopicReader, *, default: ReliabilityPolicy) -> ReliabilityPolicy:
+        """Return the best reliability that all publishers of a topic offer."""
+        offered = {found.qos_profile.reliability for found in self.publishers(reader.topic)}
+        if not offered:
+            return default
+        return BEST_EFFORT if BEST_EFFORT in offered else RELIABLE
+
+    def _follow_publishers(self) -> None:
+        """Subscribe anew to topics whose publishers now offer another reliability."""
+        now_s = time.monotonic()
+        for reader in (*self._eager, *self._others):
+            if reader.retiring is not None:
+                self._finish_switch(reader, now_s)
+                continue
+            if not reader.follows or now_s > reader.follow_until_s:
+                continue
+            reliability = self._offered(reader, default=reader.qos.reliability)
+            if reliability is reader.qos.reliability:
+                continue
+            reader.qos.reliability = reliability
+            previous = reader.subscription
+            self._open(reader)
+            reader.retiring = previous
+            self._node.get_logger().info(
+                f'{reader.topic} is now read {name_of(reliability)}, as its publishers offer'
+            )
+
+    def _finish_switch(self, reader: TopicReader, now_s: float) -> None:
+        """Destroy the earlier subscription once the new one is connected to all publishers."""
+        assert reader.subscription is not None
+        connected = reader.subscription.get_publisher_count()
+        if connected < len(self.publishers(reader.topic)) and now_s <= reader.follow_until_s:
+            return
+        while self._take(reader):
+            pass
+        self._retire(reader)
 
     def _run(self) -> None:
         try:
             while self._end_s == math.inf:
                 self._wait()
+                self._follow_publishers()
                 while self._take_turn():
                     pass
         except BaseException as error:
             self._on_failure(error)
 
     def _wait(self) -> None:
-        """Return when a message is there, or the thread has to end; call back about events."""
-        subscriptions = (*self._eager, *self._others)
+        """Return when a message has arrived, or the thread has to end; call event callbacks."""
+        readers = (*self._eager, *self._others)
+        subscriptions = [found for reader in readers for found in reader.subscriptions()]
         events = [event for found in subscriptions for event in found.event_handlers]
         wait_set = rclpy_implementation.WaitSet(
             len(subscriptions), 1, 0, 0, 0, len(events), self._node.context.handle
@@ -168,27 +331,42 @@ class SubscriptionExecutor:
         for event in events:
             event.add_to_wait_set(wait_set)
         wait_set.add_guard_condition(self._stop.handle)
-        wait_set.wait(-1)
-        for event in events:
-            if event.is_ready(wait_set) and (report := event.take_data()):
+        is_following = max(found.follow_until_s for found in readers) > time.monotonic()
+        wait_set.wait(int(FOLLOW_PERIOD_S * 1e9) if is_following else -1)
+        # all are taken before a callback is called, since the wait set holds their order
+        reports = [(event, event.take_data()) for event in events if event.is_ready(wait_set)]
+        for event, report in reports:
+            if report:
                 event.callback(report)
 
     def _take_turn(self) -> bool:
-        """Take one message of each of the others, all eager ones before it; false if none was."""
+        """Take a message of each other topic, all eager ones before it; False if none was left."""
         taken = False
-        for subscription in self._others:
+        for reader in self._others:
             for eager in self._eager:
                 while self._take(eager):
                     pass
-            taken |= self._take(subscription)
+            taken |= self._take(reader)
         return taken
 
-    def _take(self, subscription: Subscription) -> bool:
+    def _take(self, reader: TopicReader) -> bool:
         """Take a message and call the callback; return whether there was one."""
         if time.monotonic() > self._end_s:
             return False
-        taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-        if taken is None:
-            return False
-        subscription.callback(taken[0])
-        return True
+        for subscription in reader.subscriptions():
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            if taken is None:
+                continue
+            message, info = taken
+            if reader.retiring is not None:
+                if info['source_timestamp'] in reader.seen:
+                    return True
+                reader.seen.add(info['source_timestamp'])
+            reader.callback(message)
+            return True
+        return False
+
+
+def name_of(reliability: ReliabilityPolicy) -> str:
+    """Return a reliability as people write it: reliable, best effort."""
+    return str(reliability.name).lower().replace('_', ' ')

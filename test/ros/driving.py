@@ -8,7 +8,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.pipeline import Mapper
-from test.ros.live import cloud, odometry, RELIABLE, room, START_NS
+from test.ros.live import cloud, odometry, room, START_NS
 
 PERIOD_NS = 100_000_000
 SETTINGS = {
@@ -24,7 +24,7 @@ SETTINGS = {
 def arguments(**changes):
     """Return the arguments of a node with ``SETTINGS`` and some changes."""
     pairs = [('-p', f'{name}:={value}') for name, value in {**SETTINGS, **changes}.items()]
-    return ['--ros-args', *(item for pair in pairs for item in pair), *RELIABLE]
+    return ['--ros-args', *(item for pair in pairs for item in pair)]
 
 
 ARGUMENTS = arguments()

@@ -38,13 +38,10 @@ ALL = QoSProfile(depth=1000)
 """Reliable, with a queue longer than any test needs: no message is lost."""
 
 
-def reliably(*topics):
-    """Return the arguments of a node that loses nothing of these topics."""
+def reliably(*topics, value='reliable'):
+    """Return the arguments of a node that reads topics with a fixed reliability."""
     names = [f'qos_overrides.{topic}.subscription.reliability' for topic in topics]
-    return [item for name in names for item in ('-p', f'{name}:=reliable')]
-
-
-RELIABLE = reliably('/points', '/odom')
+    return [item for name in names for item in ('-p', f'{name}:={value}')]
 
 
 class Process:
@@ -96,9 +93,9 @@ class Process:
 class Peer:
     """A node of the test that publishes and collects messages."""
 
-    def __init__(self):
+    def __init__(self, arguments=()):
         self._context = rclpy.Context()
-        rclpy.init(context=self._context)
+        rclpy.init(args=list(arguments), context=self._context)
         self.node = rclpy.create_node('peer', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
@@ -192,7 +189,7 @@ class Peer:
         self.spin_until(future.done)
         return future.result()
 
-    def diagnosis(self, expected=None):
+    def diagnosis(self, expected=None, timeout_s=TIMEOUT_S):
         """Return the first report with the expected values, as (status, values)."""
         reports, values = [], {}
         listening = self.node.create_subscription(
@@ -206,8 +203,10 @@ class Peer:
                 values.get(key) == str(value) for key, value in (expected or {}).items()
             )
 
-        self.spin_until(is_as_expected, what=lambda: f'no {expected}, but {values}')
-        self.node.destroy_subscription(listening)
+        try:
+            self.spin_until(is_as_expected, timeout_s, lambda: f'no {expected}, but {values}')
+        finally:
+            self.node.destroy_subscription(listening)
         return reports[-1].status[0], values
 
 

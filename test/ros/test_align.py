@@ -19,7 +19,7 @@ from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from test.alignment.street import drifted, relative_errors, street_scans
-from test.ros.live import cloud, LATCHED, odometry, RELIABLE
+from test.ros.live import cloud, LATCHED, odometry
 
 NUM_SCANS = 4
 SETTINGS = {
@@ -33,7 +33,6 @@ SETTINGS = {
 ARGUMENTS = [
     '--ros-args',
     *(item for name, value in SETTINGS.items() for item in ('-p', f'{name}:={value}')),
-    *RELIABLE,
 ]
 
 

@@ -13,7 +13,6 @@ from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 
@@ -58,30 +57,6 @@ def test_topics_and_services_have_the_documented_names_and_types(start, peer):
     assert found['/odom'] == ['nav_msgs/msg/Odometry']
     assert found['/diagnostics'] == ['diagnostic_msgs/msg/DiagnosticArray']
     peer.spin_until(lambda: ('map', '/robot') in peer.node.get_node_names_and_namespaces())
-
-
-def test_a_lidar_that_returns_with_another_qos_is_mapped(start, peer):
-    start('node', *ARGUMENTS)
-    peer.advertise('/odom')
-    messages = drive(6)
-    lives = [ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE]
-    # the node asks for reliable in ARGUMENTS, so best effort must not come through
-    for number, reliability in enumerate(lives):
-        qos = QoSProfile(depth=10, reliability=reliability)
-        lidar = peer.node.create_publisher(PointCloud2, '/points', qos)
-        if reliability is ReliabilityPolicy.RELIABLE:
-            peer.spin_until(lidar.get_subscription_count)
-        peer.meet()
-        for points, pose in messages[2 * number : 2 * number + 2]:
-            peer.publish('/odom', pose)
-            lidar.publish(points)
-            peer.spin_for(0.05)
-        if reliability is ReliabilityPolicy.RELIABLE:
-            peer.diagnosis({'scans.mapped': 2 if number == 0 else 4})
-        peer.node.destroy_publisher(lidar)
-    _, values = peer.diagnosis()
-    assert values['scans.received'] == '4'
-    assert values['resets'] == '0'
 
 
 def test_reports_and_latencies_use_simulated_time(start, peer):

@@ -83,4 +83,10 @@ def test_latency_is_ignored_with_other_clocks_and_zero_limits():
 
 
 def test_losses_of_the_middleware_are_reported():
-    assert found(loss='3 lost, do this') == [(WARN, '3 lost, do this')]
+    assert found(received=5, loss='3 lost, do this') == [(WARN, '3 lost, do this')]
+
+
+def test_a_total_loss_is_an_error_that_does_not_ask_for_the_lidar():
+    for before in (False, True):
+        said = found(loss='28 lost', ever_received=before, silent_s=9.0, num_publishers=1)
+        assert said == [(ERROR, 'no cloud comes through: 28 lost')]

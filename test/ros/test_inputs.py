@@ -22,12 +22,17 @@ from surfel_mapper import Mapper
 from surfel_mapper.config import Config
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
+<<<<<<< HEAD
 from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.ros.context import FASTDDS_VARIABLES
+=======
+from surfel_mapper.messages.pose_messages import poses_in
+from surfel_mapper.ros.context import FASTDDS_VARIABLES, PROFILE
+>>>>>>> 629e1e0 (node: QoS follows the publishers, and a lossy one is named; launch arguments, namespaces, bond)
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
-from test.ros.live import cloud, odometry, RELIABLE, reliably, room, stamp, START_NS
+from test.ros.live import cloud, odometry, room, stamp, START_NS
 
 PERIOD_NS = 100_000_000
 RELIABLE_QOS = QoSProfile(depth=50)
@@ -42,10 +47,10 @@ SETTINGS = {
 }
 
 
-def arguments(reliable=RELIABLE, **changes):
+def arguments(**changes):
     settings = {**SETTINGS, **changes}
     pairs = [('-p', f'{name}:={value}') for name, value in settings.items()]
-    return ['--ros-args', *(item for pair in pairs for item in pair), *reliable]
+    return ['--ros-args', *(item for pair in pairs for item in pair)]
 
 
 def digest_of(scans, poses, **changes):
@@ -72,8 +77,7 @@ def test_several_lidars_are_mapped_with_their_mounting_poses(start, peer):
         'frames.sensors': ['front', 'rear'],
         'frames.base_to_sensor': [*FRONT, *REAR],
     }
-    reliable = reliably('/front/points', '/rear/points', '/odom')
-    node = start('node', *arguments(reliable, **settings))
+    node = start('node', *arguments(**settings))
     peer.advertise('/odom', '/front/points', '/rear/points')
     clouds, poses = [], []
     for number in range(8):
@@ -92,7 +96,7 @@ def test_several_lidars_are_mapped_with_their_mounting_poses(start, peer):
 
 
 def test_reliable_and_best_effort_publishers_are_mapped_after_a_restart(start, peer):
-    node = start('node', *arguments(reliably('/odom')))
+    node = start('node', *arguments())
     peer.advertise('/odom')
     number = 0
     for qos in (RELIABLE_QOS, BEST_EFFORT, RELIABLE_QOS):
@@ -130,7 +134,7 @@ def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
     image, info = '/camera/depth/image_raw', '/camera/depth/camera_info'
     node = start(
         'node',
-        *arguments(reliably('/odom', image, info), **settings),
+        *arguments(**settings),
         *('-r', f'depth/image:={image}'),
     )
     peer.advertise('/odom', image, info, kinds={image: Image, info: CameraInfo})
@@ -211,9 +215,10 @@ def moving(simulation, stamp_ns):
     return message
 
 
-def inputs_of(config):
+def inputs_of(config, publishers=()):
     node = SimpleNamespace(
         resolve_topic_name=lambda name: f'/{name}',
+        get_publishers_info_by_topic=lambda topic: publishers,
         get_logger=lambda: SimpleNamespace(warning=lambda *_, **__: None),
     )
     thread = SimpleNamespace(put_cloud=lambda *_: None, refuse_cloud=lambda *_: None)
@@ -231,16 +236,23 @@ def test_the_most_silent_of_several_lidars_is_found():
     assert inputs.most_silent[0] == '/front'
 
 
-def inputs_that_lost(size):
-    inputs = inputs_of(Config())
+def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT):
+    """Return the report about five lost clouds of a size from a publisher of a reliability."""
+    publisher = SimpleNamespace(
+        node_namespace='/robot',
+        node_name='lidar',
+        qos_profile=QoSProfile(depth=1, reliability=reliability),
+    )
+    inputs = inputs_of(Config(), [publisher])
     inputs._on_cloud('/points', bytes(size))
-    inputs._on_lost('/points', SimpleNamespace(total_count=5))
-    return inputs
+    inputs._on_lost('/points', 5)
+    assert inputs.clouds_lost == 5
+    return inputs.loss()
 
 
 @pytest.mark.skipif(any(map(os.environ.get, FASTDDS_VARIABLES)), reason='Fast DDS is configured')
 def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
-    node = start('node', *arguments([], **{'pose.source': 'identity'}))
+    node = start('node', *arguments(**{'pose.source': 'identity'}))
     publisher = peer.node.create_publisher(PointCloud2, '/points', BEST_EFFORT)
     peer.spin_until(publisher.get_subscription_count)
     points = np.zeros((350_000, 3), np.float32)  # 4 MiB, of which shared memory holds half of one
@@ -263,10 +275,12 @@ def test_lost_large_clouds_are_reported_with_a_remedy(start, peer):
 
 
 def test_the_remedy_for_lost_clouds_depends_on_their_size():
-    large, small = inputs_that_lost(4 << 20), inputs_that_lost(10_000)
-    assert inputs_that_lost(0).loss() == large.loss()  # none came at all
-    assert large.clouds_lost == small.clouds_lost == 5
-    assert 'clouds lost on the way (5 of /points)' in large.loss()
-    assert 'fastdds_shm.xml' in large.loss()
-    assert 'overloaded' in small.loss()
-    assert 'fastdds_shm.xml' not in small.loss()
+    remedy = f'its command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
+    assert loss(4_000_000).startswith('clouds lost on the way (5 of /points, up to 4.0 MB each)')
+    assert loss(0).startswith('clouds lost on the way (5 of /points, none arrived)')
+    for size in (0, 4_000_000):
+        assert '/robot/lidar publishes best effort' in loss(size)
+        assert loss(size).endswith(remedy)
+    for other in (loss(10_000), loss(4_000_000, ReliabilityPolicy.RELIABLE)):
+        assert 'overloaded' in other
+        assert remedy not in other

@@ -105,11 +105,20 @@ def test_an_impossible_transition_is_refused(start, peer):
 
 
 @pytest.mark.skipif(find_spec('tf2_msgs') is not None, reason='tf2_msgs is installed')
-def test_a_failed_transition_states_the_reason_and_keeps_the_state(start, peer):
+def test_a_missing_tf2_msgs_is_refused_before_kernels_compile(start, peer):
     node = start('node', *WAITING, '-p', 'pose.source:=tf')
+    assert not transit(peer, 'configure')
+    assert 'refused: pose.source tf needs the package tf2_msgs' in node.output
+    assert 'compiling' not in node.output
+    assert state(peer) == 'unconfigured'
+    assert node.stop() == 0
+
+
+def test_a_failed_transition_states_the_reason_and_keeps_the_state(start, peer):
+    node = start('node', *WAITING, '-p', 'qos_overrides./points.subscription.depth:=x')
     assert transit(peer, 'configure')
     assert not transit(peer, 'activate')
-    assert 'refused: pose.source tf needs the package tf2_msgs' in node.output
+    assert 'refused: qos_overrides./points.subscription' in node.output
     assert state(peer) == 'inactive'
     assert peer.node.count_subscribers('/points') == 0
     assert node.stop() == 0
@@ -175,7 +184,7 @@ def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     early = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
     send(peer, drive(2))
     peer.diagnosis({'scans.mapped': 2})
-    peer.spin_until(lambda: early)
+    peer.spin_until(lambda: early and early[-1].width)
     assert transit(peer, 'deactivate')
     late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
     peer.spin_until(lambda: late)

@@ -17,7 +17,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import load_config
 from surfel_mapper.files.map_state import load_map
-from test.ros.live import Peer, RELIABLE, ROOT, TIMEOUT_S
+from test.ros.live import Peer, ROOT, TIMEOUT_S
 
 
 def offered_settings(bag, capsys):
@@ -29,7 +29,7 @@ def offered_settings(bag, capsys):
 
 def live_digest(start, bag, config, num_scans, rate):
     """Return the digest that the node logs at its end, after mapping the bag."""
-    node = start('node', '--ros-args', '--params-file', config, *RELIABLE)
+    node = start('node', '--ros-args', '--params-file', config)
     waiting = ['--wait-for', '/points', '/odom', '--timeout', TIMEOUT_S]
     playing = start('play', bag, '--rate', rate, *waiting, '--json')
     assert playing.wait(2 * TIMEOUT_S) == 0, playing.output

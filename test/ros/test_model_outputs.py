@@ -25,7 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import poses_in
 from surfel_mapper.models.multi_model import Surface
-from test.ros.live import cloud, LATCHED, NODE, odometry, RELIABLE, RVIZ, START_NS
+from test.ros.live import cloud, LATCHED, NODE, odometry, RVIZ, START_NS
 
 ALL_OUTLINES = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SETTINGS = {
@@ -69,7 +69,7 @@ def drive(*walls):
 
 def start_node(start, peer):
     pairs = [('-p', f'{name}:={str(value).lower()}') for name, value in SETTINGS.items()]
-    start('node', '--ros-args', *(item for pair in pairs for item in pair), *RELIABLE)
+    start('node', '--ros-args', *(item for pair in pairs for item in pair))
     peer.advertise('/odom', '/points')
 
 

@@ -11,20 +11,18 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from std_msgs.msg import Int32, String
 
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
-from test.ros.live import cloud, odometry, RELIABLE, room, START_NS, TIMEOUT_S
+from test.ros.live import cloud, odometry, room, START_NS, TIMEOUT_S
 
 ARGUMENTS = (
     '--ros-args',
     *('-p', 'pose.source:=odometry'),
     *('-p', 'frames.base_to_sensor:=[0.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0]'),
     *('-p', 'publish.diagnostics_rate_hz:=20.0'),
-    *RELIABLE,
 )
 PERIOD_NS = 100_000_000
 NUM_CLOUDS = 18
@@ -110,19 +108,6 @@ def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
     peer.spin_until(lambda: len(bench.taken) == 103)
     assert bench.taken == [*range(100), 'a', 'b', 'c']
     assert bench.executor.topics() == ['/eager', '/others']
-
-
-def test_events_of_the_middleware_are_delivered(peer, bench):
-    reports = []
-    events = SubscriptionEventCallbacks(incompatible_qos=reports.append)
-    bench.executor.subscribe(String, 'others', bench.take, ALL, events=events)
-    bench.executor.start()
-
-    best_effort = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-    peer.node.create_publisher(String, 'others', best_effort)
-
-    peer.spin_until(lambda: reports)
-    assert reports[0].total_count == 1
 
 
 def test_an_error_in_a_callback_ends_the_thread_and_is_reported(peer, bench):

@@ -19,7 +19,7 @@ from visualization_msgs.msg import Marker
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.messages.test_compressed_image import packed, packed_depth
-from test.ros.live import cloud, LATCHED, odometry, reliably, stamp, START_NS
+from test.ros.live import cloud, LATCHED, odometry, stamp, START_NS
 from test.ros.test_inputs import arguments, camera_info, depth_image, OPTICAL
 from test.ros.test_node import PERIOD_NS
 from test.ros.test_outputs import BASE, start_node
@@ -78,7 +78,7 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
         'layers.tsdf.color_topic': '/rgb/image',
     }
     kinds = {'/depth/image': Image, '/depth/camera_info': CameraInfo, '/rgb/image': Image}
-    start('node', *arguments(reliably('/odom', *kinds), **settings))
+    start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
     meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
@@ -106,7 +106,7 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
         'layers.tsdf.color_topic': color_topic,
     }
     kinds = {depth_topic: CompressedImage, info: CameraInfo, color_topic: CompressedImage}
-    start('node', *arguments(reliably('/odom', *kinds), **settings))
+    start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
     meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)

@@ -33,7 +33,7 @@ from test.bench.live_publisher import ros_cloud
 from test.bench.options import Options
 from test.bench.report import Row
 from test.bench.street import Street
-from test.ros.live import Peer, Process, RELIABLE, stamp
+from test.ros.live import Peer, Process, stamp
 from test.soak.core import BASE, CONFIG, PERIOD_NS, there_and_back, TURN_M
 
 UNDER_WAY = 15
@@ -59,7 +59,7 @@ class Drive:
         settings = {**CONFIG, 'publish.diagnostics_rate_hz': 50.0, 'output.directory': MAPS}
         given = [item for k, v in settings.items() for item in ('-p', f'{k}:={v}')]
         enlarge_shared_memory()
-        self.node = Process(['node', '--ros-args', *given, *RELIABLE], folder)
+        self.node = Process(['node', '--ros-args', *given], folder)
         self.peer = Peer()
         self._reports = self.peer.collect(DiagnosticArray, '/diagnostics', QoSProfile(depth=1))
         self.peer.spin_until(lambda: self._reports)

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The node's end of a bond with Nav2's lifecycle manager, which watches active nodes by heartbeats.
+
+The manager expects a heartbeat on ``bond`` under the name of the node soon after activation
+(``bond_timeout``), and brings the robot to a stop if it ceases. This end only has to send; whether
+the manager lives is of no concern to a mapper. So the message class is all it needs, from the
+package ``bond`` that Nav2 depends on. A module of its own because nothing else knows of it.
+
+Source: bond_core, bond/msg/Status.msg and the state machine of bondcpp.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+import uuid
+
+from rclpy.timer import Timer
+
+from surfel_mapper.ros.base_node import BaseNode, steady_timer
+
+TOPIC = 'bond'
+
+HEARTBEAT_PERIOD_S = 1.0
+HEARTBEAT_TIMEOUT_S = 4.0
+"""The defaults of bondcpp; both are sent with each heartbeat."""
+
+
+class Bond:
+    """
+    Heartbeats while the node is active; none if the package ``bond`` is not installed.
+
+    Parameters
+    ----------
+    node : BaseNode
+        The node that sends.
+
+    """
+
+    def __init__(self, node: BaseNode) -> None:
+        self._node = node
+        self._timer: Timer | None = None
+        self._publisher: Any = None
+        self._instance_id = ''
+        try:
+            self._message: Any = import_module('bond.msg').Status
+        except ImportError:
+            self._message = None
+
+    def start(self) -> None:
+        """Send heartbeats from now on."""
+        if self._message is None or self._timer is not None:
+            return
+        self._instance_id = str(uuid.uuid4())
+        self._publisher = self._node.create_publisher(self._message, TOPIC, 1)
+        self._timer = steady_timer(self._node, 1.0 / HEARTBEAT_PERIOD_S, self._send)
+        self._send()
+
+    def stop(self) -> None:
+        """Tell the manager that the bond ends on purpose, and send no more."""
+        if self._timer is None:
+            return
+        self._node.destroy_timer(self._timer)
+        self._send(active=False)
+        self._node.destroy_publisher(self._publisher)
+        self._timer = self._publisher = None
+
+    def _send(self, *, active: bool = True) -> None:
+        """Send a heartbeat, or the end of the bond."""
+        message = self._message(
+            id=self._node.get_name(),
+            instance_id=self._instance_id,
+            active=active,
+            heartbeat_timeout=HEARTBEAT_TIMEOUT_S,
+            heartbeat_period=HEARTBEAT_PERIOD_S,
+        )
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)

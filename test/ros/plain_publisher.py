@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Publish clouds as an ordinary driver does: rclpy and its defaults, nothing of this package.
+
+``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS BYTES...`` publishes NUMBER
+clouds of each size at 10 Hz, once the topic has a subscriber, and confirms each size on stdout.
+"""
+
+from array import array
+import sys
+import time
+
+import rclpy
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import PointCloud2, PointField
+
+POINT_STEP = 160
+"""Bytes per point, so that mapping is cheap compared with sending."""
+
+
+def cloud(stamp_ns: int, num_bytes: int) -> PointCloud2:
+    """Return a cloud of a flat floor."""
+    num = num_bytes // POINT_STEP
+    points = bytearray(num * POINT_STEP)
+    floats = memoryview(points).cast('f')
+    for number in range(num):
+        floats[40 * number] = (number % 200) * 0.05
+        floats[40 * number + 1] = (number // 200) * 0.05
+    message = PointCloud2(height=1, width=num, point_step=POINT_STEP, row_step=len(points))
+    message.fields = [
+        PointField(name=name, offset=4 * axis, datatype=PointField.FLOAT32, count=1)
+        for axis, name in enumerate('xyz')
+    ]
+    message.data = array('B', points)
+    message.header.frame_id = 'odom'
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+    return message
+
+
+def main(reliability: str, number: str, first_ns: str, *sizes: str) -> None:
+    """Publish clouds of each size."""
+    rclpy.init()
+    node = Node('plain_lidar')
+    qos = QoSProfile(depth=10, reliability=ReliabilityPolicy[reliability.upper()])
+    publisher = node.create_publisher(PointCloud2, '/points', qos)
+    while not publisher.get_subscription_count():
+        time.sleep(0.05)
+    time.sleep(1.0)  # until the subscriber knows the publisher too
+    stamp_ns = int(first_ns)
+    for size in sizes:
+        message = cloud(stamp_ns, int(size))
+        next_s = time.monotonic()
+        for _ in range(int(number)):
+            stamp_ns += 10**8
+            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            publisher.publish(message)
+            next_s += 0.1
+            time.sleep(max(next_s - time.monotonic(), 0.0))
+        print(size, flush=True)
+        sys.stdin.readline()
+    node.destroy_node()
+    rclpy.shutdown()
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])

@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Reliability follows the publishers: the table of docs/inputs.md, and publishers that come and go.
+
+The publishers of the table are processes that use rclpy and its defaults only.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+import subprocess
+import sys
+
+import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_msgs.msg import String
+
+from surfel_mapper.ros.context import FASTDDS_VARIABLES, PROFILE
+from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
+from test.ros.live import Peer, reliably, START_NS
+
+SIZES = (200_000, 800_000, 2_000_000, 4_000_000, 8_000_000)
+NUMBER = 15
+"""Clouds of each size and kind of publisher."""
+
+DEFAULTS = ['--ros-args', '-p', 'pose.source:=identity', '-p', 'window.max_scans:=5']
+DEFAULTS += ['-p', 'input.max_waiting_clouds:=1000', '-p', 'publish.diagnostics_rate_hz:=10.0']
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+RELIABLE = QoSProfile(depth=10)
+
+
+@pytest.fixture(scope='module')
+def node(compiled, tmp_path_factory):
+    """Run a node with Fast DDS' defaults."""
+    from test.ros.live import Process
+
+    with pytest.MonkeyPatch.context() as patch:
+        for name in FASTDDS_VARIABLES:
+            patch.delenv(name, raising=False)
+        node = Process(['node', *DEFAULTS], tmp_path_factory.mktemp('qos'))
+        yield node
+        node.kill()
+
+
+def publish(peer, node, first_ns, reliability, *, profile):
+    """Run a publisher; return the number of clouds received of each size."""
+    env = {key: value for key, value in os.environ.items() if key not in FASTDDS_VARIABLES}
+    if profile:
+        env['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
+    command = [sys.executable, str(Path(__file__).with_name('plain_publisher.py'))]
+    command += [reliability, str(NUMBER), str(first_ns), *map(str, SIZES)]
+    received, values = {}, peer.diagnosis({'state': 'active'})[1]
+    with subprocess.Popen(
+        command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as publisher:
+        for size in SIZES:
+            assert publisher.stdout.readline().strip() == str(size), node.output
+            before = int(values['scans.received'])
+            try:
+                wanted = {'scans.received': before + NUMBER}
+                values = peer.diagnosis(
+                    wanted, timeout_s=20.0 if reliability == 'reliable' else 3
+                )[1]
+            except AssertionError:
+                values = peer.diagnosis()[1]
+            received[size] = int(values['scans.received']) - before
+            publisher.stdin.write('\n')
+            publisher.stdin.flush()
+    return received
+
+
+@pytest.mark.parametrize(
+    ('reliability', 'profile', 'promised'),
+    [
+        ('reliable', False, SIZES),
+        ('reliable', True, SIZES),
+        ('best_effort', True, SIZES),
+        ('best_effort', False, SIZES[:1]),
+    ],
+)
+def test_all_clouds_of_the_promised_sizes_arrive(node, peer, reliability, profile, promised):
+    number = 2 * (reliability == 'reliable') + profile
+    first_ns = START_NS + number * 1000 * 10**9
+
+    received = publish(peer, node, first_ns, reliability, profile=profile)
+
+    print(reliability, 'with profile' if profile else 'default', received)
+    missing = {size: received[size] for size in promised if received[size] != NUMBER}
+    assert not missing, f'of {NUMBER}: {missing}\n{node.output[-3000:]}'
+    node.check()
+    if sum(received.values()) < NUMBER * len(SIZES):
+        assert '/plain_lidar publishes best effort' in node.output
+        assert f'FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}' in node.output
+
+
+class Bench:
+    """A subscription executor in the node of a peer, and the publishers of a topic."""
+
+    def __init__(self, peer, topic='followed'):
+        self.peer = peer
+        self.topic = topic
+        self.taken, self.failures = [], []
+        self.executor = SubscriptionExecutor(peer.node, self.failures.append)
+
+    def subscribe(self):
+        self.executor.subscribe(
+            String, self.topic, lambda msg: self.taken.append(msg.data), RELIABLE
+        )
+        self.executor.start()
+
+    def advertise(self, qos):
+        return self.peer.node.create_publisher(String, self.topic, qos)
+
+    def wait_until(self, reliability):
+        self.peer.spin_until(
+            lambda: self.executor.reliabilities() == {f'/{self.topic}': reliability},
+            what=lambda: f'{self.executor.reliabilities()}, expected {reliability}',
+        )
+
+    def check_connected(self, publisher, text):
+        """Check that a message of a publisher arrives."""
+        self.peer.spin_until(publisher.get_subscription_count)
+
+        def has_arrived():
+            publisher.publish(String(data=text))
+            return text in self.taken
+
+        self.peer.spin_until(has_arrived)
+
+
+@pytest.fixture
+def bench(peer):
+    bench = Bench(peer)
+    yield bench
+    bench.executor.stop()
+    assert bench.failures == []
+
+
+def test_reliability_follows_publishers_that_come_and_go(bench):
+    bench.subscribe()
+    bench.wait_until('reliable')
+    first = bench.advertise(RELIABLE)
+    bench.check_connected(first, 'reliable alone')
+    second = bench.advertise(BEST_EFFORT)
+    bench.wait_until('best effort')
+    bench.check_connected(second, 'best effort beside reliable')
+    bench.check_connected(first, 'reliable beside best effort')
+    bench.peer.node.destroy_publisher(second)
+    bench.wait_until('reliable')
+    bench.check_connected(first, 'reliable again')
+    bench.peer.node.destroy_publisher(first)
+    bench.peer.spin_for(0.3)
+    third = bench.advertise(BEST_EFFORT)
+    bench.wait_until('best effort')
+    bench.check_connected(third, 'best effort alone')
+
+
+def test_a_restarted_best_effort_publisher_needs_no_new_subscription(bench):
+    publisher = bench.advertise(BEST_EFFORT)
+    bench.peer.spin_until(lambda: bench.peer.node.count_publishers('/followed'))
+    bench.subscribe()
+    bench.wait_until('best effort')
+    before = bench.peer.node.subscriptions
+    bench.peer.node.destroy_publisher(publisher)
+    bench.peer.spin_for(0.5)
+    publisher = bench.advertise(BEST_EFFORT)
+    bench.check_connected(publisher, 'back')
+    assert list(bench.peer.node.subscriptions) == list(before)
+
+
+def test_the_graph_is_looked_at_before_the_first_subscription(bench, capfd):
+    bench.advertise(BEST_EFFORT)
+    bench.peer.spin_until(lambda: bench.peer.node.count_publishers('/followed'))
+    bench.subscribe()
+    assert bench.executor.reliabilities() == {'/followed': 'best effort'}
+    bench.peer.spin_for(0.3)
+    assert 'incompatible QoS' not in capfd.readouterr().err
+
+
+def test_no_message_is_lost_or_doubled_when_the_subscription_changes(bench):
+    bench.subscribe()
+    reliable = bench.advertise(RELIABLE)
+    bench.check_connected(reliable, 'begin')
+    weak, sent = None, []
+    for number in range(300):
+        sent.append(str(number))
+        reliable.publish(String(data=sent[-1]))
+        bench.peer.spin_for(0.01)
+        if number % 100 == 50:
+            weak = bench.advertise(BEST_EFFORT)
+        elif number % 100 == 99:
+            bench.peer.node.destroy_publisher(weak)
+    bench.wait_until('reliable')
+    bench.peer.spin_until(lambda: sent[-1] in bench.taken)
+    assert [text for text in bench.taken if text != 'begin'] == sent
+
+
+@pytest.mark.parametrize('chosen', ['reliable', 'best_effort'])
+def test_a_reliability_set_by_the_user_stays(domain, chosen):
+    peer = Peer(arguments=['--ros-args', *reliably('/chosen', value=chosen)])
+    bench = Bench(peer, 'chosen')
+    try:
+        bench.subscribe()
+        publisher = bench.advertise(BEST_EFFORT if chosen == 'reliable' else RELIABLE)
+        peer.spin_for(1.0)
+        assert bench.executor.reliabilities() == {'/chosen': chosen.replace('_', ' ')}
+        assert publisher.get_subscription_count() == (chosen == 'best_effort')
+        assert (
+            peer.node.get_parameter('qos_overrides./chosen.subscription.reliability').value
+            == chosen
+        )
+    finally:
+        bench.executor.stop()
+        peer.close()
+    assert bench.failures == []
+
+
+def test_the_depth_set_by_the_user_stays_with_every_new_subscription(domain):
+    peer = Peer(arguments=['--ros-args', '-p', 'qos_overrides./deep.subscription.depth:=7'])
+    bench = Bench(peer, 'deep')
+    try:
+        bench.subscribe()
+        publisher = bench.advertise(BEST_EFFORT)
+        bench.wait_until('best effort')
+        bench.check_connected(publisher, 'one')
+        (subscription,) = [s for s in peer.node.subscriptions if s.topic_name == '/deep']
+        assert subscription.qos_profile.depth == 7
+    finally:
+        bench.executor.stop()
+        peer.close()
+    assert bench.failures == []
