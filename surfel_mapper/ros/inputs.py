@@ -33,16 +33,9 @@ from surfel_mapper.messages.images import (
     SceneImages,
     warm_up,
 )
-<<<<<<< HEAD
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
-=======
-from surfel_mapper.messages.pose_messages import ODOMETRY, POSE, TF
-from surfel_mapper.messages.raw_cloud import parse_cloud
-from surfel_mapper.messages.raw_pose import raw_poses
-from surfel_mapper.messages.scene_image import SceneImages
 from surfel_mapper.ros.context import PROFILE
->>>>>>> 629e1e0 (node: QoS follows the publishers, and a lossy one is named; launch arguments, namespaces, bond)
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from surfel_mapper.scan import Scan

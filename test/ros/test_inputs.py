@@ -22,13 +22,8 @@ from surfel_mapper import Mapper
 from surfel_mapper.config import Config
 from surfel_mapper.messages.images import CameraImage, depth_scan
 from surfel_mapper.messages.pointcloud2 import to_scan
-<<<<<<< HEAD
 from surfel_mapper.messages.poses import poses_in
-from surfel_mapper.ros.context import FASTDDS_VARIABLES
-=======
-from surfel_mapper.messages.pose_messages import poses_in
 from surfel_mapper.ros.context import FASTDDS_VARIABLES, PROFILE
->>>>>>> 629e1e0 (node: QoS follows the publishers, and a lossy one is named; launch arguments, namespaces, bond)
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.simulation import Lidar, Simulation, World
