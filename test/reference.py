@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Slow twins of what the package computes: plain, independent, exact where they can be."""
+"""Slow twins of the package in plain numpy: independent, and exact if possible."""
 
 from fractions import Fraction
 import hashlib

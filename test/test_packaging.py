@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What installs the package says the same everywhere, and the executables start."""
+"""The files that install the package agree with each other, and the executables start."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The buffer of transforms: what it returns bit for bit, what it interpolates, what it refuses.
+The buffer of transforms: exact results, interpolation, refusals.
 
 The twin below knows nothing of edges in time or of common ancestors: it multiplies 4 by 4
 matrices from the root to each of two frames and solves for what lies between, with scipy's slerp.
@@ -88,7 +88,7 @@ def test_a_lookup_downwards_is_the_inverse_of_the_one_upwards():
     assert buffer.lookup('lidar', 'odom', EPOCH + S // 3).tobytes() == inverse(upwards).tobytes()
 
 
-def test_what_two_frames_share_above_them_is_not_asked_for():
+def test_shared_ancestors_of_two_frames_are_not_looked_up():
     buffer = drive()
     buffer.add_static('base', 'camera', some_pose(2))
 
@@ -114,7 +114,7 @@ def test_a_frame_in_itself_is_the_identity_at_any_time(frame):
     np.testing.assert_array_equal(drive().lookup(frame, frame, 0), np.eye(4))
 
 
-def test_what_is_returned_and_what_was_given_may_be_written_to():
+def test_results_and_arguments_may_be_written_to():
     buffer, pose = TransformBuffer(), some_pose(3)
     buffer.add('odom', 'base', 5, pose)
     buffer.add_static('base', 'lidar', pose)
@@ -158,7 +158,7 @@ def test_any_tree_gives_what_a_slow_twin_gives(data):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
 
 
-# In which order, and what is held
+# Order of insertion and content
 
 
 @given(st.permutations(range(8)))
@@ -358,7 +358,7 @@ def test_a_static_child_takes_no_dynamic_transform_and_the_reverse():
         (np.diag([1.0, 1.0, 1.0, 2.0]), 'not a rotation'),
     ],
 )
-def test_what_is_no_rigid_transform_is_refused_and_changes_nothing(add, pose, named):
+def test_a_transform_that_is_not_rigid_is_refused_and_changes_nothing(add, pose, named):
     buffer = TransformBuffer()
 
     with pytest.raises(PoseError, match=named):
@@ -368,7 +368,7 @@ def test_what_is_no_rigid_transform_is_refused_and_changes_nothing(add, pose, na
 
 
 @given(st.integers(0, 2**32), st.sampled_from([0.0, 1e-7, 3e-7, 1e-6, 3e-6, 0.1, 1.0]))
-def test_what_counts_as_a_rotation_is_what_numpy_says(seed, skew):
+def test_rotations_are_recognised_as_by_numpy(seed, skew):
     rng = np.random.default_rng(seed)
     pose = some_pose(seed)
     pose[:3, :3] += skew * rng.uniform(-1.0, 1.0, (3, 3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What is public, and what importing the package loads: no ROS, no bags, no compiler."""
+"""Public names, and the modules that importing the package loads: no ROS, no bags, no compiler."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_every_public_name_says_what_it_is(name, member):
 
 
 @pytest.mark.parametrize(('name', 'member'), members())
-def test_what_takes_or_returns_an_array_states_a_shape(name, member):
+def test_functions_of_arrays_state_a_shape(name, member):
     if inspect.isfunction(member):
         types = inspect.get_annotations(member).values()
         arrays = [each for each in types if re.match(r'Array|ArrayLike|npt\.', str(each))]
@@ -78,7 +78,7 @@ def test_what_takes_or_returns_an_array_states_a_shape(name, member):
 
 
 @pytest.mark.parametrize(('name', 'member'), members())
-def test_what_raises_says_so(name, member):
+def test_functions_that_raise_say_so(name, member):
     if inspect.isfunction(member) and re.search(r'^ +raise ', inspect.getsource(member), re.M):
         assert re.search(r'Raises\n-{6}|\b[Rr]aises?\b', inspect.getdoc(member)), name
 

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What SECURITY.md promises of the source, read from the source; and files stay where they belong.
+Promises of SECURITY.md about the source, checked in the source; files stay in their folder.
 
-What readers do with damaged and hostile input is in test/fuzz, what the node does in test/ros.
+Readers of damaged and hostile input are tested in test/fuzz, the node in test/ros.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 MODULES = {'pickle', 'cPickle', 'marshal', 'shelve', 'dill', 'cloudpickle', 'joblib', 'subprocess'}
-"""What runs what a file says, or programs."""
+"""Functions that run programs, or code from a file."""
 
 CALLS = {'eval', 'exec', 'compile', '__import__', 'os.system', 'os.popen', 'tempfile.mktemp'}
 
@@ -29,7 +29,7 @@ SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 
 def name_of(node):
-    """Return the dotted name of what is called."""
+    """Return the dotted name of a called function."""
     if isinstance(node, ast.Attribute):
         return f'{name_of(node.value)}.{node.attr}'
     return node.id if isinstance(node, ast.Name) else ''
@@ -85,7 +85,7 @@ def test_no_source_unpickles_evaluates_or_starts_programs(path):
         'yaml.load(x, yaml.Loader)',
     ],
 )
-def test_what_is_dangerous_is_found(source):
+def test_dangerous_calls_are_found(source):
     assert dangers(source)
 
 
@@ -93,12 +93,12 @@ MENDED = {
     'numpy': '1.22',  # CVE-2021-41495, -41496, -33430, -34141
     'scipy': '1.10',  # CVE-2023-25399, -29824
     'PyYAML': '5.4',  # CVE-2020-14343
-    'pyarrow': '14.0.1',  # CVE-2023-47248: a Parquet file ran what it said
+    'pyarrow': '14.0.1',  # CVE-2023-47248: a Parquet file ran code that it contained
     'dask': '2021.10',  # CVE-2021-42343
     'distributed': '2021.10',  # CVE-2021-42343
 }
 """
-The first version without what is known of those before it and concerns what we use.
+The first version without a known vulnerability that concerns this package.
 
 Known, and of no concern here: tqdm before 4.66.3, in its command line; pyarrow before 23.0.1, in
 its IPC format.
@@ -106,7 +106,7 @@ its IPC format.
 
 
 def requirements():
-    """Return all requirements in setup.py: what stands in its lists, by their names."""
+    """Return all requirements in setup.py, by the name of their list."""
     tree = ast.parse((ROOT / 'setup.py').read_text(encoding='utf-8'))
     for node in tree.body:
         if isinstance(node, ast.Assign) and isinstance(node.value, ast.List):

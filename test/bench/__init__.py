@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Benchmarks: milliseconds a scan, and beside whom.
+Benchmarks: milliseconds a scan, beside other packages.
 
     make bench                                      all, with the environment of the project
     python -m test.bench --help                     which there are

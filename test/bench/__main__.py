@@ -78,7 +78,7 @@ def options(args: argparse.Namespace) -> Options:
 
 
 def run(names: Sequence[str], chosen: Options) -> list[Row]:
-    """Run benches, printing the table of each; return all rows with what they depend on."""
+    """Run benches and print the table of each; return all rows with the machine and options."""
     found: list[Row] = []
     for name in names:
         load_before = load()
@@ -95,7 +95,7 @@ def rounded(row: Row) -> Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what the command line asks for."""
+    """Run the benches of the command line."""
     args = parser().parse_args(arguments)
     if args.scans is not None and args.scans < 1:
         parser().error(f'--scans: {args.scans}, expected one or more')

@@ -3,10 +3,10 @@
 """
 The window aligned on the street, mapped by an odometry that drifts by 1 % and 0.05 deg a metre.
 
-Errors are means of the relative poses of scans so many apart, against the truth. ``thick_mm`` is
-the root of the mean smallest eigenvalue of flat surfels of 50 points and more: what is left of
+Errors are means of the relative poses of scans a stated number apart. ``thick_mm`` is
+the root of the mean smallest eigenvalue of flat surfels of 50 points and more: the remains of
 range noise and of the unevenness inside voxels at ``true poses``, more where scans disagree.
-``again`` is what an alignment takes of a window that is aligned but for its newest scans.
+``again`` is the time of aligning a window whose older scans are aligned already.
 """
 
 from __future__ import annotations

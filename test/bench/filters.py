@@ -62,7 +62,7 @@ CHAINS: dict[str, tuple[Any, float | None]] = {
     'sampling_surface_normal': ('sampling_surface_normal', None),
     'surface_normal': ('surface_normal', None),
 }
-"""What is timed, and the Mpt/s asked of it."""
+"""Timed filters, and the rates they should reach, Mpt/s."""
 
 STATED = {'libpointmatcher': 13.6, 'PCL VoxelGrid': 30.8, 'PCL ApproximateVoxelGrid': 58.0}
 """Mpt/s of others as stated for one real scan, 0.5 m voxels, one core."""
@@ -143,7 +143,7 @@ def row(name: str, who: str, num_points: int, figures: tuple[float, int]) -> Row
 
 
 def others(points: Points, program: Path | None) -> Iterator[tuple[str, tuple[float, int]]]:
-    """Yield the least milliseconds of PCL's voxel grids and what they leave."""
+    """Yield the least milliseconds of PCL's voxel grids and their numbers of points."""
     if program is None:
         return
     done = subprocess.run(

@@ -45,7 +45,7 @@ CPU_TICKS = os.sysconf('SC_CLK_TCK')
 
 
 def run(options: Options) -> list[Row]:
-    """Return rows of starts, latencies and rates; none where there is no ROS."""
+    """Return rows of starts, latencies and rates; none without ROS."""
     try:
         import rclpy  # noqa: F401
     except ImportError:
@@ -82,7 +82,7 @@ def starts(options: Options) -> list[Row]:
 
 
 def rates(options: Options, street: Street, size_m: float, scale: float) -> Iterator[Row]:
-    """Yield what came of 20 Hz, of rates above it until one is too much, and of none."""
+    """Yield rows for 20 Hz, for higher rates up to the first with drops, and for an idle node."""
     mount = list(street.simulation.drive.base_to_sensor)
     with Node(size_m, mount, options.window, {}) as node, listening() as listener:
         node.wait_for('ready:')
@@ -103,7 +103,7 @@ def rates(options: Options, street: Street, size_m: float, scale: float) -> Iter
 def measure(
     options: Options, node: Node, listener: Any, rate_hz: float, seconds: float
 ) -> dict[str, Any]:
-    """Return what came of a rate."""
+    """Return the row of a rate."""
     before_s = node.cpu_s()
     stamps = publish(options, listener, rate_hz, round(rate_hz * seconds))
     cpu_s = node.cpu_s() - before_s
@@ -122,7 +122,7 @@ def measure(
 
 
 def publish(options: Options, listener: Any, rate_hz: float, num: int) -> list[int]:
-    """Have the lidar publish, and listen until a second has passed without a change."""
+    """Let the lidar publish, and listen until a second has passed without a change."""
     settings = {
         'rate_hz': rate_hz,
         'num': num,
@@ -197,7 +197,7 @@ class Node:
 
 @contextmanager
 def listening() -> Iterator[Any]:
-    """Subscribe to what the node publishes, in a with-block."""
+    """Subscribe to the topics of the node, in a with-block."""
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile

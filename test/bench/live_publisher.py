@@ -51,11 +51,11 @@ def main(arguments):
     end_s = time.monotonic() + START_UP_S
     while not (points.get_subscription_count() and odom.get_subscription_count()):
         if time.monotonic() > end_s:
-            raise SystemExit('nobody subscribes')
+            raise SystemExit('no subscriber appeared')
         time.sleep(0.05)
     time.sleep(0.5)  # the other side needs to know of us too
     stamps = drive(settings, clouds, poses, points, odom)
-    time.sleep(0.5)  # what is in shared memory goes with its publisher
+    time.sleep(0.5)  # messages in shared memory vanish with their publisher
     print(json.dumps(stamps))
     rclpy.shutdown()
 

@@ -4,7 +4,7 @@
 LUM on one core, beside PCL's; then how it grows with the edges.
 
 ``compute`` is one call of all iterations from clouds and pairs just given, sums over the pairs
-included; an iteration is what each further one takes. PCL is compiled from peers/pcl_lum.cpp,
+included; an iteration is the time of each further one. PCL is compiled from peers/pcl_lum.cpp,
 where a compiler and Debian's libpcl-dev are there, and gets the same graph; else its figures are
 those stated for that package on another machine, and marked so.
 """
@@ -33,7 +33,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Case:
-    """A graph, what is asked of ours, and what is stated for PCL, ms."""
+    """A graph, the goal for this package, and the time stated for PCL, ms."""
 
     name: str
     vertices: int
@@ -45,13 +45,13 @@ class Case:
 
 
 def chain(vertices: int, steps: Sequence[int], edges: int) -> tuple[tuple[int, int], ...]:
-    """Return so many edges, each vertex with those so many steps ahead, shorter steps first."""
+    """Return ``number`` edges from each vertex to those some steps ahead, shorter steps first."""
     ends = [(v, v + step) for step in steps for v in range(vertices - step)]
     return tuple(ends[:edges])
 
 
 def loops(vertices: int, num: int) -> tuple[tuple[int, int], ...]:
-    """Return a chain with so many loops, one after the other."""
+    """Return a chain with ``number`` loops, one after the other."""
     size = vertices // num
     closing = tuple((size * k, size * k + size - 1) for k in range(num))
     return chain(vertices, (1,), vertices - 1) + closing

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What figures depend on beside the code: the machine, its load, and how many cores are used."""
+"""Conditions of the figures beside the code: the machine, its load, the number of cores."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def cpu_model() -> str:
 
 
 def installed(package: str) -> str | None:
-    """Return the version of a package, None where it is missing."""
+    """Return the version of a package, None if it is missing."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -54,9 +54,9 @@ def resident_bytes() -> int:
 @contextmanager
 def one_core() -> Iterator[None]:
     """
-    Keep this thread, and what it starts, on one core; where the system can do it.
+    Pin this thread and its children to one core, if the system can.
 
-    The last core is taken, as systems put what they do themselves onto the first.
+    The last core is used, as systems run their own work on the first.
     """
     if not hasattr(os, 'sched_setaffinity'):
         yield

@@ -25,7 +25,7 @@ from test.bench.report import rates, Row, spread
 from test.bench.street import Street
 
 BUDGET_MS = {0.5: 4.0, 0.2: 10.0}
-"""What a scan of 131,072 points may cost in a window of 100, by voxel size."""
+"""Goal for a scan of 131,072 points in a window of 100, ms, by voxel size."""
 
 Times = dict[str, list[float]]
 
@@ -102,7 +102,7 @@ def stages(options: Options, size_m: float, way: str, times: Times) -> list[Row]
 
 
 def memory(ours: Ours) -> Row:
-    """Return how many voxels there are and what they take."""
+    """Return the number of voxels and their bytes."""
     in_scans = sum(len(moments) for moments in ours.scans)
     return {
         'voxels': ours.map.num_voxels,

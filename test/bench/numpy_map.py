@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The same exact windowed map out of numpy alone: what there was before compiled kernels.
+The same exact windowed map in plain numpy, without compiled kernels.
 
 Its integers equal those of SurfelMap, views included (test_numpy_map.py; the bench compares them
 too). It is as fast as we could write it: runs of consecutive points in one voxel are summed by
@@ -35,7 +35,7 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class NumpySurfels:
-    """What is derived of K voxels; see Surfels."""
+    """Quantities derived for K voxels; see Surfels."""
 
     position: Floats
     normal: Floats

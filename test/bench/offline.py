@@ -7,7 +7,7 @@ The lidar turns at 10 Hz, so 10 ms a scan are ten times real time. ``read`` yiel
 clouds and poses, ``decode`` makes scans and poses of them, ``replay`` maps them at 0.5 m with all
 scans kept, ``command`` is the whole of `surfel-mapper replay`: a process of its own, kernels
 loaded, map, picture, report and summary written. Each is the fastest of several runs, with the
-bag in the cache of the system; core_ms_scan is what it took of the core, which changes little
+bag in the cache of the system; core_ms_scan is processor time, which changes little
 where others load the machine. The bag is kept beside the scans of the other benches.
 """
 
@@ -62,7 +62,7 @@ def run(options: Options) -> list[Row]:
 
 
 def recorded(street: Street, options: Options) -> Path:
-    """Return the bag of so many scans, which is recorded at the first call."""
+    """Return the bag of a number of scans, recorded at the first call."""
     path = street.directory.with_name(f'{street.directory.name}-{options.scans}-bag')
     if not path.exists():
         print(f'recording {options.scans} scans into {path}', file=sys.stderr)
@@ -91,7 +91,7 @@ def row(part: Callable[[Path, Path], None], options: Options, bag: Path, config:
 
 
 def busy_s() -> float:
-    """Return how long this process and its children ran on a core, whoever else wanted it."""
+    """Return the processor time of this process and its children, s."""
     spent = os.times()
     return spent.user + spent.system + spent.children_user + spent.children_system
 
@@ -122,7 +122,7 @@ def replay(bag: Path, config: Path) -> None:
 
 
 def command(bag: Path, config: Path) -> None:
-    """Map them in a process of its own, and write what it writes."""
+    """Map them in a process of its own, with all its files."""
     subprocess.run(
         [
             *(sys.executable, '-m', 'surfel_mapper.cli.main', 'replay', str(bag)),

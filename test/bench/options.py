@@ -21,7 +21,7 @@ def cache_directory() -> Path:
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """
-    What every bench is run with.
+    Options of every bench.
 
     Attributes
     ----------
@@ -30,7 +30,7 @@ class Options:
     window : int
         Scans in the window.
     windows : tuple of int
-        Lengths of window that are compared; the first is what the others are divided by.
+        Compared lengths of the window; times are divided by that of the first.
     map_voxels : tuple of int
         Sizes of map that are compared, likewise.
     voxel_sizes_m : tuple of float
@@ -40,7 +40,7 @@ class Options:
     peers : bool
         Whether others are measured that have to be installed first.
     cache : Path
-        Directory of what is kept between runs.
+        Directory of files kept between runs.
 
     """
 

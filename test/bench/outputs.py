@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What goes out of the node beside the map, and what comes in beside clouds, on one core.
+Outputs of the node beside the map, and inputs beside clouds, on one core.
 
 Each is timed as the mapping thread does it, from the map to the bytes of the message: markers of
 20,000 discs (choosing them, their surfels, vertices, CDR), changes of one scan with and without
 exact moments, the scan with normals, the grid, the models; and the other way deskewing of a sweep,
-a depth image of 640 x 480, and what a mirror takes to follow one change. Publishing is not in it.
+a depth image of 640 x 480, and the time of a mirror to follow one change. Publishing is not in it.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def row(name: str, task: Callable[[], Any]) -> Row:
 
 
 def mapped(options: Options) -> tuple[Mapper, Update]:
-    """Return a mapper whose window is full, and what the last scan did."""
+    """Return a mapper whose window is full, and the update of its last scan."""
     street = Street(options)
     drive = street.simulation.drive
     mount = drive.base_to_sensor
@@ -112,7 +112,7 @@ def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
 
 
 def models(mapper: Mapper) -> dict[str, Callable[[], Any]]:
-    """Return what says what the models are; their shapes anew, or as kept from the last time."""
+    """Return a function that describes the models, with shapes made anew or cached."""
     live = LiveModels(ModelsLayerConfig(enabled=True), mapper.map)
     live.update()
     model, versions = live.model, live.versions

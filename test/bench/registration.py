@@ -8,7 +8,7 @@ error of each step, the drift over stretches of the way, and how far the end is 
 ours is that of the Mapper, normals of all changed voxels included. Others run at the voxel sizes
 that suit them: KISS-ICP's default is 1 m for a range of 100 m.
 
-The street is exact truth. The real sequences, where SURFEL_MAPPER_TEST_DATA says where they are,
+The street has exact truth. The real sequences, if SURFEL_MAPPER_TEST_DATA names their folder,
 have the poses of another odometry, which drifts itself: all that fit the scans well agree on
 their difference from it.
 """

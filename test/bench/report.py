@@ -17,7 +17,7 @@ def spread(milliseconds: Sequence[float]) -> dict[str, float]:
     """
     Return median, 10th and 99th percentile, and slowest of the times of scans.
 
-    The 10th percentile is about what the median would be on a quiet machine.
+    The 10th percentile is near the median of a quiet machine.
     """
     return {
         'median_ms': float(np.median(milliseconds)),
@@ -48,7 +48,7 @@ def table(rows: Sequence[Row]) -> str:
 
 
 def text(value: Any) -> str:
-    """Return a value as it stands in a table: three digits of what is small, none of the large."""
+    """Return a value as text for a table: three digits if small, none if large."""
     if value is None:
         return ''
     if isinstance(value, float):

@@ -25,7 +25,7 @@ BALL, BALL_RADIUS_M = np.array([1.1, 0.0, 1.05]), 0.3
 
 
 def pose(number: int, of: int = 60) -> FloatArray:
-    """Return T_room_camera of one of so many stations on a circle, looking at the far side."""
+    """Return T_room_camera of one of several stations on a circle, looking at the far side."""
     angle = 2.0 * np.pi * number / of
     ahead = np.array([np.cos(angle), np.sin(angle), -0.25])
     ahead /= np.linalg.norm(ahead)
@@ -38,7 +38,7 @@ def pose(number: int, of: int = 60) -> FloatArray:
 
 
 def depth(T_room_camera: FloatArray) -> npt.NDArray[np.float32]:
-    """Return what the camera measures, (rows, columns) m along z, without noise."""
+    """Return the depth image of the camera, (rows, columns) m along z, without noise."""
     ahead = CAMERA.directions.astype(np.float64) @ T_room_camera[:3, :3].T
     start = T_room_camera[:3, 3]
     with np.errstate(divide='ignore', invalid='ignore'):

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What a scan costs in longer windows and larger maps, on one core.
+Cost of a scan in longer windows and larger maps, on one core.
 
-It should be the same. The maps that are compared take turns, scan by scan, so that whatever else
+It should be the same. The compared maps take turns, scan by scan, so that other work that
 the machine does hits all alike, and every other scan in the opposite order, so that none always
 finds the scan in the cache. ``ratio`` is between medians, the first being 1.
 
@@ -27,13 +27,13 @@ from test.bench.report import Row, spread
 from test.bench.street import Street
 
 FAR_INDEX = 20_000
-"""Where the voxels begin that only fill a map: far along x."""
+"""Start of the block of filler voxels, far along x."""
 
 BATCH = 10_000
 """So many are added at once: fewer than a scan has, for which the map keeps memory to reduce."""
 
 Figures = dict[int, list[float]]
-"""A figure a scan, by what is varied."""
+"""A figure a scan, by the varied quantity."""
 
 
 def run(options: Options) -> list[Row]:
@@ -97,7 +97,7 @@ def compared(
 
 
 def fill(surfel_map: SurfelMap, num_voxels: int) -> None:
-    """Add so many voxels of one point each, in a block far away."""
+    """Add a number of voxels of one point each, in a block far away."""
     side = int(np.ceil(num_voxels ** (1.0 / 3.0)))
     for start in range(0, num_voxels, BATCH):
         number = np.arange(start, min(start + BATCH, num_voxels))

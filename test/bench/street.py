@@ -29,7 +29,7 @@ from surfel_mapper.simulation.recording import cloud_bytes, SENSOR
 from test.bench.options import Options
 
 LENGTH_M = 600.0
-"""Of the street: room for 1200 scans, one every 0.5 m."""
+"""Length of the street: room for 1200 scans, one every 0.5 m."""
 
 NOISE_M = 0.02
 
@@ -56,7 +56,7 @@ class Street:
         return self.simulation.drive.T_odom_sensor(self.simulation.stamp_ns(number))
 
     def points(self, number: int) -> npt.NDArray[np.float32]:
-        """Return the points of a scan, (N, 3) in the sensor frame, m; nan where none returned."""
+        """Return the points of a scan, (N, 3) in the sensor frame, m; nan for missing returns."""
         path = self.path(number)
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,7 +70,7 @@ class Street:
         return self.directory / f'{number:05d}.npy'
 
     def prepare(self, num_scans: int) -> None:
-        """Simulate what is not there yet of the first so many scans."""
+        """Simulate the missing ones of the first ``number`` scans."""
         missing = [n for n in range(num_scans) if not self.path(n).exists()]
         if missing:
             print(f'simulating {len(missing)} scans into {self.directory}', file=sys.stderr)
@@ -78,7 +78,7 @@ class Street:
             self.points(number)
 
     def message(self, number: int) -> RawCloud:
-        """Return a scan as a PointCloud2; columns other than x y z are zero, nobody reads them."""
+        """Return a scan as a PointCloud2; columns other than x y z are zero and unread."""
         points = self.points(number)
         zeros = np.zeros(len(points), np.float32)
         columns = {'intensity': zeros, 'ring': zeros, 'time': zeros}
@@ -99,7 +99,7 @@ class Street:
 
     def drive(self, untimed: int, timed: int) -> Iterator[tuple[int, RawCloud, bool]]:
         """
-        Yield number, message and whether it counts, of so many scans each.
+        Yield number, message and whether it counts, of each run of scans.
 
         All that count are in memory before the first of them is yielded, and so are cold in the
         caches when their turn comes.

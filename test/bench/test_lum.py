@@ -23,7 +23,7 @@ def test_a_case_is_timed_and_aligned():
     case = Case('small', 5, chain(5, (1, 2), 7), 30, 4)
     clouds = points(case)
 
-    compute_ms, _ = ours(case, clouds)  # of so small a case, what an iteration adds is noise
+    compute_ms, _ = ours(case, clouds)  # in such a small case the time of an iteration is noise
     assert compute_ms > 0.0
 
     lum = LUM(max_iterations=case.iterations)

@@ -56,7 +56,7 @@ LEAST_F_SCORE = 0.5
 @dataclass(frozen=True, kw_only=True)
 class Case:
     """
-    What is fused, and what the mesh should be.
+    Input scans and the true mesh.
 
     Attributes
     ----------

@@ -40,7 +40,7 @@ from test.bench.report import Row
 from test.bench.street import Street
 
 LONGER = 4
-"""The drive has so many times the scans of other benches."""
+"""Scans of the drive, as a multiple of other benches."""
 
 DRIVES = 4
 """So many times it is mapped for the speed."""
@@ -50,7 +50,7 @@ RUNS = 2
 CONFIG = Config()
 
 BUDGET_RATIO = 1.6
-"""Two workers have to be so many times as fast as one process at least."""
+"""Least speed-up of two workers over one process."""
 
 STARTS = {
     'one process': 'from surfel_mapper.pipeline import Mapper\nMapper().warm_up()\nsay()',

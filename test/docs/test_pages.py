@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Pages are in the menu, links lead to files and headings, the reference covers what is public."""
+"""Pages are in the menu, links lead to files and headings, the reference covers public names."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_reference_has_every_name_that_pages_and_examples_import():
     for module, names in re.findall(r'from (surfel_mapper\.[\w.]+) import ([\w, ]+)', texts):
         for name in names.split(','):
             thing = getattr(import_module(module), name.strip())
-            home = getattr(thing, '__module__', module)  # constants do not know theirs
+            home = getattr(thing, '__module__', module)  # constants do not carry it
             if not {module, home, f'{home}.{name.strip()}'} & described:
                 missing.add(f'{home}.{name.strip()}')
     assert missing == set()

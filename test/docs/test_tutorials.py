@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Every tutorial is followed line by line, and prints what it shows.
+Every tutorial is followed line by line, and its output is as shown.
 
 ``pycon`` blocks are doctests that share one namespace. In ``console`` blocks lines after ``$ ``
-are commands of a shell, and the lines below are what they print: ``...`` stands for any text
+are commands of a shell, and the lines below are their output: ``...`` stands for any text
 within a line, and alone on a line for any lines.
 """
 
@@ -39,7 +39,7 @@ def pages(language):
 
 
 def pattern(shown):
-    """Return an expression for what a tutorial shows as printed."""
+    """Return an expression for the output that a tutorial shows."""
     parts = [
         '(?:.*\n)*' if line == '...' else '.*'.join(map(re.escape, line.split('...'))) + '\n'
         for line in shown

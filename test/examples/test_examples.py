@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Every example runs, as a process of its own, and what it prints is true.
+Every example runs as a process of its own, and its output is true.
 
 What they print is compared with the command line, with a second way to the same number, or with
-what a reader of the file it writes finds there.
+the content of the file it writes.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ EXAMPLES = ROOT / 'examples'
 
 
 def run(name, *arguments, folder):
-    """Run an example in a folder; return what it printed."""
+    """Run an example in a folder; return its output."""
     done = subprocess.run(
         [sys.executable, EXAMPLES / name, *map(str, arguments)],
         cwd=folder,
@@ -116,7 +116,7 @@ def test_equal_maps_compare_as_equal(street, tmp_path):
     assert printed == f'equal to the bit: {digest_of(street / "mapped")}\n'
 
 
-def test_what_came_and_went_between_two_maps_is_counted_and_written(tmp_path):
+def test_differences_between_two_maps_are_counted_and_written(tmp_path):
     rng = np.random.default_rng(2)
     before, after = SurfelMap(0.5), SurfelMap(0.5)
     stays, goes, comes = (rng.uniform(low, low + 0.5, (50, 3)) for low in (0.0, 2.0, 4.0))

@@ -41,7 +41,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run what the command line asks for."""
+    """Run the soaks of the command line."""
     args = parser().parse_args(arguments)
     beams, columns = SIZES[args.points]
     options = replace(Options(), scans=ROAD, beams=beams, columns=columns)

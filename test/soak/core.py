@@ -44,7 +44,7 @@ CONFIG = {
 
 def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
     """
-    Yield a row for every block of scans, until there were so many or the time is up.
+    Yield a row for every block of scans, up to a number of scans or a time.
 
     Raises
     ------

@@ -93,7 +93,7 @@ class Drive:
         return {item.key: item.value for item in self._reports[-1].status[0].values}
 
     def wait_for(self, num_mapped: int) -> None:
-        """Wait until so many scans are mapped."""
+        """Wait until ``number`` scans are mapped."""
         self.peer.spin_until(
             lambda: int(self.values()['scans.mapped']) >= num_mapped,
             STALL_S,
@@ -108,7 +108,7 @@ class Drive:
 
 def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) -> Iterator[Row]:
     """
-    Yield a row for every block of scans, until there were so many or the time is up.
+    Yield a row for every block of scans, up to a number of scans or a time.
 
     Raises
     ------

@@ -84,7 +84,7 @@ NORMAL_PEERS = (
         requires=SMALL_GICP,
     ),
 )
-"""Those whose normals are compared; a module has ``normals(points, support)``, (N, 3) each."""
+"""Peers whose normals are compared; a module has ``normals(points, support)``, (N, 3) each."""
 
 ODOMETRY_PEERS = (
     PeerSpec(
@@ -98,4 +98,4 @@ ODOMETRY_PEERS = (
         requires=SMALL_GICP,
     ),
 )
-"""Those that find poses; a module has ``Odometry(voxel_size_m)`` with ``register(points)``."""
+"""Peers that find poses; a module has ``Odometry(voxel_size_m)`` with ``register(points)``."""

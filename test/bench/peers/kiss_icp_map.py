@@ -20,7 +20,7 @@ class Peer:
         self._map = VoxelHashMap(voxel_size_m, MAX_RANGE_M, POINTS_A_VOXEL)
 
     def step(self, points, T_map_sensor):
-        """Add a scan and drop what is far from it."""
+        """Add a scan and drop points far from it."""
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         self._map.update(finite, T_map_sensor)
 

@@ -58,6 +58,6 @@ def tensor(key):
     """
     Return keys as the hash map takes them: as three indices.
 
-    Packed into one number they collide so much in its hash that a scan takes seconds.
+    Packed into one number they collide in its hash, and a scan takes seconds.
     """
     return core.Tensor.from_numpy(unpack(key))

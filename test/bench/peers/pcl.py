@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""PCL has no package for Python: small programs that time it are compiled, where that can be."""
+"""PCL has no package for Python: small programs that time it are compiled if possible."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ INCLUDE = ('/usr/include/pcl-1.13', '/usr/include/eigen3')
 
 
 def compiled(name: str, libraries: Sequence[str], options: Options) -> Path | None:
-    """Return the program made of a source beside this file; None where it cannot be compiled."""
+    """Return the program compiled from a source beside this file; None if that fails."""
     compiler = shutil.which('g++')
     if compiler is None:
         return None

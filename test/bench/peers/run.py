@@ -68,7 +68,7 @@ def run_normals(
     python: str | Path, peer: PeerSpec, points: npt.NDArray[np.float64], support: int
 ) -> npt.NDArray[np.float64]:
     """
-    Return the normals of points, (N, 3), from so many nearest neighbours.
+    Return the normals of points, (N, 3), from ``support`` nearest neighbours.
 
     Raises
     ------
@@ -155,7 +155,7 @@ def interpreter(version: str) -> str:
 
 
 def output(command: list[str], **settings: Any) -> str:
-    """Return what a process wrote to stdout, or raise PeerError."""
+    """Return the stdout of a process, or raise PeerError."""
     done: subprocess.CompletedProcess[str] = subprocess.run(
         command, capture_output=True, text=True, check=False, **settings
     )

@@ -9,7 +9,7 @@ import small_gicp
 from test.bench.peers import small_gicp_means
 
 NEIGHBOURS = 10
-"""What small_gicp takes when it prepares a cloud for registration."""
+"""Time of small_gicp to prepare a cloud for registration."""
 
 
 class Peer(small_gicp_means.Peer):

@@ -15,7 +15,7 @@ class Peer:
         self._volume = VDBVolume(job['voxel_size_m'], job['truncation_m'], job['carve'])
 
     def prepared(self, data, pose):
-        """Return finite points in the map frame: what it takes, so that this costs it nothing."""
+        """Return finite points in the map frame, prepared outside the timed part."""
         points = data[np.isfinite(data).all(axis=1)].astype(np.float64)
         return points @ pose[:3, :3].T + pose[:3, 3]
 
