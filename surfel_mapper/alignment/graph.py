@@ -11,6 +11,7 @@ sums over the pairs of an edge are computed only once.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -178,7 +179,8 @@ def _points(vertex: int, points: npt.ArrayLike) -> Points:
         )
     if not len(array):
         raise AlignmentError(f'vertex {vertex}: no points')
-    copy = np.array(array, np.float32 if array.dtype == np.float32 else np.float64, order='C')
+    dtype: Any = np.float32 if array.dtype == np.float32 else np.float64
+    copy: Points = np.array(array, dtype, order='C')
     copy.setflags(write=False)
     return copy
 

@@ -140,7 +140,8 @@ def pcl_step(poses: Floats, ends: Ints, terms: EdgeTerms) -> Floats:
         raise AlignmentError(
             "a pose has a pitch of 90 deg, where PCL's Jacobian is singular; use jacobian='exact'"
         ) from None
-    return poses - np.where(free[:, None], change, 0.0)
+    moved: npt.NDArray[np.float64] = poses - np.where(free[:, None], change, 0.0)
+    return moved
 
 
 def _used(ends: Ints, terms: EdgeTerms) -> Ints:

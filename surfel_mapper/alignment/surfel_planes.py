@@ -78,8 +78,8 @@ class SurfelPlanes:
         self._min_points = min_points
         self._noise_sq = noise_m * noise_m
         self._scale = (1 << (BITS + surfel_map.level)) / surfel_map.voxel_size_m
-        self._number = np.empty(0, np.int32)
-        self._planes = np.empty((0, PLANE))
+        self._number: npt.NDArray[np.int32] = np.empty(0, np.int32)
+        self._planes: npt.NDArray[np.float64] = np.empty((0, PLANE))
 
     def equations(
         self, cells: npt.NDArray[np.float64], T_map_sensor: Transform, width_m: float

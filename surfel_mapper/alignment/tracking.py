@@ -68,7 +68,7 @@ class Tracker:
     def restart(self, T_fixed_body: Transform) -> None:
         """Continue from a pose, at rest."""
         self.pose = T_fixed_body
-        self.twist = np.zeros(6)
+        self.twist: npt.NDArray[np.float64] = np.zeros(6)
         self._stamp_ns: int | None = None
         self._clear_history()
 

@@ -84,7 +84,9 @@ def channel_columns(surfels: Surfels) -> dict[str, npt.NDArray[Any]]:
     columns: dict[str, npt.NDArray[Any]] = {}
     for name, values in surfels.channels.items():
         is_colour = name != 'intensity'
-        columns[name] = np.rint(values).astype(np.uint8) if is_colour else np.float32(values)
+        columns[name] = (
+            np.rint(values).astype(np.uint8) if is_colour else values.astype(np.float32)
+        )
     return columns
 
 

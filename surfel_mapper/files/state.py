@@ -43,6 +43,9 @@ NPY_HEADER_BYTES = 12000
 ENCRYPTED = 1
 """Bit of a zip member's flags."""
 
+npy: Any = np.lib.format
+"""Typed in recent versions of numpy only."""
+
 Arrays = Mapping[str, npt.NDArray[Any]]
 
 
@@ -105,7 +108,7 @@ def write_archive(
         archive.writestr(zipfile.ZipInfo(MANIFEST), text, compress_type, compresslevel=1)
         for name, array in arrays.items():
             content = io.BytesIO()
-            np.lib.format.write_array(content, array, allow_pickle=False)
+            npy.write_array(content, array, allow_pickle=False)
             info = zipfile.ZipInfo(f'{name}.npy')  # without a date, so that bytes are equal
             archive.writestr(info, content.getbuffer(), compress_type, compresslevel=1)
         return sum(info.file_size for info in archive.infolist())
@@ -194,9 +197,9 @@ def read_array(
     """Return one array; raise ValueError if type or shape differ from its entry."""
     content = read_bytes(archive, info)
     stream = io.BytesIO(content[:NPY_HEADER_BYTES])
-    if np.lib.format.read_magic(stream) != (1, 0):
+    if npy.read_magic(stream) != (1, 0):
         raise ValueError(f'{info.filename}: no array as expected')
-    shape, fortran_order, dtype = np.lib.format.read_array_header_1_0(stream)
+    shape, fortran_order, dtype = npy.read_array_header_1_0(stream)
     if fortran_order or dtype.str != entry['dtype'] or list(shape) != entry['shape']:
         raise ValueError(f'{info.filename}: {dtype.str} {shape}, expected {entry}')
     if not is_array_type(dtype.str):

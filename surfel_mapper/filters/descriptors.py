@@ -158,7 +158,9 @@ def unit(vectors: Array) -> Array:
     vectors = vectors.astype(np.float64)
     length = np.sqrt(dot(vectors, vectors))[:, None]
     has_length = (length > 0.0) & np.isfinite(length)
-    return np.divide(vectors, length, out=np.full_like(vectors, np.nan), where=has_length)
+    result = np.full_like(vectors, np.nan)
+    np.divide(vectors, length, out=result, where=has_length)
+    return result
 
 
 @register(libpointmatcher='SphericalityDataPointsFilter')

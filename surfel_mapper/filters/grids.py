@@ -153,7 +153,7 @@ class ScanVoxels:
         """Return keys, sums of x y z with counts, and the points of each voxel."""
         number = len(points)
         keys, first = np.empty((2, number), np.int64)
-        sums = np.empty((number, 4))
+        sums: npt.NDArray[np.float64] = np.empty((number, 4))
         rows = np.empty(number if with_rows else 0, np.int32)
         found = group_points(
             points.T, self.size, self.shift, self.base, self.bits, keys, sums, first, rows
@@ -238,7 +238,7 @@ def leaves(points: Points, max_points: int, max_size_m: float) -> tuple[Ids, int
     order = np.argsort(path, kind='stable')
     path = path[order]
     starts = np.zeros(len(path), np.bool_)  # whether a leaf starts here in the sorted points
-    open_ = np.arange(len(path))  # points not assigned to a leaf yet
+    open_: npt.NDArray[np.int64] = np.arange(len(path))  # points not assigned to a leaf yet
     for level in range(LEVELS + 1):
         cube = path[open_] >> np.int64(3 * (LEVELS - level))
         first = np.flatnonzero(np.diff(cube, prepend=-1))

@@ -246,7 +246,7 @@ class SpectralDecomposition(VotingFilter):
     def apply(self, scan: Scan) -> Scan:
         """Return the points that stay, with the columns."""
         points, random = coordinates(scan), generator(scan, self.seed)
-        rows = np.arange(len(points))
+        rows: npt.NDArray[np.int64] = np.arange(len(points))
         voting, votes = self.vote(points)
         for _ in range(self.max_iterations):
             if len(rows) <= self.num_neighbours:

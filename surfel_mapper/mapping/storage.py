@@ -109,9 +109,9 @@ class HashTable:
     def __init__(self, max_depth: int) -> None:
         self._max_depth = max_depth
         self._buckets = Slab(1, hashing.SEGMENT)
-        self._directory = np.zeros(1, np.int32)
-        self._held = np.zeros(1, np.int32)
-        self._local_depth = np.zeros(1, np.int8)
+        self._directory: npt.NDArray[np.int32] = np.zeros(1, np.int32)
+        self._held: npt.NDArray[np.int32] = np.zeros(1, np.int32)
+        self._local_depth: npt.NDArray[np.int8] = np.zeros(1, np.int8)
         self.state = np.zeros(hashing.STATE, np.int64)
         self.state[hashing.FREE_ROW] = -1
         self.state[hashing.SEGMENTS] = 1

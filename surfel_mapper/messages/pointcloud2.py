@@ -380,7 +380,9 @@ def append_fields(
     """
     height, width, step = int(msg.height), int(msg.width), int(msg.point_step)
     data = np.frombuffer(msg.data, np.uint8)
-    points = np.ndarray((height, width), f'V{step}', data, 0, (int(msg.row_step), step))
+    points: npt.NDArray[Any] = np.ndarray(
+        (height, width), f'V{step}', data, 0, (int(msg.row_step), step)
+    )
     offset = -(-step // WORD_BYTES) * WORD_BYTES
     added = f'V{words.shape[1] * WORD_BYTES}'
     layout = np.dtype(

@@ -246,7 +246,7 @@ def across(normals: Array) -> tuple[Array, Array]:
     helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
     x = np.cross(helper, normals)
     x /= np.linalg.norm(x, axis=1, keepdims=True)
-    return x, np.cross(normals, x)
+    return x, np.asarray(np.cross(normals, x), np.float64)
 
 
 def above(surfels: Surfels) -> Array:

@@ -51,7 +51,7 @@ class MovedAway:
     def clear(self) -> None:
         """Forget all counts."""
         self._keys = np.empty(0, np.int64)
-        self._counts = np.empty(0, np.int64)
+        self._counts: Keys = np.empty(0, np.int64)
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""

@@ -83,4 +83,5 @@ def removed_voxels(
     if alignment is None:
         return np.concatenate(fallen)
     gone = np.unique(np.concatenate([*fallen, alignment.removed_voxel_index]), axis=0)
-    return gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
+    left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
+    return left

@@ -93,7 +93,7 @@ class Outputs:
         self._markers = node.create_publisher(MarkerArray, '~/markers', LATCHED)
         self._grid = node.create_publisher(OccupancyGrid, '~/grid', LATCHED)
         self._stamp_ns = 0
-        self._center = np.zeros(2)
+        self._center: npt.NDArray[np.float64] = np.zeros(2)
         # an empty map is published too: it replaces the latched one of a node that was killed
         self._published: dict[Any, int] = {}
         self._timers: list[Timer] = []

@@ -76,5 +76,6 @@ def rays_of_beams(
 def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
     """Return complex numbers of length 1, and 0 where there is none."""
     length = np.abs(numbers)
-    result = np.zeros_like(numbers)
-    return np.divide(numbers, length, out=result, where=length > 0.0)
+    result: npt.NDArray[np.complex128] = np.zeros_like(numbers)
+    np.divide(numbers, length, out=result, where=length > 0.0)
+    return result

@@ -89,7 +89,7 @@ class Street:
         """Yield the slabs of a pavement."""
         near, far = PAVEMENT_Y_M
         slab = 24.0
-        for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, slab):
+        for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, slab).tolist():
             size = (slab + 0.5, far - near, 1.0)
             centre = (x + slab / 2.0, side * (near + far) / 2.0, PAVEMENT_HEIGHT_M - 0.5)
             turn = (self._about(0.0, 0.4), self._about(0.0, 0.1), self._about(0.0, 0.2))
@@ -118,7 +118,7 @@ class Street:
 
     def cars(self, side: int) -> Iterator[Primitive]:
         """Yield parked cars: a body and a cabin with the same rotation."""
-        for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, 7.0):
+        for x in np.arange(-BEYOND_M, self._length_m + BEYOND_M, 7.0).tolist():
             if self._rng.random() < 0.4:
                 continue
             length, height = self._rng.uniform(3.6, 4.8), self._rng.uniform(0.8, 1.1)
@@ -133,7 +133,7 @@ class Street:
         """Yield lamps, trees and bins on the pavement, in turn."""
         kinds = (self._lamp, self._tree, self._bin, self._tree)
         places = np.arange(-BEYOND_M, self._length_m + BEYOND_M, 5.5)
-        for number, x in enumerate(places):
+        for number, x in enumerate(places.tolist()):
             if self._rng.random() < 0.75:
                 at = x + self._about(0.0, 0.8), side * self._about(6.6, 0.3)
                 yield from kinds[number % len(kinds)](*at)

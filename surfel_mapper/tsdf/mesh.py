@@ -161,7 +161,7 @@ class Mesher:
         march(neighbours, index, side, blocks.field, limits, ends - counts, edges, places)
 
         block = np.repeat(np.arange(len(rows)), 3 * counts)
-        flat = edges.reshape(-1, 4)
+        flat: npt.NDArray[np.int64] = edges.reshape(-1, 4)
         inner = flat[:, :3] - index[block] * side
         number = np.ravel_multi_index(
             (block, *inner.T, flat[:, 3]), (len(rows), side + 1, side + 1, side + 1, 3)

@@ -311,7 +311,8 @@ class LidarModel:
         if self.beam_elevations_deg:
             return np.deg2rad(self.beam_elevations_deg)
         top = self.vertical_fov_top_deg
-        return np.deg2rad(np.linspace(top, top - self.vertical_fov_deg, self.rows))
+        beams = np.linspace(top, top - self.vertical_fov_deg, self.rows, dtype=np.float64)
+        return np.asarray(np.deg2rad(beams), np.float64)
 
     @cached_property
     def elevations(self) -> Float32:

@@ -67,7 +67,8 @@ def merged(mesh: Mesh, cell_m: float) -> Mesh:
 
     def mean(values: npt.NDArray[Any]) -> npt.NDArray[np.float64]:
         sums = [np.bincount(place, column, len(count)) for column in values.T]
-        return np.stack(sums, axis=1) / count[:, None]
+        means: npt.NDArray[np.float64] = np.stack(sums, axis=1) / count[:, None]
+        return means
 
     colors = mesh.colors
     if len(colors):

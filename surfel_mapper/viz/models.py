@@ -104,14 +104,14 @@ def models_mesh(shapes: Sequence[PatchShape], gaussians: Gaussians | None = None
     vertices, faces = [shape.vertices for shape in shapes], [shape.faces for shape in shapes]
     colors = [*primitive_colors([shape.patch.id for shape in shapes])]
     if gaussians is not None:
-        begins = len(CORNERS) * np.arange(len(gaussians))
+        begins: npt.NDArray[np.int64] = len(CORNERS) * np.arange(len(gaussians))
         vertices.append(ellipsoid_corners(gaussians).reshape(-1, 3))
         faces.append((FACES + begins[:, None, None]).reshape(-1, 3))
         colors.append(np.array(GREY))
     if not vertices:
         return EMPTY
-    begins = np.cumsum([0, *map(len, vertices)])[:-1]
-    moved = [part + begin for part, begin in zip(faces, begins, strict=True)]
+    starts = np.cumsum([0, *map(len, vertices)])[:-1]
+    moved = [part + begin for part, begin in zip(faces, starts, strict=True)]
     painted = np.repeat(np.array(colors), [len(part) for part in vertices], axis=0)
     return Mesh(
         vertices=np.concatenate(vertices),
