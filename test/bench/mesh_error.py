@@ -16,7 +16,7 @@ FloatArray = npt.NDArray[np.float64]
 MAX_SAMPLES = 400_000
 
 NEAREST = 4
-"""A true point is held against the triangles of so many of the samples nearest to it."""
+"""Number of nearest samples whose triangles are compared with a true point."""
 
 
 def mesh_error(
