@@ -19,8 +19,7 @@ import numpy as np
 
 from surfel_mapper.config import GridConfig
 from surfel_mapper.files.map_state import load_map
-from surfel_mapper.mapping.cost_grid import CostGrid
-from surfel_mapper.mapping.traversability import traversability
+from surfel_mapper.layers.costs.traversability import CostGrid, traversability
 
 UNKNOWN = 255
 """What the map server's mode raw takes as not known: anything above 100."""

@@ -26,11 +26,11 @@ STAGES = (
     'register',
     'reduce',
     'insert',
-    'clear',
+    'dynamic',
     'align',
-    'normals',
     'tsdf',
     'models',
+    'normals',
     'total',
 )
 """Timed stages in the order of a scan; ``total`` is all but decoding."""
@@ -65,8 +65,8 @@ class Counters:
         without being added.
     evicted : Counter of str
         Scans evicted from the map, by the limit exceeded.
-    cleared_voxels : int
-        Voxels emptied because scans saw through them.
+    voxels_cleared : Counter of str
+        Voxels that layers have cleared, by layer.
     resets : int
         Number of times that the map was cleared because time went back.
     dropped : Counter of str
@@ -90,10 +90,10 @@ class Counters:
     mapped: int = 0
     gated: int = 0
     localised: int = 0
-    cleared_voxels: int = 0
     resets: int = 0
     points: int = 0
     evicted: Counter[str] = field(default_factory=Counter)
+    voxels_cleared: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
     dropped_by_frame: dict[str, Counter[str]] = field(default_factory=dict)
     points_left_out: Counter[str] = field(default_factory=Counter)
@@ -149,7 +149,7 @@ class Counters:
                 'dropped': dict(self.dropped),
                 'dropped_by_frame': {k: dict(v) for k, v in self.dropped_by_frame.items()},
             },
-            'cleared_voxels': self.cleared_voxels,
+            'voxels_cleared': dict(self.voxels_cleared),
             'resets': self.resets,
             'points': self.points,
             'points_left_out': dict(self.points_left_out),

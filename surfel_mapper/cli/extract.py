@@ -73,8 +73,10 @@ def run(args: argparse.Namespace) -> int:
     """Fit, write the files, report."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.model_files import write_models
+    from surfel_mapper.layers.drawings import PointsPicture
+    from surfel_mapper.layers.models.pictures import panels_of
     from surfel_mapper.models import evaluate, fit
-    from surfel_mapper.viz.models import draw_models
+    from surfel_mapper.viz.drawings import draw_points
 
     points, voxel_size_m, viewpoint = read(args)
     config = ModelsConfig(
@@ -86,7 +88,10 @@ def run(args: argparse.Namespace) -> int:
     model = fit(points, config, viewpoint)
     args.output.mkdir(parents=True, exist_ok=True)
     write_models(args.output, model, args.formats)
-    draw_models(args.output / 'models.png', points, model, viewpoint)
+    picture = PointsPicture(
+        file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
+    )
+    draw_points(args.output / picture.file_name, picture)
     content = figures(model, evaluate(model, points), len(points))
     print(json.dumps(content) if args.json else report(content))
     return 0

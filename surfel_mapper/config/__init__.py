@@ -15,8 +15,10 @@ from surfel_mapper.config.configuration import (
     Config,
     declarations,
     load_config,
+    register_stage,
     settings_table,
     stage_fields,
+    unregister_stage,
     yaml_value,
 )
 from surfel_mapper.config.layers import (
@@ -89,6 +91,8 @@ __all__ = [
     'setting',
     'settings_of',
     'settings_table',
+    'register_stage',
     'stage_fields',
+    'unregister_stage',
     'yaml_value',
 ]

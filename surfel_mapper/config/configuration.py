@@ -7,6 +7,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 import dataclasses
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
 import json
 from pathlib import Path
 from typing import Any
@@ -25,6 +27,7 @@ from surfel_mapper.config.settings import (
     near,
     setting,
     settings_of,
+    Stage,
     stage_name,
 )
 from surfel_mapper.config.stages import (
@@ -41,6 +44,12 @@ from surfel_mapper.config.stages import (
 )
 from surfel_mapper.config.yaml_files import read_yaml
 from surfel_mapper.errors import ConfigError
+
+LAYERS = 'surfel_mapper.layers'
+"""Group of the entry points by which other packages add layers, and the stages of these."""
+
+_LAYER_STAGES: dict[str, type[Stage]] = {}
+"""Stages of layers of other packages, by name."""
 
 LARGE = 1e6
 """Upper bounds from here on only keep numbers representable; the table leaves them out."""
@@ -66,6 +75,9 @@ class Config:
     dynamic: DynamicConfig = field(default_factory=DynamicConfig)
     clear: ClearConfig = field(default_factory=ClearConfig)
     diagnostics: DiagnosticsConfig = field(default_factory=DiagnosticsConfig)
+    more: Mapping[str, Stage] = field(default_factory=dict)
+    """Stages of layers of other packages, by name; see ``stage``."""
+
     filters: str = setting(
         '',
         'YAML file of the chain of filters applied to every scan before mapping; empty: none.',
@@ -119,16 +131,22 @@ class Config:
             part.name: part.default_factory(**stages.get(stage, {}))  # type: ignore[operator]
             for stage, part in stage_fields().items()
         }
-        return cls(**made, **of_no_stage)
+        more = {name: stage(**stages.get(name, {})) for name, stage in layer_stages().items()}
+        return cls(**made, **of_no_stage, more=more)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
         places: dict[str, Any] = {'': self}
         places.update((stage, getattr(self, f.name)) for stage, f in stage_fields().items())
+        places.update((stage, self.stage(stage)) for stage in layer_stages())
         return {
             declared.name: getattr(places[declared.stage], declared.key)
             for declared in declarations()
         }
+
+    def stage(self, name: str) -> Any:
+        """Return the stage of a layer of another package, by its name: ``layers.heights``."""
+        return self.more[name] if name in self.more else layer_stages()[name]()
 
     def replace(self, mapping: Mapping[str, Any]) -> Config:
         """Return a copy with some settings changed; see from_mapping."""
@@ -140,8 +158,55 @@ def stage_fields() -> dict[str, dataclasses.Field[Any]]:
     return {
         stage_name(stage.default_factory): stage  # type: ignore[arg-type]
         for stage in dataclasses.fields(Config)
-        if 'meaning' not in stage.metadata
+        if 'meaning' not in stage.metadata and stage.name != 'more'
     }
+
+
+def register_stage(stage: type[Stage]) -> type[Stage]:
+    """
+    Add the stage of a layer of another package to the configuration; a class decorator.
+
+    Raises
+    ------
+    ConfigError
+        If another stage has the name.
+
+    """
+    name = stage_name(stage)
+    other = _LAYER_STAGES.setdefault(name, stage)
+    if name in stage_fields() or other.__qualname__ != stage.__qualname__:
+        raise ConfigError(f'stage {name!r} of {stage.__module__}: another stage has this name')
+    _LAYER_STAGES[name] = stage
+    return stage
+
+
+def unregister_stage(stage: type[Stage]) -> None:
+    """Remove a stage that was registered."""
+    del _LAYER_STAGES[stage_name(stage)]
+
+
+def layer_stages() -> dict[str, type[Stage]]:
+    """Return the stages of layers of other packages, by name; loads those packages first."""
+    load_layer_packages()
+    return _LAYER_STAGES
+
+
+@cache
+def load_layer_packages() -> None:
+    """
+    Load the packages that add layers: they register them, and their stages.
+
+    Raises
+    ------
+    ConfigError
+        If a package cannot be loaded.
+
+    """
+    for point in entry_points(group=LAYERS):
+        try:
+            point.load()
+        except Exception as error:  # whatever the package raises
+            raise ConfigError(f'layer {point.name} of {point.value}: {error}') from error
 
 
 def declarations() -> list[Declaration]:
@@ -149,6 +214,8 @@ def declarations() -> list[Declaration]:
     rows = []
     for stage, holder in stage_fields().items():
         rows += settings_of(holder.default_factory, stage)  # type: ignore[arg-type]
+    for stage, cls in layer_stages().items():
+        rows += settings_of(cls, stage)
     return rows + settings_of(Config)
 
 

@@ -1,3 +1,26 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Optional parts beside the surfel map, each in a folder of its own."""
+"""Layers: representations beside the surfels that follow the scans, behind one protocol."""
+
+from surfel_mapper.layers.layer import (
+    Images,
+    InsertedScan,
+    Layer,
+    Moment,
+    Publication,
+    Surroundings,
+)
+from surfel_mapper.layers.registry import enabled, names, register, unregister
+
+__all__ = [
+    'Images',
+    'InsertedScan',
+    'Layer',
+    'Moment',
+    'Publication',
+    'Surroundings',
+    'enabled',
+    'names',
+    'register',
+    'unregister',
+]

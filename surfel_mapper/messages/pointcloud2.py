@@ -31,7 +31,9 @@ from surfel_mapper.messages.cdr import (
     frame_name,
     Header,
     MessageReader,
+    MessageWriter,
     read_header,
+    write_header,
 )
 from surfel_mapper.scan import Scan
 
@@ -276,6 +278,23 @@ def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:
         data=points.view(np.uint8),
         is_dense=all(np.isfinite(values).all() for values in arrays.values()),
     )
+
+
+def cloud_bytes(cloud: CloudBytes, *, stamp_ns: int, frame_id: str) -> bytes:
+    """Return the serialised sensor_msgs/PointCloud2 of a cloud."""
+    writer = MessageWriter()
+    write_header(writer, stamp_ns, frame_id)
+    writer.numbers('I', cloud.height, cloud.width, len(cloud.fields))
+    for member in cloud.fields:
+        writer.string(member.name)
+        writer.numbers('I', member.offset)
+        writer.numbers('B', member.datatype)
+        writer.numbers('I', member.count)
+    writer.numbers('?', cloud.is_bigendian)
+    writer.numbers('I', cloud.point_step, cloud.row_step)
+    writer.sequence(cloud.data, 'u1')
+    writer.numbers('?', cloud.is_dense)
+    return writer.join()
 
 
 def field_of(name: str, layout: np.dtype[Any]) -> Field:

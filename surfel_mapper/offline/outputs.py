@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from surfel_mapper.models.live import LiveModels
     from surfel_mapper.pipeline import Mapper, Update
     from surfel_mapper.viz.history import History
 
@@ -39,8 +38,6 @@ FORMATS = {
     BAG: 'normals',
 }
 """File of each format in the output directory; npz and parquet are exact, to be loaded again."""
-
-MODELS_PICTURE = 'models.png'
 
 
 def output_directory(recording: Path, wanted: Path | None) -> Path:
@@ -136,26 +133,24 @@ def write_files(
 
     """
     from surfel_mapper.files.atomic import write_json
-    from surfel_mapper.files.ply import write_mesh
-    from surfel_mapper.models.shapes import Shapes
-    from surfel_mapper.viz.models import models_section, page_mesh
+    from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper)
-    layers, sections = {}, []
-    if mapper.tsdf is not None:
-        mapper.tsdf.finish(mapper.window)
-        layers['mesh'] = mapper.tsdf.mesh()
-        write_mesh(output / 'mesh.ply', layers['mesh'])
-    if mapper.models is not None:
-        write_live_models(output, formats, mapper.models)
-        model = mapper.models.model
-        shapes = Shapes().of(model, mapper.models.versions)
-        layers['models'] = page_mesh(shapes, model.gaussians)
-        sections.append(models_section(model, shapes, output / MODELS_PICTURE))
+    meshes, sections = {}, []
+    for layer in mapper.layers.values():
+        layer.write(output, formats)
+        meshes.update(page_meshes(layer.drawings()))
+        section = layer.section()
+        if section is not None:
+            drawn = None
+            if section.picture is not None:
+                drawn = output / section.picture.file_name
+                draw_points(drawn, section.picture)
+            sections.append(section_html(section, drawn))
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (
@@ -164,7 +159,7 @@ def write_files(
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
     draw_map(surfels, picture, title, trajectory=trajectory.positions)
-    write_report(page, title, summary, surfels, history, picture, layers, sections)
+    write_report(page, title, summary, surfels, history, picture, meshes, sections)
     write_json(figures, summary)
     return [*(output / FORMATS[name] for name in formats), picture, page, figures]
 
@@ -182,17 +177,3 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
         parquet.write_map(path, mapper.map)
     elif name == 'npz':
         map_state.save_map(path, mapper.map, mapper.window)
-
-
-def write_live_models(output: Path, formats: Sequence[str], models: LiveModels) -> None:
-    """Write models as JSON, OBJ and further formats that were asked for, and their picture."""
-    from surfel_mapper.files.model_files import write_models
-    from surfel_mapper.models.fitting import above, surfel_points
-    from surfel_mapper.viz.models import draw_models
-
-    wanted = ['json', 'obj', *(name for name in ('parquet', DXF) if name in formats)]
-    write_models(output, models.model, wanted, models.versions)
-    surfels = models.surfels
-    points = surfel_points(surfels, models.model.voxel_size_m)
-    title = f'{len(surfels)} voxels'
-    draw_models(output / MODELS_PICTURE, points, models.model, above(surfels), title)

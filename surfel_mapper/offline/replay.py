@@ -174,8 +174,7 @@ def replay(
             replay_s = time.perf_counter() - start_s
             refuse_empty(recording, mapper, was_stopped)
             aligned = {'alignment': mapper.align().summary()} if options.align else {}
-            if mapper.models is not None:
-                mapper.models.update()  # they follow at their own period, not after alignment
+            mapper.finish_layers()
             trajectory.follow_alignment(mapper)
         summary = {
             **recording.describe(),

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What is left out: every drop is counted by cause and frame; the log hears of it now and then.
+Drops: scans and messages that are not used are counted by cause and frame, and logged.
 
-A bad cable drops ten scans a second for hours; a line a second for each cause is enough to see
-it, and the counts tell the rest.
+A bad cable drops ten scans a second for hours; the log gets one line a second for each cause, the
+counters get every drop.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from surfel_mapper.scan import Scan
 _log = logging.getLogger(__name__)
 
 WARN_EVERY_S = 1.0
-"""A warning of one cause is logged at most this often; all are counted."""
+"""Shortest time between two warnings of one cause, s; every drop is counted."""
 
 REMEDIES = {
     'bad_cloud': 'the log says what is wrong with them',
@@ -28,43 +28,44 @@ REMEDIES = {
     'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',
     'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, '
-    'and its stamps with theirs; a sensor that no transform places needs frames.base_to_sensor; '
+    'and their stamps; a sensor that no transform places needs frames.base_to_sensor; '
     'pose.max_wait_s waits longer',
     'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
     'stamp_back': 'do two sensors share one frame?',
-    'stamp_repeated': 'does somebody publish the same clouds twice?',
-    'too_many_frames': 'give every sensor one frame for good',
+    'stamp_repeated': 'is the same cloud published twice?',
+    'too_many_frames': 'give every sensor a frame that does not change',
 }
-"""What to do about scans that are dropped, by cause."""
+"""Remedy by cause of a drop, for the log."""
 
 
 class Drops:
     """
-    Counts what is left out into the counters of a pipeline, and warns about it.
+    Counts drops into the counters of a pipeline, and warns about them.
 
     Attributes
     ----------
+    counters : Counters
+        The counters.
     is_silent : bool
-        Whether it only counts.
+        Count without warnings.
     topics : dict of str to str
-        Where the scans of a frame come from, for the log.
+        Topic of the scans of each frame, for the log.
 
     """
 
     is_silent = False
 
     def __init__(self, counters: Counters) -> None:
-        """Count into these counters."""
+        self.counters = counters
         self.topics: dict[str, str] = {}
-        self._counters = counters
         self._warned_s: dict[str, float] = {}
 
     def scan(self, scan: Scan, cause: str, reason: str) -> None:
         """Count a scan as dropped for a cause."""
-        counters = self._counters
+        counters = self.counters
         counters.drop(cause, scan.frame_id)
         topic, remedy = self.topics.get(scan.frame_id), REMEDIES.get(cause)
         self.warn(
@@ -76,8 +77,8 @@ class Drops:
         )
 
     def message(self, cause: str, reason: str, number: int = 1) -> None:
-        """Count messages that are no scans as not used for a cause."""
-        self._counters.messages_ignored[cause] += number
+        """Count messages other than scans as ignored for a cause."""
+        self.counters.messages_ignored[cause] += number
         self.warn(cause, reason)
 
     def warn(self, cause: str, message: str) -> None:

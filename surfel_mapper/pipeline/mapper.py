@@ -8,8 +8,8 @@ map is the same to the bit. Time is the stamps of the data alone, never the cloc
 for its pose until newer data is more than ``pose.max_wait_s`` ahead of it, which a bag replayed
 at any speed does alike.
 
-(Longer than other files: most of it is the description of what users call. The work is done in
-scan_queue, posed_scans, inserter and what these lead to.)
+The module is long because it describes the whole interface; the stages are in scan_queue and
+inserter, and in the modules that these call.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 import logging
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -27,13 +27,13 @@ from surfel_mapper.counters import Counters
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
+from surfel_mapper.layers import names as layer_names
 from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.inserter import Inserter
-from surfel_mapper.pipeline.posed_scans import PosedScans
+from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
@@ -55,6 +55,22 @@ class Mapper:
     config : Config, optional
         All settings; the defaults without it.
 
+    Attributes
+    ----------
+    config : Config
+        The settings now; see ``reconfigure``.
+    map : SurfelMap
+        The map; changed by this class alone.
+    window : SlidingWindow
+        The scans that the map holds.
+    layers : mapping of str to Layer
+        The layers that are switched on, by name. What a layer offers to users is also an
+        attribute of its name, None if it is switched off: ``mapper.tsdf``, ``mapper.models``.
+    transforms : TransformBuffer
+        The tree of frames.
+    counters : Counters
+        Scans used and dropped, and times by stage.
+
     Raises
     ------
     ConfigError
@@ -63,22 +79,27 @@ class Mapper:
     """
 
     def __init__(self, config: Config | None = None) -> None:
-        """Make an empty map with the settings of a configuration."""
         self.config = config or Config()
         self.counters = Counters()
         self._drops = Drops(self.counters)
-        self._queue = ScanQueue(self.config.pose.max_waiting_scans, self._drops)
         self._poses = ScanPoses(self.config, self._drops)
-        self._inserter = Inserter(self.config, self._poses, self.counters, self._drops)
-        images = self._inserter.preparation.images
-        self._posed = PosedScans(self.config, self._queue, self._poses, images, self._drops)
+        self._inserter = Inserter(self.config, self._poses, self._drops)
+        self._queue = ScanQueue(
+            self.config.pose.max_waiting_scans, self._poses, self._inserter.images, self._drops
+        )
         self.transforms = self._poses.transforms
         self.registered = self._poses.registered
         self.map = self._inserter.map
         self.window = self._inserter.window
-        self.tsdf = self._inserter.tsdf
-        layer = self._inserter.models
-        self.models = layer.models if layer else None
+        self.layers = self._inserter.layers.by_name
+
+    if not TYPE_CHECKING:  # names that mypy shall not take for granted
+
+        def __getattr__(self, name: str) -> Any:
+            """Return what a layer offers, None if it is switched off: ``mapper.tsdf``."""
+            if name in layer_names():
+                return self.layers[name].public if name in self.layers else None
+            raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
 
     @property
     def chain(self) -> Chain:
@@ -103,13 +124,13 @@ class Mapper:
         parent, child : str
             Names of the frames; the pose takes points of the child to the parent.
         stamp_ns : int
-            Its time; has no meaning where it is static.
+            Its time; ignored for a static pose.
         xyz : (3,) float, m
             Position of the child in the parent.
         q_xyzw : (4,) float
             Its orientation, a unit quaternion.
         static : bool
-            Whether it holds for all time.
+            The pose holds for all time.
 
         """
         self._poses.add(parent, child, stamp_ns, xyz, q_xyzw, static=static)
@@ -143,7 +164,7 @@ class Mapper:
             self._queue.push(timed)
 
     def _timed(self, scan: Scan) -> Scan | None:
-        """Return a scan with the times that deskewing needs; None where it has none."""
+        """Return a scan with the times that deskewing needs; None if it has none."""
         settings = self.config.deskew
         if not settings.enabled:
             return scan
@@ -158,20 +179,20 @@ class Mapper:
         self, cause: str, topic: str, reason: str, number: int = 1, frame_id: str = ''
     ) -> None:
         """
-        Count clouds that came in but never became scans: damaged, too many, unwanted.
+        Count clouds that were received but not decoded: damaged, too many, or while paused.
 
         Parameters
         ----------
         cause : str
-            What they are counted as.
+            Cause of the drops.
         topic : str
-            Where they came in.
+            Their topic.
         reason : str
-            What was found, what was expected, and the remedy, for the log.
+            Value found, value expected and remedy, for the log.
         number : int
-            How many.
+            Number of clouds.
         frame_id : str
-            Their frame, under which they are counted; without it, under their topic.
+            Their frame, by which they are counted; by default the topic.
 
         """
         self.counters.received += number
@@ -182,22 +203,22 @@ class Mapper:
         )
 
     def ignore_message(self, cause: str, reason: str, number: int = 1) -> None:
-        """Count messages other than clouds that are not used, and warn about it."""
+        """Count messages other than clouds that are not used, and warn."""
         self._drops.message(cause, reason, number)
 
     def add_image(self, image: SceneImage) -> None:
-        """Take an image that scans get colours or labels from; see layers.tsdf.color_topic."""
-        self._inserter.preparation.images.add(image)
+        """Add an image that gives scans colours or labels; see layers.tsdf.color_topic."""
+        self._inserter.images.add(image)
 
     def end_images(self) -> None:
-        """Wait for no more images."""
-        self._inserter.preparation.images.ended = True
+        """Stop waiting for images: no more come."""
+        self._inserter.images.ended = True
 
     def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
         """
-        Map the waiting scans whose poses are there, in order; yield what each did.
+        Map the waiting scans whose poses are there, in order; yield an Update for each.
 
-        A scan whose pose cannot come any more, or did not in time, is dropped and counted.
+        A scan whose pose cannot come any more, or did not come in time, is dropped and counted.
 
         Parameters
         ----------
@@ -207,32 +228,32 @@ class Mapper:
             the same to the bit. Call it once without at the end.
 
         """
-        looks_ahead = self._inserter.looks_ahead
-        keeps = int(more_follows and looks_ahead)
-        while self._posed.take(1 + looks_ahead) > keeps:
-            update = self._insert(*self._posed.pop())
+        ahead = self._inserter.reduces_ahead(self.config)
+        keeps = int(more_follows and ahead)
+        while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
+            update = self._insert(*self._queue.pop_posed())
             if update is not None:
                 yield update
-        if self._posed.first is not None:
-            self._inserter.begin(*self._posed.first)
+        if self._queue.next_posed is not None:
+            self._inserter.begin(*self._queue.next_posed, self.config)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """
-        Go on from a pose of the robot that somebody states, with registration; else warn.
+        Continue registration from a given pose of the robot; warn if that is not possible.
 
         Parameters
         ----------
         frame_id : str
-            The frame that the pose is in; has to be that of the map.
+            Frame of the pose; must be that of the map.
         xyz : (3,) float, m
-            Position of the base, or of the sensor where it is not known how it sits on a base.
+            Position of the base, or of the sensor if its mount on the base is unknown.
         q_xyzw : (4,) float
             Its orientation.
 
         Returns
         -------
         bool
-            Whether it goes on from there.
+            False if the pose was ignored.
 
         """
         if self.registered is None:
@@ -250,19 +271,23 @@ class Mapper:
         self._drops.message('initial_pose', f'initial pose ignored: {reason}')
         return False
 
+    def finish_layers(self) -> None:
+        """Finish the layers at the end of a recording; see Layer.finish."""
+        self._inserter.layers.finish()
+
     def finish(self) -> None:
-        """End the input: what still waits for a pose is dropped and counted."""
-        self._queue.drop_all('no_pose', 'no pose until the end of the input')
+        """End the input: scans that still wait for a pose are dropped and counted."""
+        self._queue.drop_waiting('no_pose', 'no pose until the end of the input')
 
     def clear(self) -> None:
-        """Forget all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
-        self._posed.drop_all('cleared', 'the map was cleared')
+        """Drop all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
+        self._queue.drop_all('cleared', 'the map was cleared')
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
     def align(self) -> Alignment:
         """
-        Move the scans of the window to where they agree; see the settings ``align``.
+        Move the scans of the window to poses at which they agree; see the settings ``align``.
 
         The map then equals, to the bit, one that was built at the corrected poses. Scans to come
         are corrected like the newest one.
@@ -273,21 +298,21 @@ class Mapper:
             If points are not kept (``window.keep_points``), there are fewer than two scans, or
             no poses follow. Nothing has changed then.
         MapError
-            If a scan cannot be where it belongs. Nothing has changed then.
+            If the map refuses a scan at its new pose. Nothing has changed then.
 
         """
-        aligned = self._inserter.align()
-        _log.info('aligned: %s', aligned)
-        return aligned
+        alignment = self._inserter.align(self.config)
+        _log.info('aligned: %s', alignment)
+        return alignment
 
     @property
     def T_map_fixed(self) -> Transform:
-        """From the fixed frame of the poses that come in to the map: how alignment corrects."""
+        """Transform from the fixed frame of the poses to the map: the correction by alignment."""
         return self._inserter.aligner.T_map_fixed
 
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
         """
-        Return where a frame is in the map at a time; 0: the newest there is.
+        Return the pose of a frame in the map at a time; 0: at the newest stamp.
 
         Raises
         ------
@@ -303,7 +328,7 @@ class Mapper:
     @property
     def map_frame(self) -> str:
         """The frame of the map: that of the poses, unless alignment gives it its own."""
-        return self._inserter.map_frame
+        return map_frame(self.config)
 
     def surfels(self, level: int = 0) -> Surfels:
         """
@@ -312,7 +337,7 @@ class Mapper:
         Parameters
         ----------
         level : int
-            Of the map whose voxels are 2^level times larger.
+            Voxels are 2^level times larger than those of the map.
 
         """
         surfel_map = self.map.coarsen(level) if level else self.map
@@ -320,14 +345,14 @@ class Mapper:
 
     def clear_region(self, region: Region) -> npt.NDArray[np.int32]:
         """
-        Empty the voxels whose centres are in a part of space, for good.
+        Empty the voxels whose centres are in a region, for good.
 
-        The scans of the window lose them too, so that what leaves later leaves exactly.
+        The scans of the window lose them too, so that later evictions stay exact.
 
         Returns
         -------
         (E, 3) int32
-            Indices of the surfels (``map.min_points``) that are gone.
+            Indices of the surfels (``map.min_points``) that were removed.
 
         """
         voxel_index = self.map.moments().voxel_index
@@ -337,7 +362,7 @@ class Mapper:
 
     def restore(self, surfel_map: SurfelMap, scans: Iterable[WindowedScan]) -> None:
         """
-        Put a saved map, and the scans of its window, in the place of what there is.
+        Replace map and window by a saved map and the scans of its window.
 
         Raises
         ------
@@ -356,12 +381,12 @@ class Mapper:
 
     def reconfigure(self, config: Config) -> None:
         """
-        Take new settings while running; they hold from the next scan on.
+        Change settings while running, from the next scan on.
 
         Raises
         ------
         ConfigError
-            If a setting differs that only a new start can change, or ``filters`` names a file
+            If a setting differs that is not live, or ``filters`` names a file
             that holds no chain. Nothing has changed then.
 
         """
@@ -373,14 +398,14 @@ class Mapper:
                 )
         self._inserter.reconfigure(config)
         self._poses.reconfigure(config)
-        self.config = self._posed.config = config
+        self.config = config
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
-        self._inserter.warm_up()
+        self._inserter.warm_up(self.config)
 
     def summary(self) -> dict[str, Any]:
-        """Return counts and times, and what the map is: for files, reports and diagnostics."""
+        """Return counts, times and figures of the map, for files, reports and diagnostics."""
         return {
             **self.counters.summary(),
             'filter_chain': self.chain.to_list(),
@@ -390,12 +415,11 @@ class Mapper:
             'voxels': self.map.num_voxels,
             'surfels': len(self.map.surfels(self.config.map.min_points)),
             'digest': self.map.digest(),
-            **({'tsdf': self.tsdf.summary()} if self.tsdf else {}),
-            **({'models': self.models.summary()} if self.models else {}),
+            **self._inserter.layers.summary(),
         }
 
     def _start_anew(self, scan: Scan, back_s: float) -> None:
-        """Forget what was mapped before time was set back, and the poses of that time."""
+        """Clear the map after time was set back, and drop the poses of the time before."""
         reset_after_s = self.config.input.reset_after_s
         _log.warning(
             'scan in frame %s: time went back by %.3f s, more than input.reset_after_s '
@@ -411,8 +435,8 @@ class Mapper:
         self._queue.forget_stamps()
         newest_pose = self.transforms.newest_ns
         if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
-            self.transforms.clear()  # else the scan would be mapped where the robot was then
+            self.transforms.clear()  # else the scan would be mapped at a pose of that time
 
     def _insert(self, scan: Scan, pose: Transform) -> Update | None:
-        """Map a scan whose pose is there; None where it is left out."""
-        return self._inserter.insert(scan, pose, following=self._posed.first)
+        """Map a scan whose pose is there; None if it is left out."""
+        return self._inserter.insert(scan, pose, self.config, self._queue.next_posed)

@@ -1,19 +1,20 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Preparation: what is done to a scan before it is reduced.
+Preparation of a scan for the map: motion gate, deskewing, images, filters, registration.
 
-Deskewed, joined with images, filtered, aligned to the map where poses come from there. A scan
-that the motion gate, the filters or the alignment leave out is counted.
+A scan that the motion gate, the filters or the registration leave out is counted.
 """
 
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass, replace
 
+import numpy as np
+
 from surfel_mapper.alignment.registration import RegistrationResult
-from surfel_mapper.config import Config
-from surfel_mapper.counters import Counters, Laps
+from surfel_mapper.config import Config, WindowConfig
+from surfel_mapper.counters import Laps
 from surfel_mapper.errors import (
     AlignmentError,
     CloudFormatError,
@@ -22,11 +23,9 @@ from surfel_mapper.errors import (
     PoseError,
 )
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.geometry import Transform
-from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.window import SlidingWindow
+from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
+from surfel_mapper.layers import Surroundings
 from surfel_mapper.pipeline.drops import Drops
-from surfel_mapper.pipeline.motion_gate import stands_still
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -44,13 +43,13 @@ class Prepared:
     Attributes
     ----------
     scan : Scan
-        Deskewed.
+        Deskewed, before the filters.
     filtered : Scan
-        What the filters left of it.
+        After the filters.
     T_map_sensor : (4, 4) float64
-        Where it was taken.
+        Its pose.
     registration : RegistrationResult, optional
-        How it was aligned to the map, where poses come from there.
+        If poses come from registration to the map.
 
     """
 
@@ -67,19 +66,19 @@ class Preparation:
     Parameters
     ----------
     config : Config
-        All settings; may be replaced by ``reconfigure``.
+        All settings; later ones are passed to each call.
     poses : ScanPoses
-        Of the sensors.
-    surfel_map : SurfelMap
-        What scans are aligned to.
-    window : SlidingWindow
-        The scans in it.
+        The poses of the sensors.
+    around : Surroundings
+        The map that scans are registered to, and the window, for the motion gate.
     aligner : WindowAligner
-        How alignment has moved the map against the poses that come in.
-    counters : Counters
-        What was done.
+        Corrects the poses that come in.
+    images : ScanImages
+        The images that scans are joined with.
+    needs_free_rays : bool
+        Whether layers need the directions in which the sensor met nothing.
     drops : Drops
-        What was not.
+        Counts the scans that are left out.
 
     """
 
@@ -87,75 +86,77 @@ class Preparation:
         self,
         config: Config,
         poses: ScanPoses,
-        surfel_map: SurfelMap,
-        window: SlidingWindow,
+        around: Surroundings,
         aligner: WindowAligner,
-        counters: Counters,
+        images: ScanImages,
+        needs_free_rays: bool,
         drops: Drops,
     ) -> None:
-        """Load the filters."""
-        self._config = config
+        self._filters = config.filters
         self._poses = poses
-        self._map = surfel_map
-        self._window = window
+        self._around = around
         self._aligner = aligner
-        self._counters = counters
+        self._images = images
+        self._needs_free_rays = needs_free_rays
         self._drops = drops
         self.chain = Chain.load(config.filters) if config.filters else Chain()
-        self.images = ScanImages(config.tsdf)
 
-    @property
-    def is_trivial(self) -> bool:
-        """Whether scans go as they are to where their pose says."""
-        config = self._config
-        is_changed = len(self.chain) or config.deskew.enabled or config.tsdf.enabled
+    def is_trivial(self, config: Config) -> bool:
+        """Return whether scans are mapped as they came, at the poses that came."""
+        is_changed = (
+            len(self.chain)
+            or config.deskew.enabled
+            or self._needs_free_rays
+            or self._images.are_wanted
+        )
         return not is_changed and self._poses.registered is None
 
-    def reconfigure(self, config: Config) -> None:
+    def load_filters(self, path: str) -> None:
         """
-        Take new settings.
+        Load the chain of filters of a file, if it is another than before.
 
         Raises
         ------
         ConfigError
-            If ``filters`` names a file that holds no chain; nothing has changed then.
+            If the file holds no chain; nothing has changed then.
 
         """
-        if config.filters != self._config.filters:
-            chain = Chain.load(config.filters) if config.filters else Chain()
+        if path != self._filters:
+            chain = Chain.load(path) if path else Chain()
             chain.warm_up()
-            self.chain = chain
-        self._config = config
+            self.chain, self._filters = chain, path
 
-    def warm_up(self) -> None:
-        """Compile every kernel that is needed here."""
+    def warm_up(self, config: Config) -> None:
+        """Compile every kernel of preparation."""
         self.chain.warm_up()
-        if self._config.deskew.enabled:
+        if config.deskew.enabled:
             warm_up_deskewing()
         if self._poses.registered is not None:
             self._poses.registered.warm_up()
 
-    def prepare(self, scan: Scan, pose: Transform, laps: Laps) -> Prepared | None:
+    def prepare(self, scan: Scan, pose: Transform, config: Config, laps: Laps) -> Prepared | None:
         """
-        Deskew, filter and align a scan; None if it is left out.
+        Deskew, filter and register a scan; None if it is left out.
 
         Parameters
         ----------
         scan : Scan
             As it came in.
         pose : (4, 4) float64
-            T_map_sensor, as its pose says.
+            T_map_sensor before registration.
+        config : Config
+            All settings.
         laps : Laps
-            Times what is done.
+            Takes the time of each stage.
 
         """
-        if self._poses.registered is None and self._is_gated(pose):
+        if self._poses.registered is None and self._is_gated(pose, config.window):
             return None
         times = scan.times
         if times is not None:
             scan = self._poses.deskewed(scan, times)
             laps.end('deskew')
-        if self._config.tsdf.enabled or self._config.dynamic.clear:
+        if self._needs_free_rays or self._images.are_wanted:
             scan = self._with_surroundings(scan)
             laps.end('images')
         filtered: Scan | None = scan
@@ -167,18 +168,22 @@ class Preparation:
         prepared = Prepared(scan, filtered, pose)
         if self._poses.registered is None:
             return prepared
-        aligned = self._aligned(self._poses.registered, prepared, times)
+        registered = self._register(self._poses.registered, prepared, times)
         laps.end('register')
-        return None if aligned is None or self._is_gated(aligned.T_map_sensor) else aligned
+        return (
+            None
+            if registered is None or self._is_gated(registered.T_map_sensor, config.window)
+            else registered
+        )
 
-    def _aligned(
-        self, registered: RegisteredPoses, prepared: Prepared, times: PointTimes | None
+    def _register(
+        self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None
     ) -> Prepared | None:
-        """Return a scan at the pose where it fits the map; None if it fits nowhere."""
+        """Return a scan at the pose found by registration; None if that fails."""
         scan = prepared.scan
         try:
-            pose, registration = registered.find(
-                prepared.filtered, times, self._map, self._aligner.T_map_fixed
+            pose, registration = poses.find(
+                prepared.filtered, times, self._around.surfel_map, self._aligner.T_map_fixed
             )
         except (AlignmentError, MapError, PoseError) as error:
             self._drops.scan(scan, 'not_aligned', str(error))
@@ -187,18 +192,18 @@ class Preparation:
             num = len(registration.degenerate)
             self._drops.warn(
                 'degenerate',
-                f'scan at {scan.stamp_ns / 1e9:.6f} s: what it sees leaves {num} of 6 directions '
-                'of motion open; there the prediction is kept',
+                f'scan at {scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
+                'cannot be told from its points; there the prediction is kept',
             )
         T_map_sensor = self._aligner.to_map(pose)
         return replace(prepared, T_map_sensor=T_map_sensor, registration=registration)
 
     def _with_surroundings(self, scan: Scan) -> Scan:
-        """Return a scan with what layers want beside its points, before any is left out."""
-        if scan.free is None:
+        """Return a scan with free rays and columns from images, before points are filtered."""
+        if scan.free is None and self._needs_free_rays:
             scan = replace(scan, free=free_directions(scan))
         try:
-            scan, missing = self.images.joined(
+            scan, missing = self._images.joined(
                 scan, lambda image: self._poses.seen_from(image.frame_id, image.stamp_ns, scan)
             )
         except (CloudFormatError, PoseError) as error:
@@ -208,22 +213,22 @@ class Preparation:
             self._drops.warn(
                 f'no_{kind}_image',
                 f'scan at {scan.stamp_ns / 1e9:.6f} s: no {kind} image within '
-                f'{self._config.tsdf.image_tolerance_s:g} s; layers.tsdf.image_tolerance_s '
+                f'{self._images.wanted.tolerance_s:g} s; {self._images.wanted.setting} '
                 'allows more',
             )
         return scan
 
-    def _is_gated(self, pose: Transform) -> bool:
+    def _is_gated(self, pose: Transform, gate: WindowConfig) -> bool:
         """Return whether the motion gate leaves out a scan at a pose, and count it."""
-        last = self._window.newest
-        if last is None or not stands_still(last.T_map_sensor, pose, self._config.window):
+        last = self._around.window.newest
+        if last is None or not stands_still(last.T_map_sensor, pose, gate):
             return False
-        self._counters.gated += 1
+        self._drops.counters.gated += 1
         return True
 
     def _filter(self, scan: Scan, pose: Transform) -> Scan | None:
-        """Return what the chain leaves of a scan; None where it leaves nothing, or cannot work."""
-        T_base_sensor = self._poses.of_base(scan)  # the filters that need it say if it lacks
+        """Return a scan after the filters; None if no point is left, or a filter cannot work."""
+        T_base_sensor = self._poses.of_base(scan)  # None is refused by the filters that need it
         try:
             filtered, steps = self.chain.run(
                 replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose)
@@ -232,9 +237,21 @@ class Preparation:
             self._drops.scan(scan, 'filter', str(error))
             return None
         for step in steps:
-            self._counters.add_filter(*astuple(step))
-        self._counters.points_left_out['filtered'] += len(scan) - len(filtered)
+            self._drops.counters.add_filter(*astuple(step))
+        self._drops.counters.points_left_out['filtered'] += len(scan) - len(filtered)
         if not len(filtered):
             self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
             return None
         return filtered
+
+
+def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowConfig) -> bool:
+    """Return whether two poses are nearer than the motion gate asks; False without a gate."""
+    if not (gate.gate_distance_m or gate.gate_angle_deg):
+        return False
+    motion = compose(inverse(T_map_last), T_map_sensor)
+    distance_m = float(np.sqrt((motion[:3, 3] ** 2).sum()))
+    angle_deg = float(np.degrees(rotation_angle(motion)))
+    moved = 0.0 < gate.gate_distance_m <= distance_m
+    turned = 0.0 < gate.gate_angle_deg <= angle_deg
+    return not (moved or turned)

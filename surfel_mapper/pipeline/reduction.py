@@ -1,10 +1,18 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Scans to the exact moments that enter the map and the window, and that leave it."""
+"""
+Reduction of scans to the exact moments that enter the map and the window, and that leave it.
+
+With ``map.threads`` another thread reduces the next scan while the map takes the one before it.
+Reduction reads nothing of the map, so the order changes no bit. A reduction that was begun is
+used only for the same scan at the same pose; otherwise it is done again.
+"""
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,17 +24,83 @@ from surfel_mapper.mapping.reducer import NARROW_COUNT, within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.scan import Scan
+from surfel_mapper.threads import pool
+
+
+class Begun(NamedTuple):
+    """A scan that another thread reduces, and the arguments of the reduction."""
+
+    scan: Scan
+    T_map_sensor: Transform
+    config: Config
+    result: Future[WindowedScan]
+
+
+class Reduction:
+    """
+    Reduces scans, ahead of time if there is a thread for it.
+
+    Parameters
+    ----------
+    surfel_map : SurfelMap
+        The map that the scans are inserted into.
+    threads : int
+        With fewer than two no reduction is begun ahead of time.
+
+    """
+
+    def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
+        self._map = surfel_map
+        self._pool = pool(threads)
+        self._begun: Begun | None = None
+
+    @property
+    def has_thread(self) -> bool:
+        """Whether there is a thread beside the caller's."""
+        return self._pool is not None
+
+    def begin(self, scan: Scan, T_map_sensor: Transform, config: Config) -> None:
+        """Begin to reduce a scan in the other thread, unless that was begun before."""
+        if self._pool is None or self._is_begun(scan, T_map_sensor, config):
+            return
+        result = self._pool.submit(reduced, scan, T_map_sensor, self._map, config)
+        self._begun = Begun(scan, T_map_sensor, config, result)
+
+    def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
+        """
+        Return a scan as its moments at a pose; see ``reduced``.
+
+        Raises
+        ------
+        MapLimitError
+            If a voxel gets more than 2^23 points, or a point is out of the reach of the map.
+
+        """
+        is_begun = self._is_begun(scan, T_map_sensor, config)
+        begun, self._begun = self._begun, None
+        if begun is not None and is_begun:
+            return begun.result.result()
+        return reduced(scan, T_map_sensor, self._map, config)
+
+    def _is_begun(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
+        begun = self._begun
+        return (
+            begun is not None
+            and begun.scan is scan
+            and begun.config is config
+            and np.array_equal(begun.T_map_sensor, T_map_sensor)
+        )
 
 
 def reduced(
     scan: Scan, T_map_sensor: Transform, surfel_map: SurfelMap, config: Config
 ) -> WindowedScan:
-    """Return a scan as its moments at a pose, with its points where the window keeps them."""
+    """Return a scan as its moments at a pose, with its points if the window keeps them."""
     limits = config.input
     moments = surfel_map.reduce(
         scan.points,
         T_map_sensor,
-        origin=origin(T_map_sensor, config),
+        origin=viewpoint(T_map_sensor, config),
         min_range_m=limits.min_range_m,
         max_range_m=limits.max_range_m or np.inf,
         columns=scan.columns,
@@ -44,17 +118,17 @@ def moments_at(
 ) -> ScanMoments:
     """Return the moments of a scan of the window, whose points are kept, at another pose."""
     assert scan.points is not None, 'only scans with points are moved'
-    seen_from = origin(T_map_sensor, config)
+    seen_from = viewpoint(T_map_sensor, config)
     return surfel_map.reduce(scan.points, T_map_sensor, origin=seen_from, columns=scan.columns)
 
 
-def origin(T_map_sensor: Transform, config: Config) -> Transform | None:
-    """Return where the sensor is; None where that is unknown, and normals stay unturned."""
+def viewpoint(T_map_sensor: Transform, config: Config) -> Transform | None:
+    """Return the position of the sensor; None if unknown, and normals stay as they are."""
     return None if config.pose.source == 'identity' else T_map_sensor[:3, 3]
 
 
 def warm_up(config: Config) -> None:
-    """Compile what adds, removes and derives, for points of every type and sums of every size."""
+    """Compile adding, removing and deriving, for points of every type and sums of every size."""
     for dtype in (np.float32, np.float64):
         surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
         one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of space, in the fixed frame, of which a map can be cleared."""
+"""Regions of space, in the frame of the map, that can be cleared."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 class Region(Protocol):
-    """A part of space."""
+    """A region of space."""
 
     def contains(self, points: Floats) -> Mask:
         """Return which points (N, 3), m, are inside, (N,) bool."""
@@ -50,12 +50,12 @@ class Box:
 @dataclass(frozen=True, slots=True)
 class Ball:
     """
-    All within a radius.
+    A ball.
 
     Raises
     ------
     ValueError
-        If the radius is not positive, or something is not finite.
+        If the radius is not positive, or a number is not finite.
 
     """
 
@@ -78,9 +78,9 @@ class Ball:
 @dataclass(frozen=True, slots=True)
 class Prism:
     """
-    All above and below a polygon in x and y, its last corner joined to the first.
+    The column above and below a polygon in x and y, its last corner joined to the first.
 
-    Where edges cross, a point is inside if a ray from it crosses an odd number of them.
+    If edges cross, a point is inside if a ray from it crosses an odd number of them.
 
     Raises
     ------

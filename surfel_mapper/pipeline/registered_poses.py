@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Poses out of the scans themselves: each scan is aligned to the map that those before it made.
+Poses by registration: each scan is aligned to the map of the scans before it.
 
-What is followed is the base where it is known how the sensor sits on it, so that several sensors
-serve one track; else the sensor itself.
+The track is that of the base if the mount of the sensor on it is known, so that several sensors
+share one track; otherwise that of the sensor itself.
 """
 
 from __future__ import annotations
@@ -30,26 +30,25 @@ from surfel_mapper.scan import PointTimes, Scan
 
 class RegisteredPoses:
     """
-    Where the sensors are, found by registration.
+    The poses of the sensors, found by registration.
 
     Parameters
     ----------
     config : Config
         Its ``registration``, ``input`` and ``frames``.
     transforms : TransformBuffer
-        How sensors sit on the robot.
+        Mounts of the sensors on the robot.
 
     Attributes
     ----------
     body : str
-        The frame that is followed; empty before the first scan.
+        The tracked frame; empty before the first scan.
     T_fixed_body : (4, 4) float64
-        Where it was at the stamp of the last scan.
+        Its pose at the stamp of the last scan.
 
     """
 
     def __init__(self, config: Config, transforms: TransformBuffer) -> None:
-        """Start where the settings say, at rest."""
         self._config = config
         self._transforms = transforms
         self._registration = Registration(config.registration, config.map.voxel_size_m)
@@ -68,7 +67,7 @@ class RegisteredPoses:
 
     @property
     def twist(self) -> npt.NDArray[np.float64]:
-        """How what is followed moves, (6,) m/s and rad/s, in its own frame."""
+        """Velocity of the tracked frame, (6,) m/s and rad/s, in that frame."""
         return self._tracker.twist
 
     def warm_up(self) -> None:
@@ -81,20 +80,20 @@ class RegisteredPoses:
             self._registration.align(cells, surfel_map, [np.eye(4)], 1e3, 2.0)
 
     def restart(self, T_fixed_body: Transform | None = None) -> None:
-        """Go on from a pose, or from where the settings say."""
+        """Go on from a pose, by default the one of registration.start."""
         self._tracker.restart(self._start if T_fixed_body is None else T_fixed_body)
 
     def learn_motion(self, scan: Scan, following: Scan | None) -> None:
         """
-        Find out how the robot moves before the first scan is deskewed, from the one after it.
+        Estimate the velocity for deskewing the first scan, from the scan after it.
 
-        Both are skewed alike, so the motion between them is right; but were the first one mapped
-        as it is, those deskewed later would not fit it.
+        Both are skewed alike, so the motion between them is right; but if the first were mapped
+        without deskewing, later scans would not fit it.
 
         Raises
         ------
         PoseNotYetError
-            If the one after it is not there yet.
+            If the scan after it is not there yet.
 
         """
         if scan.times is None or not self._tracker.is_new:
@@ -116,7 +115,7 @@ class RegisteredPoses:
         Raises
         ------
         PoseError
-            If it is not known how the sensor sits on what is followed.
+            If the mount of the sensor on the tracked frame is unknown.
 
         """
         return compose(self._tracker.predict(stamp_ns), self._mount(frame_id, stamp_ns))
@@ -129,32 +128,32 @@ class RegisteredPoses:
         T_map_fixed: Transform,
     ) -> tuple[Transform, RegistrationResult | None]:
         """
-        Align a scan, and go on from there.
+        Align a scan to the map, and continue the track from its pose.
 
         Parameters
         ----------
         scan : Scan
             Deskewed and filtered.
         times : PointTimes, optional
-            When its points were measured, where it was deskewed.
+            Times of its points, if it was deskewed.
         surfel_map : SurfelMap
-            The map. While it is empty the prediction holds.
+            The map; if it is empty the prediction is used.
         T_map_fixed : (4, 4) float64
             From the frame of the poses to that of the map.
 
         Returns
         -------
         T_fixed_sensor : (4, 4) float64
-            Where the sensor was at the stamp.
+            Pose of the sensor at the stamp.
         registration : RegistrationResult or None
-            How the scan was aligned; None where the prediction holds.
+            None if the map is empty and the prediction is used.
 
         Raises
         ------
         AlignmentError
             If the scan does not fit the map.
         PoseError
-            If it is not known how the sensor sits on what is followed.
+            If the mount of the sensor on the tracked frame is unknown.
 
         """
         tracker = self._tracker
@@ -177,7 +176,7 @@ class RegisteredPoses:
         return pose, registration
 
     def summary(self) -> dict[str, Any]:
-        """Return how well scans fitted, for files and reports."""
+        """Return figures of the fit of the scans, for files and reports."""
         fits = list(self._fits) or [float('nan')]
         return {
             'body': self.body,
@@ -187,7 +186,7 @@ class RegisteredPoses:
         }
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:
-        """Return the cells of a scan in the frame that is followed."""
+        """Return the cells of a scan in the tracked frame."""
         limits = self._config.input
         cells = self._registration.cells(
             scan.points, limits.min_range_m, limits.max_range_m or np.inf
@@ -195,7 +194,7 @@ class RegisteredPoses:
         return transformed(self._mount(scan.frame_id, scan.stamp_ns), cells)
 
     def _moments(self, scan: Scan, surfel_map: SurfelMap) -> ScanMoments:
-        """Return the moments of a scan in a map around what is followed."""
+        """Return the moments of a scan in a map about the tracked frame."""
         limits = self._config.input
         return surfel_map.reduce(
             scan.points,
@@ -205,7 +204,7 @@ class RegisteredPoses:
         )
 
     def _mount(self, frame_id: str, stamp_ns: int) -> Transform:
-        """Return T_body_sensor; the first scan decides what is followed."""
+        """Return T_body_sensor; the first scan decides which frame is tracked."""
         if not self.body:
             try:
                 mount = self._transforms.lookup(self._config.frames.base, frame_id, stamp_ns)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Colours and labels of points out of images, joined with scans by their stamps.
+Colours and labels of points from images, joined with scans by their stamps.
 
-A scan waits until an image that is not older has come, so which one it gets does not depend on
-the order in which the two arrive; like poses, images are waited for no longer than
-``pose.max_wait_s``. What a point gets becomes a column of the scan, and so passes the filters and
-waits with it. Columns that a cloud has itself stay.
+A scan waits until an image that is not older has come, so the image that it gets does not depend
+on the order in which the two arrive; as for poses, the wait ends after ``pose.max_wait_s``. The
+colours and labels become columns of the scan and pass the filters with it. Columns that a cloud
+already has stay.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import Transform
+from surfel_mapper.layers import Images
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import LABEL, PinholeCamera, SceneImage
 
@@ -29,7 +29,7 @@ MAX_IMAGES = 60
 """Images kept of each kind, 2 s at 30 Hz."""
 
 COLUMNS = {'color': ('rgba', 'rgb'), LABEL: ('label',)}
-"""Columns of a scan that hold what images of a kind hold; the first is that which they give."""
+"""Columns of a scan that hold the values of a kind of image; the first is the one added."""
 
 
 class ScanImages:
@@ -38,21 +38,31 @@ class ScanImages:
 
     Parameters
     ----------
-    config : TsdfConfig
-        Says which there are, and how far stamps may differ.
+    wanted : Images
+        The kinds of images that layers want, and how far stamps may differ.
+
+    Attributes
+    ----------
+    ended : bool
+        Set when no more images come; scans then wait for none.
 
     """
 
-    def __init__(self, config: TsdfConfig) -> None:
-        """Have none yet."""
-        self._images: dict[str, deque[SceneImage]] = {
-            kind: deque(maxlen=MAX_IMAGES) for kind in config.image_topics
-        }
-        self._tolerance_ns = round(config.image_tolerance_s * 1e9)
+    def __init__(self, wanted: Images) -> None:
+        self.wanted = wanted
         self.ended = False
+        self._images: dict[str, deque[SceneImage]] = {
+            kind: deque(maxlen=MAX_IMAGES) for kind in wanted.topics
+        }
+        self._tolerance_ns = round(wanted.tolerance_s * 1e9)
+
+    @property
+    def are_wanted(self) -> bool:
+        """Whether a layer wants images."""
+        return bool(self._images)
 
     def add(self, image: SceneImage) -> None:
-        """Take an image; an older one than the last begins anew."""
+        """Add an image; one older than the last drops all before it."""
         images = self._images[image.kind]
         if images and image.stamp_ns < images[-1].stamp_ns:
             images.clear()
@@ -70,7 +80,7 @@ class ScanImages:
         self, scan: Scan, place: Callable[[SceneImage], Transform]
     ) -> tuple[Scan, list[str]]:
         """
-        Return a scan with what the images say of its points, and the kinds that none came for.
+        Return a scan with columns from its images, and the kinds of which no image came.
 
         Parameters
         ----------
@@ -99,7 +109,7 @@ class ScanImages:
         return replace(scan, columns=columns), missing
 
     def _nearest(self, kind: str, stamp_ns: int) -> SceneImage | None:
-        """Return the image taken nearest to a time, the older of two; None if none is near."""
+        """Return the image nearest to a time, the older of two; None if it is too far off."""
         images = self._images[kind]
         nearest = min(images, key=lambda image: abs(image.stamp_ns - stamp_ns), default=None)
         if nearest is None or abs(nearest.stamp_ns - stamp_ns) > self._tolerance_ns:
@@ -108,7 +118,7 @@ class ScanImages:
 
 
 def has_column(scan: Scan, kind: str) -> bool:
-    """Return whether the points of a scan have what images of a kind would give them."""
+    """Return whether a scan has a column of a kind of image already."""
     return any(name in scan.columns for name in COLUMNS[kind])
 
 
@@ -116,7 +126,7 @@ def seen_in(
     image: SceneImage, scan: Scan, place: Callable[[SceneImage], Transform]
 ) -> npt.NDArray[Any] | None:
     """
-    Return what an image shows where the points of a scan are in it; None where none is.
+    Return the pixels of an image at the points of a scan; None if no point is in the image.
 
     (N,) uint32, packed with an alpha of 255, or labels, (N,) int32. Points that are not in the
     image get 0, whose alpha is 0 too, or -1.
@@ -130,7 +140,7 @@ def seen_in(
             )
         camera, points = PinholeCamera(width, height, *scan.camera[2:]), scan.points
     else:
-        assert image.camera is not None, 'those beside a lidar come with their camera'
+        assert image.camera is not None, 'images beside a lidar come with their camera'
         camera, T = image.camera, place(image)
         points = scan.points @ T[:3, :3].T + T[:3, 3]
     pixel = pixels_of(camera, points, image.pixels.shape[:2])
@@ -147,7 +157,7 @@ def seen_in(
 
 
 def packed(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
-    """Return the colours of an image as points have them in rgba, with an alpha of 255."""
+    """Return the colours of an image packed as in a column rgba, with an alpha of 255."""
     rgba = np.full((*pixels.shape[:2], 4), 255, np.uint8)
     rgba[..., 2::-1] = pixels
     return rgba.view('<u4').astype(np.uint32, copy=False).ravel()
@@ -156,9 +166,9 @@ def packed(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:
 def pixels_of(
     camera: PinholeCamera, points: npt.NDArray[Any], size: tuple[int, ...]
 ) -> npt.NDArray[np.int32]:
-    """Return in which pixel of a camera each point is, counted row by row; -1 for none, (N,)."""
+    """Return the pixel of a camera that each point is in, counted row by row, (N,); -1: none."""
     x, y, z = (np.ascontiguousarray(points[:, axis], np.float32) for axis in range(3))
-    with np.errstate(all='ignore'):  # points behind it and those that are none
+    with np.errstate(all='ignore'):  # points behind the camera, and nan
         u = x / z * np.float32(camera.fx) + np.float32(camera.cx + 0.5)
         v = y / z * np.float32(camera.fy) + np.float32(camera.cy + 0.5)
         inside = (z > 0) & (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the sensor was at the times of a scan, in the fixed frame: looked up, or registered.
+Poses of the sensor in the fixed frame at the times of a scan: looked up, or registered.
 
-Extrinsics that the configuration states become static transforms as soon as a frame is seen, so
-that all further work has one tree of frames to ask.
+Extrinsics of the configuration become static transforms when a frame is first seen, so that
+lookups need only the tree of frames.
 """
 
 from __future__ import annotations
@@ -31,21 +31,20 @@ class ScanPoses:
     Parameters
     ----------
     config : Config
-        Where poses come from, and how sensors sit on the robot.
+        Source of the poses, and mounts of the sensors.
     drops : Drops
-        Counts poses that are none.
+        Counts poses that are refused.
 
     Attributes
     ----------
     transforms : TransformBuffer
         The tree of frames.
     registered : RegisteredPoses, optional
-        What finds poses, where ``pose.source`` is registration.
+        The poses by registration, if ``pose.source`` is ``registration``.
 
     """
 
     def __init__(self, config: Config, drops: Drops) -> None:
-        """Know none."""
         self._config = config
         self._drops = drops
         self._mounted: set[str] = set()
@@ -55,8 +54,7 @@ class ScanPoses:
             self.registered = RegisteredPoses(config, self.transforms)
 
     def reconfigure(self, config: Config) -> None:
-        """Take new settings."""
-        self._config = config
+        """Take new settings; those of frames and sources never change."""
         if self.registered is not None:
             self.registered.reconfigure(config)
 
@@ -87,9 +85,9 @@ class ScanPoses:
         Parameters
         ----------
         scan : Scan
-            Whose pose is wanted.
+            The scan.
         following : Scan, optional
-            The next one, from which registration learns how the sensor moves at first.
+            The next one, from which registration estimates the first velocity.
 
         Raises
         ------
@@ -110,14 +108,14 @@ class ScanPoses:
         return pose
 
     def deskewed(self, scan: Scan, times: PointTimes) -> Scan:
-        """Return a scan as seen from one place, where the sensor was at its stamp."""
+        """Return a scan with all points in the sensor frame at its stamp."""
         fixed, sensor = self._config.frames.fixed, scan.frame_id
         stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
         min_range_m = self._config.input.min_range_m
         return deskewed(scan, partial(self._at, sensor), stamps, min_range_m)
 
     def of_base(self, scan: Scan) -> Transform | None:
-        """Return T_base_sensor at the stamp of a scan; None where it is not known."""
+        """Return T_base_sensor at the stamp of a scan; None if unknown."""
         try:
             return self.transforms.lookup(self._config.frames.base, scan.frame_id, scan.stamp_ns)
         except PoseError:
@@ -125,14 +123,14 @@ class ScanPoses:
 
     def seen_from(self, frame_id: str, stamp_ns: int, scan: Scan) -> Transform:
         """
-        Return T_frame_sensor: from the sensor of a scan to where a frame was at another time.
+        Return T_frame_sensor from the sensor of a scan to a frame at another time.
 
-        Where the robot is not known at both times, it is taken to have stood still.
+        If the pose of the robot is unknown at one of the times, it is taken to have stood still.
 
         Raises
         ------
         PoseError
-            If the frame is not known to belong to the robot.
+            If no transforms lead from the frame to the sensor.
 
         """
         if frame_id in self._config.frames.sensors:

@@ -1,60 +1,62 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The scans that wait for their poses, in the order of their stamps.
+ScanQueue: scans that wait for their poses and images, in the order of their stamps.
 
-Time is the stamps of the data alone, never the clock, so that a bag replayed at any speed waits
-and drops alike. Every sensor has its own order: that of one lidar says nothing of another's.
+Time is the stamps of the data alone, never the clock, so a bag replayed at any speed waits and
+drops alike. Every sensor has its own order: the stamps of one lidar say nothing about another's.
+A scan whose pose cannot come any more, or did not within ``pose.max_wait_s`` of the newest data,
+is dropped and counted.
 """
 
 from __future__ import annotations
 
 from collections import deque
 
+from surfel_mapper.config import PoseConfig
+from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.geometry import Transform
 from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.scan_images import ScanImages
+from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.scan import Scan
 
 MAX_FRAMES = 64
 """Sensors of one robot; more are frame names that change, and would be remembered forever."""
 
+PosedScan = tuple[Scan, Transform]
+"""A scan and its T_fixed_sensor."""
+
 
 class ScanQueue:
     """
-    A bounded queue of scans.
+    A bounded queue of scans, and behind it the scans that have their poses.
 
     Parameters
     ----------
     max_scans : int
-        At most so many wait; the oldest is dropped.
+        Scans that may wait; of more, the oldest is dropped.
+    poses : ScanPoses
+        The poses of the sensors.
+    images : ScanImages
+        Scans wait for their images as well.
     drops : Drops
-        Counts those that are.
+        Counts the scans that are dropped.
 
     """
 
-    def __init__(self, max_scans: int, drops: Drops) -> None:
-        """Make an empty queue."""
+    def __init__(self, max_scans: int, poses: ScanPoses, images: ScanImages, drops: Drops) -> None:
         self._max_scans = max_scans
+        self._poses = poses
+        self._images = images
         self._drops = drops
         self._scans: deque[Scan] = deque()
+        self._posed: deque[PosedScan] = deque()
         self._newest_ns: dict[str, int] = {}
-
-    def __len__(self) -> int:
-        """Return how many scans wait."""
-        return len(self._scans)
-
-    @property
-    def first(self) -> Scan | None:
-        """The scan that waits longest."""
-        return self._scans[0] if self._scans else None
-
-    @property
-    def second(self) -> Scan | None:
-        """The one that comes after it."""
-        return self._scans[1] if len(self._scans) > 1 else None
 
     @property
     def newest_ns(self) -> int | None:
-        """The newest stamp that came in, whether its scan waits still or not."""
+        """The newest stamp that came in, whether its scan still waits or not."""
         return max(self._newest_ns.values(), default=None)
 
     @property
@@ -67,13 +69,18 @@ class ScanQueue:
         """Frame and stamp of every scan that waits, in order."""
         return [(scan.frame_id, scan.stamp_ns) for scan in self._scans]
 
+    @property
+    def next_posed(self) -> PosedScan | None:
+        """The scan that is mapped next; None if none has its pose yet."""
+        return self._posed[0] if self._posed else None
+
     def back_s(self, scan: Scan) -> float:
-        """Return by how much the stamp of a scan is before the newest, s; 0 where it is not."""
+        """Return by how much the stamp of a scan is before the newest one, s; 0 if it is not."""
         newest_ns = self.newest_ns
         return 0.0 if newest_ns is None else max(newest_ns - scan.stamp_ns, 0) / 1e9
 
     def has_room_for(self, frame_id: str) -> bool:
-        """Return whether scans of a frame are taken: at most MAX_FRAMES have an order kept."""
+        """Return whether scans of a frame are taken: MAX_FRAMES frames have an order kept."""
         return frame_id in self._newest_ns or len(self._newest_ns) < MAX_FRAMES
 
     def push(self, scan: Scan) -> None:
@@ -91,15 +98,53 @@ class ScanQueue:
             reason = f'{self._max_scans} newer scans wait for their poses'
             self._drops.scan(self._scans.popleft(), 'queue_full', reason)
 
-    def pop(self) -> Scan:
-        """Remove and return the scan that waits longest."""
-        return self._scans.popleft()
+    def pop_posed(self) -> PosedScan:
+        """Remove and return the scan that is mapped next."""
+        return self._posed.popleft()
 
-    def drop_all(self, cause: str, reason: str) -> None:
-        """Drop every scan that waits."""
+    def fill_posed(self, number: int, config: PoseConfig) -> int:
+        """Fill the buffer to a number of posed scans, if poses are there; return its size."""
+        while len(self._posed) < number and (found := self._next(config)) is not None:
+            self._posed.append(found)
+        return len(self._posed)
+
+    def drop_waiting(self, cause: str, reason: str) -> None:
+        """Drop every scan that waits for its pose."""
         while self._scans:
             self._drops.scan(self._scans.popleft(), cause, reason)
+
+    def drop_all(self, cause: str, reason: str) -> None:
+        """Drop every scan, with its pose or without."""
+        while self._posed:
+            self._drops.scan(self._posed.popleft()[0], cause, reason)
+        self.drop_waiting(cause, reason)
 
     def forget_stamps(self) -> None:
         """Take any stamp next, as after time was set back."""
         self._newest_ns.clear()
+
+    def _next(self, config: PoseConfig) -> PosedScan | None:
+        """Remove the next scan whose pose is there; drop those before it that get none."""
+        while self._scans:
+            scan = self._scans[0]
+            waited_s = (self._now_ns() - scan.end_ns) / 1e9
+            may_wait = waited_s <= config.max_wait_s
+            if may_wait and self._images.is_waiting(scan):
+                return None
+            try:
+                pose = self._poses.of(scan, self._scans[1] if len(self._scans) > 1 else None)
+            except PoseNotYetError as error:
+                if may_wait:
+                    return None
+                reason = f'no pose within {waited_s:.3f} s: {error}'
+            except PoseError as error:
+                reason = str(error)
+            else:
+                return self._scans.popleft(), pose
+            self._drops.scan(self._scans.popleft(), 'no_pose', reason)
+        return None
+
+    def _now_ns(self) -> int:
+        """Return the newest stamp of all data."""
+        stamps = (self.newest_ns, self._poses.transforms.newest_ns)
+        return max(stamp for stamp in stamps if stamp is not None)

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-ShardMapper: a Mapper that begins in the middle of a bag as if it had been there from the start.
+ShardMapper: a Mapper of a part of a bag that continues exactly after the part before it.
 
-It is fed what comes before its part too, but passes over those scans. Whether that was enough is
-not hoped for: its outlook there is compared with that of the mapper which mapped the part before.
-Equal outlooks mean that every later scan is mapped, or dropped, at the same pose by both.
+It is fed with the messages before its part too, but passes over those scans. Its outlook at the
+start of the part is compared with that of the mapper of the part before: if the outlooks are
+equal, both would map or drop every later scan alike, at the same pose.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from surfel_mapper.pipeline.update import Update
 from surfel_mapper.scan import Scan
 
 SWEEP_S = 1.0
-"""No point of a scan that is put straight is further from its stamp than this."""
+"""Largest time of a point from the stamp of its scan with deskewing, s."""
 
 
 class ShardMapper(Mapper):
@@ -31,13 +31,12 @@ class ShardMapper(Mapper):
     _passes_over = False
 
     def __init__(self, config: Config | None = None) -> None:
-        """Make an empty map; nobody looks at its surfels until all parts are together."""
         super().__init__(config)
-        self._inserter.derives = False
+        self._inserter.derives = False  # surfels are derived when all parts are merged
 
     @property
     def passes_over(self) -> bool:
-        """Whether scans whose turn it is are left out of the map, and nothing is warned about."""
+        """Whether scans are left out of the map, and warnings are not logged."""
         return self._passes_over
 
     @passes_over.setter
@@ -46,10 +45,10 @@ class ShardMapper(Mapper):
 
     def outlook(self) -> str:
         """
-        Return a hash of all that decides about later scans, beside the settings.
+        Return a hash of the state on which the fate of later scans depends, beside the settings.
 
-        That is which stamps are still to be expected, the scans that wait, and the transforms
-        from the oldest stamp on that can be asked for without time being set back.
+        These are the newest stamps, the scans that wait, and the transforms from the oldest stamp
+        on that can be looked up without time being set back.
         """
         stamps, waiting = self._queue.stamps, self._queue.waiting
         expected = [*stamps.values(), *(stamp_ns for _, stamp_ns in waiting)]
@@ -66,16 +65,16 @@ class ShardMapper(Mapper):
 
 
 def sweep_s(config: Config) -> float:
-    """Return how far from its stamp a pose may be needed for a scan, s."""
+    """Return the largest time from its stamp at which a scan needs a pose, s."""
     return SWEEP_S if config.deskew.enabled else 0.0
 
 
 def is_divisible(config: Config) -> bool:
     """
-    Return whether what becomes of a scan depends on its surroundings alone.
+    Return whether a recording can be mapped in parts.
 
-    With poses from registration, alignment of the window, or a motion gate it depends on the map
-    and on all scans before: then a recording can only be mapped in one go.
+    With poses from registration, alignment of the window, or a motion gate a scan depends on the
+    map and on all scans before it; then the recording can only be mapped in one go.
     """
     settings: dict[str, Any] = config.to_mapping()
     neutral = {

@@ -1,36 +1,34 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What one scan did to the map."""
+"""Update: the changes that one scan made to the map."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import RegistrationResult
+from surfel_mapper.layers import names as layer_names
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
 from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
 
-if TYPE_CHECKING:  # the models take 0.1 s to load
-    from surfel_mapper.models.live import ModelUpdate
-
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Update:
     """
-    What one scan did to the map.
+    The changes that one scan made to the map.
 
     Attributes
     ----------
     scan : Scan
-        As it came in, but deskewed; filters have not touched it.
+        Deskewed, before the filters.
     stamp_ns : int
         Stamp of the scan.
     frame_id : str
@@ -42,19 +40,20 @@ class Update:
     changed : Surfels
         Every voxel that the scan or an eviction changed and that has ``map.min_points``.
     removed_voxel_index : (K, 3) int32
-        Voxels that were surfels and, after an eviction, an alignment or because scans see
-        through them, have too few points.
+        Voxels that were surfels and have too few points since an eviction, an alignment, or a
+        layer cleared them.
     evictions : tuple of Eviction
         The scans that left, oldest first.
     alignment : Alignment, optional
         Result of the alignment of the window, if one was due after this scan.
     registration : RegistrationResult, optional
         Result of the registration to the map, if ``pose.source`` is ``registration``.
-    models : ModelUpdate, optional
-        What became of planes, surfaces and Gaussians, where they were brought up to date.
+    layers : mapping of str to object
+        The results of layers that followed the scan, by name; ``update.models`` is that of
+        ``models``, or None.
     milliseconds : dict of str to float
-        Time by stage: filter (where there are any), reduce, insert (evictions included),
-        normals, total.
+        Time by stage: filter (if there are any), reduce, insert (evictions included), one stage
+        for each layer, normals, total.
 
     """
 
@@ -69,7 +68,15 @@ class Update:
     milliseconds: dict[str, float]
     alignment: Alignment | None = None
     registration: RegistrationResult | None = None
-    models: ModelUpdate | None = None
+    layers: Mapping[str, Any] = field(default_factory=dict)
+
+    if not TYPE_CHECKING:  # names that mypy shall not take for granted
+
+        def __getattr__(self, name: str) -> Any:
+            """Return the result of a layer, None if it had none."""
+            if name in layer_names():
+                return self.layers.get(name)
+            raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
 
 
 def removed_voxels(
@@ -78,7 +85,7 @@ def removed_voxels(
     alignment: Alignment | None,
     changed: Surfels,
 ) -> npt.NDArray[np.int32]:
-    """Return the voxels (K, 3) that were surfels before all these, and are none now."""
+    """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
     fallen = [cleared, *(eviction.fallen for eviction in evictions)]
     if alignment is None:
         return np.concatenate(fallen)

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Alignment of the window: scans that were mapped at poses that drift are moved to where they agree.
+Alignment of the window: scans mapped at drifting poses are moved to poses at which they agree.
 
-A scan is reduced anew at its corrected pose and takes the place of what the map holds of it, so
-that the map equals, bit for bit, one that was built at the corrected poses. The oldest scan stays
-where it is. What corrects the newest one corrects those to come as well: it is the transform
-from the map, which jumps, to the fixed frame of the poses, which drifts.
+A scan is reduced again at its corrected pose and replaces its moments in the map, so the map
+equals, bit for bit, one built at the corrected poses. The oldest scan does not move. The
+correction of the newest scan holds for later scans too: it is the transform from the fixed frame
+of the poses, which drifts, to the map, which jumps.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ MIN_POINTS = 6
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Alignment:
     """
-    What an alignment did to the window.
+    The result of an alignment of the window.
 
     Attributes
     ----------
     solution : WindowAlignment
-        The poses found, and how well scans agree.
+        The poses found, and the residuals.
     stamps_ns : (S,) int64
-        Of the scans of the window, oldest first.
+        Stamps of the scans of the window, oldest first.
     T_map_sensor : (S, 4, 4) float64
-        Where they are in the map now: those that hardly changed are where they were.
+        Their poses in the map now; those that hardly changed are as before.
     T_map_fixed : (4, 4) float64
         From the fixed frame of the poses that come in to the map.
     num_moved : int
@@ -66,7 +66,7 @@ class Alignment:
     removed_voxel_index: npt.NDArray[np.int32]
 
     def summary(self) -> dict[str, Any]:
-        """Return it as plain numbers, and in words."""
+        """Return it as plain numbers and as a sentence."""
         gaps = [gap for gap in self.solution.residuals.values() if math.isfinite(gap)]
         return {
             'scans': len(self.stamps_ns),
@@ -83,7 +83,6 @@ class Alignment:
         }
 
     def __str__(self) -> str:
-        """Say it in a sentence, for logs and services."""
         settled = 'settled' if self.solution.settled else 'not settled'
         return (
             f'{self.num_moved} of {len(self.stamps_ns)} scans moved, by at most '
@@ -94,12 +93,12 @@ class Alignment:
 
 class WindowAligner:
     """
-    Moves the scans of a window, and remembers what they were corrected by.
+    Moves the scans of a window, and keeps the correction for later scans.
 
     Parameters
     ----------
     moments_at : callable
-        Of a scan with its points and a pose: the moments that it has there.
+        Takes a scan with its points and a pose; returns its moments there.
 
     Attributes
     ----------
@@ -109,24 +108,23 @@ class WindowAligner:
     """
 
     def __init__(self, moments_at: Callable[[WindowedScan, Transform], ScanMoments]) -> None:
-        """Correct nothing yet."""
         self._moments_at = moments_at
         self.reset()
 
     def warm_up(self) -> None:
-        """Compile the kernels of alignment; those of mapping come with the map."""
+        """Compile the kernels of alignment."""
         points = np.eye(4, 3)
         scan = Samples(points, points, np.ones(4), np.ones(4))
         align_scans([scan, scan], np.array([np.eye(4), np.eye(4)]))
 
     def reset(self) -> None:
-        """Correct nothing any more, as for an empty map."""
+        """Drop the correction, as for an empty map."""
         self.T_map_fixed: Transform = np.eye(4)
         self._samples: dict[int, tuple[object, Samples]] = {}
         self._num_new = 0
 
     def to_map(self, T_fixed_sensor: Transform) -> Transform:
-        """Return the pose in the map of what has a pose in the fixed frame."""
+        """Return the pose in the map of a sensor whose pose in the fixed frame is given."""
         if np.array_equal(self.T_map_fixed, np.eye(4)):
             return T_fixed_sensor  # to the bit
         return compose(self.T_map_fixed, T_fixed_sensor)
@@ -181,7 +179,7 @@ class WindowAligner:
         )
 
     def _moved(self, scan: WindowedScan, pose: Transform) -> WindowedScan:
-        """Return a scan as it is at another pose."""
+        """Return a scan at another pose."""
         return replace(scan, moments=self._moments_at(scan, pose), T_map_sensor=pose)
 
     def _check(self, num_scans: int, scans: list[WindowedScan], columns: tuple[str, ...]) -> None:
@@ -190,14 +188,14 @@ class WindowAligner:
         )
         if num_kept < num_scans:
             raise AlignmentError(
-                f'{num_kept} of {num_scans} scans have their points, with what else is mapped of '
-                'them; scans are moved by these, so window.keep_points is needed from the start'
+                f'{num_kept} of {num_scans} scans have their points and mapped columns, which '
+                'alignment needs: set window.keep_points from the start'
             )
         if num_scans < 2:
             raise AlignmentError(f'{num_scans} scans in the map, expected two or more to align')
 
     def _samples_of(self, scans: list[WindowedScan], voxel_size_m: float) -> list[Samples]:
-        """Return the surfels of each scan in its own frame, made once a scan."""
+        """Return the surfels of each scan in its own frame, made once per scan."""
         kept: dict[int, tuple[object, Samples]] = {}
         for scan in scans:
             known = self._samples.get(id(scan.points))  # alive, as it is kept here

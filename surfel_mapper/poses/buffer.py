@@ -3,15 +3,15 @@
 """
 TransformBuffer: the tree of coordinate frames over time, asked for one transform at a stamp.
 
-Every frame has at most one parent, so an edge is known by its child. A dynamic edge holds its
-transforms sorted by stamp, a static one a single transform for all time. Node and replay use this
-one class: a lookup depends only on the transforms held, not on the order they came in, and is
-composed in a fixed order (geometry.py), so both compute the same pose to the last bit. Nothing is
-extrapolated: a robot that turns by 1 rad/s moves a point at 50 m by 5 m in the 0.1 s of a sweep.
+Every frame has at most one parent, so an edge of the tree is stored by its child. A dynamic edge
+holds transforms sorted by stamp, a static one a single transform for all time. Node and replay
+use this one class: a lookup depends only on the transforms held, not on the order they came in,
+and is composed in a fixed order (geometry.py), so both compute the same pose to the last bit.
+Nothing is extrapolated: a robot that turns by 1 rad/s moves a point at 50 m by 5 m in the 0.1 s
+of a sweep.
 
-Two causes of failure are told apart because callers act on them: PoseNotYetError says that data
-yet to come can answer the lookup, so the scan should wait; any other PoseError says that none
-can, so it should be dropped.
+Callers act on two kinds of failure: after PoseNotYetError later data may answer the lookup, so the
+scan should wait; after any other PoseError none can, so it should be dropped.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ import numpy as np
 
 from surfel_mapper.errors import PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, Transform
-from surfel_mapper.poses.edge import Edge, NS_PER_S, rigid, seconds
+from surfel_mapper.poses.pose_track import NS_PER_S, PoseTrack, rigid, seconds
 
 MAX_EDGES = 10_000
-"""Trees of robots have some hundred; ever new names shall fill no memory."""
+"""Largest number of edges; a robot has some hundred, and new names must not fill the memory."""
 
 MAX_NAMES = 12
-"""So many frames are named in a message."""
+"""Number of frames named in a message."""
 
 
 class TransformBuffer:
@@ -40,11 +40,11 @@ class TransformBuffer:
     Parameters
     ----------
     history_s : float
-        Of every dynamic edge, the transforms at most this much older than its newest are held.
-        At 1 kHz, 60 s are 60,000 transforms, some 20 MB.
+        Every dynamic edge keeps the transforms up to this much older than its newest. At 1 kHz,
+        60 s are 60,000 transforms, some 20 MB.
     reset_after_s : float
         A transform older than the newest of its edge by more than this means that time was set
-        back: what the edge holds is forgotten. One older by less is put where it belongs.
+        back: the older transforms of the edge are dropped. One older by less is inserted.
 
     Raises
     ------
@@ -59,7 +59,7 @@ class TransformBuffer:
                 raise ValueError(f'{name}: {value}, expected zero or more seconds, finite')
         self._history_ns = round(history_s * NS_PER_S)
         self._reset_after_ns = round(reset_after_s * NS_PER_S)
-        self._edges: dict[str, Edge] = {}
+        self._edges: dict[str, PoseTrack] = {}
 
     @property
     def newest_ns(self) -> int | None:
@@ -128,7 +128,7 @@ class TransformBuffer:
         """
         asked = f'{target} <- {source} at {seconds(stamp_ns)} s'
         up, down = list(self._edges_above(source)), list(self._edges_above(target))
-        # Both lists end at the root; what they share at the end cancels.
+        # Both lists end at the root; edges that they share at the end cancel.
         while up and down and up[-1] is down[-1]:
             up.pop()
             down.pop()
@@ -144,24 +144,24 @@ class TransformBuffer:
         return compose(T_target_common, T_common_source)
 
     def stamps(self, target: str, source: str, start_ns: int, end_ns: int) -> list[int]:
-        """Return when transforms between two frames are held, in a span, ends included."""
+        """Return the stamps of transforms between two frames in a span, ends included."""
         above = {*self._edges_above(source)} ^ {*self._edges_above(target)}
         held = (edge.stamps for edge in above if not edge.is_static)
         return sorted({s for stamps in held for s in _within(stamps, start_ns, end_ns)})
 
     def held(self, since_ns: int | None = None) -> list[tuple[str, str, list[int], bytes]]:
         """
-        Return all that answers to lookups from a stamp on depend on, to compare two buffers.
+        Return the content on which lookups from a stamp on depend, to compare two buffers.
 
         Parameters
         ----------
         since_ns : int, optional
-            The oldest stamp that will be asked for; any without it.
+            The oldest stamp of those lookups; any by default.
 
         Returns
         -------
         list of (str, str, list of int, bytes)
-            For each edge, sorted: child, parent, stamps (none where static), transforms.
+            For each edge, sorted: child, parent, stamps (none if static), transforms.
 
         """
         found = []
@@ -174,11 +174,11 @@ class TransformBuffer:
         return found
 
     def clear(self) -> None:
-        """Forget the dynamic edges; static ones stay."""
+        """Drop the dynamic edges; static ones stay."""
         self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}
 
-    def _edge(self, parent: str, child: str, *, is_static: bool) -> Edge:
-        """Return the edge of a child, a new one if there is none; refuse what is no tree."""
+    def _edge(self, parent: str, child: str, *, is_static: bool) -> PoseTrack:
+        """Return the edge of a child, or a new one; refuse edges that form no tree."""
         name = f'transform {parent!r} -> {child!r}'
         if not parent or not child:
             raise PoseError(f'{name}: the name of a frame is empty')
@@ -193,7 +193,7 @@ class TransformBuffer:
                 raise PoseError(f'{name}: closes the loop {loop}')
             if len(self._edges) >= MAX_EDGES:
                 raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
-            return Edge(parent, child, is_static)
+            return PoseTrack(parent, child, is_static)
         if edge.parent != parent:
             raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')
         if edge.is_static != is_static:
@@ -201,7 +201,7 @@ class TransformBuffer:
             raise PoseError(f'{name}: known as {found}, a {came} transform came')
         return edge
 
-    def _edges_above(self, frame: str) -> Iterator[Edge]:
+    def _edges_above(self, frame: str) -> Iterator[PoseTrack]:
         """Yield the edges from a frame up to the root of its tree."""
         edge = self._edges.get(frame)
         while edge is not None:
@@ -218,7 +218,7 @@ class TransformBuffer:
         return f'no transforms lead from one to the other yet; frames seen: {names}'
 
 
-def _check_held(asked: str, edges: list[Edge], stamp_ns: int) -> None:
+def _check_held(asked: str, edges: list[PoseTrack], stamp_ns: int) -> None:
     """Raise if a dynamic edge does not reach to a stamp; too old weighs more than too new."""
     dynamic = [edge for edge in edges if not edge.is_static]
     for edge in dynamic:
@@ -234,7 +234,7 @@ def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:
     return stamps[bisect_left(stamps, start_ns) : bisect_right(stamps, end_ns)]
 
 
-def _chained(edges: list[Edge], stamp_ns: int) -> Transform | None:
+def _chained(edges: list[PoseTrack], stamp_ns: int) -> Transform | None:
     """Return the product of edges that lead upwards, from the lowest on; None without any."""
     product: Transform | None = None
     for edge in edges:

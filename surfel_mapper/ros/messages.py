@@ -10,11 +10,10 @@ array, which rclpy checks byte by byte, takes 270 ms.
 from __future__ import annotations
 
 from array import array
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Pose
-from nav_msgs.msg import OccupancyGrid
 import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import PointCloud2, PointField
@@ -22,9 +21,6 @@ from std_msgs.msg import Header
 
 from surfel_mapper.geometry import q_xyzw, Transform
 from surfel_mapper.messages.pointcloud2 import CloudBytes
-
-if TYPE_CHECKING:
-    from surfel_mapper.mapping.cost_grid import CostGrid
 
 
 def cloud_message(content: CloudBytes, stamp_ns: int, frame_id: str) -> PointCloud2:
@@ -45,17 +41,6 @@ def cloud_message(content: CloudBytes, stamp_ns: int, frame_id: str) -> PointClo
         data=data,
         is_dense=content.is_dense,
     )
-
-
-def grid_message(grid: CostGrid, stamp_ns: int, frame_id: str) -> OccupancyGrid:
-    """Return a cost grid as an OccupancyGrid: 0 free to 100 occupied, -1 unknown."""
-    message = OccupancyGrid(header=Header(stamp=time_message(stamp_ns), frame_id=frame_id))
-    message.info.map_load_time = message.header.stamp
-    message.info.resolution = grid.resolution_m
-    message.info.height, message.info.width = grid.cost.shape
-    message.info.origin.position.x, message.info.origin.position.y = grid.origin.tolist()
-    message.data = array('b', grid.cost.tobytes())
-    return message
 
 
 def pose_message(T_a_b: Transform) -> Pose:

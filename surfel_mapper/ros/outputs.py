@@ -15,7 +15,6 @@ from concurrent.futures import CancelledError
 from functools import partial
 from typing import Any
 
-from nav_msgs.msg import OccupancyGrid
 import numpy as np
 import numpy.typing as npt
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -31,7 +30,6 @@ from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.map_cloud import moment_cloud, voxel_columns
 from surfel_mapper.messages.markers import marker_array
@@ -41,11 +39,10 @@ from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
 from surfel_mapper.pipeline import Alignment, Mapper, Update
 from surfel_mapper.ros.base_node import LATCHED, result_of, steady_timer
 from surfel_mapper.ros.changes import ChangeTracker, MapChange
+from surfel_mapper.ros.layer_outputs import LayerOutputs
 from surfel_mapper.ros.mapping_thread import MappingThread
-from surfel_mapper.ros.messages import cloud_message, grid_message
-from surfel_mapper.ros.model_outputs import ModelOutputs
+from surfel_mapper.ros.messages import cloud_message
 from surfel_mapper.ros.pose_outputs import AlignmentOutputs
-from surfel_mapper.ros.tsdf_outputs import TsdfOutputs
 from surfel_mapper.scan import Scan
 
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -78,10 +75,7 @@ class Outputs:
         self._changes = ChangeTracker(mapper)
         self._ages = Ages()
         self._alignment = AlignmentOutputs(node, mapper)
-        self._tsdf = TsdfOutputs(node, mapper, mapper.tsdf, thread) if mapper.tsdf else None
-        self._models: ModelOutputs | None = None
-        if mapper.models is not None:
-            self._models = ModelOutputs(node, mapper, mapper.models, thread)
+        self._layers = LayerOutputs(node, mapper, thread)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
         self._levels = [
             node.create_publisher(PointCloud2, f'~/level_{level}/normals', LATCHED)
@@ -91,9 +85,7 @@ class Outputs:
         self._removed = node.create_publisher(PointCloud2, '~/removed', CHANGES)
         self._scan_normals = node.create_publisher(PointCloud2, '~/scan_normals', 10)
         self._markers = node.create_publisher(MarkerArray, '~/markers', LATCHED)
-        self._grid = node.create_publisher(OccupancyGrid, '~/grid', LATCHED)
         self._stamp_ns = 0
-        self._center: npt.NDArray[np.float64] = np.zeros(2)
         # an empty map is published too: it replaces the latched one of a node that was killed
         self._published: dict[Any, int] = {}
         self._timers: list[Timer] = []
@@ -105,12 +97,9 @@ class Outputs:
 
     def publish_update(self, update: Update) -> None:
         """Publish what a scan changed; called in the mapping thread."""
-        self._stamp_ns, self._center = update.stamp_ns, update.T_map_sensor[:2, 3]
+        self._stamp_ns = update.stamp_ns
         self._alignment.publish(update)
-        if self._tsdf is not None:
-            self._tsdf.note(update)
-        if self._models is not None:
-            self._models.note(update)
+        self._layers.publish_update(update)
         if self._has_clients():
             self._publish_change(self._changes.after_scan(update))
         else:
@@ -130,8 +119,7 @@ class Outputs:
         To be called whenever the map or its settings have changed in another way.
         """
         self._published.clear()
-        if self._models is not None:
-            self._models.expire()
+        self._layers.expire()
         if self._has_clients():
             self._publish_change(self._changes.collect())
 
@@ -142,7 +130,6 @@ class Outputs:
         published: list[tuple[float, Any, Callable[[], object]]] = [
             (rates.normals_rate_hz, self._normals, self._publish_normals),
             (rates.markers_rate_hz, self._markers, self._publish_markers),
-            (config.grid.rate_hz, self._grid, self._publish_grid),
             *(
                 (rates.normals_rate_hz, publisher, partial(self._publish_level, level, publisher))
                 for level, publisher in enumerate(self._levels, 1)
@@ -152,20 +139,18 @@ class Outputs:
             if rate_hz:
                 callback = self._poster(publisher, publish)
                 self._timers.append(steady_timer(self._node, rate_hz, callback))
-        if self._tsdf is not None:
-            self._tsdf.start_timers(config.tsdf)
+        self._layers.start_timers(config)
 
     def stop_timers(self) -> None:
         """Publish nothing at a rate any more."""
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers.clear()
-        if self._tsdf is not None:
-            self._tsdf.stop_timers()
+        self._layers.stop_timers()
 
     def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
         """Return a callback that has the mapping thread publish where there is news to read."""
-        is_latched_for_all = publisher is self._normals or publisher is self._grid
+        is_latched_for_all = publisher is self._normals
 
         def post() -> None:
             is_new = self._published.get(publisher) != self._mapper.map.version
@@ -241,13 +226,6 @@ class Outputs:
         )
         self._markers.publish(marker_array(markers))
         self._published[self._markers] = surfel_map.version
-
-    def _publish_grid(self) -> None:
-        config, surfel_map = self._mapper.config, self._mapper.map
-        surfels = surfel_map.surfels(config.map.min_points)
-        grid = traversability(surfels, surfel_map.voxel_size_m, self._center, config.grid)
-        self._grid.publish(grid_message(grid, self._stamp_ns, self._mapper.map_frame))
-        self._published[self._grid] = surfel_map.version
 
 
 def warm_up(config: Config) -> None:

@@ -20,13 +20,13 @@ import numpy.typing as npt
 from surfel_mapper.sensors.kernels.depth import unproject
 
 COLOR, LABEL = 'color', 'label'
-"""What images that are joined with scans hold."""
+"""Kinds of the images that are joined with scans."""
 
 UNIT_M = {np.dtype(np.uint16): 1e-3, np.dtype(np.float32): 1.0}
-"""What one unit of depth is, by type of image (REP 118): millimetres or metres."""
+"""One unit of depth in metres, by type of image (REP 118)."""
 
 END = {np.dtype(np.uint16): 65535.0, np.dtype(np.float32): np.inf}
-"""From this depth on there is none: Kinects write 65535 where they see nothing."""
+"""Values from this one on mean no depth: Kinects write 65535 for pixels without."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +41,12 @@ class PinholeCamera:
     fx, fy : float
         Focal lengths, pixels.
     cx, cy : float
-        Where the optical axis meets the image, pixels from the centre of the first pixel.
+        Principal point, pixels from the centre of the first pixel.
 
     Raises
     ------
     ValueError
-        If a size or a focal length is not positive, or something is not finite.
+        If a size or a focal length is not positive, or a number is not finite.
 
     """
 
@@ -79,11 +79,11 @@ class SceneImage:
     kind : str
         color or label.
     stamp_ns : int
-        When it was taken.
+        Its time.
     frame_id : str
         The optical frame of its camera.
     camera : PinholeCamera, optional
-        Which took it; None where it fits a depth image pixel by pixel.
+        Its camera; None if it fits a depth image pixel by pixel.
     pixels : (H, W, 3) uint8 or (H, W) int32
         Red, green and blue, or labels, -1 for unknown.
 
@@ -98,15 +98,15 @@ class SceneImage:
 
 def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[np.float32]:
     """
-    Return the points that a depth image shows.
+    Return the points of a depth image.
 
     Parameters
     ----------
     depth : (H, W) uint16, mm, or float32, m
         Along the optical axis; 0, negative values, nan, inf and, with some cameras, 65535 mm mean
-        that there is none.
+        no depth.
     camera : PinholeCamera
-        Which took it.
+        Its camera.
 
     Returns
     -------
@@ -136,7 +136,7 @@ def depth_points(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[
 
 
 def free_rays(depth: npt.NDArray[Any], camera: PinholeCamera) -> npt.NDArray[np.float32] | None:
-    """Return unit vectors of the pixels that are inf: nothing there up to the range; or None."""
+    """Return unit vectors of the pixels that are inf, free up to the range; None without any."""
     if depth.dtype.kind != 'f':
         return None
     rows, columns = np.nonzero(depth == np.inf)

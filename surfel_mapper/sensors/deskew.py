@@ -4,13 +4,13 @@
 Deskewing: a pose of its own for every point of a sweep.
 
 A lidar at 10 Hz on a car at 10 m/s sees the last point of a turn from 1 m ahead of the first.
-Drivers write the time of each point in a field; ``point_times`` finds it and says what it means,
+Drivers write the time of each point in a field; ``point_times`` finds it and its unit,
 ``deskewed`` takes the points to the sensor frame at the stamp of the scan, as if all had been
-measured then. Whatever comes later (filters, map, window) knows rigid scans alone.
+measured then. All later stages (filters, map, window) see rigid scans only.
 
-Poses are looked up where the pose source has one, and so densely between that the sensor turns
-by at most 0.005 rad; between these the way is taken as straight, which at 1 m from the base is
-3 micrometres off. A lookup for every point would take seconds.
+Poses are looked up at the stamps of the pose source, and between them at steps of at most
+0.005 rad of rotation; within a step the motion is taken as straight, which at 1 m from the base
+is 3 micrometres off. A lookup for every point would take seconds.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ UNITS_NS = {'s': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 MAX_SWEEP_NS = 1_500_000_000
 """
-A time farther from the stamp is of another unit, or of another clock; seconds since 1970, taken
-for nanoseconds since the stamp, are 1.7 s and more.
+Largest difference of a time from the stamp, ns; a larger one has another unit or clock. Seconds
+since 1970, read as nanoseconds since the stamp, are 1.7 s and more.
 """
 
 MAX_TURN_RAD = 0.005
-"""Between two poses that are looked up the sensor turns by no more."""
+"""Largest rotation of the sensor between two poses that are looked up, rad."""
 
 
 def point_times(
     scan: Scan, field: str = '', unit: str = 'auto', reference: str = 'auto'
 ) -> PointTimes:
     """
-    Return when the points of a scan were measured.
+    Return the times of the points of a scan.
 
     Parameters
     ----------
@@ -57,17 +57,17 @@ def point_times(
     field : str
         Name of the column; empty: the first of t, time, timestamp, offset_time.
     unit : str
-        s, ms, us, ns; auto: seconds for floating point numbers where that makes sense, else
-        nanoseconds.
+        s, ms, us, ns; auto: seconds for floating point numbers if that is within 1.5 s of the
+        stamp, else nanoseconds.
     reference : str
-        stamp: times count from the stamp of the scan; epoch: they are like stamps; auto:
-        whichever is nearer to the stamp.
+        stamp: times count from the stamp of the scan; epoch: they are like stamps; auto: the
+        one nearer to the stamp.
 
     Raises
     ------
     CloudFormatError
-        If there is no such column, or its times are more than 1.5 s from the stamp however they
-        are read.
+        If there is no such column, or its times are more than 1.5 s from the stamp in every
+        unit.
 
     """
     name = field or next((name for name in FIELDS if name in scan.columns), '')
@@ -104,7 +104,7 @@ def deskewed(
     min_range_m: float = 0.0,
 ) -> Scan:
     """
-    Return a scan with all points as seen from where the sensor was at its stamp.
+    Return a scan with all points in the sensor frame at its stamp.
 
     Parameters
     ----------
@@ -113,18 +113,18 @@ def deskewed(
     pose_at : callable
         Returns T_fixed_sensor at a time in nanoseconds, from the first point to the last.
     stamps_ns : iterable of int
-        Where the pose source has poses; others than between first and last are passed over.
+        Stamps of the pose source; those not between first and last point are ignored.
     min_range_m : float
         Points nearer to the sensor are put into its origin instead of being moved.
 
     Returns
     -------
     Scan
-        As many points, in the order they came in, as (N, 3) float64; all at the stamp.
+        The points in the same order, (N, 3) float64, all at the stamp.
 
     """
     times = scan.times
-    assert times is not None, 'who deskews has found the times'
+    assert times is not None, 'point_times comes before'
     stamps = [s for s in stamps_ns if times.first_ns < s < times.last_ns]
     ends = sorted({times.first_ns, *stamps, times.last_ns})
     knots, poses = _track(ends, pose_at)
@@ -151,7 +151,7 @@ def warm_up() -> None:
 
 
 def _measured(points: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
-    """Return which points are some: finite and not in the origin."""
+    """Return which points are valid: finite and not in the origin."""
     x, y, z = points.T
     with np.errstate(over='ignore', invalid='ignore'):
         reach = np.abs(x) + np.abs(y) + np.abs(z)
@@ -179,7 +179,7 @@ def _offsets(
 ) -> npt.NDArray[np.int64]:
     """Return times in nanoseconds after the stamp; the difference is taken before the factor."""
     base = stamp_ns // unit_ns if is_epoch else 0
-    limit = 4 * MAX_SWEEP_NS // unit_ns  # what is beyond is refused, and must not overflow
+    limit = 4 * MAX_SWEEP_NS // unit_ns  # larger ones are refused, and must not overflow
     if values.dtype.kind == 'f':
         base = int(float(base))
         after = np.clip(values.astype(np.float64) - base, -limit, limit) * unit_ns
@@ -192,7 +192,7 @@ def _offsets(
 def _track(
     ends: list[int], pose_at: Callable[[int], Transform]
 ) -> tuple[list[int], list[Transform]]:
-    """Return times and poses, some between the given times where the sensor turns much."""
+    """Return times and poses, with further ones between if the sensor turns much."""
     knots, poses = ends[:1], [pose_at(ends[0])]
     for start, end in pairwise(ends):
         pose = pose_at(end)

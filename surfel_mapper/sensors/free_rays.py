@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Where the rays of a lidar went that met nothing.
+Directions of the rays of a lidar that met nothing.
 
-REP 117 has inf stand for a return beyond the range, and such a point has no direction. In an
-organised cloud it is that of its neighbours: points of a row have one elevation, those of a
-column one azimuth but for an offset of the row. Points that are nan or 0 say nothing.
+REP 117 writes inf for a return beyond the range, and such a point has no direction of its own. In
+an organised cloud its neighbours give it: points of a row have one elevation, those of a column
+one azimuth but for an offset of the row. Points that are nan or 0 are unknown.
 """
 
 from __future__ import annotations
@@ -18,21 +18,21 @@ import numpy.typing as npt
 from surfel_mapper.scan import Scan
 
 MOST_OFF = 0.6
-"""Steps between columns that half of the points may be off where rows and columns are those."""
+"""Median error of the azimuth, in steps between columns, up to which rows are taken as beams."""
 
 ROUNDS = 4
-"""In each, columns follow from rows and rows from columns; four leave less than 0.1 deg."""
+"""Rounds of fitting columns to rows and rows to columns; four leave less than 0.1 deg."""
 
 
 def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
     """
-    Return unit vectors of the points at infinity, (K, 3); None where there are none.
+    Return unit vectors of the points at infinity, (K, 3); None without any.
 
     Parameters
     ----------
     scan : Scan
         With the cloud that it was read from, whose rows or columns are the beams of a lidar;
-        for one that is not so there is nothing to know.
+        None is returned for other clouds.
 
     """
     rows, columns = int(getattr(scan.msg, 'height', 0)), int(getattr(scan.msg, 'width', 0))
@@ -50,7 +50,7 @@ def free_directions(scan: Scan) -> npt.NDArray[np.float32] | None:
 def rays_of_beams(
     points: npt.NDArray[Any], infinite: npt.NDArray[np.bool_]
 ) -> npt.NDArray[np.float32] | None:
-    """Return the directions of some pixels, (beams, columns, 3), by those that have points."""
+    """Return the directions of the infinite pixels of (beams, columns, 3)."""
     level = points[..., 0] + 1j * points[..., 1].astype(np.float64)
     reach = np.abs(level)
     known = reach > 0.0
@@ -74,7 +74,7 @@ def rays_of_beams(
 
 
 def unit(numbers: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
-    """Return complex numbers of length 1, and 0 where there is none."""
+    """Return complex numbers scaled to length 1; 0 stays 0."""
     length = np.abs(numbers)
     result: npt.NDArray[np.complex128] = np.zeros_like(numbers)
     np.divide(numbers, length, out=result, where=length > 0.0)

@@ -17,16 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.messages.model_messages import GREY, primitive_colors, quaternions
-from surfel_mapper.models.shapes import ellipsoid_frames, Shapes
+from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.mesh import vertex_normals
-from surfel_mapper.viz.models import models_mesh
 from surfel_mapper.viz.picture import sides_m, SPREAD
 
 if TYPE_CHECKING:
-    from surfel_mapper.models.live import LiveModels
     from surfel_mapper.pipeline import Mapper, Update
 
 NEW = 0.25
@@ -63,7 +61,6 @@ class Viewer:
     def __init__(self, mapper: Mapper, path: str | Path | None = None) -> None:
         self._mapper = mapper
         self._rerun = import_rerun()
-        self._shapes = Shapes()
         self._positions: list[npt.NDArray[np.float64]] = []
         self._logged_voxels = self._removed = 0
         self._stream: Any = self._rerun.RecordingStream('surfel_mapper')
@@ -118,34 +115,34 @@ class Viewer:
         mapper = self._mapper
         self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
         self._logged_voxels, self._removed = mapper.map.num_voxels, 0
-        if mapper.tsdf is not None:
-            self._log_mesh('map/mesh', mapper.tsdf.mesh())
-        if mapper.models is not None:
-            self._log_models(mapper.models)
+        drawings = [drawing for layer in mapper.layers.values() for drawing in layer.drawings()]
+        for group in {drawing.name.partition('/')[0] for drawing in drawings}:
+            self._stream.log(f'map/{group}', self._rerun.Clear(recursive=True))
+        for drawing in drawings:
+            self._log_drawing(f'map/{drawing.name}', drawing)
 
-    def _log_models(self, models: LiveModels) -> None:
-        """Log planes and surfaces, their outlines with their ids, and Gaussians as ellipsoids."""
-        rerun, gaussians = self._rerun, models.model.gaussians
-        shapes = self._shapes.of(models.model, models.versions)
-        self._stream.log('map/models', rerun.Clear(recursive=True))
-        self._log_mesh('map/models/patches', models_mesh(shapes))
-        rings = [(shape.patch.id, ring) for shape in shapes for ring in shape.rings]
-        outlines = rerun.LineStrips3D(
-            [np.concatenate([ring, ring[:1]]) for _, ring in rings],
-            colors=primitive_colors([number for number, _ in rings]),
-            labels=[str(number) for number, _ in rings],
-            show_labels=False,
-        )
-        self._stream.log('map/models/outlines', outlines)
-        R_map_axes, half = ellipsoid_frames(gaussians)
-        ellipsoids = rerun.Ellipsoids3D(
-            centers=gaussians.mean,
-            half_sizes=half,
-            quaternions=quaternions(R_map_axes),
-            colors=[GREY] * len(gaussians),
-            fill_mode='solid',
-        )
-        self._stream.log('map/models/gaussians', ellipsoids)
+    def _log_drawing(self, name: str, drawing: Drawing) -> None:
+        """Log the shapes of a layer."""
+        rerun = self._rerun
+        if isinstance(drawing, MeshDrawing):
+            self._log_mesh(name, drawing.mesh)
+        elif isinstance(drawing, RingsDrawing):
+            lines = rerun.LineStrips3D(
+                [np.concatenate([ring, ring[:1]]) for ring in drawing.rings],
+                colors=drawing.colors,
+                labels=list(drawing.labels),
+                show_labels=False,
+            )
+            self._stream.log(name, lines)
+        else:
+            ellipsoids = rerun.Ellipsoids3D(
+                centers=drawing.centers,
+                half_sizes=drawing.half_sizes_m,
+                quaternions=quaternions(drawing.R_map_axes),
+                colors=[drawing.color] * len(drawing.centers),
+                fill_mode='solid',
+            )
+            self._stream.log(name, ellipsoids)
 
     def _log_mesh(self, name: str, mesh: Mesh) -> None:
         """Log a mesh, in its colours if it has any."""

@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.config import Config, GridConfig, ModelsLayerConfig
+from surfel_mapper.layers.costs.traversability import traversability
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_columns import surfel_columns
-from surfel_mapper.mapping.traversability import traversability
 from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.messages.map_cloud import MapMirror, moment_cloud
 from surfel_mapper.messages.markers import marker_array

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mappers, scans and poses for the tests of Mapper, and what a map of them has to be."""
+"""Mappers, scans and poses for the tests of Mapper, and the expected digests."""
 
 import numpy as np
 
@@ -49,7 +49,7 @@ def insert(mapper, *scans):
 
 
 def digest_of(*posed_scans):
-    """Return the digest of a map of scans at their poses, less what is within 0.1 m."""
+    """Return the digest of a map of scans at their poses, without points within 0.1 m."""
     surfel_map = SurfelMap(0.5)
     for scan, pose in posed_scans:
         moments = surfel_map.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mapper.align: scans move in the map, exactly, whatever was done to their points before."""
+"""Mapper.align: scans move in the map exactly, filtered, deskewed or cleared before."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def test_limits_of_range_and_columns_hold_for_moved_scans(drive):
     assert mapper.map.digest() == rebuilt(mapper, scans).digest()
 
 
-def test_what_filters_took_away_does_not_come_back(drive, tmp_path):
+def test_filtered_points_stay_out_after_an_alignment(drive, tmp_path):
     chain = tmp_path / 'chain.yaml'
     chain.write_text('- RandomSamplingDataPointsFilter:\n    prob: 0.5\n')
     mapper, _ = mapped(drive, {'filters': str(chain)})
@@ -121,7 +121,7 @@ def test_what_filters_took_away_does_not_come_back(drive, tmp_path):
     assert mapper.map.digest() == rebuilt(mapper, kept).digest()
 
 
-def test_what_was_cleared_does_not_come_back(drive):
+def test_cleared_voxels_stay_empty_after_an_alignment(drive):
     mapper, _ = mapped(drive)
     center = tuple(drive[2][3][:3, 3])
     mapper.clear_region(Ball(center, 8.0))

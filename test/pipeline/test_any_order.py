@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mapper: whatever comes in, in any order, the counts add up and the map is its window."""
+"""Mapper: for input in any order the counts add up and the map equals its window."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st

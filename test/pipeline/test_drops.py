@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Mapper: which scans and points are left out, that they are counted, and what is said of them."""
+"""Mapper: scans and points that are left out are counted and logged."""
 
 import logging
 

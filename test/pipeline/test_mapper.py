@@ -46,7 +46,7 @@ def test_clouds_in_the_fixed_frame_need_no_pose():
     assert (updates[0].T_map_sensor == np.eye(4)).all()
     expected = SurfelMap(0.5)
     for scan in scans:
-        expected.add(scan.points)  # from where they were seen is not known
+        expected.add(scan.points)  # their viewpoint is unknown
     assert mapper.map.digest() == expected.digest()
 
 
@@ -211,7 +211,7 @@ def test_a_region_that_is_cleared_stays_empty_until_it_is_seen_again():
     assert 0 < inside.sum() < len(before)
     assert sorted(gone.tolist()) == sorted(before.voxel_index[inside].tolist())
     add_pose(mapper, 3.0, x=100.0)
-    (update,) = insert(mapper, scan_at(3.0))  # evicts the first, without what was cleared
+    (update,) = insert(mapper, scan_at(3.0))  # evicts the first, without the cleared voxels
     removed = update.removed_voxel_index.tolist()
     assert not set(map(tuple, gone.tolist())) & set(map(tuple, removed))
     assert_counts_add_up(mapper)

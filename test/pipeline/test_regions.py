@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Regions: which points are inside, by hand and by other tests of the same; what is refused."""
+"""Regions: points inside, by hand and by independent tests; refused regions."""
 
 from matplotlib.path import Path as Polygon
 import numpy as np

@@ -143,7 +143,7 @@ def test_a_scan_that_does_not_fit_is_dropped_and_the_next_one_mapped():
     np.testing.assert_allclose(update.T_map_sensor, compose(inverse(TRUE), pose_at(5)), atol=5e-3)
 
 
-def test_what_cannot_be_known_is_said(caplog):
+def test_degenerate_registrations_are_warned_about(caplog):
     mapper = mapper_with()
 
     updates = feed(mapper, [scan_at(n, TRUE, faces=CORRIDOR, reach_m=20.0) for n in range(3)])

@@ -11,7 +11,7 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.tsdf.queries import labels_of
-from test.pipeline.test_tsdf_layer import LIDAR, RING
+from test.layers.test_distance_field import LIDAR, RING
 
 MS = 10**6
 CAMERA = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)

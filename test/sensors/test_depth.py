@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images to points: against the projection of known points, and what is refused."""
+"""Depth images to points: against the projection of known points; refused images."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def test_an_image_of_another_size_or_type_is_refused():
 @pytest.mark.parametrize(
     'wrong', [{'fx': 0.0}, {'fy': -1.0}, {'width': 0}, {'cx': np.nan}, {'fx': np.inf}]
 )
-def test_what_is_no_camera_is_refused(wrong):
+def test_invalid_cameras_are_refused(wrong):
     right = {'width': 4, 'height': 3, 'fx': 1.0, 'fy': 1.0, 'cx': 1.0, 'cy': 1.0}
     with pytest.raises(ValueError, match='is it calibrated'):
         PinholeCamera(**{**right, **wrong})

@@ -3,7 +3,7 @@
 """
 Rays that met nothing: found by rows and columns, and free up to the range of the sensor.
 
-Points that are nan say nothing: what no ray is known of stays unknown.
+Points that are nan are unknown: space without rays stays unknown.
 """
 
 from types import SimpleNamespace

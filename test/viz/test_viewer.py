@@ -13,7 +13,7 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
-from test.pipeline.test_tsdf_layer import insert, mapper_with
+from test.layers.test_distance_field import insert, mapper_with
 
 pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Points of a sweep, each moved from where the sensor was at its time to where it was at the stamp.
+Deskewing: points are moved from the pose of the sensor at their time to that at the stamp.
 
 Between two poses the position is linear and the rotation a slerp, of + - * / and sqrt alone, so
 that node and replay get the same bits on any machine. The power series of the slerp is cut after
@@ -27,8 +27,8 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
     min_range_sq  float64, m^2
     moved         (N, 3) float64, out
 
-    A point nearer to the sensor than the range (drivers write 0 0 0 where nothing came back)
-    is put into the origin, where it is still too near; moved, it could become an obstacle.
+    A point nearer to the sensor than the range (drivers write 0 0 0 for a ray without a return)
+    is put into the origin, still too near; if it were moved, it could become an obstacle.
     """
     last = len(knots) - 1
     at = -1

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which places a range image sees through, and which it sees."""
+"""Comparison of places with a range image: seen through, seen, or unknown."""
 
 from numba import njit
 import numpy as np
@@ -12,7 +12,7 @@ UNKNOWN = 0
 THROUGH = 1
 
 LEAST_PIXELS = 5
-"""Of the nine pixels around a place so many have to say something."""
+"""Pixels with a known range that are needed among the nine around a place."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -28,7 +28,7 @@ def look_through(x, y, z, sensor, image, columns, margin, verdict):
              end behind the place by more than the margin; SEEN where the nearest ends within
              it; else UNKNOWN
 
-    All nine have to end behind: at a grazing angle neighbouring pixels differ by more than any
+    All nine must end behind: at a grazing angle neighbouring pixels differ by more than any
     margin, and the place is between them.
     """
     kind, parameters, elevations = sensor

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The TSDF of a mapper: what enters, when and where, and what it says of itself.
+The distance field of a mapper: scans fused, when and where, and its figures.
 
 A lidar stands in a sphere; the mesh has to be that sphere, wherever the poses put it.
 """
@@ -75,13 +75,13 @@ def test_without_the_layer_there_is_none():
     assert 'tsdf' not in mapper.summary()
 
 
-def test_where_poses_have_to_be_final_scans_enter_as_they_leave_the_window():
+def test_with_when_final_scans_are_fused_as_they_leave_the_window():
     mapper = mapper_with(**{'layers.tsdf.when_final': True, 'window.max_scans': 2})
     for number in range(1, 4):
         insert(mapper, number, (20.0 * number, 0.0, 0.0))
     assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (1, 2)
     assert np.abs(radii(mapper.tsdf.mesh(), (20.0, 0.0, 0.0)) - RADIUS_M).max() <= 0.05
-    mapper.tsdf.finish(mapper.window)
+    mapper.finish_layers()
     assert (mapper.tsdf.summary()['scans'], mapper.tsdf.summary()['waiting']) == (3, 0)
     assert mapper.tsdf.mesh().vertices[:, 0].max() > 64.0
 

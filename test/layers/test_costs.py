@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import GridConfig
-from surfel_mapper.mapping.cost_grid import OBSTACLE, UNKNOWN
+from surfel_mapper.layers.costs.traversability import OBSTACLE, traversability, UNKNOWN
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.traversability import traversability
 
 H = 0.5
 LIMITS = GridConfig(size_m=8.0, max_slope_deg=30.0, max_step_m=0.25, clearance_m=2.0)
@@ -79,7 +78,7 @@ def test_a_kerb_above_the_limit_a_hole_and_a_wall_are_obstacles():
     assert wall.cost[4, 4] == 0
 
 
-def test_what_can_be_passed_under_is_no_obstacle():
+def test_a_surface_above_the_clearance_is_no_obstacle():
     flat = ground(lambda x, y: 0.1 + 0 * x)
     high, low = (flat + np.array([0.0, 0.0, height]) for height in (2.6, 1.6))
     assert (grid_of(flat, high).cost == 0).all()

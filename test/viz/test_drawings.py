@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Models on pages and in viewers: triangles, colours and the section of the report."""
+"""The drawings of a layer, of models as an example, on pages and in pictures."""
 
 from __future__ import annotations
 
@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 
 from surfel_mapper.config import ModelsConfig
+from surfel_mapper.layers.drawings import PointsPicture, Section, Table
+from surfel_mapper.layers.models.pictures import drawings_of, MOST_ROWS, panels_of, section_of
 from surfel_mapper.messages.model_messages import GREY, primitive_colors
 from surfel_mapper.models import fit
 from surfel_mapper.models.outlines import areas
-from surfel_mapper.models.shapes import shape_of
-from surfel_mapper.viz import models as viz_models
-from surfel_mapper.viz.models import draw_models, models_mesh, models_section, MOST_ROWS, page_mesh
+from surfel_mapper.models.shapes import ellipsoid_corners, shape_of
+from surfel_mapper.viz import drawings as viz_drawings
+from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
 from test.models.scenes import A, room, VIEW
 from test.viz.test_report import plane, report
 
@@ -26,31 +28,40 @@ def seen():
     return model, [shape_of(patch) for patch in model.patches]
 
 
-def test_the_mesh_of_models_has_their_areas_in_their_colours(seen):
+def page_mesh(shapes, gaussians):
+    return page_meshes(drawings_of(shapes, gaussians))['models']
+
+
+def test_the_page_mesh_of_models_has_their_areas_in_their_colours(seen):
     model, shapes = seen
-    mesh = models_mesh(shapes, model.gaussians)
+    mesh = page_mesh(shapes, model.gaussians)
     corners, colors = mesh.vertices[mesh.triangles], mesh.colors[mesh.triangles[:, 0]]
     for shape in shapes:
         own = np.rint(255 * primitive_colors([shape.patch.id])[0])
         area = areas(corners[(colors == own).all(axis=1)]).sum()
         assert area == pytest.approx(shape.area_m2)
-    assert (colors == np.rint(255 * np.array(GREY))).all(axis=1).sum() == 20 * len(model.gaussians)
-    assert len(models_mesh(shapes)) == len(mesh) - 20 * len(model.gaussians)
-    assert len(models_mesh([])) == 0
+    grey = (colors == np.rint(255 * np.array(GREY))).all(axis=1)
+    assert grey.sum() == 20 * len(model.gaussians)
+    expected = ellipsoid_corners(model.gaussians).reshape(-1, 3)
+    np.testing.assert_allclose(mesh.vertices[-len(expected) :], expected, rtol=0, atol=1e-9)
+
+
+def test_a_page_without_models_has_an_empty_mesh():
+    assert len(page_mesh([], fit(np.empty((0, 3))).gaussians)) == 0
 
 
 def test_a_page_gets_the_gaussians_that_fit_beside_the_patches(seen, monkeypatch):
     model, shapes = seen
     faces = sum(len(shape.faces) for shape in shapes)
-    monkeypatch.setattr(viz_models, 'MAX_TRIANGLES', faces + 20 * 3 + 19)
+    monkeypatch.setattr(viz_drawings, 'MAX_TRIANGLES', faces + 20 * 3 + 19)
     assert len(page_mesh(shapes, model.gaussians)) == faces + 20 * 3
-    monkeypatch.setattr(viz_models, 'MAX_TRIANGLES', 10)
+    monkeypatch.setattr(viz_drawings, 'MAX_TRIANGLES', 10)
     assert len(page_mesh(shapes, model.gaussians)) == faces
 
 
 def test_the_section_names_every_patch_with_its_numbers(seen):
     model, shapes = seen
-    text = models_section(model, shapes)
+    text = section_html(section_of(model, shapes))
     for shape in shapes:
         kind = 'surface' if shape.is_curved else 'plane'
         assert f'<td>{shape.patch.id}</td><td>{kind}</td>' in text
@@ -61,20 +72,20 @@ def test_the_section_names_every_patch_with_its_numbers(seen):
     assert f'<dt>Gaussians</dt><dd>{len(model.gaussians)}</dd>' in text
 
 
-def test_table_of_many_patches_lists_the_largest(seen):
+def test_of_many_patches_the_largest_are_named(seen):
     model, shapes = seen
     many = [
         replace(shape, patch=replace(shape.patch, id=100 * k + shape.patch.id))
         for k in range(5)
         for shape in shapes
     ]
-    text = models_section(model, many)
+    text = section_html(section_of(model, many))
     assert text.count('class="swatch"') == MOST_ROWS < len(many)
     assert f'The largest {MOST_ROWS} of {len(many)}.' in text
 
 
 def test_models_of_nothing_are_a_section_too():
-    text = models_section(fit(np.empty((0, 3))), [])
+    text = section_html(section_of(fit(np.empty((0, 3))), []))
     assert '<dt>planes</dt><dd>0</dd>' in text
     assert '<table>' not in text
 
@@ -82,11 +93,21 @@ def test_models_of_nothing_are_a_section_too():
 def test_models_are_a_layer_and_a_section_of_the_report(seen, tmp_path):
     model, shapes = seen
     picture = tmp_path / 'models.png'
-    draw_models(picture, room(160, 120)[0], model, VIEW, 'voxels')
-    section = models_section(model, shapes, picture)
+    panels = panels_of(room(160, 120)[0], model, 'voxels')
+    draw_points(picture, PointsPicture(file_name='models.png', panels=panels, viewpoint=VIEW))
+    section = section_html(section_of(model, shapes), picture)
     mesh = page_mesh(shapes, model.gaussians)
     parsed = report(tmp_path, plane(20), layers={'models': mesh}, sections=[section])
     assert any(text == 'models' for tag, _, text in parsed.text if tag == 'option')
-    assert [a['src'][:22] for _, a in parsed.tags if a.get('class') == 'models'] == [
+    assert [a['src'][:22] for _, a in parsed.tags if a.get('class') == 'wide'] == [
         'data:image/png;base64,'
     ]
+
+
+def test_texts_of_a_section_are_escaped():
+    table = Table(titles=('<b>',), num_texts=1, rows=[['<i>']], colors=np.zeros((1, 3)))
+    section = Section(title='<script>', figures={'<a>': '<u>'}, table=table, note='<s>')
+    text = section_html(section)
+    for tag in ('<script>', '<a>', '<u>', '<b>', '<i>', '<s>'):
+        assert tag not in text
+        assert tag.replace('<', '&lt;').replace('>', '&gt;') in text

@@ -7,8 +7,8 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.layers.distance_field.obstacles import distance_field, slice_at
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.obstacles import distance_field, slice_at
 from test.tsdf.test_mesh import blocks_of, centers, VOXEL_M
 
 FIRST = (-1, 2, 0)

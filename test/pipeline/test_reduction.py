@@ -15,7 +15,7 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.look_ahead import LookAhead
+from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import share
@@ -108,7 +108,7 @@ def carve(mapper):
 
 
 @pytest.mark.parametrize('between', [shorten, gate, carve], ids=lambda act: act.__name__)
-def test_what_is_done_between_two_scans_holds_for_the_one_that_was_kept(between):
+def test_changes_between_two_scans_hold_for_the_scan_that_waits(between):
     one, two = mapper_with(1), mapper_with(2)
     expected, found = drive(one, 1, 6), drive(two, 1, 7)  # two keeps the sixth
     assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
@@ -161,20 +161,20 @@ def test_a_scan_that_cannot_be_mapped_is_dropped_and_the_next_comes():
         {'pose.source': 'registration'},
     ],
 )
-def test_where_a_scan_depends_on_the_one_before_none_is_kept(settings):
+def test_no_scan_waits_if_scans_depend_on_the_ones_before(settings):
     mapper = mapper_with(2, **settings)
     add(mapper, 1)
     assert len(list(mapper.insert_ready(more_follows=True))) == 1
 
 
-def test_what_was_begun_counts_for_the_same_scan_at_the_same_pose_alone():
-    ahead, config = LookAhead(SurfelMap(0.5), 2), Config()
+def test_a_reduction_is_used_for_the_same_scan_at_the_same_pose_only():
+    ahead, config = Reduction(SurfelMap(0.5), 2), Config()
     points = np.random.default_rng(1).uniform(-3.0, 3.0, (50, 3))
     scan = Scan(points=points, stamp_ns=1, frame_id='lidar')
     moved = np.eye(4)
     moved[0, 3] = 0.25
     ahead.begin(scan, np.eye(4), config)
-    there = ahead.reduced(scan, moved, config)
+    there = ahead.reduce(scan, moved, config)
     expected = SurfelMap(0.5).reduce(points, moved, origin=moved[:3, 3], min_range_m=0.1)
     np.testing.assert_array_equal(there.moments.key, expected.key)
     np.testing.assert_array_equal(there.moments.total, expected.total)

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A box moves through a room: where it was is cleared, the room stays, and nothing drifts.
+A box moves through a room: its former places are cleared, the room stays, nothing drifts.
 
 The room and the box are simulated anew for every scan, so that the truth is known.
 """
@@ -12,12 +12,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from surfel_mapper.config import Config, DynamicConfig, TsdfConfig
+from surfel_mapper.config import Config
+from surfel_mapper.layers import Surroundings
+from surfel_mapper.layers.dynamic_objects import DynamicObjectsLayer
+from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.moved_away import MovedAway
-from surfel_mapper.pipeline.sensor_models import SensorModels
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.sensors import LidarModel
 
@@ -31,7 +33,7 @@ SCANS = 40
 
 
 def ranges_to_box(origin, directions, middle, half):
-    """Return where rays enter a box, inf where they miss, and where they leave it."""
+    """Return the ranges at which rays enter a box, inf if they miss it, and leave it."""
     with np.errstate(divide='ignore'):
         first = (middle - half - origin) / directions
         second = (middle + half - origin) / directions
@@ -42,9 +44,9 @@ def ranges_to_box(origin, directions, middle, half):
 
 def scan_of(number, has_box=True, missing_wall=None):
     """
-    Return what a lidar in the middle sees, and where the box is.
+    Return the scan of a lidar in the middle, its origin, and the position of the box.
 
-    In place of a missing wall, that behind the box, points are what is said.
+    Points of the wall behind the box have the value of ``missing_wall``, if given.
     """
     origin = np.array([0.02 * number, 0.0, 0.0])
     box = np.array([-5.0 + 10.0 * number / SCANS, 3.0, -1.0])
@@ -112,15 +114,15 @@ def with_clearing():
     return driven(**{'dynamic.clear': True})
 
 
-def test_where_the_box_was_is_cleared_and_the_room_stays(with_clearing):
+def test_voxels_of_a_box_that_moved_are_cleared_and_the_room_stays(with_clearing):
     mapper, updates = with_clearing
     without, _ = driven()
     assert len(ghosts(without)) > 200
     assert len(ghosts(mapper)) <= 0.02 * len(ghosts(without))
     assert len(walls(mapper)) >= 0.995 * len(walls(without))
-    assert mapper.summary()['cleared_voxels'] == mapper.counters.cleared_voxels > 200
-    assert without.counters.cleared_voxels == 0
-    assert updates[-1].milliseconds['clear'] > 0.0
+    assert mapper.summary()['voxels_cleared']['dynamic'] > 200
+    assert not without.counters.voxels_cleared
+    assert updates[-1].milliseconds['dynamic'] > 0.0
 
 
 def test_rays_that_met_nothing_clear_and_missing_ones_do_not():
@@ -133,21 +135,15 @@ def test_rays_that_met_nothing_clear_and_missing_ones_do_not():
     assert len(walls(clearing)) >= 0.995 * len(walls(without))
 
 
-def test_beyond_the_range_of_the_sensor_nothing_is_known():
-    count = MovedAway(
-        DynamicConfig(clear=True, min_scans=1), SIZE_M, SensorModels(TsdfConfig(max_range_m=2.0))
-    )
-    near, far = (6, 2, 0), INSIDE  # 1.7 and 3.3 m away; what is seen is 6 m away and more
-    assert look(count, EMPTY_ROOM, [near, far]) == []
-    count = MovedAway(
-        DynamicConfig(clear=True, min_scans=1, margin_m=0.1),
-        SIZE_M,
-        SensorModels(TsdfConfig(max_range_m=2.0)),
-    )
-    assert look(count, EMPTY_ROOM, [near, far]) == [near]
+def test_voxels_beyond_the_range_of_the_sensor_stay():
+    count = counting(min_scans=1, max_range_m=2.0)
+    near, far = (6, 2, 0), INSIDE  # 1.7 and 3.3 m away; the walls are at 6 m and more
+    assert voxels_cleared_by(count, EMPTY_ROOM, [near, far]) == []
+    count = counting(min_scans=1, margin_m=0.1, max_range_m=2.0)
+    assert voxels_cleared_by(count, EMPTY_ROOM, [near, far]) == [near]
 
 
-def test_what_is_cleared_is_said_and_gone(with_clearing):
+def test_cleared_voxels_are_in_the_updates(with_clearing):
     _, updates = with_clearing
     there = set()
     for update in updates:
@@ -169,16 +165,25 @@ def test_scans_leave_exactly_after_voxels_were_cleared():
     assert mapper.map.num_voxels == 0
 
 
-def look(count, scan, keys, hit=()):
+def voxels_cleared_by(count, scan, keys, hit=()):
     """Return which of some voxels are empty after a scan from the origin, as a list."""
     keys, hit = pack_keys(np.array(keys)), pack_keys(np.reshape(hit, (-1, 3)).astype(int))
-    found = count.look(scan, np.eye(4), np.sort(keys), hit)
+    found = count.count(scan, np.eye(4), np.sort(keys), hit)
     return sorted(map(tuple, found.tolist()))
 
 
-def counting(**settings):
-    config = DynamicConfig(clear=True, **settings)
-    return MovedAway(config, SIZE_M, SensorModels(TsdfConfig()))
+def counting(max_range_m=None, **settings):
+    """Return the layer of a map that stays empty, without a pipeline."""
+    ranges = {} if max_range_m is None else {'layers.tsdf.max_range_m': max_range_m}
+    stage = {f'dynamic.{name}': value for name, value in settings.items()}
+    config = Config.from_mapping({'dynamic.clear': True, **stage, **ranges})
+    surfel_map = SurfelMap(SIZE_M)
+    around = Surroundings(
+        surfel_map=surfel_map,
+        window=SlidingWindow(surfel_map),
+        sensors=SensorModels(config.tsdf),
+    )
+    return DynamicObjectsLayer(config, around)
 
 
 EMPTY_ROOM = replace(scan_of(0, has_box=False)[0])
@@ -188,31 +193,31 @@ INSIDE, ON_WALL, OUTSIDE = (12, 4, 1), (31, 0, 0), (60, 0, 0)
 def test_a_voxel_is_empty_once_enough_scans_in_a_row_saw_through_it():
     count = counting(min_scans=3)
     voxels = [INSIDE, ON_WALL, OUTSIDE]
-    assert [look(count, EMPTY_ROOM, voxels) for _ in range(3)] == [[], [], [INSIDE]]
+    assert [voxels_cleared_by(count, EMPTY_ROOM, voxels) for _ in range(3)] == [[], [], [INSIDE]]
 
 
 def test_a_hit_or_the_loss_of_the_voxel_begins_the_count_anew():
     count = counting(min_scans=2)
-    assert look(count, EMPTY_ROOM, [INSIDE]) == []
-    assert look(count, EMPTY_ROOM, [INSIDE], hit=[INSIDE]) == []
-    assert look(count, EMPTY_ROOM, [INSIDE]) == []
-    assert look(count, EMPTY_ROOM, [ON_WALL]) == []
-    assert look(count, EMPTY_ROOM, [INSIDE]) == []
-    assert look(count, EMPTY_ROOM, [INSIDE]) == [INSIDE]
+    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE], hit=[INSIDE]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [ON_WALL]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [INSIDE]) == [INSIDE]
 
 
-def test_what_no_ray_says_anything_about_stays():
+def test_voxels_without_rays_stay():
     count = counting(min_scans=1)
     nothing = replace(EMPTY_ROOM, points=np.full_like(EMPTY_ROOM.points, np.nan))
-    look(count, EMPTY_ROOM, [ON_WALL])  # shows the lidar
-    assert look(count, nothing, [INSIDE]) == []
+    voxels_cleared_by(count, EMPTY_ROOM, [ON_WALL])  # shows the lidar
+    assert voxels_cleared_by(count, nothing, [INSIDE]) == []
     above = (0, 1, 30)  # out of view
-    assert look(count, EMPTY_ROOM, [above]) == []
+    assert voxels_cleared_by(count, EMPTY_ROOM, [above]) == []
 
 
-def test_the_margin_bounds_what_counts_as_behind():
-    assert look(counting(min_scans=1, margin_m=20.0), EMPTY_ROOM, [INSIDE]) == []
-    assert look(counting(min_scans=1, margin_m=0.5), EMPTY_ROOM, [INSIDE]) == [INSIDE]
+def test_rays_that_end_within_the_margin_clear_nothing():
+    assert voxels_cleared_by(counting(min_scans=1, margin_m=20.0), EMPTY_ROOM, [INSIDE]) == []
+    assert voxels_cleared_by(counting(min_scans=1, margin_m=0.5), EMPTY_ROOM, [INSIDE]) == [INSIDE]
 
 
 def test_a_scan_that_shows_no_sensor_is_counted_and_mapped_all_the_same():

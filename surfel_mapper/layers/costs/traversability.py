@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A grid of what ground is worth driving on: how steep it is, and how high its steps are.
+A grid of costs of the ground: its slope, and the height of its steps.
 
-A cell is a column of voxels. Its ground is made of its lowest surfel and those not higher above
-it than a robot can pass under. A slope is no step: heights of neighbours are compared where
-their cells meet, after each has been continued along its own slope to there.
+A cell is a column of voxels. Its ground is its lowest surfel and those above it that are too low
+for a robot to pass under. A slope is no step: heights of neighbouring cells are compared on the
+border between them, each continued along its own slope to there.
 """
 
 from __future__ import annotations
@@ -17,13 +17,39 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import GridConfig
-from surfel_mapper.mapping.cost_grid import CostGrid, OBSTACLE, UNKNOWN
 from surfel_mapper.mapping.surfels import Surfels
+
+UNKNOWN = -1
+"""Cost of a cell that was never seen, as nav_msgs/OccupancyGrid has it."""
+
+OBSTACLE = 100
+"""Cost of a cell that cannot be driven on."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ground:
-    """What is known of the cells that hold surfels, one row each, by ascending cell."""
+class CostGrid:
+    """
+    Costs of the cells of an area.
+
+    Attributes
+    ----------
+    resolution_m : float
+        Edge of a cell.
+    origin : (2,) float64, m
+        x and y of the outer corner of the first cell.
+    cost : (rows along y, columns along x) int8
+        0 free to 100 obstacle, -1 never seen.
+
+    """
+
+    resolution_m: float
+    origin: npt.NDArray[np.float64]
+    cost: npt.NDArray[np.int8]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CellGround:
+    """The ground of the cells that hold surfels, one row a cell, by ascending cell."""
 
     cell: npt.NDArray[np.int64]
     top: npt.NDArray[np.int64]
@@ -35,18 +61,18 @@ def traversability(
     surfels: Surfels, voxel_size_m: float, center: npt.ArrayLike, limits: GridConfig
 ) -> CostGrid:
     """
-    Return the grid of a map.
+    Return the costs of the ground around a place.
 
     Parameters
     ----------
     surfels : Surfels
-        In a frame whose z is up; those without a normal say nothing.
+        In a frame whose z is up; those without a normal are left out.
     voxel_size_m : float
         Edge of a voxel, and of a cell.
     center : (2,) float, m
-        About where.
+        Centre of the grid.
     limits : GridConfig
-        Size of the grid, and what makes an obstacle.
+        Size of the grid, and the slope and step that make an obstacle.
 
     Returns
     -------
@@ -71,7 +97,7 @@ def traversability(
     return CostGrid(voxel_size_m, origin, cost.reshape(number, number))
 
 
-def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float) -> Ground:
+def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float) -> CellGround:
     """Return the ground of every cell: its lowest and its top surfel, and its steepest one."""
     height = surfels.position[:, 2]
     order = np.lexsort((height, cell))
@@ -81,7 +107,7 @@ def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float)
     is_ground = height[order] <= bottom + clearance_m
     number = np.add.reduceat(is_ground.astype(np.int64), starts)
     upright = np.where(is_ground, np.abs(surfels.normal[order, 2]), 1.0)
-    return Ground(
+    return CellGround(
         cell=cell[lowest],
         top=order[starts + number - 1],
         lowest=lowest,
@@ -90,7 +116,7 @@ def ground_of(surfels: Surfels, cell: npt.NDArray[np.int64], clearance_m: float)
 
 
 def steps(
-    surfels: Surfels, ground: Ground, voxel_size_m: float, number: int, max_slope_deg: float
+    surfels: Surfels, ground: CellGround, voxel_size_m: float, number: int, max_slope_deg: float
 ) -> npt.NDArray[np.float64]:
     """Return the highest step within each cell and towards its four neighbours, m."""
     steepest = math.tan(math.radians(min(max_slope_deg, 89.0)))

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Edge: the transforms of one frame in another, over time or for all time.
+PoseTrack: the transforms of one frame in its parent, over time or static.
 
-Odometry comes at 100 Hz and more, ten times as often as scans, so what is done for each transform
-is done with Python's own floats: numpy takes a microsecond for any operation on so few.
+Odometry comes at 100 Hz and more, ten times as often as scans, so every transform is checked with
+Python's own floats: numpy takes a microsecond for any operation on a few numbers.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from surfel_mapper.geometry import interpolate, Transform
 NS_PER_S = 1_000_000_000
 
 MAX_SKEW = 1e-6
-"""R R^T of a transform differs from the identity by no more; float32 gives some 1e-7."""
+"""Largest entry of R R^T - I that a transform may have; rounding to float32 gives 1e-7."""
 
 
 @dataclass(slots=True, eq=False)
-class Edge:
-    """The transforms of one child frame in its parent, by ascending stamp; one where static."""
+class PoseTrack:
+    """Transforms of a child frame in its parent by ascending stamp; one if static."""
 
     parent: str
     child: str
@@ -41,8 +41,8 @@ class Edge:
         return f'{self.parent} -> {self.child} (held from {oldest} to {newest} s)'
 
     def insert(self, stamp_ns: int, T_parent_child: Transform) -> None:
-        """Put a transform where its stamp belongs, in the place of one of the same stamp."""
-        if not self.stamps or stamp_ns > self.stamps[-1]:  # as nearly all come
+        """Insert a transform by its stamp; it replaces one of the same stamp."""
+        if not self.stamps or stamp_ns > self.stamps[-1]:  # nearly always
             self.stamps.append(stamp_ns)
             self.transforms.append(T_parent_child)
             return

@@ -1,51 +1,42 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Voxels that later scans see through: what was there has moved away.
+Dynamic objects as a layer: voxels that later scans see through are cleared.
 
-Every scan is turned into a range image, and the voxels of the map are looked up in it. One whose
-rays end behind it, or met nothing, gains a count; one that is seen or hit again loses all. A map
-that has a window forgets what moved anyway; this is for windows longer than things stand still.
+Every scan becomes a range image, and the voxels of the map are looked up in it. A voxel gains a
+count if the rays around it end behind it or met nothing, and loses all counts when it is seen or
+hit again. A short window forgets dynamic objects anyway; this is for windows longer than objects
+stand still.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 import math
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import DynamicConfig, TsdfConfig
+from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
+from surfel_mapper.layers.layer import InsertedScan, Layer, Surroundings
+from surfel_mapper.layers.sensor_models import measured, SensorModels
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.pipeline.sensor_models import measured, SensorModels
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.range_image import from_points
 
 Keys = npt.NDArray[np.int64]
 
 
-class MovedAway:
-    """
-    Counts by how many scans in a row each voxel was seen through.
+class DynamicObjectsLayer(Layer):
+    """Counts, for each voxel, the scans in a row that saw through it."""
 
-    Parameters
-    ----------
-    config : DynamicConfig
-        From how many on a voxel is empty.
-    voxel_size_m : float
-        Of the map.
-    sensors : SensorModels
-        What the scans came from.
+    name = 'dynamic'
+    needs_free_rays = True
 
-    """
-
-    def __init__(self, config: DynamicConfig, voxel_size_m: float, sensors: SensorModels) -> None:
-        """Begin with no counts."""
-        self._config = config
-        self._voxel_size_m = voxel_size_m
-        self._sensors = sensors
+    def __init__(self, config: Config, around: Surroundings) -> None:
+        super().__init__(config, around)
         self.clear()
 
     def clear(self) -> None:
@@ -53,31 +44,45 @@ class MovedAway:
         self._keys = np.empty(0, np.int64)
         self._counts: Keys = np.empty(0, np.int64)
 
+    def voxels_to_clear(self, inserted: InsertedScan) -> npt.NDArray[np.int32]:
+        """
+        Count the voxels that a scan sees through; return those to be cleared, (E, 3).
+
+        Raises
+        ------
+        CloudFormatError
+            If the sensor cannot be told from the points.
+
+        """
+        keys = self.around.surfel_map.keys()
+        return self.count(inserted.scan, inserted.T_map_sensor, keys, inserted.keys)
+
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
         turn = np.linspace(0.0, 2.0 * np.pi, 64)
         ring = np.stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), np.linspace(-1, 1, 64)], axis=1)
         for dtype in (np.float32, np.float64):
             scan = Scan(points=ring.astype(dtype), stamp_ns=0, frame_id='')
-            fresh = MovedAway(self._config, self._voxel_size_m, SensorModels(TsdfConfig()))
-            fresh.look(scan, np.eye(4), np.zeros(1, np.int64), np.zeros(1, np.int64))
+            around = replace(self.around, sensors=SensorModels(self.config.tsdf))
+            fresh = DynamicObjectsLayer(self.config, around)
+            fresh.count(scan, np.eye(4), np.zeros(1, np.int64), np.zeros(1, np.int64))
 
-    def look(
+    def count(
         self, scan: Scan, T_map_sensor: npt.NDArray[np.float64], keys: Keys, hit: Keys
     ) -> npt.NDArray[np.int32]:
         """
-        Count what a scan sees through; return the voxels that are empty by now, (E, 3).
+        Count the voxels that a scan sees through; return those seen through often enough, (E, 3).
 
         Parameters
         ----------
         scan : Scan
-            What was measured.
+            In the frame of its sensor.
         T_map_sensor : (4, 4) float64
-            From where.
+            Its pose in the map.
         keys : (K,) int64
-            Of all voxels of the map.
+            Packed indices of all voxels of the map.
         hit : (H,) int64
-            Of the voxels that have points of the scan.
+            Those of the voxels that hold points of the scan.
 
         Raises
         ------
@@ -93,20 +98,20 @@ class MovedAway:
         counts = np.concatenate([self._counts[known], np.ones(len(through), np.int64)])
         self._keys, place = np.unique(found, return_inverse=True)
         self._counts = np.bincount(place, counts, len(self._keys)).astype(np.int64)
-        empty = self._counts >= self._config.min_scans
+        empty = self._counts >= self.config.dynamic.min_scans
         return unpack_keys(self._keys[empty])
 
     def _verdict(
         self, scan: Scan, T_map_sensor: npt.NDArray[np.float64], keys: Keys
     ) -> npt.NDArray[np.int8]:
-        """Return what a scan says of each voxel."""
-        sensor = self._sensors.of(scan)
+        """Return the verdict of a scan on each voxel, (K,) int8: SEEN, THROUGH or unknown."""
+        sensor, voxel_size_m = self.around.sensors.of(scan), self.around.surfel_map.voxel_size_m
         image = from_points(sensor, measured(scan, sensor.max_range_m)).range_m
-        image = np.minimum(image, np.float32(sensor.max_range_m))  # beyond it nothing is known
+        image = np.minimum(image, np.float32(sensor.max_range_m))  # unknown beyond
         T = inverse(T_map_sensor)
-        centers = (unpack_keys(keys).astype(np.float64) + 0.5) * self._voxel_size_m
+        centers = (unpack_keys(keys).astype(np.float64) + 0.5) * voxel_size_m
         x, y, z = (centers @ T[:3, :3].T + T[:3, 3]).astype(np.float32).T.copy()
-        margin_m = self._config.margin_m or math.sqrt(3.0) * self._voxel_size_m
+        margin_m = self.config.dynamic.margin_m or math.sqrt(3.0) * voxel_size_m
         verdict = np.empty(len(keys), np.int8)
         look_through(
             *(x, y, z, sensor.projection, image, sensor.columns, np.float32(margin_m), verdict)

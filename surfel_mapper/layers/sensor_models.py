@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Which camera or lidar each scan came from, and what it measured: points, and free rays."""
+"""The camera or lidar of each scan, and its measurements: points and free rays."""
 
 from __future__ import annotations
 
@@ -17,28 +17,27 @@ from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 class SensorModels:
     """
-    The sensors that scans have come from so far.
+    The sensors of the scans so far.
 
     Parameters
     ----------
     config : TsdfConfig
-        What is known of them beforehand: rows, columns, ranges.
+        Rows, columns and ranges of the sensors, as far as configured.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
-        """Know none."""
         self._config = config
         self._lidars: dict[str, LidarModel] = {}
 
     def of(self, scan: Scan) -> CameraModel | LidarModel:
         """
-        Return the sensor of a scan: its camera, else the lidar that the first of its frame shows.
+        Return the sensor of a scan: its camera, else the lidar fitted to the first of its frame.
 
         Raises
         ------
         CloudFormatError
-            If the points of the first show no lidar.
+            If no lidar fits the points of the first.
 
         """
         config = self._config
@@ -60,7 +59,7 @@ class SensorModels:
 
 
 def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
-    """Return the points of a scan, then one beyond the range along each ray that met nothing."""
+    """Return the points of a scan, then a point beyond the range on each ray that met nothing."""
     if scan.free is None:
         return scan.points
     beyond = 2.0 * max_range_m * scan.free

@@ -86,7 +86,7 @@ def test_a_room_has_floor_walls_and_the_faces_of_the_box():
     assert normals.max(axis=1) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_they_follow_by_the_stamps_of_the_scans():
+def test_models_follow_by_the_stamps_of_the_scans():
     mapper = mapper_with(layers__models__extract_period_s=1.0)
     points = np.random.default_rng(0).uniform(-5, 5, (500, 3)).astype(np.float32)
     stamps = (10.0, 10.4, 10.99, 11.0, 11.5, 12.1)
@@ -97,7 +97,7 @@ def test_they_follow_by_the_stamps_of_the_scans():
     assert ['models' in update.milliseconds for update in updates] == due
 
 
-def test_what_leaves_the_window_leaves_the_models(street):
+def test_evicted_scans_leave_the_models(street):
     mapper = mapper_with(layers__models__extract_period_s=0.0, window__max_scans=2)
     scans, poses = street
     far = [pose.copy() for pose in poses]

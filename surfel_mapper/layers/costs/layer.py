@@ -1,0 +1,43 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The costs of the ground as a layer: ``~/grid`` for Nav2, made from the surfels when published.
+
+It stands apart from traversability.py, which needs no layer. The layer keeps nothing: the grid
+follows from the surfels around the sensor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from surfel_mapper.layers.costs.traversability import traversability
+from surfel_mapper.layers.layer import Layer, Moment, Publication
+from surfel_mapper.messages.grids import occupancy_grid
+
+
+class CostsLayer(Layer):
+    """Publishes the cost of every cell around the sensor."""
+
+    name = 'grid'
+
+    def publications(self) -> Sequence[Publication]:
+        """Return the grid, made anew when the map has changed."""
+        return (
+            Publication(
+                topic='~/grid',
+                type_name='nav_msgs/msg/OccupancyGrid',
+                messages=self._grid_messages,
+                rate_hz=lambda config: config.grid.rate_hz,
+                version=lambda: self.around.surfel_map.version,
+                is_eager=True,
+            ),
+        )
+
+    def _grid_messages(self, now: Moment) -> list[bytes]:
+        config, surfel_map = self.config, self.around.surfel_map
+        surfels = surfel_map.surfels(config.map.min_points)
+        center = now.T_map_sensor[:2, 3]
+        grid = traversability(surfels, surfel_map.voxel_size_m, center, config.grid)
+        content = (grid.resolution_m, grid.origin, grid.cost)
+        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]

@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The truncated signed distance field as a layer: fused from the scans, published as mesh and slice.
+
+A scan is fused at once or, with ``layers.tsdf.when_final``, when it leaves the window and its pose
+is final: fusion cannot be undone. The sensor is the camera that a scan names, else the lidar
+fitted to the first points of its frame; see tsdf/fitting.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import Config
+from surfel_mapper.files.ply import write_mesh
+from surfel_mapper.layers.distance_field.obstacles import slice_at
+from surfel_mapper.layers.drawings import Drawing, MeshDrawing
+from surfel_mapper.layers.layer import (
+    Images,
+    InsertedScan,
+    Layer,
+    Moment,
+    Publication,
+    Surroundings,
+)
+from surfel_mapper.layers.sensor_models import measured, SensorModels
+from surfel_mapper.mapping.channels import quantised
+from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.messages.grids import occupancy_grid
+from surfel_mapper.messages.markers import marker_bytes
+from surfel_mapper.messages.surfel_markers import mesh_marker
+from surfel_mapper.scan import Scan
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.integrator import Integrated, Integrator
+from surfel_mapper.tsdf.mesh import Mesh, Mesher
+from surfel_mapper.tsdf.range_image import from_points, RangeImage
+
+
+class TsdfLayer(Layer):
+    """
+    A signed distance field, fused scan by scan.
+
+    Attributes
+    ----------
+    blocks : BlockMap
+        The field.
+
+    """
+
+    name = 'tsdf'
+    needs_free_rays = True
+
+    def __init__(self, config: Config, around: Surroundings) -> None:
+        super().__init__(config, around)
+        self.clear()
+
+    @property
+    def images(self) -> Images:
+        """Colour and label images, if configured."""
+        config = self.config.tsdf
+        return Images(
+            topics=config.image_topics,
+            tolerance_s=config.image_tolerance_s,
+            setting='layers.tsdf.image_tolerance_s',
+        )
+
+    def clear(self) -> None:
+        """Forget everything but the sensors."""
+        self.blocks = BlockMap(self.config.tsdf)
+        self._integrator = Integrator(self.blocks)
+        self._mesher = Mesher(self.blocks)
+        self._waiting: dict[int, Scan] = {}
+        self._num_scans = self._num_refused = self._num_labels_lost = 0
+
+    def follow(self, inserted: InsertedScan) -> list[Integrated]:
+        """
+        Fuse the scan that was inserted, or those that have left the window.
+
+        Raises
+        ------
+        CloudFormatError
+            If the sensor cannot be told from the points of a scan.
+        MapLimitError
+            If the field cannot hold a scan; it is as before then.
+
+        """
+        if not self.config.tsdf.when_final:
+            return [self.insert(inserted.scan, inserted.T_map_sensor)]
+        self._waiting[inserted.scan.stamp_ns] = inserted.scan
+        return [done for eviction in inserted.evictions for done in self._settle(eviction.scan)]
+
+    def finish(self) -> None:
+        """Fuse the scans that still wait, at the poses that they have in the window."""
+        for scan in self.around.window:
+            self._settle(scan)
+        self._waiting.clear()
+
+    def insert(self, scan: Scan, T_map_sensor: npt.NDArray[np.float64]) -> Integrated:
+        """
+        Fuse a scan, and drop the blocks that are out of the limits of the layer.
+
+        Raises
+        ------
+        CloudFormatError, MapLimitError
+            See follow.
+
+        """
+        image = self._range_image(scan)
+        self.blocks.clear_updated()
+        done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
+        self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
+        self._num_scans += 1
+        self._num_refused += done.num_refused
+        self._num_labels_lost += done.num_labels_lost
+        return done
+
+    def mesh(self) -> Mesh:
+        """Return the surface; blocks that have not changed since the last call cost little."""
+        self._mesher.update()
+        return self._mesher.mesh()
+
+    def warm_up(self) -> None:
+        """Compile the kernels, for points of either type."""
+        turn = np.linspace(0.0, 2.0 * np.pi, 64)
+        ring = np.stack([10.0 * np.cos(turn), 10.0 * np.sin(turn), np.linspace(-1, 1, 64)], 1)
+        for dtype in (np.float32, np.float64):
+            around = replace(self.around, sensors=SensorModels(self.config.tsdf))
+            layer = TsdfLayer(self.config, around)
+            layer.insert(Scan(points=ring.astype(dtype), stamp_ns=0, frame_id=''), np.eye(4))
+        layer.mesh()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures of the field."""
+        return {
+            'scans': self._num_scans,
+            'waiting': len(self._waiting),
+            'blocks': self.blocks.num_blocks,
+            'blocks_refused': self._num_refused,
+            'labels_lost': self._num_labels_lost,
+            'bytes': self.blocks.nbytes,
+            'voxel_size_m': self.config.tsdf.voxel_size_m,
+        }
+
+    def publications(self) -> Sequence[Publication]:
+        """Return the mesh, and the slice at ``layers.tsdf.slice_height_m``."""
+        return (
+            Publication(
+                topic='~/mesh',
+                type_name='visualization_msgs/msg/Marker',
+                messages=self._mesh_messages,
+                rate_hz=lambda config: config.tsdf.mesh_rate_hz,
+            ),
+            Publication(
+                topic='~/tsdf_slice',
+                type_name='nav_msgs/msg/OccupancyGrid',
+                messages=self._slice_messages,
+                rate_hz=lambda config: config.tsdf.slice_rate_hz,
+                is_eager=True,
+            ),
+        )
+
+    def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
+        """Write mesh.ply."""
+        path = directory / 'mesh.ply'
+        write_mesh(path, self.mesh())
+        return [path]
+
+    def drawings(self) -> Sequence[Drawing]:
+        """Return the mesh."""
+        return [MeshDrawing(name='mesh', mesh=self.mesh())]
+
+    def _mesh_messages(self, now: Moment) -> list[bytes]:
+        return [
+            marker_bytes(mesh_marker(self.mesh(), stamp_ns=now.stamp_ns, frame_id=now.frame_id))
+        ]
+
+    def _slice_messages(self, now: Moment) -> list[bytes]:
+        found = slice_at(self.blocks, self.config.tsdf.slice_height_m)
+        content = (found.resolution_m, found.origin, found.cost)
+        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+
+    def _range_image(self, scan: Scan) -> RangeImage:
+        """Return the range image of a scan: its points, and the rays that met nothing."""
+        config, columns, sensor = self.config.tsdf, scan.columns, self.around.sensors.of(scan)
+        points = measured(scan, sensor.max_range_m)
+        num_free = len(points) - len(scan)
+        colors = colors_of(scan) if config.color else None
+        labels = columns.get('label') if config.semantics != 'none' else None
+        if colors is not None:
+            colors = np.pad(colors, ((0, num_free), (0, 0)))
+        if labels is not None:
+            labels = np.pad(labels, (0, num_free), constant_values=-1)
+        return from_points(sensor, points, colors=colors, labels=labels)
+
+    def _settle(self, windowed: WindowedScan) -> list[Integrated]:
+        """Fuse a scan of the window at its final pose, if it waits for that."""
+        scan = self._waiting.pop(windowed.stamp_ns, None)
+        return [] if scan is None else [self.insert(scan, windowed.T_map_sensor)]
+
+
+def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
+    """
+    Return the colours of the points: (N, 3), or (N, 4) with a fourth value of 0 if unknown.
+
+    Alpha tells which points have a colour, unless it is 0 everywhere, as some drivers leave it.
+    """
+    columns = scan.columns
+    if not {'rgb', 'rgba'} & columns.keys():
+        return None
+    colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
+    packed = columns['rgba'] if 'rgb' not in columns else None
+    if packed is None or packed.dtype != np.uint32 or not (packed >> 24).any():
+        return colors
+    return np.column_stack([colors, (packed >> 24).astype(np.uint8)])

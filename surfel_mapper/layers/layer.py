@@ -1,0 +1,286 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Layer: a representation beside the surfels that follows the scans.
+
+The pipeline, the node, a replay, the report and the viewer loop over the layers that are
+switched on, by these methods, and name none. A layer is below ROS and below the pictures: it
+publishes serialised messages with the name of their type, and describes pictures as arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import Config
+from surfel_mapper.layers.drawings import Drawing, Section
+from surfel_mapper.layers.sensor_models import SensorModels
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import Eviction, SlidingWindow
+from surfel_mapper.scan import Scan
+
+NO_VOXELS = np.empty((0, 3), np.int32)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Surroundings:
+    """
+    The parts of the pipeline that a layer may read.
+
+    Attributes
+    ----------
+    surfel_map : SurfelMap
+        The map; only the pipeline changes it.
+    window : SlidingWindow
+        The scans that it holds.
+    sensors : SensorModels
+        The lidar or camera of each frame, shared by all layers.
+
+    """
+
+    surfel_map: SurfelMap
+    window: SlidingWindow
+    sensors: SensorModels
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class InsertedScan:
+    """
+    A scan that has just been inserted into the map.
+
+    Attributes
+    ----------
+    scan : Scan
+        Deskewed and filtered, in the frame of its sensor.
+    T_map_sensor : (4, 4) float64
+        Its pose in the map.
+    keys : (K,) int64
+        Packed indices of the voxels that hold its points, ascending.
+    num_points : int
+        Points that entered the map.
+    evictions : tuple of Eviction
+        The scans that left the window because of it.
+
+    """
+
+    scan: Scan
+    T_map_sensor: npt.NDArray[np.float64]
+    keys: npt.NDArray[np.int64]
+    num_points: int
+    evictions: tuple[Eviction, ...]
+
+    def at(self, T_map_sensor: npt.NDArray[np.float64]) -> InsertedScan:
+        """Return the scan at another pose, to which an alignment has moved it."""
+        return replace(self, T_map_sensor=T_map_sensor)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Moment:
+    """
+    Stamp, frame and place of the messages that are published between two scans.
+
+    Attributes
+    ----------
+    stamp_ns : int
+        Stamp of the newest scan; 0 before the first.
+    frame_id : str
+        Frame of the map.
+    T_map_sensor : (4, 4) float64
+        Pose of the sensor at that stamp.
+
+    """
+
+    stamp_ns: int = 0
+    frame_id: str = ''
+    T_map_sensor: npt.NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Publication:
+    """
+    A topic of a layer.
+
+    Attributes
+    ----------
+    topic : str
+        Its name, relative or private: ``~/mesh``.
+    type_name : str
+        Type of its messages: ``visualization_msgs/msg/Marker``.
+    messages : callable
+        Takes a Moment; returns the messages, serialised (CDR). Called between two scans.
+    depth : int
+        Messages that the publisher keeps.
+    is_latched : bool
+        Transient local rather than volatile.
+    rate_hz : callable, optional
+        Returns the rate for a configuration, Hz; 0: never. Without it the topic is published
+        after every scan for which ``follow`` returned a result, and once more for every new
+        subscriber.
+    is_eager : bool
+        Published without subscribers too, so that later ones find a latched message.
+    version : callable, optional
+        Published at its rate only if this value differs from the last time.
+    prepare : callable, optional
+        One step of the work for a new subscriber; returns True when ``messages`` is quick.
+        Other scans are mapped between two steps.
+    all_messages : callable, optional
+        As ``messages``, for a new subscriber, if those depend on what was published before.
+
+    """
+
+    topic: str
+    type_name: str
+    messages: Callable[[Moment], Iterable[bytes]]
+    depth: int = 1
+    is_latched: bool = True
+    rate_hz: Callable[[Config], float] | None = None
+    is_eager: bool = False
+    version: Callable[[], object] | None = None
+    prepare: Callable[[], bool] | None = None
+    all_messages: Callable[[Moment], Iterable[bytes]] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Images:
+    """
+    The images that a layer wants joined with scans.
+
+    Attributes
+    ----------
+    topics : mapping of str to str
+        The topic of each kind: ``color``, ``label``.
+    tolerance_s : float
+        An image belongs to a scan if their stamps differ by at most this.
+    setting : str
+        Name of the setting of the tolerance, for warnings.
+
+    """
+
+    topics: Mapping[str, str] = field(default_factory=dict)
+    tolerance_s: float = 0.0
+    setting: str = ''
+
+
+class Layer:
+    """
+    Base class of layers; a layer overrides what it needs.
+
+    Attributes
+    ----------
+    name : str
+        Name of its time per scan, of its summary, and of its result in an Update.
+    needs_free_rays : bool
+        Whether scans shall come with the directions in which the sensor met nothing
+        (``Scan.free``).
+
+    Parameters
+    ----------
+    config : Config
+        All settings.
+    around : Surroundings
+        Map, window and sensors.
+
+    """
+
+    name: ClassVar[str] = ''
+    needs_free_rays: ClassVar[bool] = False
+
+    def __init__(self, config: Config, around: Surroundings) -> None:
+        self.config = config
+        self.around = around
+
+    @property
+    def public(self) -> Any:
+        """The object that users get as ``mapper.<name>``; the layer itself by default."""
+        return self
+
+    @property
+    def images(self) -> Images:
+        """The images that scans shall be joined with; none by default."""
+        return Images()
+
+    def voxels_to_clear(self, inserted: InsertedScan) -> npt.NDArray[np.int32]:
+        """
+        Return the indices (E, 3) of the voxels that the map shall empty after a scan.
+
+        Called before the alignment of the window and before surfels are derived.
+        """
+        return NO_VOXELS
+
+    def follow(self, inserted: InsertedScan) -> Any:
+        """
+        Take a scan that was inserted, after the alignment of the window if one was due.
+
+        Returns
+        -------
+        object or None
+            The result, to be found under the layer's name in the Update; None if the layer had
+            nothing to do.
+
+        Raises
+        ------
+        SurfelMapperError
+            If the layer cannot take the scan; it is as before then. The failure is counted, and
+            a layer that fails several times in a row is switched off.
+
+        """
+        return None
+
+    def finish(self) -> None:
+        """Take what still waits, at the end of a recording."""
+
+    def clear(self) -> None:
+        """Forget all scans."""
+
+    def warm_up(self) -> None:
+        """Compile the kernels, for points of every type."""
+
+    def reconfigure(self, config: Config) -> None:
+        """Take new settings, of which only live ones differ."""
+        self.config = config
+
+    def summary(self) -> dict[str, Any]:
+        """Return figures for files, reports and diagnostics; empty: no entry."""
+        return {}
+
+    def publications(self) -> Sequence[Publication]:
+        """Return the topics of the layer; called once."""
+        return ()
+
+    def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
+        """
+        Write the layer into a directory that exists, each file whole or not at all.
+
+        Parameters
+        ----------
+        directory : Path
+            Where to.
+        formats : sequence of str
+            Formats that the user asked for; see the formats of a replay.
+
+        Returns
+        -------
+        list of Path
+            The files.
+
+        Raises
+        ------
+        FileFormatError
+            If a file cannot be written.
+
+        """
+        return []
+
+    def drawings(self) -> Sequence[Drawing]:
+        """Return the layer as shapes in the map, for the viewer and the report."""
+        return ()
+
+    def section(self) -> Section | None:
+        """Return a section for the report."""
+        return None

@@ -1,0 +1,189 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The models of a map as a layer: planes, B-spline surfaces and Gaussians that follow the map.
+
+They follow by the stamps of the scans, never by the clock, so that a bag replayed at any speed
+gives the same updates. A change counts once however often it happened in between, so a longer
+period costs less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from surfel_mapper.config import Config
+from surfel_mapper.files.model_files import write_models
+from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
+from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
+from surfel_mapper.layers.models.pictures import drawings_of, panels_of, section_of
+from surfel_mapper.messages.markers import marker_array, polygon_instance
+from surfel_mapper.messages.model_messages import (
+    model_markers,
+    primitive_columns,
+    surfel_primitive_columns,
+)
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
+from surfel_mapper.models.filling import joined
+from surfel_mapper.models.live import LiveModels, ModelUpdate
+from surfel_mapper.models.shapes import PatchShape, Shapes
+from surfel_mapper.models.surfel_points import above, surfel_points
+
+STEP = 50
+"""Shapes made between two scans for a new subscriber, which takes some 15 ms."""
+
+OUTLINES_KEPT = 1000
+"""Depth of ~/outlines: there is a message for each polygon, and there may be hundreds at once."""
+
+PICTURE = 'models.png'
+
+
+class ModelsLayer(Layer):
+    """
+    Live models of the map.
+
+    Attributes
+    ----------
+    models : LiveModels
+        The models; ``mapper.models``.
+
+    """
+
+    name = 'models'
+
+    def __init__(self, config: Config, around: Surroundings) -> None:
+        super().__init__(config, around)
+        self.models = LiveModels(config.models, around.surfel_map)
+        self._last_ns: int | None = None
+        self._shapes = Shapes()
+        self._published: dict[int, int] = {}
+        """Versions of the outlines that were published, by id."""
+
+    @property
+    def public(self) -> LiveModels:
+        """The models themselves."""
+        return self.models
+
+    def clear(self) -> None:
+        """Forget the models and when they followed the map last."""
+        self.models.clear()
+        self._last_ns = None
+
+    def follow(self, inserted: InsertedScan) -> ModelUpdate | None:
+        """Update the models if ``layers.models.extract_period_s`` has passed since the last."""
+        stamp_ns = inserted.scan.stamp_ns
+        period_ns = round(self.config.models.extract_period_s * 1e9)
+        if self._last_ns is not None and abs(stamp_ns - self._last_ns) < period_ns:
+            return None
+        self._last_ns = stamp_ns
+        return self.models.update()
+
+    def finish(self) -> None:
+        """Update the models to the map as it is, alignments included."""
+        self.models.update()
+
+    def warm_up(self) -> None:
+        """Compile the kernels."""
+        self.models.warm_up()
+
+    def summary(self) -> dict[str, Any]:
+        """Return how many models there are, and their size."""
+        return self.models.summary()
+
+    def publications(self) -> Sequence[Publication]:
+        """Return markers, tables and outlines of the models."""
+        return (
+            Publication(
+                topic='~/planes',
+                type_name='visualization_msgs/msg/MarkerArray',
+                messages=self._marker_messages,
+                prepare=self._make_shapes,
+            ),
+            Publication(
+                topic='~/primitives',
+                type_name='sensor_msgs/msg/PointCloud2',
+                messages=self._primitive_messages,
+                prepare=self._make_shapes,
+            ),
+            Publication(
+                topic='~/surfel_primitives',
+                type_name='sensor_msgs/msg/PointCloud2',
+                messages=self._surfel_messages,
+            ),
+            Publication(
+                topic='~/outlines',
+                type_name='geometry_msgs/msg/PolygonInstanceStamped',
+                messages=self._changed_outlines,
+                all_messages=self._all_outlines,
+                prepare=self._make_shapes,
+                depth=OUTLINES_KEPT,
+            ),
+        )
+
+    def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
+        """Write models.json and models.obj, and Parquet and DXF if asked for."""
+        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf') if name in formats)]
+        return write_models(directory, self.models.model, wanted, self.models.versions)
+
+    def drawings(self) -> Sequence[Drawing]:
+        """Return patches and their outlines, and Gaussians as ellipsoids."""
+        return drawings_of(self._current_shapes(), self.models.model.gaussians)
+
+    def section(self) -> Section:
+        """Return figures, a picture, and a table of the largest patches."""
+        model, surfels = self.models.model, self.models.surfels
+        points = surfel_points(surfels, model.voxel_size_m)
+        picture = PointsPicture(
+            file_name=PICTURE,
+            panels=panels_of(points, model, f'{len(surfels)} voxels'),
+            viewpoint=above(surfels),
+        )
+        return section_of(model, self._current_shapes(), picture)
+
+    def _make_shapes(self) -> bool:
+        """Make some of the missing shapes; return whether none is missing."""
+        return self._shapes.make(self.models.model, self.models.versions, STEP)
+
+    def _current_shapes(self) -> list[PatchShape]:
+        return self._shapes.of(self.models.model, self.models.versions)
+
+    def _marker_messages(self, now: Moment) -> list[bytes]:
+        markers = model_markers(
+            self._current_shapes(),
+            self.models.model.gaussians,
+            self.around.surfel_map.voxel_size_m,
+            stamp_ns=now.stamp_ns,
+            frame_id=now.frame_id,
+        )
+        return [marker_array(markers)]
+
+    def _primitive_messages(self, now: Moment) -> list[bytes]:
+        gaussians, versions = self.models.model.gaussians, self.models.versions
+        columns = primitive_columns(self._current_shapes(), gaussians, versions)
+        return [cloud_bytes(from_columns(columns), stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+
+    def _surfel_messages(self, now: Moment) -> list[bytes]:
+        columns = surfel_primitive_columns(self.models.surfels, self.models.model)
+        return [cloud_bytes(from_columns(columns), stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+
+    def _all_outlines(self, now: Moment) -> Iterable[bytes]:
+        self._published = dict.fromkeys(self._published, 0)  # those removed are told once more
+        return self._changed_outlines(now)
+
+    def _changed_outlines(self, now: Moment) -> Iterable[bytes]:
+        """Yield outlines that have changed, and empty ones of patches that were removed."""
+        shapes = {shape.patch.id: shape for shape in self._current_shapes()}
+        versions = {number: self.models.versions[number] for number in shapes}
+        before, self._published = self._published, versions
+        rings = {number: np.empty((0, 3)) for number in before.keys() - shapes.keys()}
+        rings |= {
+            number: joined(shapes[number].rings)
+            for number, version in versions.items()
+            if before.get(number) != version
+        }
+        for number, ring in rings.items():
+            yield polygon_instance(ring, number, stamp_ns=now.stamp_ns, frame_id=now.frame_id)

@@ -1,0 +1,157 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Models as drawings: shapes for 3D views, panels of points for a picture, a section of the report.
+
+Every plane and surface has a colour of its own; Gaussians are grey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.layers.drawings import (
+    Drawing,
+    EllipsoidsDrawing,
+    MeshDrawing,
+    Panel,
+    PointsPicture,
+    RingsDrawing,
+    Section,
+    Table,
+)
+from surfel_mapper.messages.model_messages import GREY, primitive_colors
+from surfel_mapper.models.multi_model import Gaussians, MultiModel
+from surfel_mapper.models.shapes import ellipsoid_frames, PatchShape
+from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+
+MOST_POINTS = 120_000
+"""Points drawn of a cloud; a larger one is subsampled evenly."""
+
+MOST_OF_GAUSSIAN = 50
+"""Points drawn of one Gaussian: a voxel of a map may have thousands."""
+
+MOST_ROWS = 25
+"""Rows of the table of a report, for the largest planes and surfaces."""
+
+TITLES = ('id', 'kind', 'area (m\u00b2)', 'points', 'rms (mm)', 'slope (deg)')
+
+
+def drawings_of(shapes: Sequence[PatchShape], gaussians: Gaussians) -> list[Drawing]:
+    """Return patches as a mesh and as rings, and Gaussians as ellipsoids of two sigmas."""
+    R_map_axes, half_sizes_m = ellipsoid_frames(gaussians)
+    rings = [(shape.patch.id, ring) for shape in shapes for ring in shape.rings]
+    return [
+        MeshDrawing(name='models/patches', mesh=patches_mesh(shapes)),
+        RingsDrawing(
+            name='models/outlines',
+            rings=[ring for _, ring in rings],
+            colors=primitive_colors([number for number, _ in rings]),
+            labels=[str(number) for number, _ in rings],
+        ),
+        EllipsoidsDrawing(
+            name='models/gaussians',
+            centers=gaussians.mean,
+            half_sizes_m=half_sizes_m,
+            R_map_axes=R_map_axes,
+            color=GREY,
+            weights=gaussians.num_points,
+        ),
+    ]
+
+
+def patches_mesh(shapes: Sequence[PatchShape]) -> Mesh:
+    """Return planes and surfaces as one mesh in their colours."""
+    if not shapes:
+        return EMPTY
+    begins = np.cumsum([0, *(len(shape.vertices) for shape in shapes)])[:-1]
+    moved = [shape.faces + begin for shape, begin in zip(shapes, begins, strict=True)]
+    colors = primitive_colors([shape.patch.id for shape in shapes])
+    painted = np.repeat(colors, [len(shape.vertices) for shape in shapes], axis=0)
+    return Mesh(
+        vertices=np.concatenate([shape.vertices for shape in shapes]),
+        triangles=np.concatenate(moved).astype(np.int32),
+        colors=np.rint(255.0 * painted).astype(np.uint8),
+    )
+
+
+def panels_of(points: npt.NDArray[Any], model: MultiModel, title: str = '') -> list[Panel]:
+    """
+    Return a cloud, and beside it points on the models that stand for it.
+
+    Parameters
+    ----------
+    points : (N, 3) float, m
+        The cloud; points that are not finite are left out.
+    model : MultiModel
+        Its models.
+    title : str
+        Of the cloud; the number of its points by default.
+
+    """
+    cloud = points[np.isfinite(points).all(axis=1)].astype(np.float64)
+    cloud = cloud[:: max(len(cloud) // MOST_POINTS, 1)]
+    parts = [patch.samples(0.5 * model.voxel_size_m) for patch in model.patches]
+    colors = np.concatenate([primitive_colors([p.id for p in model.patches]), [GREY]])
+    few = np.minimum(model.gaussians.num_points, MOST_OF_GAUSSIAN)
+    parts.append(replace(model.gaussians, num_points=few).samples())
+    caption = (
+        f'{len(model.planes)} planes, {len(model.surfaces)} surfaces, '
+        f'{len(model.gaussians)} Gaussians: {model.size_bytes} bytes'
+    )
+    painted = np.repeat(colors, [len(part) for part in parts], axis=0)
+    return [
+        Panel(title=title or f'{len(points)} points', points=cloud),
+        Panel(title=caption, points=np.concatenate(parts), colors=painted),
+    ]
+
+
+def section_of(
+    model: MultiModel, shapes: Sequence[PatchShape], picture: PointsPicture | None = None
+) -> Section:
+    """Return the section of a report: figures, the picture, and the largest patches."""
+    largest = sorted(shapes, key=lambda shape: -shape.area_m2)[:MOST_ROWS]
+    labels = model.labels
+    in_patches = np.isin(labels, [shape.patch.id for shape in shapes])
+    figures = {
+        'planes': f'{len(model.planes):,}',
+        'surfaces': f'{len(model.surfaces):,}',
+        'Gaussians': f'{len(model.gaussians):,}',
+        'area of planes': f'{sum(s.area_m2 for s in shapes if not s.is_curved):.1f} m\u00b2',
+        'area of surfaces': f'{sum(s.area_m2 for s in shapes if s.is_curved):.1f} m\u00b2',
+        'surfels on them': f'{100.0 * in_patches.sum() / max(len(labels), 1):.1f} %',
+        'bytes when packed': f'{model.size_bytes:,}',
+    }
+    note = f'The largest {MOST_ROWS} of {len(shapes):,}.' if len(shapes) > MOST_ROWS else ''
+    table = Table(
+        titles=TITLES,
+        num_texts=2,
+        rows=[row_of(shape) for shape in largest],
+        colors=primitive_colors([shape.patch.id for shape in largest]),
+    )
+    return Section(
+        title='Planes, surfaces, Gaussians',
+        figures=figures,
+        picture=picture,
+        table=table if largest else None,
+        note=note,
+    )
+
+
+def row_of(shape: PatchShape) -> list[str]:
+    """Return the row of a plane or surface in the table."""
+    patch = shape.patch
+    slope_deg = np.degrees(np.arccos(min(abs(patch.normal[2]), 1.0)))
+    return [
+        str(patch.id),
+        'surface' if shape.is_curved else 'plane',
+        f'{shape.area_m2:.2f}',
+        f'{patch.num_points:,}',
+        f'{1e3 * patch.rms_m:.1f}',
+        f'{slope_deg:.1f}',
+    ]

@@ -1,0 +1,101 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The registry of layers: their names, their classes, and the settings that switch them on.
+
+A class is loaded when its layer is switched on: the models take 0.1 s, which a map without them
+does not wait for. Other packages register layers by an entry point (docs/extending.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import import_module
+
+from surfel_mapper.config import Config
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.layers.layer import Layer
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """
+    How a layer is found.
+
+    Attributes
+    ----------
+    name : str
+        Layer.name.
+    location : str
+        ``module:Class``.
+    switch : str
+        Setting that switches it on, if true and not 0; empty: it is always on.
+
+    """
+
+    name: str
+    location: str
+    switch: str = ''
+
+
+_REGISTERED: dict[str, Registration] = {}
+
+
+def register(name: str, location: str, switch: str = '') -> None:
+    """
+    Register a layer; the order of registration is the order in which layers follow a scan.
+
+    Raises
+    ------
+    ConfigError
+        If another layer has the name.
+
+    """
+    found = _REGISTERED.setdefault(name, Registration(name, location, switch))
+    if found.location != location:
+        raise ConfigError(f'layer {name!r} of {location}: {found.location} has this name already')
+
+
+def unregister(name: str) -> None:
+    """Remove a layer that was registered."""
+    del _REGISTERED[name]
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of all registered layers, switched on or not."""
+    return tuple(_REGISTERED)
+
+
+def enabled(config: Config) -> Iterator[type[Layer]]:
+    """
+    Yield the classes of the layers that a configuration switches on, in their order.
+
+    Raises
+    ------
+    ConfigError
+        If a location holds no layer of the name.
+
+    """
+    settings = config.to_mapping()
+    for registered in _REGISTERED.values():
+        if not registered.switch or settings[registered.switch]:
+            yield _load(registered)
+
+
+def _load(registered: Registration) -> type[Layer]:
+    module, _, name = registered.location.partition(':')
+    found = getattr(import_module(module), name, None)
+    if not (isinstance(found, type) and issubclass(found, Layer)):
+        raise ConfigError(f'layer {registered.name!r}: {registered.location} is no Layer')
+    if found.name != registered.name:
+        raise ConfigError(
+            f'layer {registered.name!r}: {registered.location} has the name {found.name!r}'
+        )
+    return found
+
+
+register('dynamic', 'surfel_mapper.layers.dynamic_objects:DynamicObjectsLayer', 'dynamic.clear')
+register('grid', 'surfel_mapper.layers.costs:CostsLayer')
+register('tsdf', 'surfel_mapper.layers.distance_field:TsdfLayer', 'layers.tsdf.enabled')
+register('models', 'surfel_mapper.layers.models:ModelsLayer', 'layers.models.enabled')

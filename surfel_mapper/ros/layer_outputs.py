@@ -1,0 +1,199 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The topics of the layers, whichever layers there are.
+
+A layer describes its topics (layers/layer.py); they are published here, at their rates or when
+the layer has followed a scan. Messages are made in the mapping thread, between two scans, and for
+a new subscriber of a large layer in steps, each between two scans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from typing import Any
+
+from rclpy.event_handler import PublisherEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.timer import Timer
+
+from surfel_mapper.config import Config
+from surfel_mapper.layers import Layer, Moment, Publication
+from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.ros.base_node import steady_timer
+from surfel_mapper.ros.mapping_thread import MappingThread
+
+
+class LayerOutputs:
+    """
+    The publishers of all layers of a mapper.
+
+    Parameters
+    ----------
+    node : Node
+        Node that owns the publishers.
+    mapper : Mapper
+        Mapper that owns the layers.
+    thread : MappingThread
+        The thread that owns the mapper.
+
+    """
+
+    def __init__(self, node: Node, mapper: Mapper, thread: MappingThread) -> None:
+        self._node = node
+        self._mapper = mapper
+        self._moment = Moment()
+        self._timers: list[Timer] = []
+        self._topics = [
+            LayerTopic(node, layer, publication, thread, self._now)
+            for layer in mapper.layers.values()
+            for publication in layer.publications()
+        ]
+
+    def publish_update(self, update: Update) -> None:
+        """Publish the topics of layers that followed a scan; called in the mapping thread."""
+        self._moment = Moment(
+            stamp_ns=update.stamp_ns, frame_id=update.frame_id, T_map_sensor=update.T_map_sensor
+        )
+        for topic in self._topics:
+            if topic.layer.name in update.layers and not topic.has_rate:
+                topic.publish_if_read()
+
+    def expire(self) -> None:
+        """Publish all topics anew, at once or at their next time; called in the mapping thread."""
+        for topic in self._topics:
+            topic.expire()
+            if not topic.has_rate:
+                topic.publish_if_read()
+
+    def start_timers(self, config: Config) -> None:
+        """Publish at the rates of these settings; called in the executor's thread."""
+        for topic in self._topics:
+            rate_hz = topic.rate_hz(config)
+            if rate_hz:
+                self._timers.append(steady_timer(self._node, rate_hz, topic.post_if_due))
+
+    def stop_timers(self) -> None:
+        """Stop publishing at rates."""
+        for timer in self._timers:
+            self._node.destroy_timer(timer)
+        self._timers.clear()
+
+    def _now(self) -> Moment:
+        """Return stamp, frame and place of the newest scan; before the first, of an empty map."""
+        return self._moment if self._moment.frame_id else Moment(frame_id=self._mapper.map_frame)
+
+
+class LayerTopic:
+    """
+    The publisher of one topic of a layer.
+
+    Parameters
+    ----------
+    node : Node
+        Node that owns the publisher.
+    layer : Layer
+        Layer that makes the messages.
+    publication : Publication
+        Its description of the topic.
+    thread : MappingThread
+        The thread that owns the layer.
+    now : callable
+        Returns the Moment of the messages.
+
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        layer: Layer,
+        publication: Publication,
+        thread: MappingThread,
+        now: Callable[[], Moment],
+    ) -> None:
+        self.layer = layer
+        self._publication = publication
+        self._thread = thread
+        self._now = now
+        self._published: object = None
+        matched = None if self.has_rate else self._on_matched
+        self._publisher = node.create_publisher(
+            message_class(publication.type_name),
+            publication.topic,
+            qos_of(publication),
+            event_callbacks=PublisherEventCallbacks(matched=matched),
+        )
+
+    @property
+    def has_rate(self) -> bool:
+        """Whether the topic is published at a rate, not after scans."""
+        return self._publication.rate_hz is not None
+
+    def rate_hz(self, config: Config) -> float:
+        """Return the rate for a configuration, Hz; 0: never."""
+        rate_hz = self._publication.rate_hz
+        return rate_hz(config) if rate_hz is not None else 0.0
+
+    def post_if_due(self) -> None:
+        """Have the mapping thread publish, if there is news and a reader."""
+        version = self._publication.version
+        is_new = version is None or self._published != version()
+        if is_new and (self._publication.is_eager or self._is_read()):
+            self._thread.post(self._publish)
+
+    def publish_if_read(self) -> None:
+        """Publish to the subscribers, if there are any; called in the mapping thread."""
+        if self._publication.is_eager or self._is_read():
+            self._publish()
+
+    def expire(self) -> None:
+        """Take the content as not published yet."""
+        self._published = None
+
+    def _is_read(self) -> bool:
+        return bool(self._publisher.get_subscription_count())
+
+    def _on_matched(self, status: Any) -> None:
+        """Publish for a new subscriber; called by the executor."""
+        if status.current_count_change > 0:
+            self._thread.post(self._publish_for_new)
+
+    # Called in the mapping thread from here on.
+
+    def _publish(self) -> None:
+        version = self._publication.version
+        if version is not None:
+            self._published = version()
+        self._send(self._publication.messages(self._now()))
+
+    def _publish_for_new(self) -> None:
+        """Make missing content, one step at a time between scans, and then publish."""
+        publication = self._publication
+        if publication.prepare is not None and not publication.prepare():
+            self._thread.post(self._publish_for_new)
+            return
+        self._send((publication.all_messages or publication.messages)(self._now()))
+
+    def _send(self, messages: Iterable[bytes]) -> None:
+        for message in messages:
+            self._publisher.publish(message)
+
+
+def qos_of(publication: Publication) -> QoSProfile:
+    """Return the quality of service of a topic: reliable, and latched if wanted."""
+    durability = DurabilityPolicy.VOLATILE
+    if publication.is_latched:
+        durability = DurabilityPolicy.TRANSIENT_LOCAL
+    return QoSProfile(
+        depth=publication.depth,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=durability,
+    )
+
+
+def message_class(type_name: str) -> Any:
+    """Return the class of a type of messages: ``visualization_msgs/msg/Marker``."""
+    package, kind, name = type_name.split('/')
+    return getattr(import_module(f'{package}.{kind}'), name)
