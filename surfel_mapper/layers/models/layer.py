@@ -28,10 +28,10 @@ from surfel_mapper.messages.model_messages import (
     surfel_primitive_columns,
 )
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
-from surfel_mapper.models.filling import joined
+from surfel_mapper.models.fitting import above, surfel_points
 from surfel_mapper.models.live import LiveModels, ModelUpdate
+from surfel_mapper.models.outlines import bridged
 from surfel_mapper.models.shapes import PatchShape, Shapes
-from surfel_mapper.models.surfel_points import above, surfel_points
 
 STEP = 50
 """Shapes made between two scans for a new subscriber, which takes some 15 ms."""
@@ -181,7 +181,7 @@ class ModelsLayer(Layer):
         before, self._published = self._published, versions
         rings = {number: np.empty((0, 3)) for number in before.keys() - shapes.keys()}
         rings |= {
-            number: joined(shapes[number].rings)
+            number: bridged(shapes[number].rings)
             for number, version in versions.items()
             if before.get(number) != version
         }
