@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.files.model_files import write_models
@@ -179,7 +180,8 @@ class ModelsLayer(Layer):
         shapes = {shape.patch.id: shape for shape in self._current_shapes()}
         versions = {number: self.models.versions[number] for number in shapes}
         before, self._published = self._published, versions
-        rings = {number: np.empty((0, 3)) for number in before.keys() - shapes.keys()}
+        rings: dict[int, npt.NDArray[np.float64]] = {}
+        rings |= {number: np.empty((0, 3)) for number in before.keys() - shapes.keys()}
         rings |= {
             number: bridged(shapes[number].rings)
             for number, version in versions.items()
