@@ -46,10 +46,11 @@ OTHERS = '(others)'
 
 @dataclass(slots=True)
 class FilterCounts:
-    """Counts of a filter of the chain: points in and out, latest times."""
+    """Counts of a filter: points in and out, points dropped as not finite, latest times."""
 
     points_in: int = 0
     points_out: int = 0
+    not_finite: int = 0
     milliseconds: deque[float] = field(default_factory=lambda: deque(maxlen=LATEST))
 
 
@@ -122,11 +123,19 @@ class Counters:
         """Add the time of a scan in a stage."""
         self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(milliseconds)
 
-    def add_filter(self, name: str, points_in: int, points_out: int, milliseconds: float) -> None:
+    def add_filter(
+        self,
+        name: str,
+        points_in: int,
+        points_out: int,
+        milliseconds: float,
+        not_finite: int = 0,
+    ) -> None:
         """Add the counts and time of a filter for a scan."""
         counts = self.filters.setdefault(name, FilterCounts())
         counts.points_in += points_in
         counts.points_out += points_out
+        counts.not_finite += not_finite
         counts.milliseconds.append(milliseconds)
 
     def summary(self) -> dict[str, Any]:
@@ -135,6 +144,7 @@ class Counters:
             name: {
                 'points_in': counts.points_in,
                 'points_out': counts.points_out,
+                'not_finite': counts.not_finite,
                 'milliseconds': percentiles(counts.milliseconds),
             }
             for name, counts in self.filters.items()

@@ -30,6 +30,7 @@ VERBS = (
     'replay',
     'play',
     'info',
+    'filter',
     'filters',
     'extract',
     'simulate',

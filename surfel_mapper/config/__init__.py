@@ -54,7 +54,7 @@ from surfel_mapper.config.stages import (
     PublishConfig,
     WindowConfig,
 )
-from surfel_mapper.config.yaml_files import read_yaml
+from surfel_mapper.config.yaml_files import parse_yaml, read_yaml
 
 __all__ = [
     'AlignConfig',
@@ -86,6 +86,7 @@ __all__ = [
     'flatten',
     'load_config',
     'near',
+    'parse_yaml',
     'plain',
     'read_yaml',
     'setting',

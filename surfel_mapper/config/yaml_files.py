@@ -37,9 +37,13 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
         If it is not YAML, is nested too deeply, or has an alias inside of an anchored node.
 
     """
+    return parse_yaml(Path(path).read_text(encoding='utf-8'), as_text=as_text)
+
+
+def parse_yaml(text: str, *, as_text: bool = False) -> Any:
+    """Return the content of a YAML text; raises ValueError as read_yaml does."""
     import yaml
 
-    text = Path(path).read_text(encoding='utf-8')
     try:
         check_nesting(text)
         return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)

@@ -16,8 +16,9 @@ node and replay keep the same points and any part of a bag is filtered as the wh
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+import functools
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,6 +39,39 @@ parameter = setting
 """The name of ``setting`` in filters: libpointmatcher and the docs call these parameters."""
 
 
+def taking_points(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a method of a filter that also takes an array of points; see as_scan."""
+
+    @functools.wraps(method)
+    def wrapped(self: Any, scan: Scan | Array) -> Any:
+        return method(self, as_scan(scan))
+
+    return wrapped
+
+
+def as_scan(points: Scan | npt.ArrayLike) -> Scan:
+    """
+    Return a scan of points; a scan itself is returned unchanged.
+
+    Parameters
+    ----------
+    points : Scan or (N, 3) array_like, m
+        float32 and float64 stay, other types become float64. Stamp 0, no columns, no poses.
+
+    Raises
+    ------
+    ValueError
+        If the shape is not (N, 3).
+
+    """
+    if isinstance(points, Scan):
+        return points
+    array = np.asarray(points)
+    if array.dtype not in (np.float32, np.float64):
+        array = array.astype(np.float64)
+    return Scan(points=array.reshape(-1, 3) if array.size == 0 else array, stamp_ns=0, frame_id='')
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Filter(Settings):
     """
@@ -54,6 +88,14 @@ class Filter(Settings):
 
     libpointmatcher: ClassVar[str] = ''
     """Name in libpointmatcher; empty if it has no such filter."""
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        """Let ``keep`` and ``apply`` of a filter take an array of points in place of a scan."""
+        super(Filter, cls).__init_subclass__(**kwargs)
+        for method in ('keep', 'apply'):
+            own = cls.__dict__.get(method)
+            if own is not None and not hasattr(own, '__wrapped__'):
+                setattr(cls, method, taking_points(own))
 
     def __post_init__(self) -> None:
         """Check every parameter, then conditions on several."""
@@ -83,6 +125,7 @@ class Filter(Settings):
             If the scan lacks a column that the filter needs, or its values are refused.
 
         """
+        scan = as_scan(scan)
         return select(scan, self.keep(scan))
 
     def column(self, scan: Scan, name: str) -> Array:
@@ -99,6 +142,33 @@ class Filter(Settings):
             return scan.columns[name]
         have = ', '.join(scan.columns) or 'none'
         raise FilterError(f'needs the column {name!r}; the points have {have}')
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FiniteFilter(Filter):
+    """
+    Base of the filters that group points or search neighbours.
+
+    Points with a coordinate that is nan or infinite belong to no group and have no neighbours, so
+    they are dropped first. A filter implements ``keep`` or ``apply_finite``.
+    """
+
+    def apply(self, scan: Scan) -> Scan:
+        """Return the scan filtered, without points that are not finite."""
+        return self.apply_finite(finite(scan))
+
+    def apply_finite(self, scan: Scan) -> Scan:
+        """Return the scan filtered; all its points are finite."""
+        return select(scan, self.keep(scan))
+
+
+def finite(scan: Scan) -> Scan:
+    """Return the scan without the points that have a nan or infinite coordinate."""
+    with np.errstate(all='ignore'):
+        total = scan.points.sum()  # finite only if all are, for the price of one fast pass
+    if np.isfinite(total):
+        return scan
+    return select(scan, np.isfinite(scan.points).all(axis=1))
 
 
 def select(scan: Scan, rows: Array) -> Scan:

@@ -155,7 +155,7 @@ class BoxFilter(ShapeFilter):
     )
     seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=INT32_MAX)
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the drawn points in their order, or means in the order of their first points."""
         boxes = Boxes.of(scan, self.max_points)
         fit = self.fit(scan, boxes)

@@ -30,10 +30,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import near, read_yaml, settings_of
+from surfel_mapper.config import near, parse_yaml, read_yaml, settings_of
 from surfel_mapper.config.settings import checked
 from surfel_mapper.errors import ConfigError, FilterError
-from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.base import as_scan, Filter, finite, FiniteFilter
 from surfel_mapper.filters.columns import (
     DENSITIES,
     EIGEN_VALUES,
@@ -56,6 +56,8 @@ class Step:
     points_in: int
     points_out: int
     milliseconds: float
+    not_finite: int = 0
+    """Points dropped because a coordinate is nan or infinite."""
 
 
 class Chain:
@@ -104,6 +106,23 @@ class Chain:
         return cls(made(item, f'{where}: filter {i}') for i, item in enumerate(items, start=1))
 
     @classmethod
+    def from_yaml(cls, text: str) -> Chain:
+        """
+        Return the chain that a YAML text describes.
+
+        Raises
+        ------
+        ConfigError
+            If it is not YAML, or holds no valid chain.
+
+        """
+        try:
+            content = parse_yaml(text, as_text=True)
+        except ValueError as error:
+            raise ConfigError(f'filters: not YAML: {error}') from error
+        return cls.from_list(content)
+
+    @classmethod
     def load(cls, path: str | Path) -> Chain:
         """
         Return the chain in a YAML file.
@@ -150,13 +169,18 @@ class Chain:
         """Return the number of filters."""
         return len(self.filters)
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply(self, scan: Scan | npt.ArrayLike) -> Scan:
         """Return the filtered scan; see run."""
         return self.run(scan)[0]
 
-    def run(self, scan: Scan) -> tuple[Scan, tuple[Step, ...]]:
+    def run(self, scan: Scan | npt.ArrayLike) -> tuple[Scan, tuple[Step, ...]]:
         """
         Return the filtered scan and a Step for every filter.
+
+        Parameters
+        ----------
+        scan : Scan or (N, 3) array_like, m
+            Points alone become a scan with stamp 0 and without columns.
 
         Raises
         ------
@@ -164,15 +188,22 @@ class Chain:
             If a filter refuses the scan; the message begins with its place and name.
 
         """
+        scan = as_scan(scan)
         steps = []
         for name, each in zip(self.names, self.filters, strict=True):
             start, points_in = time.perf_counter(), len(scan)
+            not_finite = 0
             try:
-                scan = each.apply(scan)
+                if isinstance(each, FiniteFilter):
+                    scan = finite(scan)
+                    not_finite = points_in - len(scan)
+                    scan = each.apply_finite(scan)
+                else:
+                    scan = each.apply(scan)
             except FilterError as error:
                 raise FilterError(f'filter {name}: {error}') from error
             milliseconds = (time.perf_counter() - start) * 1e3
-            steps.append(Step(name, points_in, len(scan), milliseconds))
+            steps.append(Step(name, points_in, len(scan), milliseconds, not_finite))
         return scan, tuple(steps)
 
     def warm_up(self) -> None:

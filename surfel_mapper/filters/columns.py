@@ -314,3 +314,56 @@ def mean_colour(column: Array, groups: PointGroups) -> Array:
     channels = np.ascontiguousarray(column).view(np.uint8).reshape(-1, 4)
     means = np.stack([mean(channels[:, i], groups) for i in range(4)], axis=1)
     return np.rint(means).astype(np.uint8).view(column.dtype).reshape(-1)
+
+
+def as_fields(
+    scan: Scan, *, is_flat: bool = False, has_int64: bool = False
+) -> dict[str, npt.NDArray[Any]]:
+    """
+    Return the coordinates and columns of a scan as the fields of a cloud or a file.
+
+    Parameters
+    ----------
+    scan : Scan
+        Any scan.
+    is_flat : bool
+        Whether the target has no fields of several components: a column (N, C) becomes C fields,
+        ``name_0`` to ``name_C-1``. ``normals`` always become normal_x, normal_y, normal_z, and
+        ``rgb`` of three components red, green, blue.
+    has_int64 : bool
+        Whether the target has integers of 64 bits; if not, they become float64, exact up to 2^53
+        and rounded to 256 for ns since 1970.
+
+    Returns
+    -------
+    dict of str to (N,) or (N, C) array
+        x, y, z first. Booleans become uint8, and a name that is taken already is left out.
+
+    """
+    fields = {name: np.asarray(scan.points[:, axis]) for axis, name in enumerate('xyz')}
+    for name in scan.columns:
+        column = scan.columns[name].reshape(len(scan), math.prod(scan.columns[name].shape[1:]))
+        if column.dtype.kind == 'b':
+            column = column.astype(np.uint8)
+        if column.dtype in (np.int64, np.uint64) and not has_int64:
+            column = column.astype(np.float64)
+        if column.dtype.kind not in 'fiu':
+            continue
+        names = component_names(name, column.shape[1])
+        if scan.columns[name].ndim == 1:
+            fields.setdefault(name, column[:, 0])
+        elif is_flat or names != [f'{name}_{i}' for i in range(column.shape[1])]:
+            for i, each in enumerate(names):
+                fields.setdefault(each, column[:, i])
+        elif column.shape[1]:
+            fields.setdefault(name, column)
+    return fields
+
+
+def component_names(name: str, number: int) -> list[str]:
+    """Return the names of the components of a column as single fields."""
+    if name == NORMALS and number == 3:
+        return list(NORMAL_FIELDS)
+    if name == 'rgb' and number == 3:
+        return ['red', 'green', 'blue']
+    return [f'{name}_{i}' for i in range(number)]

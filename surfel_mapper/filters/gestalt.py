@@ -124,7 +124,7 @@ class Gestalt(ShapeFilter):
     )
     seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the keypoints, in the order of the points; nan is refused."""
         points = coordinates(scan)
         times = times_of(scan) if self.max_time_window < math.inf else None

@@ -27,7 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import ConfigError, FilterError
-from surfel_mapper.filters.base import Filter, generator, parameter, select, with_points
+from surfel_mapper.filters.base import FiniteFilter, generator, parameter, select, with_points
 from surfel_mapper.filters.columns import MergedColumns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
@@ -43,7 +43,7 @@ KEY_BITS = 62
 
 @register(libpointmatcher='VoxelGridDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VoxelGrid(Filter):
+class VoxelGrid(FiniteFilter):
     """Replace the points of every voxel by one, in the order in which voxels first appear."""
 
     size_x_m: float = parameter(1.0, 'Edge along x, m.', low=0.001, libpointmatcher='vSizeX')
@@ -64,6 +64,7 @@ class VoxelGrid(Filter):
         '1: scale averaged normals to unit length; 0: leave them shorter.',
         libpointmatcher_default=False,
     )
+    min_points: int = parameter(1, 'Voxels of fewer points are dropped.', low=1, high=2**31 - 1)
     anchor: str = parameter(
         'origin',
         'Corner of the grid: the origin, the same for all scans, or the minimum of the '
@@ -83,14 +84,14 @@ class VoxelGrid(Filter):
     def _size(self) -> tuple[float, float, float]:
         return self.size_x_m, self.size_y_m, self.size_z_m
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """
         Return one point for every occupied voxel.
 
         Raises
         ------
         FilterError
-            If the scan extends over too many voxels, or a coordinate is not finite.
+            If the scan extends over too many voxels.
 
         """
         if not len(scan):
@@ -101,7 +102,8 @@ class VoxelGrid(Filter):
         means = sums[:, :3] / sums[:, 3:] if self.use_centroid else grid.centres(keys)
         unit = self.unit_normals
         columns = MergedColumns(scan.columns, groups, average=with_rows, unit=unit)
-        return with_points(scan, means, columns)
+        found = with_points(scan, means, columns)
+        return found if self.min_points == 1 else select(found, sums[:, 3] >= self.min_points)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,7 +135,7 @@ class ScanVoxels:
         """Return the grid over the box between two corners; refuse as over does."""
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise FilterError(
-                'a coordinate is nan or infinite; put remove_nan or a box or range before it'
+                'a coordinate is nan or infinite; drop such points with filters.finite'
             )
         shift = low / size if anchor == 'minimum' else np.zeros(3)
         base = np.floor(low / size - shift)
@@ -175,7 +177,7 @@ FIRST, RANDOM, CENTROID, MEDOID = range(4)
 
 @register(libpointmatcher='OctreeGridDataPointsFilter')
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OctreeGrid(Filter):
+class OctreeGrid(FiniteFilter):
     """
     Replace the points of every leaf of an octree by one, in the order of leaves' first points.
 
@@ -207,7 +209,7 @@ class OctreeGrid(Filter):
     )
     seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return one point for every leaf."""
         points = coordinates(scan)
         rows, number = leaves(points, self.max_points, self.max_size_m)

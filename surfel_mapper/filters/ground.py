@@ -19,7 +19,7 @@ import math
 import numpy as np
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.base import Filter, Mask, parameter, select, with_columns
+from surfel_mapper.filters.base import FiniteFilter, Mask, parameter, select, with_columns
 from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.filters.limits import cosine
 from surfel_mapper.filters.neighbours import coordinates, Points
@@ -30,7 +30,7 @@ from surfel_mapper.scan import Scan
 
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Ground(Filter):
+class Ground(FiniteFilter):
     """Select the points on level surfaces: keep them, keep the rest, or mark both."""
 
     keep_part: str = parameter(
@@ -59,7 +59,7 @@ class Ground(Filter):
         choices=('fixed', 'base', 'sensor'),
     )
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the selected points, or all with the column."""
         points = coordinates(scan)
         is_ground = self.is_ground(scan, points)

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FilterError
-from surfel_mapper.filters.base import Filter, Mask, parameter
+from surfel_mapper.filters.base import FiniteFilter, Mask, parameter
 from surfel_mapper.filters.registry import register
 from surfel_mapper.scan import Scan
 
@@ -44,14 +44,12 @@ def coordinates(scan: Scan) -> Points:
     Raises
     ------
     FilterError
-        If a coordinate is nan or infinite: such a point has no neighbours.
+        If a coordinate is nan or infinite; filters drop such points before, see FiniteFilter.
 
     """
     points = np.ascontiguousarray(scan.points, np.float64)
     if not np.isfinite(points).all():
-        raise FilterError(
-            'a coordinate is nan or infinite; put remove_nan or a box or range before it'
-        )
+        raise FilterError('a coordinate is nan or infinite; drop such points with filters.finite')
     return points
 
 
@@ -120,7 +118,7 @@ INT32_MAX = 2**31 - 1
 
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
-class StatisticalOutliers(Filter):
+class StatisticalOutliers(FiniteFilter):
     """Drop the points whose mean distance to their neighbours is unusually large."""
 
     num_neighbours: int = parameter(
@@ -147,7 +145,7 @@ class StatisticalOutliers(Filter):
 
 @register
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RadiusOutliers(Filter):
+class RadiusOutliers(FiniteFilter):
     """Drop the points with too few others within a radius."""
 
     radius_m: float = parameter(0.5, 'Radius around a point, m, included.', low=0.0)

@@ -22,7 +22,7 @@ from typing import overload, TypeVar
 
 from surfel_mapper.config import near
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.base import Filter, FiniteFilter
 
 GROUP = 'surfel_mapper.filters'
 """Group of the entry points."""
@@ -72,7 +72,8 @@ def register(
 def _register(cls: F, *, name: str, libpointmatcher: str) -> F:
     if not (isinstance(cls, type) and issubclass(cls, Filter)):
         raise ConfigError(f'{cls!r}: expected a class derived from surfel_mapper.filters.Filter')
-    if cls.keep is Filter.keep and cls.apply is Filter.apply:
+    own = [each for each in cls.__mro__ if each not in (*FiniteFilter.__mro__, cls)] + [cls]
+    if not any(name in vars(each) for each in own for name in ('keep', 'apply', 'apply_finite')):
         raise ConfigError(f'{cls.__name__}: a filter has to implement keep or apply')
     cls.name = name or re.sub(r'(?<=[a-z0-9])(?=[A-Z])', '_', cls.__name__).lower()
     cls.libpointmatcher = libpointmatcher

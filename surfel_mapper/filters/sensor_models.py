@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.special import erf
 
 from surfel_mapper.filters.base import Filter, Mask, parameter, select, with_columns, with_points
 from surfel_mapper.filters.columns import (
@@ -165,6 +164,8 @@ def waveform(depth_m: Array, angle: Array, aperture: float) -> tuple[Array, Arra
 
     Intensity and waist of the pulse scale all of them and are left out: only ratios are used.
     """
+    from scipy.special import erf  # 0.1 s, only for chains that use it
+
     length = PULSE_SIGMA_S * LIGHT_M_PER_S
     tan, cos, sin = np.tan(angle), np.cos(angle), np.sin(angle)
     spread = 2.0 * (depth_m * tan / length) ** 2 + 2.0 / aperture**2

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import Filter, parameter, with_columns
+from surfel_mapper.filters.base import FiniteFilter, parameter, with_columns
 from surfel_mapper.filters.columns import (
     DENSITIES,
     EIGEN_VALUES,
@@ -188,7 +188,7 @@ def shares(values: Points) -> Points:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ShapeFilter(Filter):
+class ShapeFilter(FiniteFilter):
     """Base of the filters that add normals and eigenvectors."""
 
     eigen_of: str = parameter(
@@ -266,7 +266,7 @@ class SurfaceNormal(ShapeFilter):
         False, 'Average the normals over the neighbours.', libpointmatcher='smoothNormals'
     )
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))

@@ -34,7 +34,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.filters.base import Filter, generator, Mask, parameter, select, with_columns
+from surfel_mapper.filters.base import (
+    FiniteFilter,
+    generator,
+    Mask,
+    parameter,
+    select,
+    with_columns,
+)
 from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
 from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, Points
@@ -140,7 +147,7 @@ class Voting:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class VotingFilter(Filter):
+class VotingFilter(FiniteFilter):
     """Base of the filters by tensor voting."""
 
     num_neighbours: int = parameter(
@@ -186,7 +193,7 @@ class VotingFilter(Filter):
 class Saliency(VotingFilter):
     """Add surfaceness, curveness and pointness by tensor voting, with normals and labels."""
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the scan with the columns added."""
         voting = Voting.among(coordinates(scan), self)
         return self.with_votes(scan, voting.again(voting.first().tensors))
@@ -243,7 +250,7 @@ class SpectralDecomposition(VotingFilter):
     )
     seed: int = parameter(0, 'Seed of the random numbers.', low=0, high=2**31 - 1)
 
-    def apply(self, scan: Scan) -> Scan:
+    def apply_finite(self, scan: Scan) -> Scan:
         """Return the points that stay, with the columns."""
         points, random = coordinates(scan), generator(scan, self.seed)
         rows: npt.NDArray[np.int64] = np.arange(len(points))

@@ -134,3 +134,17 @@ def test_a_chain_can_be_made_of_filters_and_written_as_a_list():
 def test_the_points_of_a_scan_come_out_of_an_empty_chain_untouched():
     scan = scan_of(np.array([[np.nan, np.inf, 1.0]], np.float32))
     assert Chain().run(scan) == (scan, ())
+
+
+def test_a_chain_is_read_from_text():
+    chain = Chain.from_yaml("- RemoveNaNDataPointsFilter\n- voxel_grid: {vSizeX: '0.5'}\n")
+    assert chain.names == ('1 remove_nan', '2 voxel_grid')
+    assert chain.filters[1].size_x_m == 0.5
+    assert len(Chain.from_yaml('')) == 0
+    with pytest.raises(ConfigError, match='filters: not YAML'):
+        Chain.from_yaml('- [')
+
+
+def test_points_of_another_shape_are_refused():
+    with pytest.raises(ValueError, match=r'shape \(4, 2\), expected \(N, 3\)'):
+        Chain.from_yaml('- voxel_grid').apply(np.zeros((4, 2)))

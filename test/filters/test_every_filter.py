@@ -14,8 +14,10 @@ import pytest
 
 from surfel_mapper.config import settings_of
 from surfel_mapper.errors import ConfigError, FilterError
+from surfel_mapper.filters.base import FiniteFilter
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.registry import all_filters, find
+from surfel_mapper.scan import Scan
 from test.filters import libpointmatcher
 from test.filters.examples import random_scan, scan_of
 
@@ -193,19 +195,34 @@ def test_one_point_and_several_at_one_place_are_accepted(cls):
 
 @every
 @pytest.mark.parametrize('number', [1, 250, 500])
-def test_points_that_are_not_finite_are_handled_or_refused_in_words(cls, number):
+def test_points_that_are_not_finite_lose_no_scan_and_are_counted_where_dropped(cls, number):
     scan = random_scan()
     points = scan.points.copy()
     points[:number] = np.nan
     points[number : 2 * number, 2] = np.inf
-    try:
-        found = made(cls).apply(replace(scan, points=points))
-    except FilterError as error:
-        refusal = str(error)
+    scan = replace(scan, points=points)
+    found, (step,) = Chain([made(cls)]).run(scan)
+    assert len(found) == step.points_out <= len(scan)
+    if issubclass(cls, FiniteFilter):
+        assert step.not_finite == min(2 * number, 500)
+        expected = made(cls).apply(scan.select(np.arange(2 * number, 500)))
+        assert bits_of(found) == bits_of(expected) == bits_of(made(cls).apply(scan))
     else:
-        refusal = ''
-        assert len(found) <= len(scan)
-    assert not refusal or 'nan or infinite' in refusal
+        assert step.not_finite == 0
+
+
+@every
+def test_an_array_of_points_stands_for_a_scan(cls):
+    points = random_scan(40).points
+    try:
+        expected = made(cls).apply(Scan(points=points, stamp_ns=0, frame_id=''))
+    except FilterError as error:  # a column or a pose is missing
+        with pytest.raises(FilterError, match=re.escape(str(error).split("'")[0])):
+            made(cls).apply(points)
+    else:
+        np.testing.assert_array_equal(made(cls).apply(points).points, expected.points)
+        doubles = made(cls).apply(points.astype(np.float64)).points
+        np.testing.assert_array_equal(Chain([made(cls)]).apply(points.tolist()).points, doubles)
 
 
 @every

@@ -10,9 +10,10 @@ from importlib.metadata import EntryPoint
 import numpy as np
 import pytest
 
+from surfel_mapper import filters
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.filters import parameter, registry
-from surfel_mapper.filters.base import Filter
+from surfel_mapper.filters.base import Filter, FiniteFilter
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.grids import VoxelGrid
 from surfel_mapper.filters.registry import all_filters, find, register
@@ -73,8 +74,16 @@ def test_a_name_can_be_given_and_taken_once():
 
 
 def test_a_filter_that_filters_nothing_is_refused():
-    with pytest.raises(ConfigError, match='Idle: a filter has to implement keep or apply'):
-        register(type('Idle', (Filter,), {}))
+    for base in (Filter, FiniteFilter):
+        with pytest.raises(ConfigError, match='Idle: a filter has to implement keep or apply'):
+            register(type('Idle', (base,), {}))
+
+
+def test_the_package_exports_every_filter():
+    exported = {cls for cls in vars(filters).values() if isinstance(cls, type)}
+    built_in = [c for c in all_filters() if c.__module__.startswith('surfel_mapper.filters.')]
+    assert [cls.__name__ for cls in built_in if cls not in exported] == []
+    assert all(cls.__name__ in filters.__all__ for cls in built_in)
 
 
 def test_an_entry_point_is_found_by_its_name(monkeypatch):

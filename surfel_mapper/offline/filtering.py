@@ -1,0 +1,244 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A chain of filters applied to files of clouds, folders of scans and bags, without mapping them.
+
+All columns are written, those added by filters too. A bag keeps all its other messages, so that
+it can be replayed with the filtered clouds. A scan of a bag that a filter refuses is left out and
+counted; a file that is refused is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+import logging
+from pathlib import Path
+from typing import Any
+
+from surfel_mapper.bags.paths import is_ros1, is_storage, METADATA
+from surfel_mapper.bags.reader import BagMessage, BagReader
+from surfel_mapper.bags.topics import CLOUD
+from surfel_mapper.bags.writer import BagWriter
+from surfel_mapper.counters import Counters
+from surfel_mapper.errors import BagError, CloudFormatError, FileFormatError, FilterError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
+from surfel_mapper.filters.chain import Chain
+from surfel_mapper.filters.columns import as_fields
+from surfel_mapper.geometry import Transform
+from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
+from surfel_mapper.scan import Scan
+
+log = logging.getLogger(__name__)
+
+WRITTEN = ('.ply', '.pcd')
+"""Suffixes of files that hold all columns."""
+
+Show = Callable[[int, int], None]
+"""Progress: scans done and expected."""
+
+
+@dataclass(slots=True)
+class FilteredClouds:
+    """
+    What a chain did to clouds.
+
+    Attributes
+    ----------
+    scans, refused : int
+        Scans written, and scans of bags that a filter refused or that cannot be decoded.
+    points_in, points_out : int
+        Points of the scans written, before and after the chain.
+    outputs : list of Path
+        Files and bags written.
+    filters : dict of str to dict
+        points_in, points_out, not_finite and milliseconds of every filter.
+
+    """
+
+    scans: int = 0
+    refused: int = 0
+    points_in: int = 0
+    points_out: int = 0
+    outputs: list[Path] = field(default_factory=list)
+    filters: dict[str, Any] = field(default_factory=dict)
+
+
+def filter_clouds(
+    chain: Chain,
+    inputs: Sequence[str | Path],
+    output: str | Path,
+    *,
+    topics: Sequence[str] = (),
+    T_base_sensor: Transform | None = None,
+    overwrite: bool = False,
+    show: Show = lambda done, expected: None,
+) -> FilteredClouds:
+    """
+    Apply a chain to clouds and write the results.
+
+    Parameters
+    ----------
+    chain : Chain
+        The filters.
+    inputs : sequence of path
+        Files of clouds (.ply, .pcd, .bin), folders of them, and bags.
+    output : path
+        For one file: a .ply or .pcd. For one bag: the directory of the bag to write. Else, or for
+        a folder: a directory, in which every file and bag has the name of its input.
+    topics : sequence of str
+        Topics of a bag whose clouds are filtered; empty: all clouds.
+    T_base_sensor : (4, 4) float64, optional
+        Pose of the sensor on the robot, for filters that need it.
+    overwrite : bool
+        Whether outputs may exist.
+    show : callable
+        Called with the scans done and the scans expected.
+
+    Raises
+    ------
+    FileFormatError, BagError
+        If an input cannot be read or an output cannot be written.
+    FilterError
+        If a filter refuses a file.
+
+    """
+    work = _Work(chain, topics, T_base_sensor, show)
+    pairs = list(outputs_of([Path(each) for each in inputs], Path(output)))
+    for _, target in pairs:
+        if target.exists() and not overwrite:
+            raise FileFormatError(f'{target}: exists; choose another output, or overwrite it')
+    chain.warm_up()
+    for source, target in pairs:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if is_bag(source):
+            work.filter_bag(source, target, overwrite)
+        else:
+            work.filter_file(source, target, len(pairs))
+        work.done.outputs.append(target)
+    work.done.filters = work.counters.summary()['filters']
+    return work.done
+
+
+def is_bag(path: Path) -> bool:
+    """Return whether a path is a bag: a storage file, or a directory with one or with metadata."""
+    if not path.is_dir():
+        return is_storage(path) or is_ros1(path)
+    return (path / METADATA).exists() or any(is_storage(file) for file in path.iterdir())
+
+
+def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield every file and bag to read, and the path to write for it."""
+    if len(inputs) == 1 and is_bag(inputs[0]):
+        yield inputs[0], output
+        return
+    if len(inputs) == 1 and inputs[0].is_file():
+        if output.suffix not in WRITTEN:
+            raise FileFormatError(f'{output}: expected a file ending in {" or ".join(WRITTEN)}')
+        yield inputs[0], output
+        return
+    for each in inputs:
+        if is_bag(each):
+            yield each, output / each.stem
+            continue
+        files = scan_files(each) if each.is_dir() else [each]
+        if not files:
+            raise FileFormatError(
+                f'{each}: no bag, no scans in it; expected files ending in {", ".join(SUFFIXES)}'
+            )
+        for file in files:
+            suffix = file.suffix if file.suffix in WRITTEN else '.ply'
+            yield file, output / f'{file.stem}{suffix}'
+
+
+class _Work:
+    """The chain, what it did so far, and the progress."""
+
+    def __init__(
+        self, chain: Chain, topics: Sequence[str], pose: Transform | None, show: Show
+    ) -> None:
+        self.chain = chain
+        self.topics = tuple(topics)
+        self.pose = pose
+        self.show = show
+        self.counters = Counters()
+        self.done = FilteredClouds()
+
+    def filter_file(self, source: Path, target: Path, expected: int) -> None:
+        """Filter the cloud of a file; its number is its stamp, which random filters use."""
+        points, columns = read_scan(source)
+        number = self.done.scans
+        scan = Scan(points=points, stamp_ns=number, frame_id='sensor', columns=columns)
+        try:
+            scan = self._filtered(scan)
+        except FilterError as error:
+            raise FilterError(f'{source}: {error}') from error
+        write = pcd.write_points if target.suffix == '.pcd' else ply.write_points
+        write(target, as_fields(scan, is_flat=True, has_int64=target.suffix == '.pcd'))
+        self.show(self.done.scans, expected)
+
+    def filter_bag(self, source: Path, target: Path, overwrite: bool) -> None:
+        """Filter the clouds of a bag and copy its other messages."""
+        with (
+            BagReader(source) as reader,
+            BagWriter(target, overwrite=overwrite) as writer,
+        ):
+            topics = self._cloud_topics(reader)
+            if reader.is_ros1:
+                log.warning('%s: a ROS 1 bag; only its clouds are written', source)
+            names = topics if reader.is_ros1 else None
+            count = sum(topic.count for topic in reader.topics if topic.name in topics)
+            latched = {topic.name for topic in reader.topics if reader.is_latched(topic.name)}
+            for message in reader.messages(names):
+                if message.topic in topics:
+                    self._filter_message(reader, writer, message)
+                    self.show(self.done.scans + self.done.refused, count)
+                else:
+                    writer.write(
+                        message.topic,
+                        message.type,
+                        message.record_ns,
+                        message.raw,
+                        latched=message.topic in latched,
+                    )
+
+    def _filter_message(self, reader: BagReader, writer: BagWriter, message: BagMessage) -> None:
+        """Write the filtered cloud of a message; a refused one is counted."""
+        try:
+            scan = self._filtered(to_scan(reader.decode(message), message.topic))
+        except (CloudFormatError, FilterError) as error:
+            if not self.done.refused:
+                log.warning('%s: %s; further ones are only counted', message.topic, error)
+            self.done.refused += 1
+            return
+        writer.write_cloud(
+            message.topic,
+            message.record_ns,
+            scan.stamp_ns,
+            scan.frame_id,
+            from_columns(as_fields(scan)),
+        )
+
+    def _filtered(self, scan: Scan) -> Scan:
+        """Return the scan filtered, and count it."""
+        found, steps = self.chain.run(replace(scan, T_base_sensor=self.pose))
+        for step in steps:
+            self.counters.add_filter(
+                step.name, step.points_in, step.points_out, step.milliseconds, step.not_finite
+            )
+        self.done.scans += 1
+        self.done.points_in += len(scan)
+        self.done.points_out += len(found)
+        return found
+
+    def _cloud_topics(self, reader: BagReader) -> tuple[str, ...]:
+        """Return the topics of a bag to filter."""
+        clouds = [topic.name for topic in reader.topics if topic.type == CLOUD and topic.count]
+        missing = [name for name in self.topics if name not in clouds]
+        if missing or not clouds:
+            raise BagError(
+                f'{reader.path}: no topic {", ".join(missing) or CLOUD}; '
+                f'PointCloud2 topics: {", ".join(clouds) or "none"}'
+            )
+        return self.topics or tuple(clouds)
