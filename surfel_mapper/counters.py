@@ -80,6 +80,8 @@ class Counters:
         Points not added, by cause.
     messages_ignored : Counter of str
         Other messages (transforms, odometry) not used, by cause.
+    layers_off : dict of str to str
+        Layers that were switched off because they failed, with the last error.
     milliseconds : dict of str to deque of float
         Times of every stage for the latest scans.
     filters : dict of str to FilterCounts
@@ -99,6 +101,7 @@ class Counters:
     dropped_by_frame: dict[str, Counter[str]] = field(default_factory=dict)
     points_left_out: Counter[str] = field(default_factory=Counter)
     messages_ignored: Counter[str] = field(default_factory=Counter)
+    layers_off: dict[str, str] = field(default_factory=dict)
     milliseconds: dict[str, deque[float]] = field(default_factory=dict)
     filters: dict[str, FilterCounts] = field(default_factory=dict)
 
@@ -164,6 +167,7 @@ class Counters:
             'points': self.points,
             'points_left_out': dict(self.points_left_out),
             'messages_ignored': dict(self.messages_ignored),
+            **({'layers_off': dict(self.layers_off)} if self.layers_off else {}),
             'milliseconds': {k: percentiles(v) for k, v in self.milliseconds.items()},
             'filters': filters,
         }

@@ -389,3 +389,22 @@ def test_rotations_are_recognised_as_by_numpy(seed, skew):
 def test_a_duration_that_is_none_is_refused(name, value):
     with pytest.raises(ValueError, match=name):
         TransformBuffer(**{name: value})
+
+
+# Gaps
+
+
+def test_nothing_is_interpolated_across_a_long_gap():
+    buffer = drive(max_gap_s=0.9, reset_after_s=10.0)
+    text = not_yet(buffer, 'odom', 'lidar', EPOCH + S + 1)
+    assert 'in a gap of 1.000 s of odom -> base' in text
+    assert 'pose.max_gap_s' in text
+    expected = compose(moved(10.0), some_pose(1))
+    assert buffer.lookup('odom', 'lidar', EPOCH + S).tobytes() == expected.tobytes()
+
+    buffer.add('odom', 'base', EPOCH + S + S // 2, moved(15.0))
+    assert buffer.lookup('odom', 'base', EPOCH + S + S // 4)[0, 3] == pytest.approx(12.5)
+
+
+def test_a_gap_as_long_as_the_limit_is_bridged():
+    assert drive(max_gap_s=1.0).lookup('odom', 'base', EPOCH + S // 2)[0, 3] == 5.0

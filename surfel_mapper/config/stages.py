@@ -134,6 +134,14 @@ class PoseConfig(Stage):
         high=3600.0,
         live=True,
     )
+    max_gap_s: float = setting(
+        0.5,
+        'Poses are interpolated between two at most this far apart, s; a scan in a longer gap '
+        'waits, then is dropped; 0: no such limit.',
+        low=0.0,
+        high=1e9,
+        live=True,
+    )
     max_waiting_scans: int = setting(
         20,
         'At most this many scans wait for their pose; the oldest is dropped.',

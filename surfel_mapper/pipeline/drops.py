@@ -9,6 +9,8 @@ counters get every drop.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 import logging
 import time
 
@@ -20,11 +22,16 @@ _log = logging.getLogger(__name__)
 WARN_EVERY_S = 1.0
 """Shortest time between two warnings of one cause, s; every drop is counted."""
 
+INTERNAL = 'internal_error'
+"""Cause of drops by errors that no stage expects, out of memory among them."""
+
 REMEDIES = {
     'bad_cloud': 'the log says what is wrong with them',
     'empty_frame_id': 'set the frame in the driver of the sensor',
     'filter': 'compare the filters with the fields of the clouds',
     'filtered_out': 'are the limits of the filters too narrow?',
+    INTERNAL: 'the map is unchanged by it and mapping goes on; please report it, unless memory is '
+    'short (window.max_bytes, layers.tsdf.max_blocks)',
     'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',
     'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, '
@@ -39,6 +46,12 @@ REMEDIES = {
     'too_many_frames': 'give every sensor a frame that does not change',
 }
 """Remedy by cause of a drop, for the log."""
+
+
+def described(error: BaseException) -> str:
+    """Return an error in a line: its type, and its text on one line if it has any."""
+    text = ' '.join(str(error).split())
+    return f'{type(error).__name__}: {text}' if text else type(error).__name__
 
 
 class Drops:
@@ -80,6 +93,15 @@ class Drops:
         """Count messages other than scans as ignored for a cause."""
         self.counters.messages_ignored[cause] += number
         self.warn(cause, reason)
+
+    @contextmanager
+    def guarded(self, task: str) -> Iterator[None]:
+        """Count an unexpected error of a with-block as an ignored message, log it, and go on."""
+        try:
+            yield
+        except Exception as error:  # MemoryError too
+            self.message(INTERNAL, f'{task} failed: {described(error)}')
+            _log.debug('%s failed', task, exc_info=True)
 
     def warn(self, cause: str, message: str) -> None:
         """Log a warning, unless one of the same cause was logged just before."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
@@ -22,7 +23,7 @@ from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow
-from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.drops import described, Drops
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
 from surfel_mapper.pipeline.reduction import moments_at, Reduction
@@ -85,6 +86,7 @@ class Inserter:
             drops,
         )
         self._reduction = Reduction(self.map, config.map.threads)
+        self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
 
     def reconfigure(self, config: Config) -> None:
         """Take new settings; if preparation refuses them, nothing has changed."""
@@ -161,9 +163,11 @@ class Inserter:
             inserted = inserted.at(alignment.T_map_sensor[-1])
             laps.end('align')
         results = self.layers.follow(inserted, laps)
-        changed = self._changed_since(version, config)
+        removed = [cleared, *(eviction.fallen for eviction in inserted.evictions)]
+        self._count(inserted)
+        changed = self._changed_since(version, removed, config)
         laps.end('normals')
-        self._count(inserted, laps)
+        self._add_times(laps)
         return Update(
             scan=prepared.scan,
             stamp_ns=prepared.scan.stamp_ns,
@@ -171,7 +175,7 @@ class Inserter:
             T_map_sensor=inserted.T_map_sensor,
             num_points=inserted.num_points,
             changed=changed,
-            removed_voxel_index=removed_voxels(inserted.evictions, cleared, alignment, changed),
+            removed_voxel_index=removed_voxels(removed, alignment, changed),
             evictions=inserted.evictions,
             milliseconds=laps.milliseconds,
             layers=results,
@@ -234,25 +238,39 @@ class Inserter:
             return None
         try:
             alignment = self.aligner.align(self.window, config)
-        except (AlignmentError, MapError) as error:
-            self._drops.warn('alignment', f'the window is not aligned: {error}')
+        except (AlignmentError, MapError, MemoryError) as error:
+            self._drops.warn('alignment', f'the window is not aligned: {described(error)}')
             return None
         _log.debug('aligned: %s', alignment)
         return alignment
 
-    def _changed_since(self, version: int, config: Config) -> Surfels:
-        """Return the surfels of the voxels that changed after a version of the map."""
+    def _changed_since(
+        self, version: int, removed: list[npt.NDArray[np.int32]], config: Config
+    ) -> Surfels:
+        """
+        Return the surfels of the voxels that changed after a version of the map.
+
+        After a failure (out of memory) the next scan reports those changes and removals too.
+        """
         if not self.derives:
             return self.map.surfels_changed(self.map.version)
-        return self.map.surfels_changed(version, config.map.min_points)
+        if self._unreported is not None:
+            version = self._unreported[0]
+            removed += self._unreported[1]
+        try:
+            changed = self.map.surfels_changed(version, config.map.min_points)
+        except Exception:
+            self._unreported = version, removed
+            raise
+        self._unreported = None
+        return changed
 
-    def _count(self, inserted: InsertedScan, laps: Laps) -> None:
+    def _count(self, inserted: InsertedScan) -> None:
         """Count a scan that was mapped, and the scans that left."""
         counters = self._drops.counters
         counters.mapped += 1
         counters.points += inserted.num_points
         counters.evicted.update(eviction.limit for eviction in inserted.evictions)
-        self._add_times(laps)
 
     def _add_times(self, laps: Laps) -> None:
         for stage, milliseconds in laps.milliseconds.items():

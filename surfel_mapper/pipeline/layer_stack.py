@@ -3,13 +3,15 @@
 """
 LayerStack: the layers that are switched on, in the order in which they follow a scan.
 
-All that is called on every layer is called here, so that a layer that fails costs its own result
-and nothing else: the failure is counted under the name of the layer and logged.
+All calls on every layer are made here, so that a layer that fails costs its own result and nothing
+else: the failure is counted under the name of the layer and logged. A layer that fails
+MAX_FAILURES times in a row is switched off until it is cleared, because it may be inconsistent.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+import logging
 from typing import Any
 
 import numpy as np
@@ -17,9 +19,14 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
-from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.errors import CloudFormatError, SurfelMapperError
 from surfel_mapper.layers import enabled, Images, InsertedScan, Layer, Surroundings
-from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.drops import described, Drops
+
+_log = logging.getLogger(__name__)
+
+MAX_FAILURES = 3
+"""Failures in a row after which a layer is switched off: one bad scan or two may come."""
 
 
 class LayerStack:
@@ -45,10 +52,12 @@ class LayerStack:
         layers = [layer(config, around) for layer in enabled(config)]
         self.by_name: Mapping[str, Layer] = {layer.name: layer for layer in layers}
         self._drops = drops
+        self._failures: dict[str, int] = {}
 
     def __iter__(self) -> Iterator[Layer]:
-        """Iterate over the layers, in their order."""
-        return iter(self.by_name.values())
+        """Iterate over the layers that are not switched off, in their order."""
+        off = self._drops.counters.layers_off
+        return iter([layer for name, layer in self.by_name.items() if name not in off])
 
     @property
     def needs_free_rays(self) -> bool:
@@ -67,7 +76,7 @@ class LayerStack:
         for layer in self:
             try:
                 voxels = layer.voxels_to_clear(inserted)
-            except SurfelMapperError as error:
+            except Exception as error:  # MemoryError too
                 self._count_failure(layer, inserted, error)
                 continue
             if len(voxels):
@@ -75,6 +84,7 @@ class LayerStack:
                 self._drops.counters.voxels_cleared[layer.name] += len(voxels)
             if type(layer).voxels_to_clear is not Layer.voxels_to_clear:
                 laps.end(layer.name)
+                self._failures.pop(layer.name, None)
         if len(found) < 2:
             return found[0] if found else np.empty((0, 3), np.int32)
         return np.unique(np.concatenate(found), axis=0)
@@ -85,18 +95,22 @@ class LayerStack:
         for layer in self:
             try:
                 result = layer.follow(inserted)
-            except SurfelMapperError as error:
+            except Exception as error:  # MemoryError too
                 self._count_failure(layer, inserted, error)
                 continue
             if result is not None:
                 results[layer.name] = result
                 laps.end(layer.name)
+                self._failures.pop(layer.name, None)
         return results
 
     def clear(self) -> None:
-        """Clear all layers."""
+        """Clear all layers, and switch those on that were switched off."""
+        self._failures.clear()
+        self._drops.counters.layers_off.clear()
         for layer in self:
-            layer.clear()
+            with self._drops.guarded(f'clearing layer {layer.name}'):
+                layer.clear()
 
     def finish(self) -> None:
         """Finish all layers, at the end of a recording."""
@@ -111,7 +125,8 @@ class LayerStack:
     def reconfigure(self, config: Config) -> None:
         """Give all layers new settings."""
         for layer in self:
-            layer.reconfigure(config)
+            with self._drops.guarded(f'reconfiguring layer {layer.name}'):
+                layer.reconfigure(config)
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return the figures of the layers that have any, by name."""
@@ -119,5 +134,18 @@ class LayerStack:
         return {name: figures for name, figures in found.items() if figures}
 
     def _count_failure(self, layer: Layer, inserted: InsertedScan, error: Exception) -> None:
-        stamp_s = inserted.scan.stamp_ns / 1e9
-        self._drops.message(layer.name, f'layer {layer.name}: scan at {stamp_s:.6f} s: {error}')
+        """Count a failure; switch the layer off if it was the last of several in a row."""
+        name, stamp_s = layer.name, inserted.scan.stamp_ns / 1e9
+        is_known = isinstance(error, SurfelMapperError)
+        text = str(error) if is_known else described(error)
+        self._drops.message(name, f'layer {name}: scan at {stamp_s:.6f} s: {text}')
+        self._failures[name] = self._failures.get(name, 0) + 1
+        if self._failures[name] >= MAX_FAILURES and not isinstance(error, CloudFormatError):
+            self._drops.counters.layers_off[name] = text
+            _log.error(
+                'layer %s is switched off until the map is cleared: it failed %d times in a row, '
+                'last with: %s',
+                name,
+                self._failures[name],
+                text,
+            )

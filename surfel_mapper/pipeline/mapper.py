@@ -15,6 +15,7 @@ inserter, and in the modules that these call.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 import logging
 from typing import Any, TYPE_CHECKING
@@ -32,7 +33,7 @@ from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import WindowedScan
-from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -201,6 +202,15 @@ class Mapper:
         self._drops.warn(
             cause, f'cloud on {topic} dropped: {reason} ({dropped} dropped for this cause)'
         )
+
+    def guarded(self, task: str) -> AbstractContextManager[None]:
+        """
+        Return a context that counts and logs an unexpected error of its block, and goes on.
+
+        For what a node does with messages, requests and timers: ``messages_ignored`` counts
+        such errors, MemoryError too, as ``internal_error``.
+        """
+        return self._drops.guarded(task)
 
     def ignore_message(self, cause: str, reason: str, number: int = 1) -> None:
         """Count messages other than clouds that are not used, and warn."""
@@ -439,4 +449,13 @@ class Mapper:
 
     def _insert(self, scan: Scan, pose: Transform) -> Update | None:
         """Map a scan whose pose is there; None if it is left out."""
-        return self._inserter.insert(scan, pose, self.config, self._queue.next_posed)
+        num_mapped = self.counters.mapped + self.counters.localised + self.counters.gated
+        try:
+            return self._inserter.insert(scan, pose, self.config, self._queue.next_posed)
+        except Exception as error:  # MemoryError too: the next scan may fit
+            _log.debug('scan at %d ns', scan.stamp_ns, exc_info=True)
+            if self.counters.mapped + self.counters.localised + self.counters.gated == num_mapped:
+                self._drops.scan(scan, INTERNAL, described(error))
+            else:
+                self._drops.message(INTERNAL, f'surfels not derived: {described(error)}')
+            return None

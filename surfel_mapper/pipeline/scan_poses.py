@@ -10,6 +10,7 @@ lookups need only the tree of frames.
 from __future__ import annotations
 
 from functools import partial
+import math
 from typing import Any
 
 import numpy as np
@@ -49,14 +50,19 @@ class ScanPoses:
         self._drops = drops
         self._mounted: set[str] = set()
         self.transforms = TransformBuffer(reset_after_s=config.input.reset_after_s)
+        self._set_max_gap(config)
         self.registered: RegisteredPoses | None = None
         if config.pose.source == 'registration':
             self.registered = RegisteredPoses(config, self.transforms)
 
     def reconfigure(self, config: Config) -> None:
         """Take new settings; those of frames and sources never change."""
+        self._set_max_gap(config)
         if self.registered is not None:
             self.registered.reconfigure(config)
+
+    def _set_max_gap(self, config: Config) -> None:
+        self.transforms.max_gap_s = config.pose.max_gap_s or math.inf
 
     def add(
         self, parent: str, child: str, stamp_ns: int, xyz: Any, q_xyzw: Any, *, static: bool

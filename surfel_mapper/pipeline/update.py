@@ -80,15 +80,13 @@ class Update:
 
 
 def removed_voxels(
-    evictions: Sequence[Eviction],
-    cleared: npt.NDArray[np.int32],
+    removed: Sequence[npt.NDArray[np.int32]],
     alignment: Alignment | None,
     changed: Surfels,
 ) -> npt.NDArray[np.int32]:
     """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
-    fallen = [cleared, *(eviction.fallen for eviction in evictions)]
     if alignment is None:
-        return np.concatenate(fallen)
-    gone = np.unique(np.concatenate([*fallen, alignment.removed_voxel_index]), axis=0)
+        return np.concatenate(removed)
+    gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
     left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
     return left

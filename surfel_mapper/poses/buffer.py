@@ -45,6 +45,13 @@ class TransformBuffer:
     reset_after_s : float
         A transform older than the newest of its edge by more than this means that time was set
         back: the older transforms of the edge are dropped. One older by less is inserted.
+    max_gap_s : float
+        Transforms are interpolated between two of an edge that are at most this far apart.
+
+    Attributes
+    ----------
+    max_gap_s : float
+        May be changed at any time.
 
     Raises
     ------
@@ -53,12 +60,18 @@ class TransformBuffer:
 
     """
 
-    def __init__(self, history_s: float = 60.0, reset_after_s: float = 1.0) -> None:
+    def __init__(
+        self,
+        history_s: float = 60.0,
+        reset_after_s: float = 1.0,
+        max_gap_s: float = math.inf,
+    ) -> None:
         for name, value in (('history_s', history_s), ('reset_after_s', reset_after_s)):
             if not 0.0 <= value < math.inf:
                 raise ValueError(f'{name}: {value}, expected zero or more seconds, finite')
         self._history_ns = round(history_s * NS_PER_S)
         self._reset_after_ns = round(reset_after_s * NS_PER_S)
+        self.max_gap_s = max_gap_s
         self._edges: dict[str, PoseTrack] = {}
 
     @property
@@ -121,7 +134,8 @@ class TransformBuffer:
         ------
         PoseNotYetError
             If a frame was never seen, no edges lead from one to the other, or the newest
-            transform of an edge between them is older than the stamp: each may still come.
+            transform of an edge between them is older than the stamp, or the stamp is in a gap
+            longer than ``max_gap_s``: what is missing may still come.
         PoseError
             If the stamp is before the oldest transform held of an edge between them.
 
@@ -134,7 +148,7 @@ class TransformBuffer:
             down.pop()
         if (up[-1].parent if up else source) != (down[-1].parent if down else target):
             raise PoseNotYetError(f'{asked}: {self._why_not_connected(target, source)}')
-        _check_held(asked, [*up, *down], stamp_ns)
+        _check_held(asked, [*up, *down], stamp_ns, self.max_gap_s)
         T_common_source, T_common_target = _chained(up, stamp_ns), _chained(down, stamp_ns)
         if T_common_target is None:
             return np.eye(4) if T_common_source is None else np.array(T_common_source)
@@ -218,8 +232,8 @@ class TransformBuffer:
         return f'no transforms lead from one to the other yet; frames seen: {names}'
 
 
-def _check_held(asked: str, edges: list[PoseTrack], stamp_ns: int) -> None:
-    """Raise if a dynamic edge does not reach to a stamp; too old weighs more than too new."""
+def _check_held(asked: str, edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
+    """Raise if a dynamic edge has no transforms around a stamp; too old comes before too new."""
     dynamic = [edge for edge in edges if not edge.is_static]
     for edge in dynamic:
         if stamp_ns < edge.stamps[0]:
@@ -227,6 +241,13 @@ def _check_held(asked: str, edges: list[PoseTrack], stamp_ns: int) -> None:
     for edge in dynamic:
         if stamp_ns > edge.stamps[-1]:
             raise PoseNotYetError(f'{asked}: newer than all of {edge}')
+    for edge in dynamic:
+        gap_s = edge.gap_ns(stamp_ns) / NS_PER_S
+        if gap_s > max_gap_s:
+            raise PoseNotYetError(
+                f'{asked}: in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s '
+                '(pose.max_gap_s)'
+            )
 
 
 def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:

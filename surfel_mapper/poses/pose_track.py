@@ -59,6 +59,14 @@ class PoseTrack:
             row = bisect_left(self.stamps, stamp_ns)
             del self.stamps[:row], self.transforms[:row]
 
+    def gap_ns(self, stamp_ns: int) -> int:
+        """Return how far apart the transforms around a stamp held are; 0 at a stored stamp."""
+        if self.is_static:
+            return 0
+        row = bisect_left(self.stamps, stamp_ns)
+        newer = self.stamps[row]
+        return 0 if newer == stamp_ns else newer - self.stamps[row - 1]
+
     def at(self, stamp_ns: int) -> Transform:
         """Return the transform at a stamp within those held."""
         if self.is_static:

@@ -21,7 +21,7 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
-from surfel_mapper.pipeline.drops import REMEDIES
+from surfel_mapper.pipeline.drops import described, INTERNAL, REMEDIES
 from surfel_mapper.pipeline.scan_images import MAX_IMAGES
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
@@ -217,15 +217,20 @@ class MappingThread:
             lost, self._lost = self._lost, Counter()
         self._count(lost)
         for pose, static in poses:
-            self._mapper.add_pose(*pose, static=static)
+            with self._mapper.guarded('a pose'):
+                self._mapper.add_pose(*pose, static=static)
         for image in images:
-            self._mapper.add_image(image)
+            with self._mapper.guarded('an image'):
+                self._mapper.add_image(image)
         if isinstance(item, QueuedCloud):
             self._add(item)
         elif item is not None:
-            run_call(item)
-        for update in self._mapper.insert_ready(more_follows=self._num_clouds > 0):
-            on_update(update)
+            with self._mapper.guarded('a task between two scans'):
+                run_call(item)
+        with self._mapper.guarded('mapping'):
+            for update in self._mapper.insert_ready(more_follows=self._num_clouds > 0):
+                with self._mapper.guarded('publishing'):
+                    on_update(update)
         return True
 
     def _has_input(self) -> bool:
@@ -261,7 +266,13 @@ class MappingThread:
             reason = f'in frame {frame_id!r}, {error}'
             self._mapper.refuse_clouds('bad_cloud', cloud.topic, reason, frame_id=frame_id)
             return
-        self._mapper.add_scan(scan, cloud.topic)
+        except Exception as error:  # MemoryError too
+            self._mapper.refuse_clouds(
+                INTERNAL, cloud.topic, f'not decoded: {described(error)}', frame_id=frame_id
+            )
+            return
+        with self._mapper.guarded('a scan'):
+            self._mapper.add_scan(scan, cloud.topic)
 
 
 def run_call(call: Call) -> None:

@@ -20,6 +20,7 @@ def mapper_with(**changes):
     changes = {name.replace('__', '.', 1): value for name, value in changes.items()}
     defaults = {
         'pose.source': 'odometry',
+        'pose.max_gap_s': 0.0,
         'frames.base_to_sensor': (0.0, 0.0, 0.0, *LEVEL),
         'window.max_scans': 0,
         'map.min_points': 1,

@@ -172,3 +172,33 @@ def test_how_the_sensor_is_mounted_outlives_a_reset():
     add_pose(mapper, 3.0, x=4.0)
     (update,) = mapper.insert_ready()
     assert update.T_map_sensor[:3, 3].tolist() == [4.0, 0.0, 2.0]
+
+
+def test_a_scan_in_a_long_gap_of_poses_waits_and_is_dropped(caplog):
+    mapper = mapper_with(pose__max_gap_s=0.5)
+    add_pose(mapper, 1.0)
+    add_pose(mapper, 1.4, x=4.0)
+    mapper.add_scan(scan_at(1.2))
+    assert [update.T_map_sensor[0, 3] for update in mapper.insert_ready()] == [pytest.approx(2.0)]
+    add_pose(mapper, 10.0, x=90.0)
+    mapper.add_scan(scan_at(9.9))
+    assert list(mapper.insert_ready()) == []  # a pose in between may come
+    add_pose(mapper, 10.39, x=94.0)
+    assert list(mapper.insert_ready()) == []
+    add_pose(mapper, 10.5, x=95.0)
+    mapper.add_scan(scan_at(10.2))
+    assert [update.T_map_sensor[0, 3] for update in mapper.insert_ready()] == [
+        pytest.approx(90.0 + 4.0 * 0.2 / 0.39)
+    ]
+    assert mapper.counters.dropped == {'no_pose': 1}
+    assert 'in a gap of 8.600 s' in caplog.text
+
+
+def test_a_pose_that_comes_late_into_a_gap_is_used():
+    mapper = mapper_with(pose__max_gap_s=0.5)
+    add_pose(mapper, 1.0)
+    add_pose(mapper, 1.8, x=8.0)
+    mapper.add_scan(scan_at(1.5))
+    assert list(mapper.insert_ready()) == []
+    add_pose(mapper, 1.4, x=4.0)
+    assert [update.T_map_sensor[0, 3] for update in mapper.insert_ready()] == [pytest.approx(5.0)]

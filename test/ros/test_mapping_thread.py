@@ -154,9 +154,29 @@ def test_bad_and_paused_clouds_are_counted_and_the_next_is_mapped(bench):
     assert bench.mapper.counters.dropped == {'bad_cloud': 1, 'paused': 1}
 
 
-def test_an_unexpected_error_ends_the_thread_and_cancels_calls():
+def test_an_unexpected_error_is_counted_and_the_thread_goes_on():
     def fail(update):
         raise RuntimeError('broken')
+
+    bench = Bench(on_update=fail)
+    bench.hold()
+    for number in range(3):
+        bench.put_pose(START_NS + number)
+        bench.put_cloud(START_NS + number)
+    bench.thread.post(lambda: 1 // 0)
+    waiting = bench.thread.call(lambda: 1)
+    bench.release()
+    assert waiting.result(TIMEOUT_S) == 1
+    bench.thread.stop()
+
+    assert bench.failures == []
+    assert bench.mapper.counters.mapped == 3
+    assert bench.mapper.counters.messages_ignored == {'internal_error': 4}
+
+
+def test_a_fatal_error_ends_the_thread_and_cancels_calls():
+    def fail(update):
+        raise SystemExit('broken')
 
     bench = Bench(on_update=fail)
     bench.hold()

@@ -1,0 +1,174 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Errors that no stage expects: they cost one scan or one layer, are counted, and mapping goes on.
+
+Every stage fails in turn, out of memory or by a bug, between scans that do not fail; the map then
+equals the one of the scans that were mapped.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import pytest
+
+from surfel_mapper import layers
+from surfel_mapper.errors import CloudFormatError, MapError
+from surfel_mapper.layers import Layer
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow
+from surfel_mapper.pipeline import inserter
+from surfel_mapper.pipeline.preparation import Preparation
+from surfel_mapper.pipeline.reduction import Reduction
+from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
+
+ERRORS = [MemoryError(), ZeroDivisionError('division by zero')]
+BEFORE = {
+    'prepare': (Preparation, 'prepare'),
+    'reduce': (Reduction, 'reduce'),
+    'window': (SlidingWindow, 'insert'),
+    'map': (SurfelMap, 'insert'),
+}
+
+
+def fail_once(monkeypatch, cls, name, error):
+    """Have the next call of a method raise an error."""
+    work = getattr(cls, name)
+
+    def failing(self, *args, **kwargs):
+        monkeypatch.setattr(cls, name, work)
+        raise error
+
+    monkeypatch.setattr(cls, name, failing)
+
+
+def drive(mapper, *stamps_s):
+    for stamp_s in stamps_s:
+        add_pose(mapper, stamp_s, x=stamp_s)
+    return insert(mapper, *map(scan_at, stamps_s))
+
+
+@pytest.mark.parametrize('stage', BEFORE)
+@pytest.mark.parametrize('error', ERRORS, ids=lambda error: type(error).__name__)
+def test_a_failure_before_the_map_costs_one_scan(monkeypatch, caplog, stage, error):
+    mapper, expected = mapper_with(window__max_scans=3), mapper_with(window__max_scans=3)
+    drive(mapper, 1.0, 2.0)
+    fail_once(monkeypatch, *BEFORE[stage], error)
+    assert drive(mapper, 3.0) == []
+    assert len(drive(mapper, 4.0, 5.0, 6.0)) == 3
+
+    drive(expected, 1.0, 2.0, 4.0, 5.0, 6.0)
+    assert mapper.map.digest() == expected.map.digest()
+    assert mapper.counters.dropped == {'internal_error': 1}
+    assert type(error).__name__ in caplog.text
+    assert_counts_add_up(mapper)
+
+
+@pytest.mark.parametrize('error', ERRORS, ids=lambda error: type(error).__name__)
+def test_changes_that_could_not_be_derived_come_with_the_next_scan(monkeypatch, error):
+    mapper, expected = mapper_with(window__max_scans=2), mapper_with(window__max_scans=2)
+    drive(mapper, 1.0, 2.0)
+    fail_once(monkeypatch, SurfelMap, 'surfels_changed', error)
+    assert drive(mapper, 3.0) == []
+    (update,) = drive(mapper, 4.0)
+
+    _, _, third, fourth = drive(expected, 1.0, 2.0, 3.0, 4.0)
+    assert mapper.map.digest() == expected.map.digest()
+    changed = set(map(tuple, update.changed.voxel_index.tolist()))
+    removed = set(map(tuple, update.removed_voxel_index.tolist()))
+    assert changed >= set(map(tuple, fourth.changed.voxel_index.tolist()))
+    assert removed >= set(map(tuple, third.removed_voxel_index.tolist()))
+    assert mapper.counters.mapped == 4
+    assert mapper.counters.messages_ignored == {'internal_error': 1}
+    assert_counts_add_up(mapper)
+
+
+class Fragile(Layer):
+    """A layer that raises an error given from outside, and notes the stamps that it took."""
+
+    name = 'fragile'
+    error: Exception | None = None
+
+    def __init__(self, config, around):
+        super().__init__(config, around)
+        self.stamps = []
+
+    def follow(self, inserted):
+        if Fragile.error is not None:
+            raise Fragile.error
+        self.stamps.append(inserted.scan.stamp_ns // 10**9)
+        return len(self.stamps)
+
+    def clear(self):
+        self.stamps.clear()
+
+
+@pytest.fixture
+def fragile():
+    layers.register('fragile', f'{__name__}:Fragile')
+    yield Fragile
+    Fragile.error = None
+    layers.unregister('fragile')
+
+
+@pytest.mark.parametrize(
+    'error', [*ERRORS, MapError('full')], ids=lambda error: type(error).__name__
+)
+def test_a_layer_that_fails_three_times_in_a_row_is_switched_off(fragile, caplog, error):
+    mapper = mapper_with()
+    drive(mapper, 1.0)
+    fragile.error = error
+    updates = drive(mapper, 2.0, 3.0)
+    fragile.error = None
+    updates += drive(mapper, 4.0)
+    assert not mapper.counters.layers_off  # two in a row may come
+    fragile.error = error
+    drive(mapper, 5.0, 6.0)
+    with caplog.at_level(logging.ERROR):
+        drive(mapper, 7.0)
+    fragile.error = None
+    (update,) = drive(mapper, 8.0)
+
+    assert [update.fragile for update in updates] == [None, None, 2]
+    assert update.fragile is None
+    assert mapper.fragile.stamps == [1, 4]
+    assert mapper.counters.mapped == 8
+    assert mapper.counters.messages_ignored == {'fragile': 5}
+    assert list(mapper.summary()['layers_off']) == ['fragile']
+    assert 'layer fragile is switched off' in caplog.text
+
+    mapper.clear()
+    (update,) = drive(mapper, 9.0)
+    assert update.fragile == 1
+    assert 'layers_off' not in mapper.summary()
+
+
+def test_scans_that_a_layer_cannot_use_do_not_switch_it_off(fragile):
+    mapper = mapper_with()
+    fragile.error = CloudFormatError('no lidar')
+    drive(mapper, 1.0, 2.0, 3.0, 4.0)
+    fragile.error = None
+    (update,) = drive(mapper, 5.0)
+    assert update.fragile == 1
+
+
+def test_an_alignment_without_memory_leaves_the_window(monkeypatch, caplog):
+    settings = {'align__every_scans': 2, 'window__keep_points': True}
+    mapper, expected = mapper_with(**settings), mapper_with(window__keep_points=True)
+    fail_once(monkeypatch, inserter.WindowAligner, 'align', MemoryError())
+    updates = drive(mapper, 1.0, 2.0)
+    drive(expected, 1.0, 2.0)
+    assert len(updates) == 2
+    assert mapper.map.digest() == expected.map.digest()
+    assert 'the window is not aligned: MemoryError' in caplog.text
+
+
+def test_guarded_work_is_counted_and_goes_on(caplog):
+    mapper = mapper_with()
+    with mapper.guarded('a timer'):
+        raise KeyError('x')
+    assert mapper.counters.messages_ignored == {'internal_error': 1}
+    assert "a timer failed: KeyError: 'x'" in caplog.text
+    with pytest.raises(KeyboardInterrupt), mapper.guarded('a timer'):
+        raise KeyboardInterrupt
