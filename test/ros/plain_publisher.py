@@ -3,8 +3,8 @@
 """
 Publish clouds as an ordinary driver does: rclpy and its defaults, nothing of this package.
 
-``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS BYTES...`` publishes NUMBER
-clouds of each size at 10 Hz, once the topic has a subscriber, and confirms each size on stdout.
+``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS`` publishes, once the topic has a
+subscriber, NUMBER clouds at 10 Hz for each size in bytes read from stdin, and confirms it on stdout.
 """
 
 from array import array
@@ -39,7 +39,7 @@ def cloud(stamp_ns: int, num_bytes: int) -> PointCloud2:
     return message
 
 
-def main(reliability: str, number: str, first_ns: str, *sizes: str) -> None:
+def main(reliability: str, number: str, first_ns: str) -> None:
     """Publish clouds of each size."""
     rclpy.init()
     node = Node('plain_lidar')
@@ -49,7 +49,7 @@ def main(reliability: str, number: str, first_ns: str, *sizes: str) -> None:
         time.sleep(0.05)
     time.sleep(1.0)  # until the subscriber knows the publisher too
     stamp_ns = int(first_ns)
-    for size in sizes:
+    for size in sys.stdin:
         message = cloud(stamp_ns, int(size))
         next_s = time.monotonic()
         for _ in range(int(number)):
@@ -58,8 +58,7 @@ def main(reliability: str, number: str, first_ns: str, *sizes: str) -> None:
             publisher.publish(message)
             next_s += 0.1
             time.sleep(max(next_s - time.monotonic(), 0.0))
-        print(size, flush=True)
-        sys.stdin.readline()
+        print(size.strip(), flush=True)
     node.destroy_node()
     rclpy.shutdown()
 

@@ -57,6 +57,8 @@ def test_topics_and_services_have_the_documented_names_and_types(start, peer):
     assert found['/odom'] == ['nav_msgs/msg/Odometry']
     assert found['/diagnostics'] == ['diagnostic_msgs/msg/DiagnosticArray']
     peer.spin_until(lambda: ('map', '/robot') in peer.node.get_node_names_and_namespaces())
+    status, _ = peer.diagnosis()
+    assert (status.name, status.hardware_id) == ('robot/map: mapping', 'robot/map')
 
 
 def test_reports_and_latencies_use_simulated_time(start, peer):

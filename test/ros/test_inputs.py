@@ -221,7 +221,7 @@ def inputs_of(config, publishers=()):
 
 
 def test_the_most_silent_of_several_lidars_is_found():
-    inputs = inputs_of(Config.from_mapping({'input.topics': ['front', 'rear']}))
+    inputs = inputs_of(Config.from_mapping({**SETTINGS, 'input.topics': ['front', 'rear']}))
     before = time.monotonic()
     inputs._on_cloud('/front', b'')
     topic, heard_s = inputs.most_silent
@@ -238,7 +238,7 @@ def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT):
         node_name='lidar',
         qos_profile=QoSProfile(depth=1, reliability=reliability),
     )
-    inputs = inputs_of(Config(), [publisher])
+    inputs = inputs_of(Config.from_mapping(SETTINGS), [publisher])
     inputs._on_cloud('/points', bytes(size))
     inputs._on_lost('/points', 5)
     assert inputs.clouds_lost == 5

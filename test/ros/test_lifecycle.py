@@ -189,3 +189,16 @@ def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
     peer.spin_until(lambda: late)
     assert late[0] == early[-1]
+
+
+def test_a_restarted_node_replaces_the_latched_map_of_a_killed_one(start, peer):
+    first = start('node', *ARGUMENTS)
+    peer.advertise('/odom', '/points')
+    normals = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
+    send(peer, drive(2))
+    peer.spin_until(lambda: normals and normals[-1].width)
+    first.kill()
+
+    start('node', *ARGUMENTS)
+
+    peer.spin_until(lambda: normals[-1].width == 0)

@@ -256,7 +256,7 @@ def test_the_diagnostics_report_missing_clouds(start, peer):
     ('arguments', 'messages'),
     [
         (['-p', 'window.max_scan:=5'], ['window.max_scan', 'did you mean window.max_scans?']),
-        (['-p', 'map.voxel_size_m:=0.0'], ['map.voxel_size_m: 0.0, expected a value in']),
+        (['-p', 'map.voxel_size_m:=0.0'], ['map.voxel_size_m: 0, expected a value in']),
         (['-p', 'map.mode:=frozen'], ['map.load: empty, expected a map to freeze']),
         (['-p', 'use_sim_time:=maybe'], ['use_sim_time']),
         (['--params-file', 'nowhere.yaml'], ['nowhere.yaml']),

