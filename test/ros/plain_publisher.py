@@ -3,8 +3,9 @@
 """
 Publish clouds as an ordinary driver does: rclpy and its defaults, nothing of this package.
 
-``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS`` publishes, once the topic has a
-subscriber, NUMBER clouds at 10 Hz for each size in bytes read from stdin, and confirms it on stdout.
+``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS`` publishes, once the topic
+has a subscriber, NUMBER clouds at 10 Hz for each size in bytes read from stdin, and confirms each
+size on stdout.
 """
 
 from array import array

@@ -29,7 +29,7 @@ NUMBER = 15
 """Clouds of each size and kind of publisher."""
 
 ATTEMPTS = 3
-"""The promise is for a machine with time to spare: a publisher keeps 10 clouds, 1 s, and no more."""
+"""The promise is for a machine with time to spare: the publisher keeps 10 clouds, that is 1 s."""
 
 DEFAULTS = ['--ros-args', '-p', 'pose.source:=identity', '-p', 'window.max_scans:=5']
 DEFAULTS += ['-p', 'input.max_waiting_clouds:=1000', '-p', 'publish.diagnostics_rate_hz:=10.0']
