@@ -9,6 +9,7 @@ beside this one or a part below.
 
 from __future__ import annotations
 
+from functools import partial
 import logging
 
 import numpy as np
@@ -26,8 +27,8 @@ from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline.drops import described, Drops
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
-from surfel_mapper.pipeline.reduction import moments_at, Reduction
-from surfel_mapper.pipeline.reduction import warm_up as warm_up_reduction
+from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
+from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.update import removed_voxels, Update
@@ -106,13 +107,12 @@ class Inserter:
         with self._drops.counters.timed('align'):
             return self.aligner.align(self.window, config)
 
-    def warm_up(self, config: Config) -> None:
-        """Compile every kernel that mapping needs, for all types that scans may have."""
-        self.preparation.warm_up(config)
+    def warm_up_steps(self, config: Config) -> tuple[list[Step], list[Step]]:
+        """Return the steps that compile all kernels; see Mapper.warm_up_steps."""
+        before, later = reduction_steps(config)
         if config.window.keep_points:
-            self.aligner.warm_up()
-        warm_up_reduction(config)
-        self.layers.warm_up()
+            later.append(self.aligner.warm_up)
+        return [partial(self.preparation.warm_up, config), *before, self.layers.warm_up], later
 
     def reduces_ahead(self, config: Config) -> bool:
         """Return whether another thread reduces a scan while the one before is inserted."""

@@ -35,6 +35,7 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
+from surfel_mapper.pipeline.reduction import Step
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
@@ -412,7 +413,25 @@ class Mapper:
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
-        self._inserter.warm_up(self.config)
+        before, later = self.warm_up_steps()
+        for step in (*before, *later):
+            step()
+
+    def warm_up_steps(self) -> tuple[list[Step], list[Step]]:
+        """
+        Return the steps of ``warm_up``, for callers that do not want to wait for all of them.
+
+        Returns
+        -------
+        before : list of callable
+            Compile the kernels of the first scan, as the settings let expect it.
+        later : list of callable
+            Compile all others: those of evictions, of points of another type, of voxels of 65536
+            points. They change nothing of the mapper, so another thread may call them while scans
+            are mapped; a kernel that is needed earlier is compiled by the first call.
+
+        """
+        return self._inserter.warm_up_steps(self.config)
 
     def summary(self) -> dict[str, Any]:
         """Return counts, times and figures of the map, for files, reports and diagnostics."""

@@ -10,11 +10,14 @@ used only for the same scan at the same pose; otherwise it is done again.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
@@ -25,6 +28,8 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
+
+Step = Callable[[], object]
 
 
 class Begun(NamedTuple):
@@ -127,16 +132,43 @@ def viewpoint(T_map_sensor: Transform, config: Config) -> Transform | None:
     return None if config.pose.source == 'identity' else T_map_sensor[:3, 3]
 
 
-def warm_up(config: Config) -> None:
-    """Compile adding, removing and deriving, for points of every type and sums of every size."""
-    for dtype in (np.float32, np.float64):
-        surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-        one, most = ({n: np.zeros(num) for n in CHANNELS} for num in (1, NARROW_COUNT))
-        moments = surfel_map.add(np.zeros((1, 3), dtype), columns=one)
-        surfel_map.surfels_changed(since=0)
-        surfel_map.remove(moments)
-        many = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=most)  # int64 sums
-        surfel_map.remove(many)
+def warm_up_steps(config: Config) -> tuple[list[Step], list[Step]]:
+    """Return the steps that compile reduction, insertion and removal; see Mapper.warm_up_steps."""
+    expected: npt.DTypeLike = np.float32
+    other: npt.DTypeLike = np.float64
+    if config.deskew.enabled:  # which moves points in double precision
+        expected, other = other, expected
+    later: list[Step] = [
+        partial(compile_removing, config, expected),
+        partial(compile_wide_sums, config, expected),
+        partial(compile_adding, config, other),
+        partial(compile_removing, config, other),
+        partial(compile_wide_sums, config, other),
+    ]
+    return [partial(compile_adding, config, expected)], later
+
+
+def compile_adding(config: Config, dtype: npt.DTypeLike) -> None:
+    """Compile adding points of a type, and deriving surfels."""
+    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+    surfel_map.add(np.zeros((1, 3), dtype), columns={n: np.zeros(1) for n in CHANNELS})
+    surfel_map.surfels_changed(since=0)
+
+
+def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
+    """Compile removing points of a type, the digest, and coarser maps if they are published."""
+    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+    columns = {n: np.zeros(1) for n in CHANNELS}
+    moments = surfel_map.add(np.zeros((1, 3), dtype), columns=columns)
     surfel_map.digest()
     if config.publish.levels:
         surfel_map.coarsen(1).surfels()
+    surfel_map.remove(moments)
+
+
+def compile_wide_sums(config: Config, dtype: npt.DTypeLike) -> None:
+    """Compile adding and removing voxels of so many points that their sums need 64 bits."""
+    surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+    columns = {n: np.zeros(NARROW_COUNT) for n in CHANNELS}
+    moments = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=columns)
+    surfel_map.remove(moments)

@@ -11,19 +11,27 @@ a new subscriber of a large layer in steps, each between two scans.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from concurrent.futures import CancelledError
 from importlib import import_module
 from typing import Any
 
+from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap
+from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.timer import Timer
 
 from surfel_mapper.config import Config
 from surfel_mapper.layers import Layer, Moment, Publication
 from surfel_mapper.pipeline import Mapper, Update
-from surfel_mapper.ros.base_node import steady_timer
+from surfel_mapper.ros.base_node import result_of, steady_timer
 from surfel_mapper.ros.mapping_thread import MappingThread
+
+GRID = 'nav_msgs/msg/OccupancyGrid'
+"""Topics of this type also have a service: ``~/get_grid`` returns the grid of ``~/grid``."""
 
 
 class LayerOutputs:
@@ -114,6 +122,7 @@ class LayerTopic:
         now: Callable[[], Moment],
     ) -> None:
         self.layer = layer
+        self._node = node
         self._publication = publication
         self._thread = thread
         self._now = now
@@ -125,6 +134,10 @@ class LayerTopic:
             qos_of(publication),
             event_callbacks=PublisherEventCallbacks(matched=matched),
         )
+        if publication.type_name == GRID:
+            name = publication.topic.replace('~/', '~/get_', 1)
+            group = ReentrantCallbackGroup()  # it waits for the mapping thread
+            node.create_service(GetMap, name, self._on_get_map, callback_group=group)
 
     @property
     def has_rate(self) -> bool:
@@ -135,6 +148,15 @@ class LayerTopic:
         """Return the rate for a configuration, Hz; 0: never."""
         rate_hz = self._publication.rate_hz
         return rate_hz(config) if rate_hz is not None else 0.0
+
+    async def _on_get_map(self, _: GetMap.Request, response: GetMap.Response) -> GetMap.Response:
+        """Answer with the present grid; with an empty one if the node is about to end."""
+        try:
+            grid = await result_of(self._thread.call(self._newest), self._node.executor)
+        except CancelledError:
+            return response
+        response.map = deserialize_message(grid, OccupancyGrid)
+        return response
 
     def post_if_due(self) -> None:
         """Have the mapping thread publish, if there is news and a reader."""
@@ -161,6 +183,11 @@ class LayerTopic:
             self._thread.post(self._publish_for_new)
 
     # Called in the mapping thread from here on.
+
+    def _newest(self) -> bytes:
+        """Return the serialised message of the present state."""
+        (message,) = self._publication.messages(self._now())
+        return message
 
     def _publish(self) -> None:
         version = self._publication.version

@@ -89,7 +89,6 @@ class Outputs:
         # an empty map is published too: it replaces the latched one of a node that was killed
         self._published: dict[Any, int] = {}
         self._timers: list[Timer] = []
-        warm_up(mapper.config)
         group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on
         node.create_service(
             Trigger, '~/publish_normals', self._on_publish_normals, callback_group=group

@@ -5,8 +5,10 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import CancelledError
 from contextlib import suppress
+from functools import partial
 import threading
 import time
 
@@ -21,6 +23,7 @@ from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.outputs import Outputs
+from surfel_mapper.ros.outputs import warm_up as warm_up_outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
 from surfel_mapper.ros.services import Services
 
@@ -61,18 +64,22 @@ class Session:
     def __init__(self, node: Node, config: Config, tasks: TaskQueue) -> None:
         """Compile the kernels, then create publishers and services."""
         self._node = node
+        self._tasks = tasks
         self.config = config
         self.mapper = Mapper(config)
         if config.map.load:
             surfel_map, _ = load_map(config.map.load, voxel_size_m=config.map.voxel_size_m)
-            self.mapper.restore(
-                surfel_map, []
-            )  # without its window, so these scans are never evicted
+            self.mapper.restore(surfel_map, [])  # without its window: nothing is evicted
         self.thread = MappingThread(self.mapper, tasks.fail)
         self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
-        log.info('compiling kernels: a moment, or half a minute the first time')
-        self.mapper.warm_up()
+        log.info('compiling kernels: a moment, the first time a quarter of a minute')
+        before, later = self.mapper.warm_up_steps()
+        for step in before:
+            step()
+        self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *later]
+        self._compiler = threading.Thread(target=self._compile, name='compiling', daemon=True)
+        self._is_closing = threading.Event()
         self.outputs = Outputs(node, self.mapper, self.thread)
         self.registration = registration_outputs(node, self.mapper, self.thread)
         self.services = Services(node, self.mapper, self.thread, self.outputs)
@@ -92,6 +99,8 @@ class Session:
         with self._changing:
             self._is_active = True
             self.outputs.start_timers(self.config)
+        if self._compiler.ident is None:
+            self._compiler.start()
 
     def deactivate(self) -> None:
         """Unsubscribe, map the messages received so far, and stop publishing."""
@@ -112,6 +121,9 @@ class Session:
 
     def close(self, *, save: bool) -> None:
         """Map the messages received so far, end the thread, save the map if asked, and log."""
+        self._is_closing.set()
+        if self._compiler.ident is not None:
+            self._compiler.join()
         self.thread.stop()
         self.mapper.finish()
         log = self._node.get_logger()
@@ -121,6 +133,20 @@ class Session:
             except (SurfelMapperError, OSError) as error:
                 log.error(f'the map could not be saved: {error}')
         log.info(report(self.mapper))
+
+    def _compile(self) -> None:
+        """Compile the kernels that the first scans do not need; run in a thread of its own."""
+        start = time.monotonic()
+        try:
+            for step in self._later:
+                if self._is_closing.is_set():
+                    return
+                step()
+        except Exception as error:
+            self._tasks.fail(error)
+        else:
+            seconds = time.monotonic() - start
+            self._node.get_logger().info(f'all kernels ready after another {seconds:.1f} s')
 
     def _on_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""

@@ -140,11 +140,11 @@ def test_settings_changed_before_configure_are_used(start, peer):
 def test_settings_changed_while_kernels_compile_are_used(compiled, peer, monkeypatch):
     answers = []
 
-    def compile_until_set(mapper):
+    def compile_until_set():
         changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
         answers.extend(peer.result(changed).results)
 
-    monkeypatch.setattr(Mapper, 'warm_up', compile_until_set)
+    monkeypatch.setattr(Mapper, 'warm_up_steps', lambda mapper: ([compile_until_set], []))
     with context(ARGUMENTS):
         node = MapperNode()
         with executing(node):

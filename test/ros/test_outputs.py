@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.msg import OccupancyGrid
+from nav_msgs.srv import GetMap
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from scipy.spatial import cKDTree
@@ -276,6 +277,22 @@ def test_the_grid_is_published_and_latched(start, peer):
     assert 0 <= cost[row, column] < 50
     assert cost[int((3.3 - origin.y) / 0.5), column] == 100
     assert cost[0, 0] == -1
+
+
+def test_the_grid_is_returned_on_request(start, peer):
+    start_node(start, peer, **{'grid.size_m': 20.0})
+    before = peer.call('get_grid', GetMap).map
+    assert set(before.data) == {-1}
+    send(peer, drive(3))
+    peer.diagnosis({'scans.mapped': 3})
+    grid = peer.call('get_grid', GetMap).map
+    assert (grid.header.frame_id, stamp_of(grid)) == ('odom', START_NS + 2 * PERIOD_NS)
+    assert (grid.info.width, grid.info.height) == (40, 40)
+    cost = np.array(grid.data).reshape(40, 40)
+    origin = grid.info.origin.position
+    column = int((0.9 - origin.x) / 0.5)
+    assert 0 <= cost[int((0.0 - origin.y) / 0.5), column] < 50
+    assert cost[int((3.3 - origin.y) / 0.5), column] == 100
 
 
 def test_voxel_indices_equal_those_of_the_map(start, peer):
