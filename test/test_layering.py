@@ -193,6 +193,15 @@ def test_the_package_itself_imports_nothing_foreign():
     assert foreign == {'surfel_mapper'}
 
 
+def test_no_two_classes_share_a_name():
+    homes: dict[str, list[str]] = {}
+    for module, path in MODULES.items():
+        for node in ast.parse(path.read_text(encoding='utf-8')).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
+                homes.setdefault(node.name, []).append(module)
+    assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
 def test_every_folder_has_a_docstring():
     folders = sorted({path.parent for path in PACKAGE.rglob('*.py')})
     silent = [

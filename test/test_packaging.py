@@ -14,6 +14,7 @@ import sys
 from xml.etree import ElementTree
 
 import pytest
+import yaml
 
 import surfel_mapper
 
@@ -27,6 +28,24 @@ NO_RULE = {'numba'}  # no rosdep rule for Ubuntu 24.04
 def test_the_version_is_the_same_everywhere():
     in_setup = re.search(r"version='([^']+)'", SETUP).group(1)
     assert {in_setup, MANIFEST.findtext('version')} == {surfel_mapper.__version__}
+
+
+def test_the_citation_states_the_version():
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert citation['version'] == surfel_mapper.__version__
+    assert citation['license'] == MANIFEST.findtext('license')
+
+
+def test_workflows_run_targets_of_the_makefile():
+    makefile = (ROOT / 'Makefile').read_text(encoding='utf-8')
+    targets = set(re.findall(r'^([a-z]+):', makefile, flags=re.MULTILINE))
+    named = set()
+    for path in (ROOT / '.github/workflows').glob('*.yml'):
+        for job in yaml.safe_load(path.read_text(encoding='utf-8'))['jobs'].values():
+            for step in job['steps']:
+                words = step.get('run', '').split()
+                named |= {word for word in words[1:] if words[0] == 'make' and '=' not in word}
+    assert named and named <= targets
 
 
 def test_the_changelog_begins_with_what_is_to_come_or_with_this_version():

@@ -19,7 +19,7 @@ from surfel_mapper.layers.layer import Layer
 
 
 @dataclass(frozen=True, slots=True)
-class Registration:
+class RegisteredLayer:
     """
     How a layer is found.
 
@@ -39,7 +39,7 @@ class Registration:
     switch: str = ''
 
 
-_REGISTERED: dict[str, Registration] = {}
+_REGISTERED: dict[str, RegisteredLayer] = {}
 
 
 def register(name: str, location: str, switch: str = '') -> None:
@@ -52,7 +52,7 @@ def register(name: str, location: str, switch: str = '') -> None:
         If another layer has the name.
 
     """
-    found = _REGISTERED.setdefault(name, Registration(name, location, switch))
+    found = _REGISTERED.setdefault(name, RegisteredLayer(name, location, switch))
     if found.location != location:
         raise ConfigError(f'layer {name!r} of {location}: {found.location} has this name already')
 
@@ -83,7 +83,7 @@ def enabled(config: Config) -> Iterator[type[Layer]]:
             yield _load(registered)
 
 
-def _load(registered: Registration) -> type[Layer]:
+def _load(registered: RegisteredLayer) -> type[Layer]:
     module, _, name = registered.location.partition(':')
     found = getattr(import_module(module), name, None)
     if not (isinstance(found, type) and issubclass(found, Layer)):
