@@ -45,7 +45,8 @@ def test_workflows_run_targets_of_the_makefile():
             for step in job['steps']:
                 words = step.get('run', '').split()
                 named |= {word for word in words[1:] if words[0] == 'make' and '=' not in word}
-    assert named and named <= targets
+    assert named
+    assert named <= targets
 
 
 def test_the_changelog_begins_with_what_is_to_come_or_with_this_version():
