@@ -14,6 +14,9 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.fitting import fitted_lidar
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
+MAX_LIDARS = 64
+"""Frames whose lidars are kept; frame names may change without end."""
+
 
 class SensorModels:
     """
@@ -48,6 +51,8 @@ class SensorModels:
                 columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **ranges
             )
         if scan.frame_id not in self._lidars:
+            if len(self._lidars) >= MAX_LIDARS:
+                del self._lidars[next(iter(self._lidars))]
             self._lidars[scan.frame_id] = fitted_lidar(
                 scan.points,
                 scan.columns.get('ring'),

@@ -22,6 +22,9 @@ _log = logging.getLogger(__name__)
 WARN_EVERY_S = 1.0
 """Shortest time between two warnings of one cause, s; every drop is counted."""
 
+MAX_TOPICS = 64
+"""Frames whose topics are kept; frame names may change without end."""
+
 INTERNAL = 'internal_error'
 """Cause of drops by errors that no stage expects, out of memory among them."""
 
@@ -38,12 +41,12 @@ REMEDIES = {
     'and their stamps; a sensor that no transform places needs frames.base_to_sensor; '
     'pose.max_wait_s waits longer',
     'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
+    'odd_stamp': 'is the clock of this sensor right? Two messages in a row that agree set time',
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',
     'stamp_back': 'do two sensors share one frame?',
     'stamp_repeated': 'is the same cloud published twice?',
-    'too_many_frames': 'give every sensor a frame that does not change',
 }
 """Remedy by cause of a drop, for the log."""
 
@@ -75,6 +78,12 @@ class Drops:
         self.counters = counters
         self.topics: dict[str, str] = {}
         self._warned_s: dict[str, float] = {}
+
+    def name_topic(self, frame_id: str, topic: str) -> None:
+        """Keep the topic of the scans of a frame, for the log; the oldest of many are dropped."""
+        if frame_id not in self.topics and len(self.topics) >= MAX_TOPICS:
+            del self.topics[next(iter(self.topics))]
+        self.topics[frame_id] = topic
 
     def scan(self, scan: Scan, cause: str, reason: str) -> None:
         """Count a scan as dropped for a cause."""

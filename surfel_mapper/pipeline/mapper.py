@@ -17,6 +17,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from functools import partial
 import logging
 from typing import Any, TYPE_CHECKING
 
@@ -38,7 +39,8 @@ from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.reduction import Step
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
-from surfel_mapper.pipeline.scan_queue import MAX_FRAMES, ScanQueue
+from surfel_mapper.pipeline.scan_queue import ScanQueue
+from surfel_mapper.pipeline.stamp_guard import StampGuard
 from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment
 from surfel_mapper.scan import Scan
@@ -84,6 +86,7 @@ class Mapper:
         self.config = config or Config()
         self.counters = Counters()
         self._drops = Drops(self.counters)
+        self._guard = StampGuard(self.config.input.reset_after_s)
         self._poses = ScanPoses(self.config, self._drops)
         self._inserter = Inserter(self.config, self._poses, self._drops)
         self._queue = ScanQueue(
@@ -135,7 +138,16 @@ class Mapper:
             The pose holds for all time.
 
         """
-        self._poses.add(parent, child, stamp_ns, xyz, q_xyzw, static=static)
+        add = partial(self._poses.add, parent, child, stamp_ns, xyz, q_xyzw, static=static)
+        if static:
+            add()
+            return
+        refuse = partial(self._refuse_pose, parent, child)
+        own_ns = self.transforms.newest_of(child)
+        self._guard.take(stamp_ns, own_ns, self._queue.newest_ns, add, refuse)
+
+    def _refuse_pose(self, parent: str, child: str, reason: str) -> None:
+        self._drops.message('odd_stamp', f'pose of {child!r} in {parent!r} ignored: {reason}')
 
     def add_scan(self, scan: Scan, topic: str = '') -> None:
         """
@@ -143,15 +155,12 @@ class Mapper:
 
         A scan without points or frame, or with a stamp that is not newer than the last of its
         frame, is dropped and counted. A stamp that goes back by more than
-        ``input.reset_after_s`` clears the map first. The topic it came on is for the log.
+        ``input.reset_after_s`` clears the map, if the next message agrees; else the scan is
+        dropped. The topic is for the log.
         """
         self.counters.received += 1
-        if not self._queue.has_room_for(scan.frame_id):
-            reason = f'scans of {MAX_FRAMES} other frames came before'
-            self._drops.scan(scan, 'too_many_frames', reason)
-            return
         if topic:
-            self._drops.topics[scan.frame_id] = topic
+            self._drops.name_topic(scan.frame_id, topic)
         if not scan.frame_id:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
@@ -160,10 +169,16 @@ class Mapper:
             reason = f'its points have no {" and no ".join(missing)}'
             self._drops.scan(scan, 'missing_column', reason)
         elif (timed := self._timed(scan)) is not None:
-            if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
-                self._start_anew(scan, back_s)
-            self._poses.mount(scan.frame_id)
-            self._queue.push(timed)
+            own_ns, other_ns = self._queue.newest_ns, self.transforms.newest_ns
+            refuse = partial(self._drops.scan, timed, 'odd_stamp')
+            self._guard.take(scan.stamp_ns, own_ns, other_ns, partial(self._accept, timed), refuse)
+
+    def _accept(self, scan: Scan) -> None:
+        """Queue a scan; if time was set back, clear the map first."""
+        if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
+            self._start_anew(scan, back_s)
+        self._poses.mount(scan.frame_id)
+        self._queue.push(scan)
 
     def _timed(self, scan: Scan) -> Scan | None:
         """Return a scan with the times that deskewing needs; None if it has none."""
@@ -288,10 +303,12 @@ class Mapper:
 
     def finish(self) -> None:
         """End the input: scans that still wait for a pose are dropped and counted."""
+        self._guard.drop_held()
         self._queue.drop_waiting('no_pose', 'no pose until the end of the input')
 
     def clear(self) -> None:
         """Drop all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
+        self._guard.drop_held()
         self._queue.drop_all('cleared', 'the map was cleared')
         if self.config.map.mode != 'frozen':
             self._inserter.clear()

@@ -20,7 +20,7 @@ from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
-from surfel_mapper.poses import TransformBuffer
+from surfel_mapper.poses import MAX_EDGES, TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewed
 
@@ -81,6 +81,8 @@ class ScanPoses:
         """Enter the configured extrinsics of a sensor when its frame is first seen."""
         values, base = self._config.frames.mount_of(frame_id), self._config.frames.base
         if values and frame_id != base and frame_id not in self._mounted:
+            if len(self._mounted) >= MAX_EDGES:  # frame names may change without end
+                self._mounted.clear()
             self._mounted.add(frame_id)
             self.add(base, frame_id, 0, values[:3], values[3:], static=True)
 

@@ -22,7 +22,7 @@ from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.scan import Scan
 
 MAX_FRAMES = 64
-"""Sensors of one robot; more are frame names that change, and would be remembered forever."""
+"""Frames whose newest stamp is kept; of more, the one that was silent longest is forgotten."""
 
 PosedScan = tuple[Scan, Transform]
 """A scan and its T_fixed_sensor."""
@@ -79,20 +79,19 @@ class ScanQueue:
         newest_ns = self.newest_ns
         return 0.0 if newest_ns is None else max(newest_ns - scan.stamp_ns, 0) / 1e9
 
-    def has_room_for(self, frame_id: str) -> bool:
-        """Return whether scans of a frame are taken: MAX_FRAMES frames have an order kept."""
-        return frame_id in self._newest_ns or len(self._newest_ns) < MAX_FRAMES
-
     def push(self, scan: Scan) -> None:
         """Add a scan, unless its stamp is not newer than the last of its frame."""
-        last_ns = self._newest_ns.get(scan.frame_id)
+        last_ns = self._newest_ns.pop(scan.frame_id, None)
         if last_ns is not None and scan.stamp_ns <= last_ns:
             behind_s = (last_ns - scan.stamp_ns) / 1e9
             cause = 'stamp_back' if behind_s else 'stamp_repeated'
             reason = f'its stamp is {behind_s:.3f} s before the one before it'
             self._drops.scan(scan, cause, reason)
+            self._newest_ns[scan.frame_id] = last_ns
             return
-        self._newest_ns[scan.frame_id] = scan.stamp_ns
+        if len(self._newest_ns) >= MAX_FRAMES:
+            del self._newest_ns[next(iter(self._newest_ns))]
+        self._newest_ns[scan.frame_id] = scan.stamp_ns  # at the end: in order of arrival
         self._scans.append(scan)
         while len(self._scans) > self._max_scans:
             reason = f'{self._max_scans} newer scans wait for their poses'

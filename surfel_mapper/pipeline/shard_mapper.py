@@ -56,7 +56,13 @@ class ShardMapper(Mapper):
         if expected:
             back_ns = round(self.config.input.reset_after_s * 1e9)
             since_ns = min(*expected, max(expected) - back_ns) - round(sweep_s(self.config) * 1e9)
-        state = [sorted(stamps.items()), waiting, self.transforms.held(since_ns)]
+        state = [
+            sorted(stamps.items()),
+            waiting,
+            self._guard.newest_ns,
+            self._guard.held_ns,
+            self.transforms.held(since_ns),
+        ]
         return hashlib.sha256(repr(state).encode()).hexdigest()
 
     def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:

@@ -80,6 +80,11 @@ class TransformBuffer:
         newest = [edge.stamps[-1] for edge in self._edges.values() if not edge.is_static]
         return max(newest, default=None)
 
+    def newest_of(self, child: str) -> int | None:
+        """Return the newest stamp of the edge above a frame; None if it is static or unknown."""
+        edge = self._edges.get(child)
+        return None if edge is None or edge.is_static else edge.stamps[-1]
+
     def add(self, parent: str, child: str, stamp_ns: int, T_parent_child: Transform) -> None:
         """
         Add the transform of an edge at one stamp.

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Stamps far from all others: one message alone changes nothing, two in a row set time."""
+
+from __future__ import annotations
+
+import pytest
+
+from surfel_mapper.pipeline.scan_queue import MAX_FRAMES
+from surfel_mapper.pipeline.stamp_guard import MAX_AHEAD_S, StampGuard
+from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
+
+YEAR_2033_S = 2e9
+
+
+def drive(mapper, *stamps_s):
+    updates = []
+    for stamp_s in stamps_s:
+        add_pose(mapper, stamp_s)
+        updates += insert(mapper, scan_at(stamp_s))
+    return [update.stamp_ns / 1e9 for update in updates]
+
+
+@pytest.mark.parametrize('odd_s', [YEAR_2033_S, 40.0])
+def test_one_scan_with_an_odd_stamp_is_dropped_and_the_map_stays(odd_s, caplog):
+    mapper, expected = mapper_with(), mapper_with()
+    drive(mapper, 100.0, 100.1)
+    assert insert(mapper, scan_at(odd_s)) == []
+    assert mapper.counters.dropped == {}  # held
+    assert drive(mapper, 100.2, 100.3) == [100.2, 100.3]
+    drive(expected, 100.0, 100.1, 100.2, 100.3)
+    assert mapper.map.digest() == expected.map.digest()
+    assert mapper.counters.dropped == {'odd_stamp': 1}
+    assert mapper.counters.resets == 0
+    assert 'the next message does not agree' in caplog.text
+    assert_counts_add_up(mapper)
+
+
+@pytest.mark.parametrize('odd_s', [YEAR_2033_S, 40.0])
+def test_one_pose_with_an_odd_stamp_is_ignored(odd_s):
+    mapper = mapper_with()
+    drive(mapper, 100.0, 100.1)
+    add_pose(mapper, odd_s, x=50.0)
+    add_pose(mapper, 100.3, x=1.0)
+    updates = insert(mapper, scan_at(100.2))
+    assert [update.T_map_sensor[0, 3] for update in updates] == [pytest.approx(0.5)]
+    assert mapper.counters.messages_ignored == {'odd_stamp': 1}
+    assert mapper.counters.resets == 0
+
+
+def test_time_is_set_back_when_pose_and_scan_agree():
+    mapper, expected = mapper_with(), mapper_with()
+    drive(mapper, 100.0, 100.1)
+    assert drive(mapper, 40.0, 40.1) == [40.0, 40.1]
+    drive(expected, 40.0, 40.1)
+    assert mapper.map.digest() == expected.map.digest()
+    assert mapper.counters.resets == 1
+    assert mapper.counters.dropped == {}
+
+
+def test_time_is_set_back_when_two_scans_agree():
+    mapper = mapper_with(pose__source='identity')
+    insert(mapper, scan_at(100.0), scan_at(100.1))
+    assert insert(mapper, scan_at(40.0)) == []
+    assert mapper.counters.resets == 0
+    updates = insert(mapper, scan_at(42.0))  # slower than any lidar
+    assert [update.stamp_ns / 1e9 for update in updates] == [40.0, 42.0]
+    assert mapper.counters.resets == 1
+    assert mapper.map.digest() != mapper_with().map.digest()
+
+
+def test_after_a_long_pause_no_message_is_lost():
+    mapper = mapper_with()
+    stamps_s = [100.0, 100.0 + 2 * MAX_AHEAD_S, 100.1 + 2 * MAX_AHEAD_S]
+    assert drive(mapper, *stamps_s) == stamps_s
+    assert mapper.counters.dropped == {}
+    assert mapper.counters.resets == 0
+
+
+def test_a_sensor_with_another_clock_does_not_clear_the_map():
+    mapper = mapper_with()
+    for k in range(20):
+        stamp_s = 100.0 + 0.1 * k
+        add_pose(mapper, stamp_s)
+        insert(mapper, scan_at(stamp_s, 'front'))
+        insert(mapper, scan_at(stamp_s - 30.0, 'rear'))
+    mapper.finish()
+    assert mapper.counters.resets == 0
+    assert mapper.counters.mapped == 20
+    assert mapper.counters.dropped == {'odd_stamp': 20}
+    assert_counts_add_up(mapper)
+
+
+def test_a_message_that_is_held_at_the_end_is_counted():
+    mapper = mapper_with()
+    drive(mapper, 100.0)
+    insert(mapper, scan_at(YEAR_2033_S))
+    mapper.finish()
+    assert mapper.counters.dropped == {'odd_stamp': 1}
+    assert_counts_add_up(mapper)
+
+
+def test_a_lidar_is_mapped_after_many_frames_that_came_once():
+    mapper = mapper_with(pose__source='identity')
+    for number in range(3 * MAX_FRAMES):
+        insert(mapper, scan_at(100.0 + 0.01 * number, f'frame_{number}'))
+    updates = insert(mapper, *(scan_at(102.0 + 0.1 * k) for k in range(5)))
+    assert len(updates) == 5
+    assert mapper.counters.dropped == {}
+    insert(mapper, scan_at(102.3))
+    assert mapper.counters.dropped == {'stamp_back': 1}  # its order is kept
+
+
+def test_two_odd_messages_that_do_not_agree_are_both_dropped():
+    guard, used, refused = StampGuard(1.0), [], []
+
+    def take(stamp_s):
+        own_ns = guard.newest_ns
+        refuse = lambda reason: refused.append(stamp_s)  # noqa: E731
+        guard.take(round(stamp_s * 1e9), own_ns, None, lambda: used.append(stamp_s), refuse)
+
+    for stamp_s in (100.0, 2e9, 50.0, 100.1):
+        take(stamp_s)
+    assert used == [100.0, 100.1]
+    assert refused == [2e9, 50.0]
