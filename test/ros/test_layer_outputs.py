@@ -21,6 +21,5 @@ def test_a_layer_from_outside_is_published(start, peer, tmp_path):
     numbers = peer.collect(Int64, f'{BASE}/num_columns', LATCHED)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, POINTS))
-    peer.spin_until(lambda: numbers)
-    assert numbers[-1].data == 2
+    peer.spin_until(lambda: numbers and numbers[-1].data == 2)
     node.check()
