@@ -159,7 +159,7 @@ class LayerTopic:
         return response
 
     def post_if_due(self) -> None:
-        """Have the mapping thread publish, if there is news and a reader."""
+        """Post publishing to the mapping thread if the content changed and is subscribed to."""
         version = self._publication.version
         is_new = version is None or self._published != version()
         if is_new and (self._publication.is_eager or self._is_read()):

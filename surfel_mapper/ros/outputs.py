@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node publishes of the map: all of it, its changes, the scan with normals, pictures.
+The topics of the map: the full map, its changes, the scan with normals, and markers.
 
-Timers run in the executor's thread and only ask whether there is news and somebody to read it;
-messages are made in the mapping thread, between two scans, where the map does not change. Rates
-are those of a steady clock: they hold while simulated time stands still or jumps.
+Timers run in the executor's thread and only check for changes and subscribers; messages are built
+in the mapping thread, between two scans, while the map does not change. Timers use the steady
+clock, so the rates hold while simulated time stands still or jumps.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from surfel_mapper.ros.pose_outputs import AlignmentOutputs
 from surfel_mapper.scan import Scan
 
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""Holds 5 s at 20 Hz, so that a client that mirrors the map may be slow for a while."""
+"""Holds 5 s at 20 Hz, so that a client that mirrors the map may lag for a while."""
 
 
 NO_VOXELS = np.empty((0, 3), np.int32)
@@ -59,16 +59,16 @@ class Outputs:
     Parameters
     ----------
     node : Node
-        Whose publishers they are.
+        The node that publishes.
     mapper : Mapper
-        What they publish.
+        The mapper whose map is published.
     thread : MappingThread
         The thread that owns the mapper.
 
     """
 
     def __init__(self, node: Node, mapper: Mapper, thread: MappingThread) -> None:
-        """Make the publishers; ``start_timers`` starts what is published at a rate."""
+        """Create the publishers; ``start_timers`` starts the periodic ones."""
         self._node = node
         self._mapper = mapper
         self._thread = thread
@@ -89,13 +89,13 @@ class Outputs:
         # an empty map is published too: it replaces the latched one of a node that was killed
         self._published: dict[Any, int] = {}
         self._timers: list[Timer] = []
-        group = ReentrantCallbackGroup()  # it waits for the mapping thread while others go on
+        group = ReentrantCallbackGroup()  # it waits for the mapping thread
         node.create_service(
             Trigger, '~/publish_normals', self._on_publish_normals, callback_group=group
         )
 
     def publish_update(self, update: Update) -> None:
-        """Publish what a scan changed; called in the mapping thread."""
+        """Publish the changes of a scan; called in the mapping thread."""
         self._stamp_ns = update.stamp_ns
         self._alignment.publish(update)
         self._layers.publish_update(update)
@@ -107,15 +107,15 @@ class Outputs:
             self._publish_scan_normals(update)
 
     def publish_aligned(self, aligned: Alignment) -> None:
-        """Publish what an alignment changed that was asked for; called in the mapping thread."""
+        """Publish the result of ~/align; called in the mapping thread."""
         self._alignment.publish_path(aligned)
         self.expire()
 
     def expire(self) -> None:
         """
-        Publish all anew, and what else than a scan has changed; called in the mapping thread.
+        Publish the present state of all topics; called in the mapping thread.
 
-        To be called whenever the map or its settings have changed in another way.
+        Needed whenever the map or its settings have changed otherwise than by a scan.
         """
         self._published.clear()
         self._layers.expire()
@@ -123,7 +123,7 @@ class Outputs:
             self._publish_change(self._changes.collect())
 
     def start_timers(self, config: Config) -> None:
-        """Publish at the rates of these settings from now on; called in the executor's thread."""
+        """Publish at the rates of these settings; called in the executor's thread."""
         self.stop_timers()
         rates = config.publish
         published: list[tuple[float, Any, Callable[[], object]]] = [
@@ -141,14 +141,14 @@ class Outputs:
         self._layers.start_timers(config)
 
     def stop_timers(self) -> None:
-        """Publish nothing at a rate any more."""
+        """Stop publishing periodically."""
         for timer in self._timers:
             self._node.destroy_timer(timer)
         self._timers.clear()
         self._layers.stop_timers()
 
     def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
-        """Return a callback that has the mapping thread publish where there is news to read."""
+        """Return a timer callback that posts ``publish`` if the map has changed and is read."""
         is_latched_for_all = publisher is self._normals
 
         def post() -> None:
@@ -168,7 +168,7 @@ class Outputs:
             response.message = 'the node is about to end'
         return response
 
-    # What follows is called in the mapping thread.
+    # The methods below run in the mapping thread.
 
     def _has_clients(self) -> bool:
         wants_changed = self._mapper.config.publish.changed
@@ -188,7 +188,7 @@ class Outputs:
     def _surfel_cloud(
         self, surfels: Surfels, removed: npt.NDArray[np.int32] = NO_VOXELS
     ) -> PointCloud2:
-        """Return surfels as a cloud; with moments also what is gone, if they are asked for."""
+        """Return surfels as a cloud; with ``publish.moments`` also moments and removed voxels."""
         if self._mapper.config.publish.moments:
             moments = self._mapper.map.moments(surfels.voxel_index)
             content = moment_cloud(surfels, moments, removed)
@@ -228,7 +228,7 @@ class Outputs:
 
 
 def warm_up(config: Config) -> None:
-    """Compile the kernels of what is published, and run the rest once: it loads its libraries."""
+    """Compile the kernels of the outputs, and load their libraries by running them once."""
     surfel_map = SurfelMap(config.map.voxel_size_m)
     scan = Scan(
         points=np.ones((1, 3), np.float64 if config.deskew.enabled else np.float32),

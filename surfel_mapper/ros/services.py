@@ -5,7 +5,7 @@ The services of the node, and ~/clear_polygon: commands that change, save or loa
 
 Requests are carried out in the mapping thread, behind the clouds that arrived before them, so the
 answer covers all of these. The executor runs other callbacks meanwhile. Every answer states the
-result and where it is; it is logged too, because nav_msgs/LoadMap has no field for text.
+result and its location; it is logged too, because nav_msgs/LoadMap has no field for text.
 """
 
 from __future__ import annotations

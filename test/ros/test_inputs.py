@@ -104,7 +104,8 @@ def test_reliable_and_best_effort_publishers_are_mapped_after_a_restart(start, p
             publisher.publish(cloud(stamp_ns, room(seed=number, num=500)))
             peer.spin_for(0.1)
             number += 1
-        peer.diagnosis({'scans.mapped': number})
+        used = 'best effort' if qos is BEST_EFFORT else 'reliable'
+        peer.diagnosis({'scans.mapped': number, 'qos./points': used})
         peer.node.destroy_publisher(publisher)
     assert node.is_running()
 

@@ -65,7 +65,7 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     )
     assert len(distance) > 50
     assert distance.min() > RADIUS_M - 0.4
-    assert (cost == 0).sum() > 500  # what the rays passed through
+    assert (cost == 0).sum() > 500  # the space that rays passed through
 
 
 def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
