@@ -41,9 +41,7 @@ SEGMENTS = 3
 DEPTH = 4
 """The directory has 2^DEPTH entries."""
 POINTS = 5
-CHANGED = 6
-"""Number of rows that the current operation has changed so far."""
-STATE = 7
+STATE = 6
 
 _LOW = np.int64(0xFFFFFFFF)
 

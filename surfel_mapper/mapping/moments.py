@@ -54,6 +54,9 @@ class ScanMoments:
         Sums of the channels over the points; units in mapping/channels.py.
     left_out : mapping of str to int
         Number of points left out by cause: not_finite, too_near, too_far, beyond_map.
+    rows : (K,) int32, optional
+        Rows of the voxels in the map that inserted these moments last. Only hints, which save
+        the look-up at removal: a map confirms each by the key in the row.
 
     """
 
@@ -67,6 +70,7 @@ class ScanMoments:
     channel_names: tuple[str, ...] = ()
     channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
+    rows: npt.NDArray[np.int32] | None = field(default=None, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Default to zero channels for every voxel."""
@@ -94,7 +98,7 @@ class ScanMoments:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the arrays."""
+        """Bytes of the arrays, without the hints."""
         return sum(a.nbytes for a in self.arrays) + self.channels.nbytes
 
     @property

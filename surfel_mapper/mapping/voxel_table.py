@@ -32,8 +32,7 @@ from surfel_mapper.mapping.kernels.queries import (
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
-    first_missing,
-    subtract_moments,
+    remove_moments,
 )
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.storage import HashTable, Slab
@@ -85,7 +84,7 @@ class VoxelTable:
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
-        Add moments to their voxels; return the changed rows, each once.
+        Add moments to their voxels; return the row of each.
 
         Raises
         ------
@@ -93,8 +92,7 @@ class VoxelTable:
             If there is no memory for the voxels; the table is unchanged.
 
         """
-        changed = np.empty(len(moments), np.int32)
-        self._state[hashing.CHANGED] = 0
+        found = np.empty(len(moments), np.int32)
         done = 0
         while done < len(moments):
             done = add_moments(
@@ -105,15 +103,15 @@ class VoxelTable:
                 self._state,
                 version,
                 done,
-                changed,
+                found,
             )
             if done < len(moments):
                 self._make_room_or_undo(moments.select(slice(done)), version)
         if self._channels:
             if len(self._channels.array) < len(self.rows):
                 self._channels.grow(len(self.rows))
-            self._channels.array[self.find(moments.key)] += moments.channels
-        return changed[: self._state[hashing.CHANGED]]
+            self._channels.array[found] += moments.channels
+        return found
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 if not found."""
@@ -121,33 +119,44 @@ class VoxelTable:
         find_rows(key, self.rows, self._hash.arrays, self._state, found)
         return found
 
-    def first_missing(self, moments: ScanMoments, found: npt.NDArray[np.int32]) -> int:
-        """Return the first voxel whose row does not hold its moments, or -1."""
-        return int(first_missing(moments.arrays, moments.view_is_sum, self.rows, found))
+    def hints(self, moments: ScanMoments) -> npt.NDArray[np.int32]:
+        """Return the likely row of each voxel of moments, to be confirmed."""
+        if moments.rows is None or len(moments.rows) != len(moments):
+            return self.find(moments.key)
+        return np.array(moments.rows, np.int32)
 
-    def subtract(
-        self,
-        moments: ScanMoments,
-        version: int,
-        found: npt.NDArray[np.int32],
-        min_points: int = 1,
-    ) -> npt.NDArray[np.int64]:
-        """Subtract moments from the rows found; return the keys that fell below min_points."""
+    def remove(
+        self, moments: ScanMoments, version: int, min_points: int = 1
+    ) -> tuple[int, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+        """
+        Subtract moments from their voxels, or nothing if one does not hold them.
+
+        Returns
+        -------
+        missing : int
+            The first voxel that does not hold its moments, or -1.
+        rows : (K,) int32
+            The row of each voxel.
+        fallen : (E,) int64
+            The keys of the voxels that fell below min_points.
+
+        """
+        rows = self.hints(moments)
         fallen = np.empty(len(moments), np.int64)
-        num_fallen = subtract_moments(
+        missing, num_fallen = remove_moments(
             moments.arrays,
             moments.view_is_sum,
             self.rows,
             self._hash.arrays,
             self._state,
             version,
-            found,
+            rows,
             max(min_points, 1),
             fallen,
         )
-        if self._channels:
-            self._channels.array[found] -= moments.channels
-        return fallen[:num_fallen]
+        if self._channels and missing < 0:
+            self._channels.array[rows] -= moments.channels
+        return int(missing), rows, fallen[:num_fallen]
 
     def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """Return the channel sums of some rows, (K, C)."""
@@ -185,7 +194,7 @@ class VoxelTable:
         except MapLimitError:
             if self._channels:  # not added yet
                 added = replace(added, channels=np.zeros_like(added.channels))
-            self.subtract(added, version, self.find(added.key))
+            self.remove(added, version)
             raise
 
     def _make_room(self) -> None:

@@ -17,7 +17,6 @@ import numpy as np
 
 from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
-    CHANGED,
     DEPTH,
     find_row,
     first_bucket,
@@ -99,24 +98,24 @@ def find_rows(keys, rows, table, state, found):
 
 
 @njit(cache=True, nogil=True)
-def add_moments(moments, view_weight, rows, table, state, version, start, changed):
+def add_moments(moments, view_weight, rows, table, state, version, start, found):
     """
     Add the moments of a scan from voxel start on; return the number of voxels done.
 
     moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
     view_weight  0: the view is multiplied by the count; 1: it is a sum already
     version      int64, marks the rows as changed
-    changed      (K,) int32, out: rows changed, each once; their number is state[CHANGED]
+    found        (K,) int32, out: row of each voxel
 
     Fewer than K are done if slab, segments or directory have no room for a new voxel: make room
     and continue from there.
     """
-    keys, count, total, product, view = moments
+    keys, count, _, _, _ = moments
     directory, buckets, _, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
     hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
-    num_changed, num_points = state[CHANGED], np.int64(0)
+    num_points = np.int64(0)
     done = start
     while done < len(keys):
         num = min(BLOCK, len(keys) - done)
@@ -130,23 +129,14 @@ def add_moments(moments, view_weight, rows, table, state, version, start, change
             if row < 0:
                 row = new_row(key, hashes[i], rows, table, state)
                 if row < 0:
-                    state[CHANGED], state[POINTS] = num_changed, state[POINTS] + num_points
+                    state[POINTS] += num_points
                     return place
-            n = np.int64(count[place])
-            weight = n if view_weight == 0 else np.int64(1)
-            num_points += n
-            rows[row, COUNT] += n
-            for axis in range(3):
-                rows[row, SUM + axis] += total[place, axis]
-                rows[row, VIEW + axis] += weight * view[place, axis]
-            for pair in range(6):
-                rows[row, PRODUCT + pair] += product[place, pair]
-            if rows[row, VERSION] != version:
-                rows[row, VERSION] = version
-                changed[num_changed] = row
-                num_changed += 1
+            num_points += np.int64(count[place])
+            change_row(moments, view_weight, rows, row, place, 1)
+            rows[row, VERSION] = version
+            found[place] = row
         done += num
-    state[CHANGED], state[POINTS] = num_changed, state[POINTS] + num_points
+    state[POINTS] += num_points
     return done
 
 
@@ -174,73 +164,91 @@ def new_row(key, hashed, rows, table, state):
 
 
 @njit(cache=True, nogil=True)
-def first_missing(moments, view_weight, rows, found):
+def remove_moments(moments, view_weight, rows, table, state, version, found, min_points, fallen):
     """
-    Return the first voxel whose moments cannot be subtracted, or -1 if all can.
+    Subtract moments, or nothing if a voxel does not hold them; free the rows that become empty.
 
-    found  (K,) int32, row of each voxel
+    version     int64, marks the rows as changed
+    found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
+    min_points  smallest number of points of a surfel, at least 1
+    fallen      (K,) int64, out: keys of the voxels that held min_points before and hold fewer now
 
-    A voxel must hold at least as many points as are subtracted; if it holds no others, its sums
-    must be equal.
+    Returns the first voxel that does not hold its moments, or -1, and the number of fallen voxels.
+
+    A row keeps its voxel as long as that holds points, so a hint is right unless the voxel was
+    emptied since; a wrong one is replaced by a look-up. A voxel must hold at least as many points
+    as are subtracted; if it holds no others, its sums must be equal. One pass that is undone on
+    failure: a pass of checks before it would read every row from memory twice.
     """
-    keys, count, total, product, view = moments
+    keys, count, _, _, _ = moments
+    used, depth = state[ROWS_USED], state[DEPTH]
+    flat = rows.ravel()
+    emptied, versions = np.empty(len(keys), np.int32), np.empty(len(keys), np.int64)
+    num_emptied = num_fallen = 0
+    num_points = np.int64(0)
     for place in range(len(keys)):
-        row = found[place]
-        if row < 0 or rows[row, COUNT] < count[place]:
-            return place
-        if rows[row, COUNT] == count[place]:
-            weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
-            for axis in range(3):
-                if rows[row, SUM + axis] != total[place, axis]:
-                    return place
-                if rows[row, VIEW + axis] != weight * view[place, axis]:
-                    return place
-            for pair in range(6):
-                if rows[row, PRODUCT + pair] != product[place, pair]:
-                    return place
-    return -1
+        if place + AHEAD < len(keys):
+            ahead = np.int64(found[place + AHEAD])
+            if 0 <= ahead < used:
+                prefetch(flat, ahead * ROW)
+                prefetch(flat, ahead * ROW + ROW // 2)
+        key, n = keys[place], np.int64(count[place])
+        row = np.int64(found[place])
+        if not (0 <= row < used and rows[row, KEY] == key and rows[row, COUNT] > 0):
+            row = find_row(key, rows, table, depth)
+            found[place] = row
+        held = rows[row, COUNT] if row >= 0 else np.int64(-1)
+        if held < n or (held == n and not holds_exactly(moments, view_weight, rows, row, place)):
+            for done in range(place):
+                change_row(moments, view_weight, rows, np.int64(found[done]), done, 1)
+                rows[found[done], VERSION] = versions[done]
+            return place, 0
+        if held >= min_points > held - n:
+            fallen[num_fallen] = key
+            num_fallen += 1
+        if held == n:
+            emptied[num_emptied] = place
+            num_emptied += 1
+        change_row(moments, view_weight, rows, row, place, -1)
+        versions[place] = rows[row, VERSION]
+        rows[row, VERSION] = version
+        num_points += n
+    state[POINTS] -= num_points
+    state[VOXELS] -= num_emptied
+    for place in emptied[:num_emptied]:
+        row = np.int64(found[place])
+        remove_row(keys[place], row, table, depth)
+        rows[row, KEY] = state[FREE_ROW]
+        state[FREE_ROW] = row
+    return -1, num_fallen
+
+
+@njit(cache=True, nogil=True, inline='always')
+def change_row(moments, view_weight, rows, row, place, sign):
+    """Add the moments of a voxel to its row, or subtract them with a sign of -1."""
+    _, count, total, product, view = moments
+    n = np.int64(count[place])
+    weight = sign * (n if view_weight == 0 else np.int64(1))
+    rows[row, COUNT] += sign * n
+    for axis in range(3):
+        rows[row, SUM + axis] += sign * total[place, axis]
+        rows[row, VIEW + axis] += weight * view[place, axis]
+    for pair in range(6):
+        rows[row, PRODUCT + pair] += sign * product[place, pair]
 
 
 @njit(cache=True, nogil=True)
-def subtract_moments(moments, view_weight, rows, table, state, version, found, min_points, fallen):
-    """
-    Subtract moments; free the rows that become empty; return the number of fallen voxels.
-
-    found       (K,) int32, row of each voxel
-    min_points  smallest number of points of a surfel, at least 1
-    fallen      (K,) int64, out: keys of the voxels that held min_points before and hold fewer now
-    """
-    keys, count, total, product, view = moments
-    depth = state[DEPTH]
-    flat = rows.ravel()
-    num_fallen = 0
-    for place in range(len(keys)):
-        if place + AHEAD < len(keys):
-            prefetch(flat, np.int64(found[place + AHEAD]) * ROW)
-            prefetch(flat, np.int64(found[place + AHEAD]) * ROW + ROW // 2)
-        row = np.int64(found[place])
-        n = np.int64(count[place])
-        state[POINTS] -= n
-        rows[row, VERSION] = version
-        key = keys[place]
-        if rows[row, COUNT] >= min_points > rows[row, COUNT] - n:
-            fallen[num_fallen] = key
-            num_fallen += 1
-        if rows[row, COUNT] == n:
-            remove_row(key, row, table, depth)
-            state[VOXELS] -= 1
-            rows[row, COUNT] = 0
-            rows[row, KEY] = state[FREE_ROW]
-            state[FREE_ROW] = row
-            continue
-        weight = n if view_weight == 0 else np.int64(1)
-        rows[row, COUNT] -= n
-        for axis in range(3):
-            rows[row, SUM + axis] -= total[place, axis]
-            rows[row, VIEW + axis] -= weight * view[place, axis]
-        for pair in range(6):
-            rows[row, PRODUCT + pair] -= product[place, pair]
-    return num_fallen
+def holds_exactly(moments, view_weight, rows, row, place):
+    """Return whether the sums of a row are the moments of a voxel."""
+    _, count, total, product, view = moments
+    weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
+    equal = True
+    for axis in range(3):
+        equal &= rows[row, SUM + axis] == total[place, axis]
+        equal &= rows[row, VIEW + axis] == weight * view[place, axis]
+    for pair in range(6):
+        equal &= rows[row, PRODUCT + pair] == product[place, pair]
+    return equal
 
 
 @njit(cache=True, nogil=True)

@@ -14,8 +14,7 @@ from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION,
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
-    first_missing,
-    subtract_moments,
+    remove_moments,
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
@@ -44,31 +43,29 @@ class Memory:
     def add(self, moments, version, start=0, weight=1):
         """Return the number of rows done, and the changed rows."""
         changed = np.full(len(moments[0]), -1, np.int32)
-        self.state[hashing.CHANGED] = 0
         done = self.call(
             add_moments,
             *(moments, weight, self.rows, self.table, self.state, version, start, changed),
         )
-        return done, changed[: self.state[hashing.CHANGED]].tolist()
+        return done, changed[start:done].tolist()
 
     def find(self, keys):
         found = np.full(len(keys), -9, np.int32)
         self.call(find_rows, keys, self.rows, self.table, self.state, found)
         return found
 
-    def missing(self, moments, weight=1):
-        return self.call(first_missing, moments, weight, self.rows, self.find(moments[0]))
-
-    def subtract(self, moments, version, min_points=1, weight=1):
-        """Return the voxels that fell below min_points."""
+    def remove(self, moments, version, min_points=1, weight=1, hints=None):
+        """Return the first voxel that does not hold its moments, and the fallen voxels."""
         fallen = np.full(len(moments[0]), -1, np.int64)
-        found = self.find(moments[0])
-        num = self.call(
-            subtract_moments,
+        found = self.find(moments[0]) if hints is None else hints
+        missing, num = self.call(
+            remove_moments,
             *(moments, weight, self.rows, self.table, self.state, version, found),
             *(min_points, fallen),
         )
-        return list(map(tuple, unpack_keys(fallen[:num]).tolist()))
+        if missing < 0:
+            np.testing.assert_array_equal(self.rows[found, VERSION], version)
+        return missing, list(map(tuple, unpack_keys(fallen[:num]).tolist()))
 
     def content(self):
         """Return the content of the table as a dict."""
@@ -120,9 +117,9 @@ def test_moments_are_added_and_subtracted_as_integers(call, wide):
     assert memory.state[hashing.VOXELS] == len(expected)
 
     for version, twin in enumerate(twins[::-1], 7):
-        assert memory.missing(arrays_of(twin)) == -1
         before = set(expected)
-        fallen = memory.subtract(arrays_of(twin, wide), version)
+        missing, fallen = memory.remove(arrays_of(twin, wide), version)
+        assert missing == -1
         reference.add_moments(expected, twin, -1)
         assert sorted(fallen) == sorted(before - set(expected))
         assert memory.content() == expected
@@ -138,9 +135,8 @@ def test_a_view_of_one_point_counts_for_all_of_them(call):
     moments = (keys, count.astype(np.int32), total, product, view.astype(np.int16))
     memory.add(moments, 1, weight=0)
     assert memory.content()[0, 0, 0][10:] == [15, -18, 21]
-    assert memory.missing(moments, weight=0) == -1
-    assert memory.missing(moments, weight=1) == 0
-    memory.subtract(moments, 2, weight=0)
+    assert memory.remove(moments, 2, weight=1)[0] == 0
+    assert memory.remove(moments, 2, weight=0)[0] == -1
     assert memory.content() == {}
 
 
@@ -186,7 +182,7 @@ def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
     memory, first, second = Memory(call, 400), some_moments(2), some_moments(3, num_points=30)
     memory.add(arrays_of(first), 1)
     used = memory.state[hashing.ROWS_USED]
-    memory.subtract(arrays_of(first), 2)
+    memory.remove(arrays_of(first), 2)
     assert (memory.rows[:used, COUNT] == 0).all()
     _, changed = memory.add(arrays_of(second), 3)
     assert memory.state[hashing.ROWS_USED] == used
@@ -196,16 +192,37 @@ def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
 
 @both
 @pytest.mark.parametrize('column', range(13))
-def test_moments_not_held_are_found_missing(call, column):
+def test_a_failed_removal_names_the_voxel_and_changes_nothing(call, column):
     memory = Memory(call, 200)
-    twin = some_moments(4)
+    twin, other = some_moments(4), some_moments(5)
     memory.add(arrays_of(twin), 1)
+    memory.add(arrays_of({v: other[v] for v in list(other)[::2] if v not in twin}), 2)
     voxel = list(twin)[7]
     one_off = {v: list(row) for v, row in twin.items()}
     one_off[voxel][column] += 1
-    assert memory.missing(arrays_of(one_off)) == 7
     absent = {(50, 50, 50): [1] * 13}
-    assert memory.missing(arrays_of({**dict(list(twin.items())[:4]), **absent})) == 4
+    rows, state = memory.rows.copy(), memory.state.copy()
+    assert memory.remove(arrays_of(one_off), 3) == (7, [])
+    assert memory.remove(arrays_of({**dict(list(twin.items())[:4]), **absent}), 3) == (4, [])
+    np.testing.assert_array_equal(memory.rows, rows)
+    np.testing.assert_array_equal(memory.state, state)
+
+
+@both
+def test_wrong_hints_of_rows_are_replaced_by_a_look_up(call):
+    memory, twin, gone = Memory(call, 400), some_moments(6), some_moments(7)
+    memory.add(arrays_of(gone), 1)
+    memory.add(arrays_of(twin), 2)
+    memory.remove(arrays_of({v: row for v, row in gone.items() if v not in twin}), 3)
+    expected = {v: list(row) for v, row in memory.content().items()}
+    hints = memory.find(arrays_of(twin)[0])
+    hints[::4] = -1
+    hints[1::4] = 399  # never used
+    hints[2::4] = memory.state[hashing.FREE_ROW]  # emptied
+    hints[3::8] = hints[7]  # another voxel's
+    assert memory.remove(arrays_of(twin), 4, hints=hints)[0] == -1
+    reference.add_moments(expected, twin, -1)
+    assert memory.content() == expected
 
 
 @both
@@ -215,7 +232,7 @@ def test_voxels_fall_when_they_had_enough_points_and_have_no_more(call, min_poin
     counts = {(0, 0, n): n for n in range(1, 5)}
     memory.add(arrays_of({v: [n] + [0] * 12 for v, n in counts.items()}), 1)
     one_each = arrays_of({v: [1] + [0] * 12 for v in counts})
-    fallen = memory.subtract(one_each, 2, min_points)
+    _, fallen = memory.remove(one_each, 2, min_points)
     assert fallen == ([(0, 0, min_points)] if min_points < 5 else [])
 
 
