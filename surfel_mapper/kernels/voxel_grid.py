@@ -36,7 +36,7 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
     first  (N,) int64, out: first point of each voxel
     rows   (N,) or (0,) int32, out if N long: voxel of each point
     """
-    table = np.full(2 * ROWS, -1, np.int32)
+    table = np.full(4 * ROWS, -1, np.int32)
     chunk_keys = np.empty(CHUNK, np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     run_rows = np.empty(CHUNK, np.int32)
@@ -47,7 +47,7 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
         find_keys(x, y, z, size, shift, base, bits, chunk_keys)
         num_runs = find_runs(chunk_keys, len(x), starts)
-        if 2 * (num_rows + num_runs) > len(table):
+        if 4 * (num_rows + num_runs) > len(table):
             table = enlarged_table(table, keys, num_rows)
         num_rows = find_run_rows(
             chunk_keys, starts, num_runs, table, keys, sums, num_rows, run_rows

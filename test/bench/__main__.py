@@ -20,6 +20,7 @@ from test.bench.report import Row, table
 
 BENCHES = (
     'mapping',
+    'real',
     'threads',
     'scaling',
     'live',

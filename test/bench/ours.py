@@ -10,6 +10,7 @@ of all voxels that changed.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
@@ -54,16 +55,16 @@ class Ours:
             for stage, start, end in zip(STAGES, times[:-1], times[1:], strict=True)
         }
 
-    def put(self, moments: ScanMoments) -> list[float]:
+    def put(self, moments: ScanMoments, clock: Callable[[], float] = perf_counter) -> list[float]:
         """Insert a reduced scan; return when that, evicting and deriving were done, s."""
         version = self.map.version
         self.map.insert(moments)
         self.scans.append(moments)
-        times = [perf_counter()]
+        times = [clock()]
         if len(self.scans) > self._window:
             self.map.remove(self.scans.popleft())
-        times.append(perf_counter())
+        times.append(clock())
         changed = self.map.surfels_changed(version)
-        times.append(perf_counter())
+        times.append(clock())
         self.num_changed = len(changed)
         return times

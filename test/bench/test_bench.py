@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
-from test.bench import accuracy
+from test.bench import accuracy, real
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -49,6 +49,27 @@ def options(tmp_path_factory):
         columns=64,
         cache=tmp_path_factory.mktemp('cache'),
     )
+
+
+def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_path):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
+    assert bench.run(['real'], options) == []
+
+    name, file = list(real.SCANS.items())[-1]
+    folder = tmp_path / 'data' / 'scans'
+    folder.mkdir(parents=True)
+    points = np.random.default_rng(1).uniform(-5.0, 5.0, (300, 5)).astype(np.float32)
+    points[::9, :3] = 0.0
+    points[::7, 1] = np.nan
+    points.tofile(folder / file)
+    monkeypatch.setenv('SURFEL_MAPPER_TEST_DATA', str(tmp_path))
+    rows = bench.run(['real'], options)
+
+    assert [(row['scan'], row['voxel_m']) for row in rows] == [
+        (scan, size_m) for size_m in (0.5, 0.2) for scan in (name, 'geometric mean')
+    ]
+    assert rows[0]['points'] == (np.isfinite(points).all(1) & points[:, :3].any(1)).sum()
+    assert all(row['x_numpy'] > 0.0 for row in rows)
 
 
 @pytest.mark.parametrize('name', ['mapping', 'scaling', 'compare'])
