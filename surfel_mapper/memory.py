@@ -13,6 +13,12 @@ Stands alone: a process of any part calls it once at its start.
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
+CGROUP_LIMIT = Path('/sys/fs/cgroup/memory.max')
+"""Limit of a container, bytes, or ``max``."""
+
 LARGEST = 31 << 20
 """Size of the freed block, bytes; glibc adapts its threshold to blocks of up to 32 MiB."""
 
@@ -27,3 +33,13 @@ def keep_freed_memory() -> None:
     set by the environment stay.
     """
     bytes(LARGEST)
+
+
+def machine_bytes() -> int:
+    """Return the memory of the machine, or of the container if that is limited to less, bytes."""
+    total = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
+    try:
+        text = CGROUP_LIMIT.read_text(encoding='ascii').strip()
+    except OSError:
+        return total
+    return min(total, int(text)) if text.isdigit() else total

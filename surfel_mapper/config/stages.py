@@ -45,7 +45,16 @@ class MapConfig(Stage):
     )
     load: str = setting(
         '',
-        'Map to start from, a .npz file of ~/save_map; its surfels stay. Empty: none.',
+        'Map to start from, a .npz file of ~/save_map; its surfels stay. latest: the newest map '
+        'or checkpoint in output.directory, if any, with its window. Empty: none.',
+    )
+    max_bytes: int = setting(
+        -1,
+        'The oldest scans are evicted while map and window need more bytes; -1: half of the '
+        'memory of the machine, for scans that a window limit keeps; 0: no such limit.',
+        low=-1,
+        high=2**62,
+        live=True,
     )
     threads: int = setting(
         1, 'Threads that share the work of a scan; the map does not depend on it.', low=1, high=64
@@ -290,6 +299,14 @@ class OutputConfig(Stage):
     map_name: str = setting('map', 'Name of the files of ~/save_map inside it, no extension.')
     save_on_shutdown: bool = setting(
         False, 'Save the map when the node ends, as ~/save_map does.', live=True
+    )
+    checkpoint_s: float = setting(
+        0.0,
+        'The node saves the map this often while it changes, s; the last two checkpoints are kept '
+        'beside map_name; 0: never.',
+        low=0.0,
+        high=1e9,
+        live=True,
     )
 
     def check(self, stage: str) -> None:

@@ -57,6 +57,10 @@ class WindowedScan:
         return self.moments.nbytes + sum(array.nbytes for array in kept)
 
 
+VOXEL_BYTES = 160
+"""A row of a voxel, 128 bytes, and its share of the hash table, at most 32."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Eviction:
     """
@@ -66,8 +70,8 @@ class Eviction:
     ----------
     scan : WindowedScan
     limit : str
-        The limit that it exceeded: max_scans, max_age_s, max_distance_m, max_bytes or
-        max_voxels.
+        The limit that it exceeded: max_scans, max_age_s, max_distance_m, max_bytes, max_voxels
+        or max_total_bytes.
     fallen : (E, 3) int32
         Indices of the voxels that fell below min_points, the number of points of a surfel.
 
@@ -91,6 +95,14 @@ class SlidingWindow:
     max_voxels : int
         Scans are evicted while the map holds more voxels; 0 means no such limit.
 
+    Attributes
+    ----------
+    max_total_bytes : int
+        Scans are evicted while the voxels and the kept scans need more bytes; 0 means no such
+        limit.
+    keeps_scans : bool
+        Whether that limit alone is a reason to keep scans.
+
     """
 
     def __init__(
@@ -102,6 +114,8 @@ class SlidingWindow:
     ) -> None:
         self.config = config or WindowConfig()
         self.max_voxels = max_voxels
+        self.max_total_bytes = 0
+        self.keeps_scans = False
         self._map = surfel_map
         self._scans: deque[tuple[WindowedScan, float]] = deque()
         self._reset()
@@ -124,6 +138,11 @@ class SlidingWindow:
     def nbytes(self) -> int:
         """Size of the kept scans, bytes."""
         return self._nbytes
+
+    @property
+    def total_bytes(self) -> int:
+        """Size of the voxels that hold points and of the kept scans, bytes."""
+        return self._map.num_voxels * VOXEL_BYTES + self._nbytes
 
     @property
     def newest(self) -> WindowedScan | None:
@@ -273,7 +292,7 @@ class SlidingWindow:
         """Whether no limit can evict a scan and points are not kept."""
         config = self.config
         limits = (config.max_scans, config.max_age_s, config.max_distance_m, config.max_bytes)
-        return not (any(limits) or self.max_voxels or config.keep_points)
+        return not (any(limits) or self.max_voxels or config.keep_points or self.keeps_scans)
 
     def _evict(self, limit: str, min_points: int) -> Eviction:
         scan, _ = self._scans[0]
@@ -293,6 +312,7 @@ class SlidingWindow:
             'max_distance_m': (self._travelled_m - travelled_m, config.max_distance_m),
             'max_bytes': (self._nbytes, config.max_bytes),
             'max_voxels': (self._map.num_voxels, self.max_voxels),
+            'max_total_bytes': (self.total_bytes, self.max_total_bytes),
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')

@@ -36,6 +36,7 @@ ALL_SCANS: Mapping[str, Any] = {
     'window.max_distance_m': 0.0,
     'window.max_bytes': 0,
     'map.max_voxels': 0,
+    'map.max_bytes': 0,
 }
 """Settings with which no scan leaves the map."""
 
@@ -215,13 +216,11 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
 
 def started_mapper(config: Config) -> Mapper:
     """Return a mapper with compiled kernels and the map that ``map.load`` names, if any."""
-    from surfel_mapper.files.map_state import load_map
     from surfel_mapper.pipeline import Mapper
+    from surfel_mapper.pipeline.checkpoints import load_start
 
     mapper = Mapper(config)
-    if config.map.load:
-        surfel_map, _ = load_map(config.map.load, voxel_size_m=mapper.map.voxel_size_m)
-        mapper.restore(surfel_map, [])
+    load_start(mapper)
     mapper.warm_up()
     return mapper
 

@@ -24,6 +24,7 @@ from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow
+from surfel_mapper.memory import machine_bytes
 from surfel_mapper.pipeline.drops import described, Drops
 from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
@@ -70,7 +71,8 @@ class Inserter:
         self.map = SurfelMap(
             config.map.voxel_size_m, columns=config.map.columns, threads=config.map.threads
         )
-        self.window = SlidingWindow(self.map, config.window, max_voxels=config.map.max_voxels)
+        self.window = SlidingWindow(self.map)
+        self._set_limits(config)
         around = Surroundings(
             surfel_map=self.map, window=self.window, sensors=SensorModels(config.tsdf)
         )
@@ -93,8 +95,15 @@ class Inserter:
         """Take new settings; if preparation refuses them, nothing has changed."""
         self.preparation.load_filters(config.filters)
         self.layers.reconfigure(config)
+        self._set_limits(config)
+
+    def _set_limits(self, config: Config) -> None:
+        """Set the limits of the window."""
+        wanted = config.map.max_bytes
         self.window.config = config.window
         self.window.max_voxels = config.map.max_voxels
+        self.window.max_total_bytes = machine_bytes() // 2 if wanted < 0 else wanted
+        self.window.keeps_scans = wanted > 0
 
     def clear(self) -> None:
         """Empty map, window and layers."""

@@ -16,8 +16,8 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
-from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper, Update
+from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import save_map
@@ -67,9 +67,8 @@ class Session:
         self._tasks = tasks
         self.config = config
         self.mapper = Mapper(config)
-        if config.map.load:
-            surfel_map, _ = load_map(config.map.load, voxel_size_m=config.map.voxel_size_m)
-            self.mapper.restore(surfel_map, [])  # without its window: nothing is evicted
+        load_start(self.mapper)
+        self._checkpoints = Checkpoints(self.mapper)
         self.thread = MappingThread(self.mapper, tasks.fail)
         self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
@@ -158,6 +157,8 @@ class Session:
         self.outputs.publish_update(update)
         if self.registration is not None:
             self.registration.publish(update)
+        with self.mapper.guarded('a checkpoint'):
+            self._checkpoints.save_if_due()
         now_ns = self._node.get_clock().now().nanoseconds
         self.latencies_s.append((now_ns - update.stamp_ns) / 1e9)
 

@@ -1,0 +1,115 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Checkpoints of a map: saved every ``output.checkpoint_s``, and found again after a restart.
+
+A checkpoint is a file as ~/save_map writes it, whole or not at all. The one before is kept, so
+that at any moment, also while one is written, a whole one is there.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+import time
+
+from surfel_mapper.config import OutputConfig
+from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.pipeline.mapper import Mapper
+
+LATEST = 'latest'
+"""Value of map.load: the newest map or checkpoint in output.directory."""
+
+_log = logging.getLogger(__name__)
+
+
+class Checkpoints:
+    """
+    Saves the map of a mapper now and then.
+
+    Parameters
+    ----------
+    mapper : Mapper
+        Its settings say how often, and where.
+
+    """
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._saved_s = time.monotonic()
+        self._version = mapper.map.version
+
+    def save_if_due(self) -> Path | None:
+        """
+        Save the map if it has changed and the last checkpoint is old enough; return the file.
+
+        Raises
+        ------
+        FileFormatError, OSError
+            If it cannot be written. The next attempt comes after ``output.checkpoint_s`` again.
+
+        """
+        mapper, now_s = self._mapper, time.monotonic()
+        every_s = mapper.config.output.checkpoint_s
+        if not every_s or now_s - self._saved_s < every_s or mapper.map.version == self._version:
+            return None
+        self._saved_s, version = now_s, mapper.map.version
+        newest, before = checkpoint_paths(mapper.config.output)
+        newest.parent.mkdir(parents=True, exist_ok=True)
+        for path in (newest, before):
+            if path.is_symlink():
+                raise FileFormatError(f'{path}: a link, expected a file or none')
+        if newest.exists():
+            os.replace(newest, before)
+        save_map(newest, mapper.map, mapper.window)
+        self._version = version
+        return newest
+
+
+def checkpoint_paths(output: OutputConfig) -> tuple[Path, Path]:
+    """Return the files of the newest checkpoint and of the one before it."""
+    directory = Path(output.directory).expanduser().absolute()
+    name = output.map_name
+    return directory / f'{name}.checkpoint.npz', directory / f'{name}.checkpoint.1.npz'
+
+
+def load_start(mapper: Mapper) -> None:
+    """
+    Give a mapper the map that ``map.load`` names, if any.
+
+    A file is loaded without its window, so its surfels stay. ``latest`` continues with the newest
+    map or checkpoint in ``output.directory`` and its window; a damaged one is passed over with a
+    warning, and without any the map starts empty.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, or has another voxel size.
+    MapError
+        If the map has other columns than are configured.
+
+    """
+    config = mapper.config
+    voxel_size_m = config.map.voxel_size_m
+    if config.map.load == LATEST:
+        _load_latest(mapper)
+    elif config.map.load:
+        surfel_map, _ = load_map(config.map.load, voxel_size_m=voxel_size_m)
+        mapper.restore(surfel_map, [])
+
+
+def _load_latest(mapper: Mapper) -> None:
+    output = mapper.config.output
+    saved = checkpoint_paths(output)[0].with_name(f'{output.map_name}.npz')
+    found = [path for path in (saved, *checkpoint_paths(output)) if path.is_file()]
+    for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
+        try:
+            mapper.restore(*load_map(path, voxel_size_m=mapper.config.map.voxel_size_m))
+        except (FileFormatError, MapError) as error:
+            _log.warning('map.load latest: %s; an older one is tried', error)
+            continue
+        _log.info('map.load latest: starts from %s, digest %s', path, mapper.map.digest())
+        return
+    _log.warning('map.load latest: no map in %s, starts with an empty one', saved.parent)

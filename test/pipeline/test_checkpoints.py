@@ -1,0 +1,156 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints: when they are written, which one a restart finds, and what damage costs."""
+
+from __future__ import annotations
+
+import logging
+import os
+
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.pipeline import checkpoints
+from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
+from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
+
+
+class Clock:
+    """The steady clock of the module, set by hand."""
+
+    now_s = 100.0
+
+    def monotonic(self):
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr(checkpoints, 'time', clock)
+    return clock
+
+
+def mapper_in(folder, **changes):
+    changes = {'window__max_scans': 3, 'output__checkpoint_s': 10.0, **changes}
+    return mapper_with(output__directory=str(folder), **changes)
+
+
+def drive(mapper, *stamps_s):
+    for stamp_s in stamps_s:
+        add_pose(mapper, stamp_s, x=stamp_s)
+        insert(mapper, scan_at(stamp_s))
+
+
+def test_a_checkpoint_is_written_when_due_and_two_are_kept(tmp_path, clock):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    drive(mapper, 1.0)
+    assert saving.save_if_due() is None
+    digests = []
+    for stamp_s in (2.0, 3.0, 4.0):
+        clock.now_s += 10.0
+        drive(mapper, stamp_s)
+        assert saving.save_if_due() == newest
+        assert saving.save_if_due() is None
+        digests.append(mapper.map.digest())
+    clock.now_s += 10.0
+    assert saving.save_if_due() is None  # the map is as it was
+    assert sorted(path.name for path in tmp_path.iterdir()) == sorted([newest.name, before.name])
+
+    for path, digest in ((newest, digests[2]), (before, digests[1])):
+        assert checkpoints.load_map(path)[0].digest() == digest
+
+
+def test_latest_continues_with_map_and_window(tmp_path, clock):
+    mapper = mapper_in(tmp_path)
+    saving = Checkpoints(mapper)
+    drive(mapper, 1.0, 2.0, 3.0, 4.0)
+    clock.now_s += 10.0
+    assert saving.save_if_due() is not None
+    after = mapper_in(tmp_path, map__load='latest')
+    load_start(after)
+    assert after.map.digest() == mapper.map.digest()
+    for each in (mapper, after):
+        drive(each, 5.0, 6.0)
+    assert after.map.digest() == mapper.map.digest()  # the same scans have left
+
+
+@pytest.mark.parametrize('damage', ['cut', 'missing'])
+def test_the_checkpoint_before_is_used_if_the_newest_is_damaged(tmp_path, clock, caplog, damage):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    digests = []
+    for stamp_s in (1.0, 2.0):
+        drive(mapper, stamp_s)
+        clock.now_s += 10.0
+        saving.save_if_due()
+        digests.append(mapper.map.digest())
+    if damage == 'cut':
+        newest.write_bytes(newest.read_bytes()[:-100])
+    else:
+        newest.unlink()  # killed while the newest one was written
+    os.utime(before, (1, 1))
+    after = mapper_in(tmp_path, map__load='latest')
+    load_start(after)
+    assert after.map.digest() == digests[0]
+    assert ('an older one is tried' in caplog.text) == (damage == 'cut')
+
+
+def test_latest_without_any_map_starts_empty(tmp_path, caplog):
+    mapper = mapper_in(tmp_path, map__load='latest')
+    with caplog.at_level(logging.WARNING):
+        load_start(mapper)
+    assert mapper.map.num_voxels == 0
+    assert 'no map in' in caplog.text
+
+
+def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clock, monkeypatch):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    drive(mapper, 1.0)
+    clock.now_s += 10.0
+    saving.save_if_due()
+    digest = mapper.map.digest()
+
+    def fail(*args):
+        raise FileFormatError('no space')
+
+    monkeypatch.setattr(checkpoints, 'save_map', fail)
+    for _ in range(3):
+        drive(mapper, 2.0 + clock.now_s)
+        clock.now_s += 10.0
+        with pytest.raises(FileFormatError):
+            saving.save_if_due()
+    assert not newest.exists()
+    assert checkpoints.load_map(before)[0].digest() == digest
+
+
+def test_a_checkpoint_is_not_written_through_a_link(tmp_path, clock):
+    mapper = mapper_in(tmp_path)
+    newest, _ = checkpoint_paths(mapper.config.output)
+    newest.symlink_to(tmp_path / 'elsewhere')
+    saving = Checkpoints(mapper)
+    drive(mapper, 1.0)
+    clock.now_s += 10.0
+    with pytest.raises(FileFormatError, match='a link'):
+        saving.save_if_due()
+
+
+def test_the_oldest_scans_leave_beyond_the_bytes_of_the_map():
+    mapper = mapper_with(map__max_bytes=30_000)
+    drive(mapper, *(float(k) for k in range(1, 31)))
+    assert mapper.window.total_bytes <= 30_000
+    assert 0 < len(mapper.window) < 30
+    assert mapper.counters.evicted['max_total_bytes'] == 30 - len(mapper.window)
+    expected = mapper_with()
+    drive(expected, *(scan.stamp_ns / 1e9 for scan in mapper.window))
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_half_of_the_machine_is_the_limit_by_default():
+    mapper, unlimited = mapper_with(), mapper_with(map__max_bytes=0)
+    total = os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES')
+    assert 0 < mapper.window.max_total_bytes <= total // 2
+    assert unlimited.window.max_total_bytes == 0
+    assert not mapper.window.keeps_scans
