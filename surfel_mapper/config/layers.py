@@ -52,6 +52,26 @@ class TsdfConfig(Stage):
     sensor_columns: int = setting(
         0, 'Azimuth steps of the lidar; 0: estimated from the first scan.', low=0, high=65536
     )
+    sensor_fov_deg: tuple[float, ...] = setting(
+        (),
+        'Elevation of the lowest and the highest beam of the lidar, deg; empty: estimated. Needs '
+        'sensor_rows.',
+    )
+    sensor_beams_deg: tuple[float, ...] = setting(
+        (), 'Elevation of every beam of the lidar, deg; empty: evenly spaced or estimated.'
+    )
+    sensor_center_m: tuple[float, ...] = setting(
+        (),
+        'Optical centre of the lidar in the frame of its clouds, x y z in m; empty: the origin. '
+        'For clouds that are not given in the frame of the lidar.',
+    )
+    fusion: str = setting(
+        'auto',
+        'How scans are fused: images, voxels are looked up in the range image of a sensor; '
+        'points, ray by ray, slower and for any cloud; auto, images if a model of the sensor with '
+        'at least 24 beams fits.',
+        choices=('auto', 'images', 'points'),
+    )
     min_range_m: float = setting(
         0.5, 'Measurements nearer than this are ignored, m.', low=0.001, high=1e3
     )
@@ -232,6 +252,31 @@ class TsdfConfig(Stage):
                 'another where label_topic is given',
             ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
+            (
+                'sensor_fov_deg',
+                not self.sensor_fov_deg
+                or (
+                    len(self.sensor_fov_deg) == 2
+                    and -90.0 < self.sensor_fov_deg[0] < self.sensor_fov_deg[1] < 90.0
+                ),
+                'two ascending angles between -90 and 90',
+            ),
+            (
+                'sensor_fov_deg',
+                not self.sensor_fov_deg or self.sensor_rows >= 2,
+                'empty without sensor_rows',
+            ),
+            (
+                'sensor_beams_deg',
+                not self.sensor_beams_deg
+                or (
+                    len(set(self.sensor_beams_deg)) == len(self.sensor_beams_deg) >= 2
+                    and max(map(abs, self.sensor_beams_deg)) < 90.0
+                    and self.sensor_rows in (0, len(self.sensor_beams_deg))
+                ),
+                'two or more different angles between -90 and 90, one for each of sensor_rows',
+            ),
+            ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
         )
         for name, holds, expected in checks:
             if not holds:

@@ -204,7 +204,9 @@ def read_array(
         raise ValueError(f'{info.filename}: {dtype.str} {shape}, expected {entry}')
     if not is_array_type(dtype.str):
         raise ValueError(f'{info.filename}: {dtype.str}, expected numbers, booleans or strings')
-    return np.frombuffer(content, dtype, offset=stream.tell()).reshape(shape)
+    values = np.frombuffer(content, dtype, offset=stream.tell())
+    array: npt.NDArray[Any] = values.reshape(shape)
+    return array
 
 
 def read_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:

@@ -1,66 +1,210 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The camera or lidar of each scan, and its measurements: points and free rays."""
+"""
+The camera or lidar of each scan, and its measurements: points and free rays.
+
+The model of a lidar is fitted to the first scan of its frame and checked on every scan. If a scan
+does not fit, the model is fitted again, at growing intervals while nothing fits; until then the
+frame has no model, and layers do without one.
+"""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+import logging
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
+from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.fitting import fitted_lidar
+from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+
+logger = logging.getLogger(__name__)
+
+MISFIT = 0.8 * LEAST_FIT
+"""Share of fitting points of a scan below which the model is fitted again."""
+
+FIRST_RETRY, LAST_RETRY = 2, 256
+"""Scans until the next fit of a frame without a model; doubled after every failure."""
+
+NUM_CHECKED = 4096
+"""Points of a scan that a check looks at."""
+
 
 MAX_LIDARS = 64
 """Frames whose lidars are kept; frame names may change without end."""
+
+
+@dataclass(slots=True)
+class FrameModel:
+    """
+    The model of one frame.
+
+    Attributes
+    ----------
+    model : LidarModel or None
+        None while no model fits.
+    share : float
+        Share of fitting points of the last scan.
+    retry : int
+        Scans between two fits.
+    due : int
+        Scans until the next fit.
+
+    """
+
+    model: LidarModel | None = None
+    share: float = 0.0
+    retry: int = FIRST_RETRY
+    due: int = 0
 
 
 class SensorModels:
     """
     The sensors of the scans so far.
 
+    Attributes
+    ----------
+    frames : dict of str to FrameModel
+        The state of each frame with a lidar.
+    num_refits : int
+        Number of times that a model was replaced.
+
     Parameters
     ----------
     config : TsdfConfig
-        Rows, columns and ranges of the sensors, as far as configured.
+        Rows, columns, angles and ranges of the sensors, as far as configured.
 
     """
 
     def __init__(self, config: TsdfConfig) -> None:
         self._config = config
-        self._lidars: dict[str, LidarModel] = {}
+        self.frames: dict[str, FrameModel] = {}
+        self.num_refits = 0
+        self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
 
-    def of(self, scan: Scan) -> CameraModel | LidarModel:
+    def of(self, scan: Scan) -> CameraModel | LidarModel | None:
         """
-        Return the sensor of a scan: its camera, else the lidar fitted to the first of its frame.
+        Return the sensor of a scan: its camera, else the lidar of its frame; None if none fits.
 
         Raises
         ------
         CloudFormatError
-            If no lidar fits the points of the first.
+            If rows are configured and the points do not span two beams.
 
         """
         config = self._config
-        ranges = {'min_range_m': config.min_range_m, 'max_range_m': config.max_range_m}
         if scan.camera:
             width, height, fx, fy, cx, cy = scan.camera
             return CameraModel(
-                columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **ranges
+                columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **self._ranges
             )
-        if scan.frame_id not in self._lidars:
-            if len(self._lidars) >= MAX_LIDARS:
-                del self._lidars[next(iter(self._lidars))]
-            self._lidars[scan.frame_id] = fitted_lidar(
+        if self._checked[0] is not scan:  # several layers ask for the same scan
+            if scan.frame_id not in self.frames and len(self.frames) >= MAX_LIDARS:
+                del self.frames[next(iter(self.frames))]
+            frame = self.frames.setdefault(scan.frame_id, FrameModel())
+            if config.sensor_rows or config.sensor_beams_deg:
+                self._check_configured(frame, scan)
+            else:
+                self._check_fitted(frame, scan)
+            self._checked = scan, frame.model
+        return self._checked[1]
+
+    def summary(self) -> dict[str, Any]:
+        """Return the model and the share of fitting points of each frame, and the refits."""
+        models = {name: frame.model for name, frame in self.frames.items()}
+        return {
+            'sensor_refits': self.num_refits,
+            'sensors': {
+                name: 'none' if model is None else f'{model.rows} x {model.columns}'
+                for name, model in models.items()
+            },
+            'sensor_fit': {name: round(frame.share, 3) for name, frame in self.frames.items()},
+        }
+
+    @property
+    def _ranges(self) -> dict[str, Any]:
+        return {'min_range_m': self._config.min_range_m, 'max_range_m': self._config.max_range_m}
+
+    def _check_configured(self, frame: FrameModel, scan: Scan) -> None:
+        """Make the configured model once; warn if scans do not fit it."""
+        if frame.model is None:
+            frame.model = self._configured(scan)
+            frame.share = self._share(frame.model, scan)
+            if frame.share < MISFIT:
+                logger.warning(
+                    'layers.tsdf.sensor_rows, sensor_beams_deg, sensor_fov_deg: only %.0f %% of '
+                    'the points in %s fit this sensor; expected %.0f %%. Correct them, or leave '
+                    'them out to have the sensor fitted',
+                    *(100.0 * frame.share, scan.frame_id, 100.0 * LEAST_FIT),
+                )
+        else:
+            frame.share = self._share(frame.model, scan)
+
+    def _configured(self, scan: Scan) -> LidarModel:
+        """Return the model of the configured angles; missing ones are fitted to a scan."""
+        config = self._config
+        fitted = fitted_lidar(
+            scan.points,
+            scan.columns.get('ring'),
+            rows=config.sensor_rows or len(config.sensor_beams_deg),
+            columns=config.sensor_columns,
+            **self._ranges,
+        )
+        angles: dict[str, Any] = {'rows': fitted.rows, 'columns': fitted.columns}
+        if config.sensor_beams_deg:
+            beams = tuple(sorted(config.sensor_beams_deg, reverse=True))
+            return LidarModel(beam_elevations_deg=beams, **angles, **self._ranges)
+        if config.sensor_fov_deg:
+            low, high = config.sensor_fov_deg
+            angles |= {'vertical_fov_deg': high - low, 'vertical_fov_top_deg': high}
+            return LidarModel(**angles, **self._ranges)
+        return fitted
+
+    def _check_fitted(self, frame: FrameModel, scan: Scan) -> None:
+        """Check the model of a frame on a scan; fit it again if the scan does not fit."""
+        if frame.model is not None:
+            frame.share = self._share(frame.model, scan)
+            if frame.share >= MISFIT:
+                return
+            logger.warning(
+                'layers.tsdf: only %.0f %% of the points in %s fit the sensor of %d x %d rays; it '
+                'is fitted again',
+                *(100.0 * frame.share, scan.frame_id, frame.model.rows, frame.model.columns),
+            )
+            self.num_refits += 1
+            frame.model, frame.due, frame.retry = None, 0, FIRST_RETRY
+        if frame.due > 0:
+            frame.due -= 1
+            return
+        try:
+            frame.model, frame.share = best_fit(
                 scan.points,
                 scan.columns.get('ring'),
-                rows=config.sensor_rows,
-                columns=config.sensor_columns,
-                **ranges,
+                self._config.voxel_size_m,
+                columns=self._config.sensor_columns,
+                **self._ranges,
             )
-        return self._lidars[scan.frame_id]
+        except CloudFormatError:  # fewer than two beams: nothing to fit
+            frame.model, frame.share = None, 0.0
+        if frame.model is None:
+            if frame.retry == FIRST_RETRY:
+                logger.warning(
+                    'layers.tsdf: no model of a lidar fits the points in %s (%.0f %% of them, '
+                    'expected %.0f %%): they are fused point by point, which is slower. For a '
+                    'single lidar set layers.tsdf.sensor_center_m or sensor_rows',
+                    *(scan.frame_id, 100.0 * frame.share, 100.0 * LEAST_FIT),
+                )
+            frame.due, frame.retry = frame.retry, min(2 * frame.retry, LAST_RETRY)
+        else:
+            frame.retry = FIRST_RETRY
+
+    def _share(self, model: LidarModel, scan: Scan) -> float:
+        return fit_share(model, scan.points, self._config.voxel_size_m, num_checked=NUM_CHECKED)
 
 
 def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
@@ -69,3 +213,9 @@ def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
         return scan.points
     beyond = 2.0 * max_range_m * scan.free
     return np.concatenate([scan.points, beyond.astype(scan.points.dtype)])
+
+
+def two_beams(dtype: Any) -> npt.NDArray[Any]:
+    """Return the points of a lidar of two beams in a round room, by which layers compile."""
+    lidar = LidarModel(rows=2, columns=64, vertical_fov_deg=10.0)
+    return np.asarray(3.0 * lidar.directions.reshape(-1, 3), dtype)

@@ -115,16 +115,30 @@ def test_colours_and_labels_of_points_enter():
     assert set(np.unique(labels)) == {-1, 7}
 
 
-def test_a_scan_that_shows_no_lidar_is_counted_and_mapped_all_the_same():
+def test_scan_that_fits_no_lidar_is_fused_point_by_point(caplog):
     mapper = mapper_with()
     mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
     flat = np.array([[1.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
     mapper.add_scan(Scan(points=flat, stamp_ns=S, frame_id='lidar'))
     assert len(list(mapper.insert_ready())) == 1
-    assert mapper.counters.messages_ignored == {'tsdf': 1}
-    assert mapper.counters.mapped == 1
-    insert(mapper, 2)
-    assert mapper.tsdf.summary()['scans'] == 1
+    assert 'fused point by point' in caplog.text
+    summary = mapper.tsdf.summary()
+    assert summary['scans'] == summary['scans_by_points'] == 1
+    assert summary['sensors'] == {'lidar': 'none'}
+    assert mapper.counters.messages_ignored == {}
+
+
+def test_cloud_about_another_origin_is_fused_about_the_optical_centre():
+    mounted = np.array([1.0, 0.4, 1.8])
+    name = 'layers.tsdf.sensor_center_m'
+    mapper = mapper_with(**{name: mounted.tolist()})
+    mapper.add_pose('odom', 'lidar', S, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    scan = sphere(ring=RING)
+    mapper.add_scan(replace(scan, points=scan.points + mounted, stamp_ns=S))
+    assert len(list(mapper.insert_ready())) == 1
+    assert np.abs(radii(mapper.tsdf.mesh(), mounted) - RADIUS_M).max() < 0.02
+    with pytest.raises(ConfigError, match=r'sensor_center_m: .*x y z'):
+        mapper_with(**{name: [1.0, 2.0]})
 
 
 def test_a_depth_image_is_fused_as_its_camera_saw_it():

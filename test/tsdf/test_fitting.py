@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.tsdf.fitting import fitted_lidar
+from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
 from surfel_mapper.tsdf.sensors import LidarModel
 
 RANGES = {'min_range_m': 0.5, 'max_range_m': 40.0}
@@ -43,14 +43,14 @@ def test_given_rows_and_columns_are_not_fitted():
     found = fitted_lidar(points, ring, rows=32, columns=512, **RANGES)
     assert (found.rows, found.columns, found.beam_elevations_deg) == (32, 512, ())
     assert fitted_lidar(points, ring, columns=512, **RANGES).columns == 512
-    assert fitted_lidar(points, **RANGES).rows == 64
 
 
 def test_rings_of_one_elevation_are_one_beam():
     points, _ = points_of(LidarModel(rows=2, columns=64, vertical_fov_deg=10.0))
     found = fitted_lidar(points, np.arange(128) // 32, **RANGES)
     assert found.rows == 2
-    assert fitted_lidar(points, np.zeros(128, int), **RANGES).rows == 64  # of one ring: no beams
+    # without usable rings the clusters of elevations are the beams
+    assert fitted_lidar(points, np.zeros(128, int), **RANGES).rows == 2
 
 
 @pytest.mark.parametrize(
@@ -66,3 +66,64 @@ def test_rings_of_one_elevation_are_one_beam():
 def test_points_without_two_beams_are_refused(points):
     with pytest.raises(CloudFormatError, match='expected those of a lidar with two beams'):
         fitted_lidar(points, **RANGES)
+
+
+def test_beams_without_rings_are_the_clusters_of_elevations():
+    beams = (12.0, 7.5, 4.0, 1.0, -0.5, -3.0, -9.0, -20.0)
+    points, _ = points_of(LidarModel(rows=8, columns=256, beam_elevations_deg=beams))
+    found = fitted_lidar(points, **RANGES)
+    assert (found.rows, found.columns) == (8, 256)
+    assert np.abs(np.subtract(found.beam_elevations_deg, beams)).max() <= 1e-4
+
+
+def test_part_of_a_revolution_gives_the_columns_of_all():
+    points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
+    part = np.arctan2(points[:, 1], points[:, 0]) > 2.0
+    assert fitted_lidar(points[part], ring[part], **RANGES).columns == 1024
+
+
+def test_rings_of_missing_points_do_not_count():
+    points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
+    missing = np.full((50_000, 3), np.nan, np.float32)
+    found = fitted_lidar(
+        np.concatenate([points, missing]), np.r_[ring, np.zeros(50_000, int)], **RANGES
+    )
+    assert (found.rows, found.columns) == (16, 1024)
+
+
+def wall_around(lidar, radius_m=8.0):
+    """Return the points of a lidar in the middle of a round room with a floor."""
+    directions = lidar.directions.reshape(-1, 3).astype(np.float64)
+    level = np.hypot(directions[:, 0], directions[:, 1])
+    distance = radius_m / level
+    down = directions[:, 2] < 0.0
+    distance[down] = np.minimum(distance[down], -1.5 / directions[down, 2])
+    return directions * distance[:, None]
+
+
+def test_a_lidar_fits_its_model_and_no_other_cloud_does():
+    lidar = LidarModel(rows=64, columns=1024, vertical_fov_deg=40.0, max_range_m=40.0)
+    points = wall_around(lidar)
+    model, share = best_fit(points, None, 0.2, **RANGES)
+    assert model is not None
+    assert (model.rows, model.columns) == (64, 1024)
+    assert share > 0.9
+
+    mounted = points + np.array([1.2, 0.3, 1.8])
+    offset = np.array([1.5, 0.0, 0.3])
+    merged = np.concatenate([points + offset, points[:, [1, 0, 2]] - offset])
+    rng = np.random.default_rng(1)
+    scattered = rng.normal(size=(9000, 3)) * rng.uniform(2.0, 9.0, (9000, 1))
+    for cloud in (mounted, merged, scattered):
+        model, share = best_fit(cloud, None, 0.2, **RANGES)
+        assert model is None
+        assert share < LEAST_FIT
+
+
+def test_share_of_fitting_points_falls_with_wrong_columns():
+    lidar = LidarModel(rows=64, columns=1024, vertical_fov_deg=40.0, max_range_m=40.0)
+    points = wall_around(lidar)
+    assert fit_share(lidar, points, 0.2) > 0.99
+    twice = LidarModel(rows=64, columns=2048, vertical_fov_deg=40.0, max_range_m=40.0)
+    assert fit_share(twice, points, 0.2) < 0.1
+    assert fit_share(lidar, np.full((4, 3), np.nan), 0.2) == 0.0

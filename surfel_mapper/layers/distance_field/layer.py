@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
+from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.files.ply import write_mesh
 from surfel_mapper.layers.distance_field.obstacles import slice_at
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
@@ -30,7 +31,7 @@ from surfel_mapper.layers.layer import (
     Publication,
     Surroundings,
 )
-from surfel_mapper.layers.sensor_models import measured, SensorModels
+from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
@@ -40,7 +41,12 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrated, Integrator
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
-from surfel_mapper.tsdf.range_image import from_points, RangeImage
+from surfel_mapper.tsdf.point_integrator import PointIntegrator
+from surfel_mapper.tsdf.range_image import from_points
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+
+SPARSE_ROWS = 24
+"""Lidars of fewer fitted beams are fused point by point: their images have gaps."""
 
 
 class TsdfLayer(Layer):
@@ -75,9 +81,11 @@ class TsdfLayer(Layer):
         """Forget everything but the sensors."""
         self.blocks = BlockMap(self.config.tsdf)
         self._integrator = Integrator(self.blocks)
+        self._point_integrator = PointIntegrator(self.blocks)
         self._mesher = Mesher(self.blocks)
         self._waiting: dict[int, Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
+        self._num_by_points = 0
 
     def follow(self, inserted: InsertedScan) -> list[Integrated]:
         """
@@ -112,9 +120,20 @@ class TsdfLayer(Layer):
             See follow.
 
         """
-        image = self._range_image(scan)
+        if self.config.tsdf.sensor_center_m:
+            scan, T_map_sensor = self._centered(scan, T_map_sensor)
+        sensor = self._sensor(scan)
         self.blocks.clear_updated()
-        done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
+        if sensor is None:
+            points, channels = self._measured(scan, self.config.tsdf.max_range_m)
+            done = self._point_integrator.integrate(
+                points, T_map_sensor, scan.stamp_ns, **channels
+            )
+            self._num_by_points += 1
+        else:
+            points, channels = self._measured(scan, sensor.max_range_m)
+            image = from_points(sensor, points, **channels)
+            done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
         self._num_scans += 1
         self._num_refused += done.num_refused
@@ -128,12 +147,20 @@ class TsdfLayer(Layer):
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
-        turn = np.linspace(0.0, 2.0 * np.pi, 64)
-        ring = np.stack([10.0 * np.cos(turn), 10.0 * np.sin(turn), np.linspace(-1, 1, 64)], 1)
-        for dtype in (np.float32, np.float64):
-            around = replace(self.around, sensors=SensorModels(self.config.tsdf))
-            layer = TsdfLayer(self.config, around)
-            layer.insert(Scan(points=ring.astype(dtype), stamp_ns=0, frame_id=''), np.eye(4))
+        for fusion in ('images', 'points'):
+            tsdf = replace(
+                self.config.tsdf,
+                fusion=fusion,
+                sensor_rows=0,
+                sensor_columns=0,
+                sensor_fov_deg=(),
+                sensor_beams_deg=(),
+            )
+            config = replace(self.config, tsdf=tsdf)
+            for dtype in (np.float32, np.float64):
+                around = replace(self.around, sensors=SensorModels(tsdf))
+                layer = TsdfLayer(config, around)
+                layer.insert(Scan(points=two_beams(dtype), stamp_ns=0, frame_id=''), np.eye(4))
         layer.mesh()
 
     def summary(self) -> dict[str, Any]:
@@ -146,6 +173,8 @@ class TsdfLayer(Layer):
             'labels_lost': self._num_labels_lost,
             'bytes': self.blocks.nbytes,
             'voxel_size_m': self.config.tsdf.voxel_size_m,
+            'scans_by_points': self._num_by_points,
+            **self.around.sensors.summary(),
         }
 
     def publications(self) -> Sequence[Publication]:
@@ -186,10 +215,39 @@ class TsdfLayer(Layer):
         content = (found.resolution_m, found.origin, found.cost)
         return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
 
-    def _range_image(self, scan: Scan) -> RangeImage:
-        """Return the range image of a scan: its points, and the rays that met nothing."""
-        config, columns, sensor = self.config.tsdf, scan.columns, self.around.sensors.of(scan)
-        points = measured(scan, sensor.max_range_m)
+    def _sensor(self, scan: Scan) -> CameraModel | LidarModel | None:
+        """Return the model of the sensor of a scan; None if it is fused point by point."""
+        config = self.config.tsdf
+        if config.fusion == 'points':
+            return None
+        sensor = self.around.sensors.of(scan)
+        if config.fusion == 'images':
+            if sensor is None:
+                raise CloudFormatError(
+                    f'no model of a lidar fits the points in {scan.frame_id}; set '
+                    'layers.tsdf.sensor_rows, or layers.tsdf.fusion to auto'
+                )
+            return sensor
+        is_configured = config.sensor_rows or config.sensor_beams_deg
+        if isinstance(sensor, LidarModel) and not is_configured and sensor.rows < SPARSE_ROWS:
+            return None
+        return sensor
+
+    def _centered(
+        self, scan: Scan, T_map_sensor: npt.NDArray[np.float64]
+    ) -> tuple[Scan, npt.NDArray[np.float64]]:
+        """Return a scan about the optical centre of its sensor, and the pose of the centre."""
+        center = np.array(self.config.tsdf.sensor_center_m)
+        T = T_map_sensor.copy()
+        T[:3, 3] += T[:3, :3] @ center
+        return replace(scan, points=(scan.points - center).astype(scan.points.dtype)), T
+
+    def _measured(
+        self, scan: Scan, max_range_m: float
+    ) -> tuple[npt.NDArray[Any], dict[str, npt.NDArray[Any] | None]]:
+        """Return points and free rays of a scan, with colours and labels as configured."""
+        config, columns = self.config.tsdf, scan.columns
+        points = measured(scan, max_range_m)
         num_free = len(points) - len(scan)
         colors = colors_of(scan) if config.color else None
         labels = columns.get('label') if config.semantics != 'none' else None
@@ -197,7 +255,7 @@ class TsdfLayer(Layer):
             colors = np.pad(colors, ((0, num_free), (0, 0)))
         if labels is not None:
             labels = np.pad(labels, (0, num_free), constant_values=-1)
-        return from_points(sensor, points, colors=colors, labels=labels)
+        return points, {'colors': colors, 'labels': labels}
 
     def _settle(self, windowed: WindowedScan) -> list[Integrated]:
         """Fuse a scan of the window at its final pose, if it waits for that."""

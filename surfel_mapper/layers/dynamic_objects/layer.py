@@ -21,7 +21,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.layers.layer import InsertedScan, Layer, Surroundings
-from surfel_mapper.layers.sensor_models import measured, SensorModels
+from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.range_image import from_points
@@ -59,10 +59,8 @@ class DynamicObjectsLayer(Layer):
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
-        turn = np.linspace(0.0, 2.0 * np.pi, 64)
-        ring = np.stack([9.0 * np.cos(turn), 9.0 * np.sin(turn), np.linspace(-1, 1, 64)], axis=1)
         for dtype in (np.float32, np.float64):
-            scan = Scan(points=ring.astype(dtype), stamp_ns=0, frame_id='')
+            scan = Scan(points=two_beams(dtype), stamp_ns=0, frame_id='')
             around = replace(self.around, sensors=SensorModels(self.config.tsdf))
             fresh = DynamicObjectsLayer(self.config, around)
             fresh.count(scan, np.eye(4), np.zeros(1, np.int64), np.zeros(1, np.int64))
@@ -106,6 +104,8 @@ class DynamicObjectsLayer(Layer):
     ) -> npt.NDArray[np.int8]:
         """Return the verdict of a scan on each voxel, (K,) int8: SEEN, THROUGH or unknown."""
         sensor, voxel_size_m = self.around.sensors.of(scan), self.around.surfel_map.voxel_size_m
+        if sensor is None:  # no model fits: nothing is known about any voxel
+            return np.zeros(len(keys), np.int8)
         image = from_points(sensor, measured(scan, sensor.max_range_m)).range_m
         image = np.minimum(image, np.float32(sensor.max_range_m))  # unknown beyond
         T = inverse(T_map_sensor)
