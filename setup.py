@@ -53,6 +53,10 @@ CLUSTER = [
     'pyarrow>=14.0.1',  # the tiles of a map as Parquet
 ]
 
+LAS = [
+    'laspy[lazrs]>=2.5',  # scans in LAS and LAZ files; lazrs unpacks LAZ
+]
+
 VIEWER = [
     'rerun-sdk>=0.23',  # replay --view and --rrd
 ]
@@ -60,6 +64,7 @@ VIEWER = [
 TEST = [
     *FORMATS,
     *CLUSTER,
+    *LAS,
     *VIEWER,
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
@@ -122,6 +127,7 @@ setup(
     extras_require={
         'formats': FORMATS,
         'cluster': CLUSTER,
+        'las': LAS,
         'viewer': VIEWER,
         'ros': ROS,
         'test': TEST,

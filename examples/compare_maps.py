@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What has changed from one map to another: what came, what went, what turned.
+Changes from one map to another: new surfels, lost surfels, turned surfels.
 
     surfel-mapper replay monday/ --formats ply,npz --output monday_map/
     surfel-mapper replay tuesday/ --formats ply,npz --output tuesday_map/
     python examples/compare_maps.py monday_map/map.npz tuesday_map/map.npz --output changes.ply
 
-Both maps have to be in one frame and of one voxel size. That they are equal to the bit, their
-digests say.
+Both maps have to be in one frame and of one voxel size. Equal digests show that they are equal
+to the bit.
 """
 
 from __future__ import annotations
@@ -28,10 +28,20 @@ def main() -> None:
     """Compare two maps, voxel by voxel."""
     parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
     parser.add_argument('before', type=Path, help='map.npz of a replay, or of ~/save_map')
-    parser.add_argument('after', type=Path, help='likewise')
-    parser.add_argument('--min-points', type=int, default=20, help='a surfel has (%(default)s)')
-    parser.add_argument('--angle', type=float, default=30.0, metavar='DEG', help='is a turn')
-    parser.add_argument('--output', type=Path, help='write what came and what turned, a PLY')
+    parser.add_argument('after', type=Path, help='map.npz of the later map')
+    parser.add_argument(
+        '--min-points', type=int, default=20, help='points that a surfel needs (%(default)s)'
+    )
+    parser.add_argument(
+        '--angle',
+        type=float,
+        default=30.0,
+        metavar='DEG',
+        help='angle that counts as a turn (%(default)s)',
+    )
+    parser.add_argument(
+        '--output', type=Path, help='write new and turned surfels to this PLY file'
+    )
     args = parser.parse_args()
 
     first, _ = load_map(args.before)

@@ -7,8 +7,8 @@ Many bags into one map, on the processes of this machine or the workers of a Das
     python examples/dask_run.py monday.mcap tuesday.mcap --output city/ --workers 2
     python examples/dask_run.py /shelf/*.mcap --output /shelf/city/ --scheduler tcp://head:8786
 
-``surfel-mapper replay BAG... --workers 2`` does the same; this is for those who have more to do
-with the result. The digest is that of a single process, however the work was shared out.
+``surfel-mapper replay BAG... --workers 2`` does the same; this script is a start for programs that
+use the result. The digest is that of a single process, however the work is distributed.
 """
 
 from __future__ import annotations

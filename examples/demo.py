@@ -24,7 +24,7 @@ import time
 SETTINGS = Path(os.path.relpath(Path(__file__).with_name('street.yaml')))
 
 COMMAND = [sys.executable, '-m', 'surfel_mapper.cli.main']
-"""What `surfel-mapper` stands for, wherever it is installed."""
+"""The program `surfel-mapper`, wherever it is installed."""
 
 
 def main() -> int:
@@ -32,7 +32,7 @@ def main() -> int:
     args = arguments()
     bag, live, offline = (args.output / name for name in ('street', 'live', 'offline'))
 
-    # Nobody else's nodes should hear us, nor we theirs.
+    # Keep the nodes of this demo apart from all others on the network.
     os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
 
@@ -40,7 +40,7 @@ def main() -> int:
     lidar = ['--scans', args.scans, '--beams', args.beams, '--columns', args.columns]
     call('simulate', 'street', '--output', bag, '--overwrite', '--noise', 0.02, *lidar)
 
-    say('2. The node maps what is played, as it would on a robot.')
+    say('2. The node maps the bag while it is played, as it would on a robot.')
     with node('--params-file', SETTINGS, '-p', f'output.directory:={live}') as running:
         played = play(running, bag)
         mapped = save_map()
@@ -89,7 +89,7 @@ def command(*words: object) -> list[str]:
 
 
 def call(*words: object) -> None:
-    """Run a command; end the demo where it fails."""
+    """Run a command; end the demo if it fails."""
     done = subprocess.run(command(*words))
     if done.returncode:
         sys.exit(done.returncode)
@@ -102,7 +102,7 @@ def node(*ros_args: object) -> Iterator[subprocess.Popen[bytes]]:
     try:
         yield process
     finally:
-        process.terminate()  # it logs what it mapped, and ends
+        process.terminate()  # it logs its counts, and ends
         try:
             process.wait(60)
         except subprocess.TimeoutExpired:
@@ -110,7 +110,7 @@ def node(*ros_args: object) -> Iterator[subprocess.Popen[bytes]]:
 
 
 def play(running: subprocess.Popen[bytes], bag: Path) -> dict[str, dict[str, int]]:
-    """Play the bag once the node has subscribed, which may compile first; return what was sent."""
+    """Play the bag once the node has compiled and subscribed; return the messages sent."""
     words = command('play', bag, '--wait-for', '/points', '/odom', '--timeout', 600, '--json')
     with subprocess.Popen(words, stdout=subprocess.PIPE) as playing:
         while playing.poll() is None:
@@ -124,7 +124,7 @@ def play(running: subprocess.Popen[bytes], bag: Path) -> dict[str, dict[str, int
 
 
 def save_map() -> dict[str, str]:
-    """Ask the node to save its map, as `ros2 service call` would; return what it answers."""
+    """Ask the node to save its map, as `ros2 service call` would; return its answer."""
     import rclpy
     from std_srvs.srv import Trigger
 
@@ -134,7 +134,7 @@ def save_map() -> dict[str, str]:
     client = asking.create_client(Trigger, '/surfel_mapper/save_map')
     if not client.wait_for_service(60.0):
         sys.exit('The node does not answer.')
-    for _ in range(6):  # it answers nobody whom it has not discovered yet, though he knows it
+    for _ in range(6):  # the first answers are lost until the node has discovered this client
         future = client.call_async(Trigger.Request())
         rclpy.spin_until_future_complete(asking, future, timeout_sec=10.0)
         if future.done():

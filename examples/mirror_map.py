@@ -6,7 +6,7 @@ The map of a running node in another process, equal to the bit.
     ros2 run surfel_mapper node --ros-args -p publish.moments:=true -r points:=/lidar/points
     python examples/mirror_map.py
 
-A planner can ask its copy anything a SurfelMap answers, without asking the node.
+A planner can use the copy like any SurfelMap, without calls to the node.
 """
 
 from __future__ import annotations
@@ -26,11 +26,13 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def main() -> None:
-    """Follow a node; say once a second what the copy holds."""
+    """Follow a node; print figures of the copy once a second."""
     parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
-    parser.add_argument('--node', default='/surfel_mapper', help='whose map (%(default)s)')
+    parser.add_argument('--node', default='/surfel_mapper', help='name of the node (%(default)s)')
     parser.add_argument('--voxel-size', type=float, default=0.5, help='its map.voxel_size_m')
-    parser.add_argument('--seconds', type=float, default=float('inf'), help='end after so many')
+    parser.add_argument(
+        '--seconds', type=float, default=float('inf'), help='end after this time, s'
+    )
     args = parser.parse_args()
 
     rclpy.init()
@@ -55,7 +57,7 @@ def main() -> None:
 
 
 def show(mirror: MapMirror) -> None:
-    """Print what a planner may want to know."""
+    """Print figures that a planner may use."""
     surfels = mirror.map.surfels(min_points=5)
     level = (surfels.planarity > 0.8) & (surfels.normal[:, 2] > 0.9)
     print(

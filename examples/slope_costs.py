@@ -22,7 +22,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers.costs.traversability import CostGrid, traversability
 
 UNKNOWN = 255
-"""What the map server's mode raw takes as not known: anything above 100."""
+"""Value of unknown cells in mode raw of the map server, which takes any above 100."""
 
 
 def main() -> None:
@@ -56,7 +56,7 @@ def main() -> None:
 
 
 def write(grid: CostGrid, output: Path) -> None:
-    """Write an image, its first row the greatest y, and where it lies."""
+    """Write an image, its first row the greatest y, and its position."""
     image = np.where(grid.cost < 0, UNKNOWN, grid.cost).astype(np.uint8)[::-1]
     header = f'P5 {image.shape[1]} {image.shape[0]} 255\n'
     output.with_suffix('.pgm').write_bytes(header.encode() + image.tobytes())

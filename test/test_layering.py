@@ -53,6 +53,7 @@ HOMES = {
     'ezdxf': ('files/model_files',),
     'geometry_msgs': ('ros/',),
     'lifecycle_msgs': ('ros/',),
+    'laspy': ('files/las',),
     'llvmlite': ('kernels/',),
     'lz4': ('bags/',),
     'lzf': ('files/pcd',),
@@ -211,3 +212,16 @@ def test_every_folder_has_a_docstring():
         or ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) is None
     ]
     assert silent == []
+
+
+def test_no_verb_imports_another():
+    folder = PACKAGE / 'cli'
+    verbs = {path.stem for path in folder.glob('[a-z]*.py')} - {'main'}
+    found = [
+        f'cli/{verb}.py imports {name}'
+        for verb in sorted(verbs)
+        for name in imports(folder / f'{verb}.py')
+        if name.startswith('surfel_mapper.cli.') and name.split('.')[2] in verbs | {'main'}
+    ]
+    assert 'replay' in verbs
+    assert found == []

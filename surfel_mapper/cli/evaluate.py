@@ -3,7 +3,7 @@
 """
 ``surfel-mapper evaluate``: a map against a world, a cloud or another map; or a trajectory.
 
-Both have to be in one frame; trajectories are moved onto each other first.
+Maps have to be in one frame; trajectories are aligned first.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ SUMMARY = 'Compare a map with the truth or another map, or a trajectory with ano
 EXAMPLE = 'surfel-mapper evaluate street_surfels --truth street'
 
 TRAJECTORIES = ('.tum', '.txt', '.csv', '.kitti')
-"""Files that are taken for trajectories."""
+"""Endings of trajectories."""
 
 DEFAULT_M = 0.5
-"""For max-distance and radius where no voxel size is known."""
+"""Default of --max-distance and --radius for maps without a voxel size, m."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -51,27 +51,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--max-distance',
         type=positive_float,
         metavar='M',
-        help='surfels farther from the truth are not compared (the voxel size)',
+        help='do not compare surfels farther from the truth than this (the voxel size)',
     )
     add(
         '--radius',
         type=positive_float,
         metavar='M',
-        help='a place of the truth is found by a surfel this near (the voxel size)',
+        help='a place of the truth counts as found if a surfel is this near (the voxel size)',
     )
     add(
         '--max-difference',
         type=positive_float,
         default=0.01,
         metavar='S',
-        help='poses at most so far apart in time are compared (%(default)s)',
+        help='compare poses at most this far apart in time (%(default)s)',
     )
     add(
         '--min-points',
         type=int,
         default=5,
         metavar='N',
-        help='from how many points on a voxel counts as a surfel (%(default)s)',
+        help='points that a voxel needs to count as a surfel (%(default)s)',
     )
     add('--json', action='store_true', help='print as JSON')
 
@@ -113,14 +113,14 @@ def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
 
 
 def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
-    """Return whether two maps are equal to the bit, where both are exact."""
+    """Return whether two maps are equal to the bit, if both are exact."""
     if surfels.digest is None or other.digest is None:
         return {}
     return {'equal': surfels.digest == other.digest}
 
 
 def map_lines(result: dict[str, Any]) -> list[str]:
-    """Return the errors of a map for people."""
+    """Return the errors of a map as lines of text."""
     lines = [f'surfels {result["surfels"]}   compared {result["compared"]}']
     for name, unit, factor in (('position_m', 'mm', 1e3), ('normal_deg', 'deg', 1.0)):
         if name in result:
@@ -131,14 +131,14 @@ def map_lines(result: dict[str, Any]) -> list[str]:
         radius = result['completeness_radius_m']
         lines.append(f'completeness {result["completeness"]:.2%} within {radius:g} m')
     else:
-        lines.append('completeness unknown: of a world it takes the bag with simulation.json')
+        lines.append('completeness unknown: for a world it needs the bag with simulation.json')
     if 'equal' in result:
         lines.append('equal to the bit' if result['equal'] else 'not equal to the bit')
     return lines
 
 
 def in_words(errors: dict[str, float | None], unit: str, factor: float = 1.0) -> str:
-    """Return errors in a line."""
+    """Return errors as one line of text."""
     return '   '.join(
         f'{name} {"-" if value is None else f"{value * factor:.3f} {unit}"}'
         for name, value in errors.items()

@@ -3,8 +3,8 @@
 """
 ``surfel-mapper extract``: planes, surfaces and Gaussians of a cloud or a map, as files.
 
-Of a map every surfel is nine points across its disc, so that its slope is seen too, and voxels
-are half as large as those of the map.
+Every surfel of a map becomes nine points across its disc, so that its slope counts too, and the
+voxels are half as large as those of the map.
 """
 
 from __future__ import annotations
@@ -50,27 +50,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--profile', default='robust', help="robust, or paper: the paper's rules to the letter"
     )
     parser.add_argument(
-        '--noise', type=float, default=0.0, metavar='M', help='sigma of the sensor (lidar: 0.02)'
+        '--noise',
+        type=float,
+        default=0.0,
+        metavar='M',
+        help='sigma of the range of the sensor (lidar: 0.02)',
     )
     parser.add_argument(
         '--noise-per-range-sq',
         type=float,
         default=0.0,
         metavar='S',
-        help='and this times range^2 (Kinect: 0.001425)',
+        help='sigma that grows with range^2, 1/m (Kinect: 0.001425)',
     )
     parser.add_argument(
         '--viewpoint',
         type=float,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
-        help='where the sensor was; default: the origin, or above the middle of a map',
+        help='position of the sensor; default: the origin, or above the middle of a map',
     )
     parser.add_argument('--json', action='store_true', help='print the figures as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Fit, write the files, report."""
+    """Fit models, write the files, report."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.model_files import write_models
     from surfel_mapper.layers.drawings import PointsPicture
@@ -130,7 +134,7 @@ def read(
 
 
 def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:
-    """Return what the report says; None for what is not defined."""
+    """Return the figures of the report; None for undefined ones."""
     values = {
         'points': num_points,
         'thinned': model.num_thinned,
@@ -147,7 +151,7 @@ def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:
 
 
 def report(content: dict[str, Any]) -> str:
-    """Return the figures for people."""
+    """Return the figures as two lines of text."""
     c = {name: float('nan') if value is None else value for name, value in content.items()}
     return (
         f'points {c["points"]} (thinned to {c["thinned"]})   planes {c["planes"]}   '

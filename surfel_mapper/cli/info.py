@@ -1,6 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper info``: topics, rates and poses of a bag, and settings for a replay of it."""
+"""
+``surfel-mapper info``: topics, rates and poses of a bag, and settings for a replay of it.
+
+Of a folder or a file of scans: their number, times and columns. Both state the source of poses
+that a replay without settings takes.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +24,9 @@ if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.offline.survey import Offer, Survey
 
-SUMMARY = 'Show the topics, rates and poses of a bag, or the settings of node and replay.'
+SUMMARY = (
+    'Show the topics and poses of a bag or folder of scans, or the settings of node and replay.'
+)
 
 EXAMPLE = 'surfel-mapper info street.mcap'
 
@@ -32,14 +39,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar='BAG',
         nargs='?',
-        help='rosbag2 directory, .mcap, .db3 or ROS 1 .bag',
+        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory or file of scans',
     )
     what.add_argument(
         '--parameters', action='store_true', help='print all settings of node and replay instead'
     )
     parser.add_argument('--json', action='store_true', help='print as JSON')
     parser.add_argument(
-        '--strict', action='store_true', help='exit with 3 where the bag is cut off or damaged'
+        '--strict', action='store_true', help='exit with 3 if the bag is cut off or damaged'
     )
 
 
@@ -51,21 +58,26 @@ def run(args: argparse.Namespace) -> int:
         print(settings_table(), end='')
         return 0
     from surfel_mapper.bags.reader import BagReader
+    from surfel_mapper.offline.scan_folder import is_scans
     from surfel_mapper.offline.survey import offers, survey, surveyed_topics
 
+    if is_scans(args.bag):
+        content = folder_content(args.bag)
+        print(json.dumps(content) if args.json else folder_report(content))
+        return 0
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
         read = itertools.count(1)
         with progress('info', 'message') as show:
             found = survey(reader, lambda: show(next(read), total))
         made = offers(found)
-        content = as_mapping(reader, found, made)
+        content = {**as_mapping(reader, found, made), 'replay': chosen(args.bag)}
     print(json.dumps(content) if args.json else report(content, made))
     return CUT if args.strict and content['cut'] else 0
 
 
 def as_mapping(reader: BagReader, found: Survey, made: list[Offer]) -> dict[str, Any]:
-    """Return everything as plain values."""
+    """Return the survey as plain values."""
     return {
         'bag': str(reader.path),
         'format': 'ROS 1' if reader.is_ros1 else 'ROS 2',
@@ -104,12 +116,66 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
         for offer in made:
             lines += offered(offer) if offer.clouds == clouds else []
     if not made:
-        lines += ['', 'no poses; clouds that are in a fixed frame map with pose.source: identity']
+        lines += ['', 'no poses; clouds that are in a fixed frame map with --poses-from identity']
+    lines += ['', replay_line(content['replay'])] if content['replay'] else []
     return '\n'.join(lines)
 
 
+def replay_line(replay: dict[str, Any]) -> str:
+    """Return the source of poses that a replay takes, and why."""
+    deskewed = ', deskewed' if replay['deskewed'] else ''
+    why = f': {replay["poses_reason"]}' if replay['poses_reason'] else ''
+    return f'replay takes poses from {replay["poses_from"]}{deskewed}{why}'
+
+
+def chosen(path: Path) -> dict[str, Any]:
+    """Return the source of poses for a replay without settings; empty if that is refused."""
+    from surfel_mapper.config import Config
+    from surfel_mapper.errors import BagError
+    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.request import Request
+
+    try:
+        with open_recording(Request(path=path), Config()) as recording:
+            found = recording.describe()
+    except BagError:  # several topics of clouds, or none: a topic has to be named
+        return {}
+    return {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')}
+
+
+def folder_content(path: Path) -> dict[str, Any]:
+    """Return the number, times and columns of scans in files as plain values."""
+    from surfel_mapper.config import Config
+    from surfel_mapper.offline.request import Request
+    from surfel_mapper.offline.scan_folder import ScanFolder
+
+    folder = ScanFolder(Request(path=path), Config(), None)
+    first = folder.first_scan()
+    found = folder.describe()
+    return {
+        'bag': str(path),
+        'format': folder.format,
+        'scans': len(folder.files),
+        'seconds': folder.recorded_s,
+        'points': 0 if first is None else len(first),
+        'columns': [] if first is None else sorted(first.columns),
+        'replay': {name: found[name] for name in ('poses_from', 'poses_reason', 'deskewed')},
+    }
+
+
+def folder_report(content: dict[str, Any]) -> str:
+    """Return the figures of scans in files as lines of text."""
+    columns = ', '.join(content['columns']) or 'none'
+    return (
+        f'{content["bag"]}: {content["format"]}, {content["scans"]} scans, '
+        f'{content["seconds"]:.1f} s\n'
+        f'  first scan: {content["points"]} points; columns beside x y z: {columns}\n\n'
+        f'{replay_line(content["replay"])}'
+    )
+
+
 def table(topics: list[dict[str, Any]]) -> list[str]:
-    """Return a line for every topic, in columns."""
+    """Return one line a topic, in columns."""
     rows = [
         (
             topic['topic'],
@@ -129,7 +195,7 @@ def table(topics: list[dict[str, Any]]) -> list[str]:
 
 
 def offered(offer: Offer) -> list[str]:
-    """Return how many clouds have a pose in one source, and the settings to use it."""
+    """Return the number of clouds with a pose from a source, and the settings to use it."""
     import yaml
 
     from surfel_mapper.config import Config

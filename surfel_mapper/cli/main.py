@@ -4,9 +4,9 @@
 ``surfel-mapper VERB ...``: finds the verb, runs it, and turns errors into messages.
 
 A verb is a module of this folder with SUMMARY and EXAMPLE (str), ``add_arguments(parser)`` and
-``run(args) -> int``. It loads what it needs inside ``run``, so that help comes at once and a
-replay loads no ROS. What the verb prints on stdout is its result; all else goes to stderr. What
-follows --ros-args is ``args.ros_args``.
+``run(args) -> int``. It imports heavy modules inside ``run``, so that help is fast and a replay
+loads no ROS. A verb prints its result on stdout and everything else on stderr. Arguments after
+--ros-args are ``args.ros_args``. Modules with a leading underscore are shared by verbs.
 
 Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
 --strict; 130: interrupted.
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         code = int(args.run(args))
         sys.stdout.flush()
         return code
-    except BrokenPipeError:  # whoever read the result has seen enough, as `head` does
+    except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except SurfelMapperError as error:
@@ -73,16 +73,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def refused(verb: str, message: str) -> int:
-    """Say why a verb ended without a result, and return the exit code of that."""
+    """Print why a verb ended without a result, and return the exit code for it."""
     print(f'surfel-mapper {verb}: {message}', file=sys.stderr)
     return 1
 
 
 def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     """
-    Return the arguments for us and, from --ros-args on, those for ROS.
+    Split arguments at --ros-args into those of the verb and those for ROS.
 
-    A launch file adds these to whatever it starts, so every verb takes them; the node uses them.
+    A launch file adds the latter to every program, so every verb takes them; the node uses them.
     """
     arguments = list(argv)
     cut = arguments.index('--ros-args') if '--ros-args' in arguments else len(arguments)
@@ -90,7 +90,7 @@ def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parser_of(arguments: Sequence[str]) -> argparse.ArgumentParser:
-    """Return the parser for some arguments; it loads all verbs only where none is named."""
+    """Return the parser for some arguments; all verbs are loaded only if none is named."""
     about = str(surfel_mapper.__doc__).strip().partition('\n\n')[0]
     parser = argparse.ArgumentParser(prog='surfel-mapper', description=about, epilog=EPILOG)
     version = f'surfel-mapper {surfel_mapper.__version__}'

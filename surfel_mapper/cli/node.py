@@ -3,7 +3,7 @@
 """
 ``surfel-mapper node``: the live map, as ``ros2 run surfel_mapper node``.
 
-SIGINT and SIGTERM end it alike, with exit code 0, at any time from its start on.
+SIGINT and SIGTERM both end it with exit code 0, at any time after its start.
 """
 
 from __future__ import annotations

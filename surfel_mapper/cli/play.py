@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-``surfel-mapper play``: publish a bag over DDS, where there is no ``ros2 bag play``.
+``surfel-mapper play``: publish a bag over DDS on machines without ``ros2 bag play``.
 
-It differs from that in waiting for subscribers where asked, and in its shared memory, which is
-large enough for clouds.
+Unlike that, it can wait for subscribers, and its shared memory is large enough for clouds.
 """
 
 from __future__ import annotations
@@ -25,29 +24,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='rosbag2 directory, or a .mcap or .db3 file')
-    add('--topics', nargs='+', metavar='T', help='play these alone')
-    add('--rate', type=float, default=1.0, metavar='R', help='times the pace (%(default)s)')
-    add('--loop', action='store_true', help='begin anew at the end')
+    add('--topics', nargs='+', metavar='T', help='play only these')
+    add('--rate', type=float, default=1.0, metavar='R', help='factor of the pace (%(default)s)')
+    add('--loop', action='store_true', help='start again at the end')
     add('--clock', action='store_true', help='publish the record time on /clock')
     add(
         '--wait-for',
         nargs='+',
         default=[],
         metavar='T',
-        help='begin when somebody subscribes to each of these',
+        help='wait for a subscriber of each of these before playing',
     )
     add(
         '--timeout',
         type=float,
         default=60.0,
         metavar='S',
-        help='s to wait for subscribers at most (%(default)s)',
+        help='longest wait for subscribers, s (%(default)s)',
     )
     add('--json', action='store_true', help='report as JSON')
 
 
 def run(args: argparse.Namespace) -> int:
-    """Play a bag and report what was published."""
+    """Play a bag and report the number of messages published."""
     from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.cli._ros import loading_ros
 

@@ -44,7 +44,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=Path,
         metavar='BAG',
-        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag, or directory of .ply, .pcd, .bin scans',
+        help='rosbag2 directory, .mcap, .db3, ROS 1 .bag; directory or file of .ply, .pcd, .bin, '
+        '.las, .laz scans',
     )
     add('--config', type=Path, metavar='FILE', help='YAML file of settings')
     add(
@@ -76,6 +77,12 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         help='pose of the sensor of a topic in frames.base, m; repeatable',
     )
     add('--pose-topic', metavar='TOPIC', help='topic of the poses (/tf, /odom or /pose)')
+    add(
+        '--poses-from',
+        choices=('tf', 'odometry', 'pose', 'file', 'registration', 'identity'),
+        help='source of the poses (default: pose.source of the configuration; else the first of '
+        'tf, odometry, pose that the recording has; else registration)',
+    )
     add('--poses', type=Path, metavar='FILE', help='file of poses of frames.base instead')
     add(
         '--poses-format',
@@ -220,6 +227,7 @@ def request_of(args: argparse.Namespace, bag: Path) -> Request:
         pose_topic=args.pose_topic,
         poses=args.poses,
         poses_format=args.poses_format,
+        poses_from=args.poses_from,
         mounts=dict(args.mount),
         start_s=args.start,
         duration_s=args.duration,

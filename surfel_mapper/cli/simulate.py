@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Simulate a lidar driving through a world with known surfaces, and record it as a bag."""
+"""``surfel-mapper simulate``: a lidar drives through known surfaces, recorded as a bag."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SUMMARY = 'Simulate a lidar driving through a world with known surfaces; record 
 EXAMPLE = 'surfel-mapper simulate street --output street --scans 100 --noise 0.02'
 
 SPARE_M = 20.0
-"""The street is longer than the drive by this."""
+"""Length of the street beyond the drive, m."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('world', choices=['street'], help='a street canyon, turned and tilted off the grid')
     add('--output', required=True, metavar='DIR', help='directory of the bag; must not exist')
-    add('--overwrite', action='store_true', help='replace a bag that is there')
+    add('--overwrite', action='store_true', help='replace an existing bag')
     add('--storage', choices=['mcap', 'sqlite3'], default='mcap', help='format (%(default)s)')
     length = parser.add_mutually_exclusive_group()
     length.add_argument('--scans', type=int, default=100, metavar='N', help='number (%(default)s)')
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Simulate and record; the report says what the bag holds."""
+    """Simulate and record a drive, and report the counts."""
     from tqdm import tqdm
 
     from surfel_mapper.scan import Scan

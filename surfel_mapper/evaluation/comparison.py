@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-How far a map is from the truth: its positions, its normals, and what is missing.
+Errors of a map against the truth: positions, normals, completeness.
 
 The truth is a world of known surfaces, or points with or without normals, such as another map.
-A surfel is compared with the nearest place of the truth. Its position is off by the distance to
-the surface there, along the normal, for a surfel may lie anywhere on its surface; where the truth
-has no normals, by the distance to the point. Angles are between axes; how many normals point to
-the other side is said apart. Completeness is the share of the truth, evenly thinned, that has a
-surfel near it.
+A surfel is compared with the nearest place of the truth. Its error of position is the distance
+to the surface there, along the normal, because a surfel may lie anywhere on its surface; if the
+truth has no normals, the distance to the point. Angles are between axes; normals that point to
+the other side are counted separately. Completeness is the share of the truth, evenly thinned,
+that has a surfel near it.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ class Nearest:
     Attributes
     ----------
     distance_m : (K,) float64
-        How far they are; inf where there is none.
+        Distance; inf if there is no place.
     off_m : (K,) float64
-        How far the positions are from the surface there.
+        Distance of the positions from the surface there.
     normal : (K, 3) float64, or None
-        Of the surface; None where unknown.
+        Normal of the surface; None if unknown.
 
     """
 
@@ -47,18 +47,18 @@ class Nearest:
 
 
 class Truth(Protocol):
-    """What a map is compared with."""
+    """Reference that a map is compared with."""
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return what is nearest to positions (K, 3), m."""
+        """Return the places of the truth nearest to positions (K, 3), m."""
 
     def samples(self) -> Floats | None:
-        """Return places (N, 3), m, where a complete map has surfels; None where unknown."""
+        """Return places (N, 3), m, where a complete map has surfels; None if unknown."""
 
 
 class CloudTruth:
     """
-    Points as truth: a scan of reference, or another map.
+    Points as truth: a reference scan, or another map.
 
     Parameters
     ----------
@@ -68,12 +68,11 @@ class CloudTruth:
     """
 
     def __init__(self, discs: Discs) -> None:
-        """Put the points into a tree."""
         self._discs = discs
         self._tree = cKDTree(discs.position)
 
     def nearest(self, position: Floats) -> Nearest:
-        """Return what is nearest to positions (K, 3), m."""
+        """Return the places of the truth nearest to positions (K, 3), m."""
         distance_m, row = self._tree.query(position)
         if self._discs.normal is None or not len(self._discs):
             return Nearest(distance_m, distance_m, None)
@@ -97,12 +96,12 @@ def evaluate(
     surfels : Discs
         The map.
     truth : Truth
-        What it should be.
+        The reference.
     max_distance_m : float
-        Surfels farther than this from all of the truth are counted apart, not compared.
+        Surfels farther than this from the truth are not compared.
     radius_m : float
-        A place of the truth is there if a surfel is this near; places are thinned to one in a
-        cube of this edge.
+        A place of the truth counts as found if a surfel is this near; places are thinned to one
+        in a cube of this edge.
 
     """
     nearest = truth.nearest(surfels.position)
@@ -128,7 +127,7 @@ def evaluate(
 
 
 def spread(errors: Floats) -> dict[str, float | None]:
-    """Return mean, median, 95th percentile and maximum; None of no errors."""
+    """Return mean, median, 95th percentile and maximum; None for no errors."""
     if not len(errors):
         return dict.fromkeys(('mean', 'median', 'p95', 'max'))
     return {

@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Maps in files, of whatever format, as discs: where each surfel is, and its normal.
+Maps in files of any format as discs: position and normal of each surfel.
 
-A file or a directory that a replay or a merge wrote, or points of anyone as PLY or PCD. Of the
-exact formats the digest comes along, so that two maps can be found equal to the bit.
+Reads files and directories of a replay or a merge, and points as PLY or PCD. Exact formats give
+the digest too, so that two maps can be compared to the bit.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ IN_DIRECTORY = ('map.parquet', 'map.npz', 'map.ply', 'map.pcd')
 """Files of a replay that hold its map, the exact ones first."""
 
 NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
-"""What the components of normals are called."""
+"""Names of the components of normals."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,11 +41,11 @@ class Discs:
     ----------
     position : (K, 3) float64, m
     normal : (K, 3) float64, or None
-        Of unit length, or nan; None where the file has none.
+        Of unit length, or nan; None if the file has no normals.
     voxel_size_m : float, optional
-        Of the map, where the file says so.
+        Voxel size of the map, if the file has it.
     digest : str, optional
-        Of the map, where the file is exact.
+        Digest of the map, if the file is exact.
 
     """
 
@@ -55,7 +55,7 @@ class Discs:
     digest: str | None = None
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of surfels or points."""
         return len(self.position)
 
 
@@ -69,7 +69,7 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
         Output directory of a replay or a merge, a dataset of tiles, or a file: .parquet, .npz,
         .ply or .pcd.
     min_points : int
-        From how many points on a voxel counts, where the file has them all.
+        Points that a voxel needs to count as a surfel, if the file has all voxels.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
 
 
 def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:
-    """Return the points of a cloud; normals of other length than 1 are brought to it."""
+    """Return the points of a cloud, with normals scaled to unit length."""
     if not {'x', 'y', 'z'} <= set(columns):
         raise FileFormatError(f'{path}: no x, y, z among {", ".join(columns)}')
     names = next((names for names in NORMALS if set(names) <= set(columns)), None)

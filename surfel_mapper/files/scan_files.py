@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Folders of scans, one file each: PLY, PCD, and the raw float32 of KITTI and nuScenes.
+Folders of scans, one file each: PLY, PCD, LAS, LAZ, and the raw float32 of KITTI and nuScenes.
 
 Such files state neither time nor frame; the caller supplies both.
 """
@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import pcd, ply
+from surfel_mapper.files import las, pcd, ply
 from surfel_mapper.files.atomic import by_number
 
-SUFFIXES = ('.ply', '.pcd', '.bin')
+SUFFIXES = ('.ply', '.pcd', '.bin', *las.SUFFIXES)
 
 RAW_COLUMNS = {'.bin': 4, '.pcd.bin': 5}
 """Float32 numbers per point: KITTI x y z intensity, nuScenes x y z intensity ring."""
@@ -45,7 +45,7 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
     Parameters
     ----------
     path : str or Path
-        A .ply, a .pcd, a .bin of four or a .pcd.bin of five float32 a point.
+        A .ply, .pcd, .las or .laz, a .bin of four or a .pcd.bin of five float32 a point.
 
     Raises
     ------
@@ -58,7 +58,8 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
         return read_raw(Path(path))
     if suffix not in SUFFIXES:
         raise FileFormatError(f'{path}: expected a scan ending in {", ".join(SUFFIXES)}')
-    columns = ply.read_points(path) if suffix == '.ply' else pcd.read_points(path)
+    readers = {'.ply': ply.read_points, '.pcd': pcd.read_points}
+    columns = readers.get(suffix, las.read_points)(path)
     missing = [name for name in 'xyz' if name not in columns]
     if missing:
         raise FileFormatError(

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bags through the pipeline, and what a bag offers to it."""
+"""Recordings through the pipeline, the files that a replay writes, and surveys of bags."""

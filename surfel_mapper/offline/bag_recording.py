@@ -25,6 +25,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, CloudFormatError, PoseError
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.poses import raw_poses
+from surfel_mapper.offline.pose_choice import choose_for_bag, pose_summary
 from surfel_mapper.offline.pose_sources import pose_topics, PosePath, PoseTopics, static_topics
 from surfel_mapper.offline.request import part, Request, Span, WHOLE
 
@@ -62,10 +63,12 @@ class BagRecording:
         self.cuts = reader.cuts
         self.topics = chosen_topics(reader, request, config)
         check_mounts(request, self.topics, config)
+        choice = choose_for_bag(reader, self.topics, request, config)
+        self.pose_reason, config = choice.reason, choice.config
         if request.mounts:
             config = config.replace({'frames.base_to_sensor': ()})
         self.poses = self._poses(request, config, path)
-        self.config = config if path is None else config.replace({'pose.source': 'pose'})
+        self.config = config
         self.span = part(
             str(request.path),
             reader.start_ns,
@@ -118,6 +121,7 @@ class BagRecording:
             'topics': self.topics,
             'pose_topics': [*self.poses.kinds, *self.poses.static],
             'poses': None if path is None else str(path.path),
+            **pose_summary(self.config, path, self.pose_reason),
         }
 
     def replay(

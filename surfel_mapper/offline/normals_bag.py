@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What the node would have published while a recording is mapped, as a bag to play beside it.
+Bag of surfels to play beside the input: the messages that the node would have published.
 
-Two topics of PointCloud2, named and laid out as those of the node: ``changed`` after every scan,
-and ``normals``, the whole map. Recorded and stamped with the stamp of the scan, so that RViz and
-Foxglove show them in step with the input. The whole map is written at most once a second, and
-only when as many surfels have changed as it holds, so the bag grows with the changes and not with
-the square of the map.
+Two topics of PointCloud2 with the names and layout of the node's: ``changed`` after every scan,
+and ``normals``, the whole map. Both are recorded and stamped with the stamp of the scan, so that
+RViz and Foxglove show them in step with the input. The whole map is written at most once a
+second, and only when as many surfels have changed as it has, so the bag grows with the changes
+and not with the square of the map.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 CHANGED, NORMALS = '/surfel_mapper/changed', '/surfel_mapper/normals'
 
 EVERY_NS = 1_000_000_000
+"""Least time between two whole maps."""
 
 
 class NormalsBag:
@@ -34,14 +35,13 @@ class NormalsBag:
     Parameters
     ----------
     bag : BagWriter
-        Entered; whoever made it ends it.
+        Entered; the caller closes it.
     mapper : Mapper
-        Whose updates come.
+        Makes the updates and holds the map.
 
     """
 
     def __init__(self, bag: BagWriter, mapper: Mapper) -> None:
-        """Begin with nothing written."""
         self._bag = bag
         self._mapper = mapper
         self._newest: Update | None = None
@@ -49,7 +49,7 @@ class NormalsBag:
         self._changed = 0
 
     def add(self, update: Update) -> None:
-        """Write what a scan changed, and now and then the map."""
+        """Write the surfels that a scan changed, and the whole map when it is due."""
         self._newest = update
         if len(update.changed):
             self._write(CHANGED, update, update.changed)
@@ -61,7 +61,7 @@ class NormalsBag:
             self._write_map(update)
 
     def finish(self) -> None:
-        """Write the map as it is after the last scan."""
+        """Write the map after the last scan."""
         if self._newest is not None and self._changed:
             self._write_map(self._newest)
 

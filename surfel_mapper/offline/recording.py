@@ -18,7 +18,7 @@ from surfel_mapper.errors import BagError
 from surfel_mapper.offline.bag_recording import BagRecording
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import Request
-from surfel_mapper.offline.scan_folder import is_scan_folder, ScanFolder
+from surfel_mapper.offline.scan_folder import is_scans, ScanFolder
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -72,12 +72,11 @@ def open_recording(request: Request, config: Config) -> Iterator[Recording]:
 
     """
     poses = None if request.poses is None else PosePath(request.poses, request.poses_format)
-    span = {'start_s': request.start_s, 'duration_s': request.duration_s, 'every': request.every}
-    if is_scan_folder(request.path):
+    if is_scans(request.path):
         named = [*request.topics, *request.mounts, *filter(None, [request.pose_topic])]
         if named:
-            raise BagError(f'{request.path}: a folder of scans has no topic {named[0]}')
-        yield ScanFolder(request.path, config, poses, **span)
+            raise BagError(f'{request.path}: files of scans have no topic {named[0]}')
+        yield ScanFolder(request, config, poses)
         return
     with BagReader(request.path) as reader:
         yield BagRecording(reader, request, config, poses)

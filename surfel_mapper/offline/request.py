@@ -39,6 +39,9 @@ class Request:
         A file of poses of frames.base instead.
     poses_format : str, optional
         tum, kitti or csv.
+    poses_from : str, optional
+        Source of the poses: tf, odometry, pose, file, registration or identity; without, the
+        configuration decides, then pose_choice.py.
     mounts : mapping of str to 7 floats
         Pose of the sensor of each topic in frames.base, x y z qx qy qz qw.
     start_s, duration_s, every : float, float, int
@@ -51,6 +54,7 @@ class Request:
     pose_topic: str | None = None
     poses: Path | None = None
     poses_format: str | None = None
+    poses_from: str | None = None
     mounts: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     start_s: float = 0.0
     duration_s: float = math.inf

@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A folder of scans, one file each, through the pipeline.
+Scans in files, one file each, through the pipeline: a folder of them, or a single file.
 
-The scans are in the frame frames.base, whose poses are read from a file; if
-frames.base_to_sensor is set, they are in a frame called sensor on it. The time of scan i is that
-of pose i, if there are as many poses as scans; else it is parsed from the name of its file.
+With a file of poses, the scans are in frames.base, whose poses it gives; if
+frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
+registered. The time of scan i is that of pose i, if there are as many poses as scans; else the
+time in the name of its file; else, or if it has no poses, scans follow each other at 10 Hz.
 """
 
 from __future__ import annotations
@@ -17,10 +18,11 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
-from surfel_mapper.files.scan_files import read_scan, scan_files
+from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.files.trajectory import nanoseconds
+from surfel_mapper.offline.pose_choice import choose_for_folder, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
-from surfel_mapper.offline.request import part, Span
+from surfel_mapper.offline.request import part, Request, Span
 from surfel_mapper.scan import Scan
 
 if TYPE_CHECKING:
@@ -38,40 +40,42 @@ UNITS = {19: 'ns', 16: 'us', 13: 'ms'}
 
 class ScanFolder:
     """
-    Scans of a folder, with their poses.
+    Scans of a folder or of one file, with their poses if there are any.
 
     Parameters
     ----------
-    path : Path
-        The directory.
+    request : Request
+        The directory or the file, the part of it, and the source of poses.
     config : Config
-        Without poses its ``pose.source`` has to be identity.
+        Its ``pose.source`` counts if it is not the default.
     poses : PosePath, optional
         Poses of frames.base.
-    part_of : mapping
-        start_s, duration_s, every; see ``part``.
 
     Raises
     ------
     BagError
-        If there are no poses, or they cannot be assigned to the scans.
+        If poses cannot be assigned to the scans.
 
     """
 
     cuts: tuple[str, ...] = ()
+    format = 'scans in files'
 
-    def __init__(self, path: Path, config: Config, poses: PosePath | None, **part_of: Any) -> None:
-        self.path = path
-        self.files = scan_files(path)
+    def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
+        self.path = request.path
+        self.files = [self.path] if self.path.is_file() else scan_files(self.path)
         self.poses = poses
-        if poses is None and config.pose.source != 'identity':
-            raise BagError(
-                f'{path}: scans without poses; name a file of poses with --poses, or set '
-                'pose.source to identity if they are in the fixed frame'
-            )
-        self.config = config if poses is None else config.replace({'pose.source': 'pose'})
         self.stamps = self._stamps()
-        self.span: Span = part(str(path), self.stamps[0], self.stamps[-1], **part_of)
+        choice = choose_for_folder(request, config, poses is not None, self.first_scan())
+        self.config, self.pose_reason = choice.config, choice.reason
+        self.span: Span = part(
+            str(self.path),
+            self.stamps[0],
+            self.stamps[-1],
+            start_s=request.start_s,
+            duration_s=request.duration_s,
+            every=request.every,
+        )
 
     @property
     def num_scans(self) -> int:
@@ -86,7 +90,21 @@ class ScanFolder:
 
     def describe(self) -> dict[str, Any]:
         """Return the sources of scans and poses, for the summary."""
-        return {'bag': str(self.path), 'poses': str(self.poses.path) if self.poses else None}
+        path = None if self.poses is None else self.poses.path
+        return {
+            'bag': str(self.path),
+            'poses': None if path is None else str(path),
+            **pose_summary(self.config, path, self.pose_reason),
+        }
+
+    def first_scan(self) -> Scan | None:
+        """Return the first scan that can be read; None if there is none."""
+        for number, stamp_ns in enumerate(self.stamps):
+            try:
+                return self._read(number, stamp_ns, '')
+            except (FileFormatError, ValueError):
+                continue
+        return None
 
     def replay(
         self, mapper: Mapper, stopped: Callable[[], bool] = lambda: False
@@ -108,8 +126,7 @@ class ScanFolder:
         stamp_ns = self.stamps[number]
         try:
             with mapper.counters.timed('decode'):
-                points, columns = read_scan(self.files[number])
-                scan = Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
+                scan = self._read(number, stamp_ns, frame)
         except (FileFormatError, ValueError) as error:
             mapper.refuse_clouds('bad_cloud', str(self.path), str(error))
             return
@@ -117,11 +134,15 @@ class ScanFolder:
             self.poses.add_for(mapper, stamp_ns, number)
         mapper.add_scan(scan)
 
+    def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
+        points, columns = read_scan(self.files[number])
+        return Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
+
     def _stamps(self) -> list[int]:
         """Return the time of every scan."""
         number = len(self.files)
         if self.poses is None:
-            return [PERIOD_NS * at for at in range(number)]
+            return times_in_names(self.files) or [PERIOD_NS * at for at in range(number)]
         stamps = self.poses.trajectory.stamp_ns
         if len(self.poses.trajectory) == number:
             return [PERIOD_NS * at for at in range(number)] if stamps is None else stamps.tolist()
@@ -142,14 +163,36 @@ class ScanFolder:
         return times
 
 
+def times_in_names(files: list[Path]) -> list[int]:
+    """Return the times in the names of files; empty if they are numbers or words."""
+    texts = [stem(file) for file in files]
+    if not all('.' in text or len(text) in UNITS for text in texts):
+        return []
+    try:
+        times = [name_ns(file) for file in files]
+    except FileFormatError:
+        return []
+    return times if times == sorted(set(times)) else []
+
+
 def name_ns(file: Path) -> int:
     """Return the time in the name of a file: 1532402927.647951.pcd, 1532402927647951.pcd.bin."""
-    text = file.name.removesuffix('.bin').removesuffix('.pcd').removesuffix('.ply')
+    text = stem(file)
     return nanoseconds(text, str(file), UNITS.get(len(text), ''))
 
 
-def is_scan_folder(path: Path) -> bool:
-    """Return whether a path is a directory of scans and not of a bag."""
+def stem(file: Path) -> str:
+    """Return the name of a file without its endings of scans."""
+    text = file.name
+    for suffix in ('.bin', *SUFFIXES):
+        text = text.removesuffix(suffix)
+    return text
+
+
+def is_scans(path: Path) -> bool:
+    """Return whether a path is a file of points, or a directory of scans and not of a bag."""
+    if path.is_file():
+        return path.suffix in SUFFIXES
     if not path.is_dir() or (path / METADATA).exists():
         return False
     return not any(map(is_storage, path.iterdir())) and bool(scan_files(path))

@@ -28,7 +28,14 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     aligned = f'{summary["alignment"]["text"]}\n' if 'alignment' in summary else ''
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     speed = summary['recorded_s'] / summary['replay_s']
+    deskewed = ', deskewed' if summary.get('deskewed') else ''
+    poses = (
+        f'poses from {summary["poses_from"]}{deskewed}: {summary["poses_reason"]}\n'
+        if summary.get('poses_reason')
+        else ''
+    )
     return (
+        f'{poses}'
         f'scans {scans["received"]}{out if scans["dropped"] else ""}'
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'

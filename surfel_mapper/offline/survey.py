@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-What a bag offers: its topics with rates and frames, and which poses its clouds have.
+Survey of a bag: its topics with rates and frames, and the poses that its clouds have.
 
-Every source of poses is tried on every cloud with the TransformBuffer that mapping uses, so what
-is promised here is what a replay finds, but for scans whose poses come later than
-``pose.max_wait_s``. Of clouds only the headers are read.
+Every source of poses is tried on every cloud with the TransformBuffer that mapping uses, so a
+replay finds the same poses, except for scans whose poses come later than ``pose.max_wait_s``.
+Only the headers of clouds are read.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SOURCES = {type_: source for source, type_ in TYPES.items()}
 """The pose.source that reads each type."""
 
 ALL_TIME_S = 1e9
-"""A survey holds every transform of a bag."""
+"""Buffer length of a survey, s: it holds every transform of a bag."""
 
 DEFAULTS = Config()
 
@@ -37,7 +37,7 @@ DEFAULTS = Config()
 @dataclass(slots=True)
 class TopicSurvey:
     """
-    What was seen of a topic.
+    Times and frames of the messages of a topic.
 
     Attributes
     ----------
@@ -55,14 +55,14 @@ class TopicSurvey:
     frames: list[str] = field(default_factory=list)
 
     def add(self, record_ns: int, frames: Iterable[str]) -> None:
-        """Take note of a message."""
+        """Add the time and frames of a message."""
         self.first_ns = record_ns if self.first_ns is None else self.first_ns
         self.last_ns = record_ns
         self.frames += [name for name in dict.fromkeys(frames) if name not in self.frames]
 
     @property
     def rate_hz(self) -> float | None:
-        """Messages a second from the first to the last; None where that is not known."""
+        """Messages a second from the first to the last; None if unknown."""
         if self.first_ns is None or self.last_ns is None or self.last_ns <= self.first_ns:
             return None
         return (self.topic.count - 1) * 1e9 / (self.last_ns - self.first_ns)
@@ -71,7 +71,7 @@ class TopicSurvey:
 @dataclass(slots=True)
 class Survey:
     """
-    What was read of a bag.
+    Topics, clouds and poses of a bag.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class Survey:
     poses : dict of str to list of StampedPose
         By topic.
     static : list of StampedPose
-        Those that hold for all time.
+        Static transforms.
     undecodable : int
-        Messages of clouds and poses that are damaged.
+        Number of damaged messages of clouds and poses.
 
     """
 
@@ -106,9 +106,9 @@ class Offer:
     covered, total : int
         Clouds that have a pose at their stamp, and all.
     settings : dict of str
-        What the configuration has to say for it.
+        The settings that choose it.
     missing : str
-        Why there is none for the last cloud that has none; empty where all have one.
+        Why the last cloud without a pose has none; empty if all have one.
 
     """
 
@@ -120,7 +120,11 @@ class Offer:
     missing: str = ''
 
 
-def survey(reader: BagReader, on_message: Callable[[], object] = lambda: None) -> Survey:
+def survey(
+    reader: BagReader,
+    on_message: Callable[[], object] = lambda: None,
+    stop_ns: int | None = None,
+) -> Survey:
     """
     Read all clouds and poses of a bag.
 
@@ -129,7 +133,9 @@ def survey(reader: BagReader, on_message: Callable[[], object] = lambda: None) -
     reader : BagReader
         The bag.
     on_message : callable
-        Called after every message read, for a progress bar.
+        Called after every message, for a progress bar.
+    stop_ns : int, optional
+        Record time at which to stop; without, the whole bag is read.
 
     Raises
     ------
@@ -138,7 +144,7 @@ def survey(reader: BagReader, on_message: Callable[[], object] = lambda: None) -
 
     """
     found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics})
-    for message in reader.messages(surveyed_topics(reader)):
+    for message in reader.messages(surveyed_topics(reader), None, stop_ns):
         try:
             frames = note_message(found, reader, message)
         except (BagError, CloudFormatError, PoseError):
@@ -191,7 +197,7 @@ def offers(found: Survey) -> list[Offer]:
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A topic of poses: what pose.source calls it, and all that it says."""
+    """A topic of poses: its pose.source and its poses."""
 
     topic: str
     kind: str
@@ -225,7 +231,7 @@ def tried(
 
 
 def transforms(poses: list[StampedPose], static: list[StampedPose]) -> TransformBuffer:
-    """Return a buffer of all poses; those that mapping would ignore are left out."""
+    """Return a buffer of all poses but those that mapping would ignore."""
     buffer = TransformBuffer(ALL_TIME_S, ALL_TIME_S)
     for pose, is_static in [*((p, True) for p in static), *((p, False) for p in poses)]:
         with suppress(PoseError, ValueError):
@@ -252,8 +258,7 @@ def mounting(static: list[StampedPose], base: str, frame: str) -> list[float]:
     """
     Return the pose of a sensor in its base as frames.base_to_sensor wants it; empty if unknown.
 
-    The numbers of a direct transform are handed on as they are, so that mapping with them gives
-    the same bits.
+    A direct transform is returned unchanged, so that mapping with it gives the same bits.
     """
     direct = [pose for pose in static if (pose.parent, pose.child) == (base, frame)]
     if direct:

@@ -120,7 +120,7 @@ def test_the_report_says_it_in_a_few_lines(street, capsys):
         ('other.ply', 'No such file'),
     ],
 )
-def test_what_is_no_map_and_no_truth_is_refused_by_name(street, tmp_path, capsys, name, text):
+def test_a_file_that_is_no_map_or_truth_is_refused_by_name(street, tmp_path, capsys, name, text):
     bag, output = street
     (tmp_path / 'empty').mkdir()
     assert main(['evaluate', str(output), '--truth', str(tmp_path / name)]) == 1

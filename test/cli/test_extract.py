@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper extract``: from clouds and maps to files, and what it refuses."""
+"""``surfel-mapper extract``: clouds and maps to files, and bad input refused."""
 
 from __future__ import annotations
 
@@ -63,14 +63,14 @@ def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
 
 
 @pytest.mark.parametrize('name', ['room.txt', 'missing.ply', 'missing.npz'])
-def test_what_is_no_cloud_is_refused_with_its_name(tmp_path, capsys, name):
+def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
     if name == 'room.txt':
         (tmp_path / name).write_text('1 2 3\n')
     assert main(['extract', str(tmp_path / name), '--output', str(tmp_path / 'out')]) == 1
     assert name in capsys.readouterr().err
 
 
-def test_what_can_be_read_is_told_where_the_ending_says_something_else(tmp_path, capsys):
+def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
     assert main(['extract', 'notes.md', '--output', str(tmp_path)]) == 1
     said = capsys.readouterr().err
     assert 'a cloud ending in .ply, .pcd, .bin, or a map ending in .npz, .parquet' in said

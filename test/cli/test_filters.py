@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper filters`` lists what a chain may have; ``replay --filters`` runs one."""
+"""``surfel-mapper filters`` lists the filters of a chain; ``replay --filters`` runs one."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper info`` prints what a bag holds and settings that work as they stand."""
+"""``surfel-mapper info`` prints the topics of a bag and settings that work unchanged."""
 
 import json
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The command line lists its verbs, turns errors into messages, and loads only what it needs."""
+"""The command line lists its verbs, turns errors into messages, and loads few modules."""
 
 from importlib import import_module
 import os
@@ -85,7 +85,7 @@ def test_mistakes_of_our_own_keep_their_traceback(monkeypatch):
         main(['replay', 'a.bag'])
 
 
-def test_what_follows_ros_args_is_not_read_as_options(monkeypatch):
+def test_arguments_after_ros_args_are_not_read_as_options(monkeypatch):
     seen = []
     monkeypatch.setattr(replay, 'run', lambda args: seen.append(args) or 0)
 

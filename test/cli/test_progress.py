@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Progress is a bar on a terminal, else lines; after Ctrl-C what was mapped is written."""
+"""Progress is a bar on a terminal, else lines; after Ctrl-C the scans so far are written."""
 
 import fcntl
 import json
@@ -35,7 +35,7 @@ sys.exit(main.main())
 """
 
 
-def test_lines_say_how_far_it_is_how_fast_and_how_long_it_takes(monkeypatch, capsys):
+def test_lines_state_progress_rate_and_time_left(monkeypatch, capsys):
     monkeypatch.setattr(progress_module, 'EVERY_S', 0.0)
 
     with progress('replay', 'scan') as show:
@@ -124,11 +124,11 @@ def command(long_bag, tmp_path):
 
 
 def is_underway(shown):
-    """Return whether what is shown says that some scans are mapped."""
+    """Return whether the progress shown counts some scans."""
     return re.search(rb'\b[1-9]\d*(/| of )%d' % MANY, shown) is not None
 
 
-def test_ctrl_c_ends_the_replay_and_what_was_mapped_is_written(command, tmp_path):
+def test_ctrl_c_ends_the_replay_and_the_map_is_written(command, tmp_path):
     output = tmp_path / 'out'
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
 

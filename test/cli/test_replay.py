@@ -46,7 +46,7 @@ def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     assert vertices.count == summary['surfels'] > 100
     # the floor is at z = 0 in odom, the wall at y = 3.1
     on_floor, on_wall = np.abs(vertices['z']) < 1e-3, np.abs(vertices['y'] - 3.1) < 1e-3
-    assert (on_floor | on_wall).mean() > 0.9  # all but the voxels where they meet
+    assert (on_floor | on_wall).mean() > 0.9  # all but the voxels with both
     np.testing.assert_allclose(vertices['nz'][on_floor & ~on_wall], 1.0, atol=1e-4)
     np.testing.assert_allclose(vertices['ny'][on_wall & ~on_floor], -1.0, atol=1e-4)
     assert (output / 'map.png').read_bytes().startswith(PNG_MAGIC)
@@ -55,7 +55,7 @@ def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     assert lines[0] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
     assert lines[1].startswith('decode ')
     assert lines[2] == f'digest {summary["digest"]}'
-    assert printed.err == ''  # no progress where there is no terminal
+    assert printed.err == ''  # no progress without a terminal
 
 
 def test_json_prints_the_summary_alone(bag, tmp_path, capsys):

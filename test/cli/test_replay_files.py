@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What ``surfel-mapper replay`` writes others read; bad input and full disks leave no halves."""
+"""Other readers read the files of a replay; bad input and full disks leave no partial files."""
 
 import json
 import shutil
@@ -36,7 +36,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def output(bag, tmp_path_factory):
-    """Return what a replay wrote in every format."""
+    """Return the output directory of a replay in every format."""
     output = tmp_path_factory.mktemp('out') / 'map'
     poses = ['--poses-out', str(output.with_name('poses.tum'))]
     assert main(['replay', str(bag), '--formats', ALL, '--output', str(output), *poses]) == 0

@@ -160,7 +160,7 @@ def test_an_output_that_holds_something_else_is_left_alone(bags, tmp_path, capsy
 @pytest.mark.parametrize(
     'option', [['--window'], ['--align'], ['--poses-out', 'x'], ['--formats', 'ply'], ['--view']]
 )
-def test_what_needs_the_whole_map_in_one_process_is_refused(bags, tmp_path, capsys, option):
+def test_options_that_need_one_process_are_refused(bags, tmp_path, capsys, option):
     assert main(['replay', *bags, '--output', str(tmp_path), *TF, *option]) == 1
     assert f'{option[0]}: not with several bags' in capsys.readouterr().err
 

@@ -25,7 +25,7 @@ def bag(tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def output(bag, tmp_path_factory):
-    """Return what a replay with models wrote."""
+    """Return the output directory of a replay with models."""
     pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
     pytest.importorskip('pyarrow', reason='pyarrow is not installed (extra formats)')
     pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""surfel-mapper simulate: what it writes and reports, its defaults, what it refuses."""
+"""``surfel-mapper simulate``: its bag, its report, its defaults and refusals."""
 
 import argparse
 import json
@@ -24,7 +24,7 @@ def counts(path):
         return {topic.name: topic.count for topic in reader.topics}
 
 
-def test_it_writes_a_bag_and_says_what_is_in_it(tmp_path, capsys):
+def test_a_simulation_writes_a_bag_and_reports_its_counts(tmp_path, capsys):
     assert run(tmp_path / 'street', '--scans', '3') == 0
     out, err = capsys.readouterr()
     assert out.startswith(f'{tmp_path}/street: scans 3   points 1.54 k (')
@@ -70,7 +70,7 @@ def test_every_option_reaches_the_simulation(tmp_path):
     assert simulation.world.primitives == World.street(seed=4, length_m=21.2).primitives
 
 
-def test_its_defaults_are_those_of_the_simulation():
+def test_defaults_are_those_of_the_simulation():
     parser = argparse.ArgumentParser()
     simulate.add_arguments(parser)
     simulation = simulate.simulation_of(parser.parse_args(['street', '--output', 'x']))

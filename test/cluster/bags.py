@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Small bags whose borders are not easy to cross, and their maps by one process."""
+"""Small bags with difficult borders between shards, and their maps by one process."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ BAGS = {
     'time set back': (time_set_back, {}),
     'gate': (plain, {'window.gate_distance_m': 0.8}),
 }
-"""Bags by what is hard about them, and settings."""
+"""Bags by the difficulty at their borders, and settings."""
 
 
 def written(path, name):
@@ -97,7 +97,7 @@ def written(path, name):
 
 
 def request(bag, config, **part):
-    """Return what is to be mapped of a bag of recorded.py."""
+    """Return the request for a bag of recorded.py."""
     pose_topic = '/tf' if config.pose.source == 'tf' else None
     return Request(path=bag, topics=('/points',), pose_topic=pose_topic, **part)
 

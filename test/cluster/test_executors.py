@@ -101,7 +101,7 @@ print(words[words.index('SigIgn:') + 1])
 
 
 @pytest.mark.skipif(not os.path.exists('/proc/self/status'), reason='signals are not shown')
-def test_what_workers_are_forked_from_ignores_ctrl_c_from_its_first_moment():
+def test_the_fork_server_ignores_ctrl_c_from_its_start():
     done = subprocess.run(
         [sys.executable, '-c', FORKSERVER], capture_output=True, text=True, check=True
     )

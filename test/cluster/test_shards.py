@@ -60,7 +60,7 @@ def test_a_bag_is_cut_into_equal_parts_without_gaps(tmp_path):
         {'pose.source': 'registration'},
     ],
 )
-def test_where_a_scan_depends_on_all_before_it_a_bag_is_not_cut(tmp_path, settings):
+def test_a_bag_whose_scans_depend_on_all_before_is_not_cut(tmp_path, settings):
     bag, _ = written(tmp_path, 'plain')
     assert len(shards_of(bag, Config().replace(settings), 1.0)) == 1
 
@@ -142,12 +142,12 @@ class LastFirst(SerialExecutor):
 
 
 def after(number):
-    """Return what says after so many shards that it is enough."""
+    """Return a function that asks to stop after a number of shards."""
     asked = iter(range(number))
     return lambda: next(asked, None) is None
 
 
-def test_what_is_mapped_when_it_is_stopped_is_the_map(tmp_path):
+def test_a_stopped_run_gives_the_map_of_the_shards_done(tmp_path):
     bag, config = written(tmp_path, 'plain')
     expected = in_one_go(bag, config, duration_s=RECORDED_S / 6 * 2 - 1e-6)
 

@@ -109,7 +109,7 @@ def test_a_world_is_the_truth_of_positions_and_normals(ground):
     result = compared(grid(height_m=-0.02, tilt_deg=5.0), WorldTruth(world))
     assert result['position_m']['mean'] == pytest.approx(0.02)
     assert result['normal_deg']['mean'] == pytest.approx(5.0)
-    assert 'completeness' not in result  # nobody knows what was seen
+    assert 'completeness' not in result  # a world alone has no samples
 
 
 def test_complete_is_a_map_of_what_the_drive_saw_without_its_noise(ground):

@@ -32,7 +32,7 @@ from test.bags.recorded import (
     write_ros1,
     write_rosbag2,
 )
-from test.offline.test_replay import expected_digest, points_of
+from test.offline.test_bag_recording import expected_digest, points_of
 
 NO_TURN = (0.0, 0.0, 0.0, 1.0)
 STAMPS = START_NS + PERIOD_NS * np.arange(NUM_SCANS)
@@ -328,10 +328,10 @@ def test_a_scan_that_does_not_read_is_counted(tmp_path):
 @pytest.mark.parametrize(
     ('number', 'format_', 'request_', 'says'),
     [
-        (6, None, {}, 'scans without poses; name a file of poses with --poses'),
+        (6, None, {'poses_from': 'tf'}, 'no messages with poses'),
         (5, 'kitti', {}, '5 poses without times for 6 scans'),
         (5, 'tum', {}, '5 poses for 6 scans, expected as many, or names that are times'),
-        (6, 'tum', {'topics': ('/points',)}, 'a folder of scans has no topic /points'),
+        (6, 'tum', {'topics': ('/points',)}, 'files of scans have no topic /points'),
     ],
 )
 def test_scans_whose_poses_are_not_known_are_refused(tmp_path, number, format_, request_, says):

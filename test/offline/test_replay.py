@@ -1,168 +1,100 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag maps to what its scans and poses say, whichever way the poses come."""
+"""``surfel_mapper.replay`` writes and returns what the verb replay does."""
 
-import sqlite3
+import json
 
 import numpy as np
 import pytest
 
-from surfel_mapper import Config, Mapper, SurfelMap
-from surfel_mapper.bags.reader import BagReader
-from surfel_mapper.errors import BagError
-from surfel_mapper.offline.bag_recording import feed
-from surfel_mapper.offline.pose_sources import pose_topics
-from surfel_mapper.offline.replay import ALL_SCANS
-from test.bags.recorded import (
-    CLOUD,
-    drive,
-    HEIGHT_M,
-    MOUNT_M,
-    NUM_SCANS,
-    ODOMETRY,
-    POSE,
-    ROS1,
-    START_NS,
-    TF,
-    write_ros1,
-    write_rosbag2,
-)
-
-MOUNTED = {'frames.base_to_sensor': [*MOUNT_M, 0.0, 0.0, 0.0, 1.0]}
+from surfel_mapper import Config, replay
+from surfel_mapper.cli.main import main
+from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.offline.replay import ReplayOptions
+from surfel_mapper.offline.request import Request
+from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
 
 
-def mapped(path, settings, pose_topic=None, cloud_topic='/points'):
-    """Replay a bag and return the mapper."""
-    mapper = Mapper(Config.from_mapping({**ALL_SCANS, **settings}))
-    with BagReader(path) as reader:
-        poses = pose_topics(reader.topics, mapper.config, pose_topic)
-        for _ in feed(reader, mapper, cloud_topic, poses):
-            pass
-    return mapper
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory):
+    return write_rosbag2(tmp_path_factory.mktemp('bags') / 'drive', drive())
 
 
-def points_of(message):
-    columns = message.data.view('<f4').reshape(-1, 4)
-    return columns[:, :3].astype(np.float64)
+def test_a_replay_in_python_is_that_of_the_verb(bag, tmp_path):
+    assert main(['replay', str(bag), '--output', str(tmp_path / 'verb')]) == 0
+
+    result = replay(bag, output=tmp_path / 'call')
+
+    written = json.loads((tmp_path / 'call' / 'summary.json').read_text())
+    assert json.loads(json.dumps(result.summary)) == written
+    assert [path.name for path in result.written] == [
+        'map.ply',
+        'map.png',
+        'report.html',
+        'summary.json',
+    ]
+    expected = json.loads((tmp_path / 'verb' / 'summary.json').read_text())
+    for values in (written, expected):
+        del values['replay_s'], values['milliseconds']
+    assert written == expected
+    assert result.mapper.map.digest() == expected['digest']
+    ply = [(tmp_path / name / 'map.ply').read_bytes() for name in ('call', 'verb')]
+    assert ply[0] == ply[1]
 
 
-def expected_digest(entries):
-    """Map the drive by hand: it does not turn, so every pose is a shift."""
-    surfel_map = SurfelMap(Config().map.voxel_size_m)
-    clouds = [message for _, type_, _, message in entries if type_ == CLOUD]
-    for i, message in enumerate(clouds):
-        origin = np.array([0.5 * i, 0.0, HEIGHT_M]) + MOUNT_M
-        surfel_map.add(points_of(message) + origin, origin=origin)
-    return surfel_map.digest()
+def test_options_and_a_part_are_followed(bag, tmp_path):
+    poses = tmp_path / 'poses.tum'
+    options = ReplayOptions(window=True, formats=('npz',), poses_out=poses)
+    config = Config.from_mapping({'window.max_scans': 2})
+    counts = []
+
+    result = replay(
+        Request(path=bag, every=2),
+        output=tmp_path / 'out',
+        config=config,
+        options=options,
+        progress=lambda done, total: counts.append((done, total)),
+    )
+
+    assert counts == [(done, NUM_SCANS // 2) for done in range(1, NUM_SCANS // 2 + 1)]
+    assert len(result.mapper.window) == 2
+    assert load_map(tmp_path / 'out' / 'map.npz')[0].digest() == result.summary['digest']
+    np.testing.assert_array_equal(read_trajectory(poses).stamp_ns, result.trajectory.stamps_ns)
+    assert result.trajectory.stamps_ns[0] == START_NS
 
 
-@pytest.mark.parametrize('source', ['tf', 'odometry', 'pose'])
-@pytest.mark.parametrize('mount', [{}, MOUNTED])
-def test_every_source_of_poses_gives_the_map_made_by_hand(tmp_path, source, mount):
-    entries = drive()
+def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
+    done = []
+    result = replay(
+        bag,
+        output=tmp_path / 'out',
+        progress=lambda *counts: done.append(counts),
+        stopped=lambda: len(done) == 3,
+    )
+    assert result.summary['interrupted']
+    assert result.summary['scans']['mapped'] == 3
 
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {'pose.source': source, **mount})
-
-    assert mapper.counters.mapped == NUM_SCANS
-    assert mapper.map.digest() == expected_digest(entries)
-
-
-def test_a_ros1_bag_gives_the_same_map(tmp_path):
-    mapper = mapped(write_ros1(tmp_path / 'a.bag', drive(ROS1)), {})
-
-    assert mapper.map.digest() == expected_digest(drive())
-
-
-def test_with_identity_clouds_are_mapped_as_they_are(tmp_path):
-    entries = [row for row in drive() if row[1] == CLOUD]
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {'pose.source': 'identity'})
-
-    expected = SurfelMap(Config().map.voxel_size_m)
-    for *_, message in entries:
-        expected.add(points_of(message))
-    assert mapper.map.digest() == expected.digest()
-
-
-def test_transforms_under_a_name_of_their_own_are_used(tmp_path):
-    names = {'/tf': '/robot/tf', '/tf_static': '/robot/tf_static'}
-    entries = [(names.get(name, name), *rest) for name, *rest in drive()]
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {})
-
-    assert mapper.counters.mapped == NUM_SCANS
-
-
-def test_static_transforms_alone_do_for_a_sensor_at_rest(tmp_path):
-    entries = [row for row in drive() if row[0] in ('/tf_static', '/points')]
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {'frames.fixed': 'base_link'})
-
-    assert mapper.counters.mapped == NUM_SCANS
-
-
-def test_a_cloud_that_cannot_be_decoded_is_counted_and_the_rest_is_mapped(tmp_path):
-    entries = drive()
-    bad = [message for _, type_, _, message in entries if type_ == CLOUD][2]
-    bad.point_step = 15
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), {})
-
-    assert mapper.counters.received == NUM_SCANS
-    assert mapper.counters.mapped == NUM_SCANS - 1
-    assert sum(mapper.counters.dropped.values()) == 1
-
-
-def test_a_pose_message_of_another_content_is_counted_and_its_scan_dropped(tmp_path):
-    path = write_rosbag2(tmp_path / 'a', drive(), 'sqlite3')
-    with BagReader(path) as reader:
-        raw = [bytes(message.raw) for message in reader.messages(['/odom'])][3]
-    with sqlite3.connect(path / 'a.db3') as database:
-        database.execute('UPDATE messages SET data = ? WHERE data = ?', (raw[:50], raw))
-
-    mapper = mapped(path, {'pose.source': 'odometry', 'pose.max_wait_s': 0.0})
-
-    assert sum(mapper.counters.messages_ignored.values()) == 1
-    assert mapper.counters.mapped >= NUM_SCANS - 1  # between two others the pose is interpolated
-
-
-def test_scans_before_the_first_pose_are_dropped_and_counted(tmp_path):
-    entries = [row for row in drive() if row[1] not in (ODOMETRY, TF) or row[2] != START_NS]
-    settings = {'pose.source': 'odometry', **MOUNTED}
-
-    mapper = mapped(write_rosbag2(tmp_path / 'a', entries), settings)
-
-    assert mapper.counters.mapped == NUM_SCANS - 1
-    assert dict(mapper.counters.dropped) == {'no_pose': 1}
+    with pytest.raises(MapError, match='stopped before a scan was mapped'):
+        replay(bag, output=tmp_path / 'none', stopped=lambda: True)
+    assert not (tmp_path / 'none').exists()
 
 
 @pytest.mark.parametrize(
-    ('kept', 'source', 'topic', 'says'),
+    ('options', 'config', 'error', 'says'),
     [
-        ((CLOUD, ODOMETRY), 'tf', None, r'pose.source is tf, .* offers odometry \(/odom\)'),
-        ((CLOUD, POSE, TF), 'odometry', None, r'offers tf \(/tf, /tf_static\), pose \(/pose\)'),
-        ((CLOUD,), 'pose', None, 'offers no poses at all; identity maps'),
-        ((CLOUD, ODOMETRY), 'odometry', '/odm', 'no topic /odm; Odometry topics: /odom'),
-        ((CLOUD, TF), 'tf', '/points', '/points is of type .*, not TFMessage; .*: /tf,'),
+        ({'formats': ('stl',)}, None, ConfigError, "formats: 'stl', expected some of ply"),
+        ({'formats': ('dxf',)}, None, ConfigError, 'layers.models.enabled: true'),
+        ({}, {'frames.fixed': 'map'}, BagError, 'none of 6 clouds of /points was mapped'),
     ],
 )
-def test_a_source_that_the_bag_lacks_is_refused_with_what_it_offers(
-    tmp_path, kept, source, topic, says
-):
-    path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] in kept])
-
-    with pytest.raises(BagError, match=says):
-        mapped(path, {'pose.source': source}, topic)
-
-
-def test_one_of_two_odometries_has_to_be_named_unless_it_is_called_odom(tmp_path):
-    entries = drive()
-    both = [*entries, *(('/wheels', *row[1:]) for row in entries if row[1] == ODOMETRY)]
-    neither = [('/lidar' if row[0] == '/odom' else row[0], *row[1:]) for row in both]
-    settings = {'pose.source': 'odometry'}
-
-    assert mapped(write_rosbag2(tmp_path / 'a', both), settings).counters.mapped == NUM_SCANS
-    path = write_rosbag2(tmp_path / 'b', sorted(neither, key=lambda row: row[2]))
-    with pytest.raises(BagError, match='Odometry topics: /lidar, /wheels'):
-        mapped(path, settings)
-    assert mapped(path, settings, '/wheels').counters.mapped == NUM_SCANS
+def test_wrong_options_are_refused_and_leave_nothing(bag, tmp_path, options, config, error, says):
+    with pytest.raises(error, match=says):
+        replay(
+            bag,
+            output=tmp_path / 'out',
+            config=Config.from_mapping(config or {}),
+            options=ReplayOptions(**options),
+        )
+    assert not (tmp_path / 'out').exists()

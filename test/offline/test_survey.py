@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What a survey promises of a bag is what a replay with its settings finds."""
+"""A replay with the settings of a survey finds the poses that the survey promises."""
 
 from itertools import pairwise
 import sqlite3
