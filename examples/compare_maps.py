@@ -3,8 +3,8 @@
 """
 Changes from one map to another: new surfels, lost surfels, turned surfels.
 
-    surfel-mapper replay monday/ --formats ply,npz --output monday_map/
-    surfel-mapper replay tuesday/ --formats ply,npz --output tuesday_map/
+    surfel-mapper replay monday/ --output monday_map/
+    surfel-mapper replay tuesday/ --output tuesday_map/
     python examples/compare_maps.py monday_map/map.npz tuesday_map/map.npz --output changes.ply
 
 Both maps have to be in one frame and of one voxel size. Equal digests show that they are equal

@@ -3,7 +3,7 @@
 """
 Costs of slopes and steps as a map for Nav2's map server.
 
-    surfel-mapper replay street/ --formats ply,npz --output mapped/
+    surfel-mapper replay street/ --output mapped/
     python examples/slope_costs.py mapped/map.npz costs --max-slope 20
     ros2 run nav2_map_server map_server --ros-args -p yaml_filename:=costs.yaml
 

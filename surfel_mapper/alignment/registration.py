@@ -25,7 +25,15 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.surfel_planes import PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
-from surfel_mapper.geometry import compose, pose_matrix, q_xyzw, se3_exp, Transform
+from surfel_mapper.geometry import (
+    compose,
+    inverse,
+    pose_matrix,
+    q_xyzw,
+    rotation_angle,
+    se3_exp,
+    Transform,
+)
 from surfel_mapper.kernels.layout import BITS, HALF
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import Reducer
@@ -43,8 +51,17 @@ SEARCH_STEP_DEG = 7.5
 SEARCH_CELLS = 3000
 """Maximum number of cells that the heading search uses."""
 
-SEARCH_STARTS = 3
-"""Number of best headings from which the scan is aligned."""
+SEARCH_STARTS = 4
+"""Number of best places of the search from which the whole scan is aligned."""
+
+AMBIGUOUS = 0.85
+"""Places with this share of the best support fit equally well; the nearest is taken."""
+
+FARTHER = 1.5
+"""A place that needs this times the motion of the nearest is no rival of it."""
+
+SAME_PLACE_DEG = 10.0
+"""Poses of the search that differ by less, and by less than a voxel, are one place."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -73,6 +90,9 @@ class RegistrationResult:
         Directions in which the prediction is kept, unit vectors, rotations scaled by ``radius_m``.
     radius_m : float
         Root mean square lever of the cells, by which rotations are scaled.
+    rival : float
+        Support of another place that fits about equally well and is about as near to the starts;
+        0 if there is none, or if the first start fitted and no search was needed.
 
     """
 
@@ -85,6 +105,7 @@ class RegistrationResult:
     information: npt.NDArray[np.float64]
     degenerate: npt.NDArray[np.float64]
     radius_m: float
+    rival: float = 0.0
 
     @property
     def support(self) -> float:
@@ -154,10 +175,33 @@ class Registration:
             width_m = levels.voxel_size_m(self.config.coarse_levels)
             others = [
                 self._descend(cells, levels, start, width_m)
-                for start in self._headings(cells, levels, starts)
+                for start in self._places(cells, levels, starts)
             ]
-            found = max([found, *others], key=lambda other: (other.converged, other.support))
+            found = self._chosen([found, *others], starts)
         return found
+
+    def _chosen(
+        self, places: Sequence[RegistrationResult], starts: Sequence[Transform]
+    ) -> RegistrationResult:
+        """Return the nearest of the places that fit about equally well, with its rival."""
+        best = max(places, key=lambda place: (place.converged, place.support))
+        if not (best.converged and best.support > 0.0):
+            return best
+
+        def motion_m(place: RegistrationResult) -> float:
+            off = [compose(inverse(start), place.T_map_sensor) for start in starts]
+            return min(math.hypot(*T[:3, 3], best.radius_m * rotation_angle(T)) for T in off)
+
+        equal = [p for p in places if p.converged and p.support >= AMBIGUOUS * best.support]
+        nearest = min(equal, key=motion_m)
+        reach_m = FARTHER * motion_m(nearest)
+        rivals = [
+            place.support
+            for place in equal
+            if motion_m(place) < reach_m
+            and not is_near(place.T_map_sensor, nearest.T_map_sensor, self._voxel_size_m)
+        ]
+        return replace(nearest, rival=max(rivals, default=0.0))
 
     def fits(self, alignment: RegistrationResult) -> bool:
         """Return whether overlap and fit reach their minimum."""
@@ -221,25 +265,49 @@ class Registration:
             radius_m=radius_m,
         )
 
-    def _headings(
+    def _places(
         self, cells: npt.NDArray[np.float64], levels: PlaneLevels, starts: Sequence[Transform]
     ) -> list[Transform]:
-        """Return the best starts and headings of the heading search."""
+        """
+        Return the best places that a coarse alignment of some cells finds.
+
+        Every start is turned in steps, aligned to the largest voxels, and kept unless it arrives
+        at a place that is already known. Comparing headings without aligning them would compare
+        errors of position: a hall of two symmetries then takes the wrong corner.
+        """
         num = int(self.config.search_deg / SEARCH_STEP_DEG)
-        if not num:
-            return list(starts[1:])
+        level = self.config.coarse_levels
         some = np.ascontiguousarray(cells[:: max(len(cells) // SEARCH_CELLS, 1)])
-        planes = levels.planes(self.config.coarse_levels)
-        width_m = levels.voxel_size_m(self.config.coarse_levels)
-        turned = [
-            moved(start, np.array([0.0, 0.0, 0.0, 0.0, 0.0, math.radians(k * SEARCH_STEP_DEG)]))
-            for start in starts
-            for k in range(-num, num + 1)
+        size_m = levels.voxel_size_m(level)
+        found = [
+            self._converge(some, levels.planes(level), start, size_m, COARSE_TOLERANCE * size_m)
+            for start in turned(starts, num)
         ]
-        found = [planes.equations(some, pose, width_m) for pose in turned]
-        support = [overlap * fit for _, _, overlap, fit in found]
-        best = np.argsort(support, kind='stable')[::-1][:SEARCH_STARTS]
-        return [turned[place] for place in best]
+        places: list[Transform] = []
+        for each in sorted(found, key=lambda other: other.support, reverse=True):
+            pose = each.T_map_sensor
+            if not any(is_near(pose, place, self._voxel_size_m) for place in places):
+                places.append(pose)
+            if len(places) == SEARCH_STARTS:
+                break
+        return places
+
+
+def turned(starts: Sequence[Transform], num: int) -> list[Transform]:
+    """Return starts turned about the vertical by up to ``num`` steps to both sides."""
+    steps = [math.radians(k * SEARCH_STEP_DEG) for k in range(-num, num + 1)]
+    return [
+        moved(start, np.array([0.0, 0.0, 0.0, 0.0, 0.0, angle]))
+        for start in starts
+        for angle in steps
+    ]
+
+
+def is_near(T_a: Transform, T_b: Transform, distance_m: float) -> bool:
+    """Return whether two poses are at the same place within a distance and SAME_PLACE_DEG."""
+    off = compose(inverse(T_a), T_b)
+    is_close = math.dist(T_a[:3, 3], T_b[:3, 3]) < distance_m
+    return is_close and rotation_angle(off) < math.radians(SAME_PLACE_DEG)
 
 
 def means(moments: ScanMoments) -> npt.NDArray[np.float64]:

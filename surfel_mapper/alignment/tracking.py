@@ -58,11 +58,14 @@ class Tracker:
         The last T_fixed_body.
     twist : (6,) float64
         The last velocity, m/s and rad/s, in the frame of the body.
+    num_ambiguous : int
+        Number of scans that fitted the map at two places.
 
     """
 
     def __init__(self, registration: Registration, start: Transform) -> None:
         self._registration = registration
+        self.num_ambiguous = 0
         self.restart(start)
 
     def restart(self, T_fixed_body: Transform) -> None:
@@ -125,7 +128,8 @@ class Tracker:
         Raises
         ------
         AlignmentError
-            If the scan does not fit the map. The predicted velocity is halved then.
+            If the scan does not fit the map, or fits it at two places about equally well. The
+            predicted velocity is halved then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
@@ -135,7 +139,9 @@ class Tracker:
         expected = EXPECTED_SUPPORT * usual
         found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
         is_steady = found.converged or found.support >= expected > 0.0
-        if not (is_steady and self._registration.fits(found)):
+        is_ambiguous = found.rival > 0.0
+        self.num_ambiguous += is_ambiguous and is_steady
+        if is_ambiguous or not (is_steady and self._registration.fits(found)):
             self._clear_history()
             self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
             raise AlignmentError(self._refusal(found))
@@ -151,6 +157,11 @@ class Tracker:
             f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
             f'{found.fit:.0%} of these fit it'
         )
+        if found.rival > 0.0:
+            return (
+                f'{said}, but another place fits {found.rival / max(found.support, 1e-9):.0%} as '
+                'well: its pose is ambiguous'
+            )
         if self._registration.fits(found):
             return f'{said}, but its pose has not settled (registration.max_iterations)'
         return (

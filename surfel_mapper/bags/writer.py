@@ -90,7 +90,8 @@ class BagWriter:
         """Give the bag its name, or remove the incomplete bag after an error."""
         try:
             if kind is not None:
-                self._writer.abort()
+                with suppress(OSError):  # of a full disk, and the error on its way says more
+                    self._writer.abort()
                 return
             with self._refusing():
                 self._writer.close()

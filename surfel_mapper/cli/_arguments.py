@@ -9,10 +9,46 @@ On its own because no verb imports another.
 from __future__ import annotations
 
 import argparse
+from difflib import get_close_matches
 import math
+import re
+from typing import NoReturn
 
 CUT, INTERRUPTED = 3, 130
 """Exit codes: a recording ends too early and --strict was given; Ctrl-C ended the work."""
+
+
+class UsageError(Exception):
+    """Options that do not go together; exit code 2."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser that names the nearest option or verb for one that does not exist."""
+
+    def error(self, message: str) -> NoReturn:
+        """Print usage and message, with the nearest known words, and exit with 2."""
+        found = re.match(r"argument VERB: invalid choice: '([^']*)'", message)
+        if found:
+            actions = (a for a in self._actions if isinstance(a, argparse._SubParsersAction))
+            verbs = [verb for action in actions for verb in action.choices]
+            message = (
+                f'no verb {found[1]!r}{nearest(found[1], verbs) or ";"} verbs: {", ".join(verbs)}'
+            )
+        super().error(message)
+
+    def refuse_unknown(self, words: list[str]) -> NoReturn:
+        """Exit with 2 for words that are no arguments, naming the nearest option of each."""
+        known = [option for action in self._actions for option in action.option_strings]
+        options = [word.partition('=')[0] for word in words if word.startswith('-')]
+        if not options:
+            self.error(f'too many arguments: {" ".join(words)}')
+        self.error('; '.join(f'no option {word}{nearest(word, known)}' for word in options))
+
+
+def nearest(word: str, known: list[str]) -> str:
+    """Return a question with the nearest known word; empty if none is near."""
+    close = get_close_matches(word, known, n=1)
+    return f', did you mean {close[0]}?' if close else ''
 
 
 def positive_int(text: str) -> int:
@@ -30,6 +66,17 @@ def positive_float(text: str) -> float:
         value = math.nan
     if not 0.0 < value < math.inf:
         raise argparse.ArgumentTypeError(f'{text!r}, expected a positive number')
+    return value
+
+
+def seconds(text: str) -> float:
+    """Return a finite number of zero or more."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 <= value < math.inf:
+        raise argparse.ArgumentTypeError(f'{text!r}, expected seconds, zero or more')
     return value
 
 

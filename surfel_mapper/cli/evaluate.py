@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_float
+from surfel_mapper.cli._arguments import positive_float, positive_int
 from surfel_mapper.errors import FileFormatError
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--min-points',
-        type=int,
+        type=positive_int,
         default=5,
         metavar='N',
         help='points that a voxel needs to count as a surfel (%(default)s)',

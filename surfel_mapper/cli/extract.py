@@ -32,7 +32,10 @@ FORMATS = ('json', 'obj', 'parquet', 'dxf')
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.add_argument(
-        'cloud', type=Path, metavar='CLOUD|MAP', help='.ply, .pcd, .bin; or a map, .npz, .parquet'
+        'cloud',
+        type=Path,
+        metavar='CLOUD|MAP',
+        help='.ply, .pcd, .bin, .las; or a map: .npz, .parquet, output of a replay',
     )
     parser.add_argument('--output', type=Path, required=True, metavar='DIR', help='made if needed')
     parser.add_argument(
@@ -111,6 +114,7 @@ def read(
     from surfel_mapper.files.scan_files import read_scan, SUFFIXES
     from surfel_mapper.models.fitting import above, surfel_points
 
+    args.cloud = map_in(args.cloud)
     if args.cloud.suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
@@ -125,12 +129,29 @@ def read(
         points: npt.NDArray[Any] = surfel_points(surfels, surfel_map.voxel_size_m)
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:
-        points, _ = read_scan(args.cloud)
+        points, columns = read_scan(args.cloud)
+        if {'planarity', 'curvature', 'num_points'} <= set(columns):
+            raise FileFormatError(
+                f'{args.cloud}: surfels of a map, not points of a cloud; expected its map.npz or '
+                'the output directory of the replay'
+            )
         points = np.ascontiguousarray(points)
         voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
     if args.viewpoint is not None:
         viewpoint = np.array(args.viewpoint)
     return points, args.voxel_size if args.voxel_size is not None else voxel_size_m, viewpoint
+
+
+def map_in(path: Path) -> Path:
+    """Return the exact map in an output directory of a replay; another path as it is."""
+    from surfel_mapper.errors import FileFormatError
+
+    if not path.is_dir():
+        return path
+    for name in ('map.npz', 'map.parquet'):
+        if (path / name).is_file():
+            return path / name
+    raise FileFormatError(f'{path}: no map.npz or map.parquet in this directory')
 
 
 def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:

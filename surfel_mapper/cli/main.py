@@ -23,6 +23,7 @@ import sys
 from types import ModuleType
 
 import surfel_mapper
+from surfel_mapper.cli._arguments import Parser, UsageError
 from surfel_mapper.errors import SurfelMapperError
 
 VERBS = (
@@ -52,7 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     """
     arguments, ros_args = without_ros_args(sys.argv[1:] if argv is None else argv)
-    args = parser_of(arguments).parse_args(arguments)
+    args, unknown = parser_of(arguments).parse_known_args(arguments)
+    if unknown:
+        args.parser.refuse_unknown(unknown)
     args.ros_args = ros_args
     logging.basicConfig(format=f'surfel-mapper {args.verb}: %(message)s', level=logging.WARNING)
     try:
@@ -62,6 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except UsageError as error:
+        args.parser.print_usage(sys.stderr)
+        return refused(args.verb, str(error), 2)
     except SurfelMapperError as error:
         return refused(args.verb, str(error))
     except OSError as error:
@@ -72,10 +78,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def refused(verb: str, message: str) -> int:
-    """Print why a verb ended without a result, and return the exit code for it."""
+def refused(verb: str, message: str, code: int = 1) -> int:
+    """Print why a verb ended without a result, and return the exit code."""
     print(f'surfel-mapper {verb}: {message}', file=sys.stderr)
-    return 1
+    return code
 
 
 def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:
@@ -89,10 +95,10 @@ def without_ros_args(argv: Sequence[str]) -> tuple[list[str], list[str]]:
     return arguments[:cut], arguments[cut:]
 
 
-def parser_of(arguments: Sequence[str]) -> argparse.ArgumentParser:
+def parser_of(arguments: Sequence[str]) -> Parser:
     """Return the parser for some arguments; all verbs are loaded only if none is named."""
     about = str(surfel_mapper.__doc__).strip().partition('\n\n')[0]
-    parser = argparse.ArgumentParser(prog='surfel-mapper', description=about, epilog=EPILOG)
+    parser = Parser(prog='surfel-mapper', description=about, epilog=EPILOG)
     version = f'surfel-mapper {surfel_mapper.__version__}'
     parser.add_argument('--version', action='version', version=version)
     verbs = parser.add_subparsers(dest='verb', metavar='VERB', required=True, title='verbs')
@@ -103,9 +109,7 @@ def parser_of(arguments: Sequence[str]) -> argparse.ArgumentParser:
     return parser
 
 
-def add_verb(
-    verbs: argparse._SubParsersAction[argparse.ArgumentParser], verb: str, module: ModuleType
-) -> None:
+def add_verb(verbs: argparse._SubParsersAction[Parser], verb: str, module: ModuleType) -> None:
     """Add the parser of one verb."""
     parser = verbs.add_parser(
         verb,
@@ -115,7 +119,7 @@ def add_verb(
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     module.add_arguments(parser)
-    parser.set_defaults(run=module.run)
+    parser.set_defaults(run=module.run, parser=parser)
 
 
 if __name__ == '__main__':

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=Path,
         metavar='DIR',
-        help='output of a replay with --formats parquet or --workers, of a merge, or map.parquet',
+        help='output of a replay or a merge, or a file of it, map.npz or map.parquet',
     )
     add('--output', type=Path, required=True, metavar='DIR', help='directory to write to')
     add(

@@ -13,7 +13,7 @@ import json
 from pathlib import Path
 import sys
 
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.cli._arguments import positive_float, seconds
 
 SUMMARY = 'Publish the messages of a bag over DDS at the pace of their record times.'
 
@@ -25,7 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add('bag', type=Path, metavar='BAG', help='rosbag2 directory, or a .mcap or .db3 file')
     add('--topics', nargs='+', metavar='T', help='play only these')
-    add('--rate', type=float, default=1.0, metavar='R', help='factor of the pace (%(default)s)')
+    add(
+        '--rate',
+        type=positive_float,
+        default=1.0,
+        metavar='R',
+        help='of the pace (%(default)s)',
+    )
     add('--loop', action='store_true', help='start again at the end')
     add('--clock', action='store_true', help='publish the record time on /clock')
     add(
@@ -37,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--timeout',
-        type=float,
+        type=seconds,
         default=60.0,
         metavar='S',
         help='longest wait for subscribers, s (%(default)s)',
@@ -50,8 +56,6 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.bags.reader import BagReader
     from surfel_mapper.cli._ros import loading_ros
 
-    if not args.rate > 0.0:
-        raise ConfigError(f'rate: {args.rate}, expected more than 0')
     with BagReader(args.bag) as reader, loading_ros():
         from surfel_mapper.ros.player import play
 

@@ -17,9 +17,17 @@ import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import add_workers, CUT, INTERRUPTED
+from surfel_mapper.cli._arguments import (
+    add_workers,
+    CUT,
+    INTERRUPTED,
+    positive_float,
+    positive_int,
+    seconds,
+    UsageError,
+)
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
-from surfel_mapper.errors import ConfigError, MapError
+from surfel_mapper.errors import MapError
 from surfel_mapper.offline.outputs import FORMATS, output_directory
 from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.offline.request import Request
@@ -89,9 +97,9 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
         choices=('tum', 'kitti', 'csv'),
         help='its format (default: recognised by its first line)',
     )
-    add('--start', type=float, default=0.0, metavar='S', help='leave out the first S seconds')
-    add('--duration', type=float, default=math.inf, metavar='S', help='map S seconds')
-    add('--every', type=int, default=1, metavar='N', help='map one cloud of every N')
+    add('--start', type=seconds, default=0.0, metavar='S', help='leave out the first S seconds')
+    add('--duration', type=positive_float, default=math.inf, metavar='S', help='map S seconds')
+    add('--every', type=positive_int, default=1, metavar='N', help='map one cloud of every N')
     add(
         '--window',
         action='store_true',
@@ -112,7 +120,8 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         '--formats',
         type=formats,
         metavar='LIST',
-        help=f'of the map (dxf: of its models), with a comma between: {", ".join(FORMATS)} (ply)',
+        help='of the map (dxf: of its models), with a comma between: '
+        f'{", ".join(FORMATS)} (ply,npz)',
     )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
@@ -152,6 +161,11 @@ def formats(text: str) -> tuple[str, ...]:
 
 def run(args: argparse.Namespace) -> int:
     """Map one recording or many, and report."""
+    if (args.poses_from == 'file') != (args.poses is not None) and args.poses_from is not None:
+        raise UsageError(
+            f'--poses-from {args.poses_from} and --poses {args.poses}: expected both '
+            'for a file of poses, else no --poses'
+        )
     is_many = len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
     with stopped_by_interrupt() as stopped:
         with progress('replay', 'recorded second' if is_many else 'scan') as show:
@@ -193,7 +207,7 @@ def replay_many(args: argparse.Namespace, options: dict[str, Any]) -> Any:
 
     given = [name for name in ONE_PROCESS if getattr(args, name)]
     if given:
-        raise ConfigError(
+        raise UsageError(
             f'--{given[0].replace("_", "-")}: not with several bags, --workers or --scheduler, '
             'where no process holds the whole map'
         )

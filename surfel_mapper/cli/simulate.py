@@ -6,11 +6,11 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import time
 from typing import TYPE_CHECKING
 
+from surfel_mapper.cli._arguments import positive_float, positive_int, UsageError
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.offline.summary import rounded
 
@@ -33,8 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--overwrite', action='store_true', help='replace an existing bag')
     add('--storage', choices=['mcap', 'sqlite3'], default='mcap', help='format (%(default)s)')
     length = parser.add_mutually_exclusive_group()
-    length.add_argument('--scans', type=int, default=100, metavar='N', help='number (%(default)s)')
-    length.add_argument('--duration', type=float, metavar='S', help='s, instead of --scans')
+    length.add_argument(
+        '--scans', type=positive_int, default=100, metavar='N', help='number (%(default)s)'
+    )
+    length.add_argument(
+        '--duration', type=positive_float, metavar='S', help='s, instead of --scans'
+    )
     add('--speed', type=float, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
     add('--beams', type=int, default=64, metavar='N', help='points a column (%(default)s)')
     add('--columns', type=int, default=2048, metavar='N', help='points a turn (%(default)s)')
@@ -53,7 +57,10 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.scan import Scan
     from surfel_mapper.simulation import record
 
-    simulation = simulation_of(args)
+    try:
+        simulation = simulation_of(args)
+    except ConfigError as error:  # the options are its only settings
+        raise UsageError(str(error)) from error
     returns = 0
     begin = time.perf_counter()
     bar = tqdm(total=simulation.num_scans, unit='scan', disable=not sys.stderr.isatty())
@@ -106,8 +113,6 @@ def simulation_of(args: argparse.Namespace) -> Simulation:
     drive = Drive(start=tuple(street_pose()), speed_m_s=args.speed)
     num_scans = args.scans
     if args.duration is not None:
-        if not 0.0 < args.duration < math.inf:
-            raise ConfigError(f'duration: {args.duration} s, expected positive and finite')
         num_scans = max(round(args.duration * lidar.rate_hz), 1)
     length_m = max(args.speed * num_scans / lidar.rate_hz, 0.0) + SPARE_M
     world = World.street(seed=args.seed, length_m=length_m)

@@ -16,6 +16,7 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cluster.executors import never, open_executor, start_forkserver
+from surfel_mapper.errors import BagError
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
@@ -148,6 +149,16 @@ def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], 
     cuts: list[str] = []
     for request in requests:
         with open_recording(request, config) as recording:
+            found = recording.describe()
+            if (
+                len(requests) > 1
+                and found['poses_from'] == 'registration'
+                and found['poses_reason']
+            ):
+                raise BagError(
+                    f'{request.path}: {found["poses_reason"]}; several recordings that are '
+                    'registered have no common frame, replay them one by one'
+                )
             lengths_s.append(recording.recorded_s)
             cuts += recording.cuts
     return lengths_s, cuts

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from itertools import islice
+import logging
 from pathlib import Path
 import secrets
 import shutil
@@ -25,6 +26,7 @@ import numpy as np
 from surfel_mapper.cluster.executors import Executor
 from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
     kind_of,
@@ -37,16 +39,22 @@ from surfel_mapper.files.parquet_tiles import (
     write_shard,
     write_tile,
 )
+from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.mapping.surfels import Surfels
 
 DATASET = 'map'
 """Directory of the tiles inside the output directory of a replay."""
 
-FILE = 'map.parquet'
-"""File of the map inside the output directory of a replay by one process."""
+FILES = ('map.parquet', 'map.npz')
+"""Files of an exact map inside the output directory of a replay by one process."""
+
+TRAJECTORY = 'trajectory.tum'
+"""File of the poses of its scans there."""
 
 SAMPLE = 100_000
 """About this many surfels are returned for pictures."""
+
+_log = logging.getLogger(__name__)
 
 Parts = Mapping[Tile, list[Part]]
 
@@ -183,7 +191,7 @@ def merge_maps(
     Parameters
     ----------
     sources : sequence of str or Path
-        Output directories of a replay or a merge, datasets of tiles, or Parquet files.
+        Output directories of a replay or a merge, datasets of tiles, or files, .parquet or .npz.
     executor : Executor
         Runs the tasks.
     directory : Path
@@ -212,6 +220,7 @@ def merge_maps(
                 kinds[source] = kind_of(part.path)
             found += parts
         check_kinds(kinds)
+        warn_of_repeated_scans(sources)
         return merge_parts(parts_by_tile(found), executor, directory, min_points, on_done)
 
 
@@ -267,7 +276,7 @@ def parts_of_map(source: str | Path, work: Path) -> list[dict[Tile, Part]]:
     Parameters
     ----------
     source : str or Path
-        Output directory of a replay or a merge, a dataset of tiles, or a Parquet file.
+        Output directory of a replay or a merge, a dataset of tiles, or a file, .parquet or .npz.
     work : Path
         Directory for the parts of a map that is cut.
 
@@ -282,11 +291,17 @@ def parts_of_map(source: str | Path, work: Path) -> list[dict[Tile, Part]]:
         tiles = tiles_in(directory) if directory.is_dir() else {}
         if tiles:
             return [{tile: tile_part(file) for tile, file in tiles.items()}]
-    file = path / FILE if path.is_dir() else path
+    file = next((path / name for name in FILES if (path / name).is_file()), path)
     if not file.is_file():
         raise FileFormatError(
-            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, or the {FILE} of '
-            'surfel-mapper replay --formats parquet'
+            f'{source}: no map; expected {DATASET}/tile_i=*/tile_j=*/, or {" or ".join(FILES)} of '
+            'surfel-mapper replay'
+        )
+    if file.suffix == '.npz':
+        return [write_shard(work / 'piece.parquet', load_map(file)[0])]
+    if file.suffix != '.parquet':
+        raise FileFormatError(
+            f'{file}: not an exact map; expected .npz or .parquet, or a directory'
         )
     return [
         write_shard(work / f'piece-{number}.parquet', piece)
@@ -303,6 +318,27 @@ def check_kinds(kinds: Mapping[str | Path, Mapping[str, Any]]) -> None:
                 raise MapError(
                     f'{source}: {name} {value}, expected {expected[name]} as in {first}'
                 )
+
+
+def warn_of_repeated_scans(sources: Sequence[str | Path]) -> None:
+    """Log a warning if two maps contain scans of equal stamps, by the trajectories beside them."""
+    seen: dict[int, str | Path] = {}
+    for source in sources:
+        folder = Path(source) if Path(source).is_dir() else Path(source).parent
+        path = folder / TRAJECTORY
+        stamps = read_trajectory(path).stamp_ns if path.is_file() else None
+        stamps_ns = set() if stamps is None else set(stamps.tolist())
+        repeated = seen.keys() & stamps_ns
+        if repeated:
+            _log.warning(
+                '%s: %d of its %d scans have stamps of scans in %s; the points of a drive that is '
+                'merged twice count twice',
+                source,
+                len(repeated),
+                len(stamps_ns),
+                seen[min(repeated)],
+            )
+        seen |= dict.fromkeys(stamps_ns - seen.keys(), source)
 
 
 def take_name(fresh: Path, wanted: Path) -> None:

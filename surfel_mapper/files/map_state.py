@@ -26,6 +26,9 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 
 KIND = 'surfel map'
+
+FILE = 'map.npz'
+"""Name of the file in the output directory of a replay."""
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 
@@ -87,7 +90,8 @@ def load_map(
     Parameters
     ----------
     path : str or Path
-        A file that save_map wrote.
+        A file that save_map wrote, or the output directory of a replay or of ~/save_map, which
+        holds it as map.npz.
     voxel_size_m : float, optional
         The voxel size that is required.
 
@@ -105,6 +109,8 @@ def load_map(
         size.
 
     """
+    if Path(path).is_dir():
+        path = Path(path) / FILE
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')

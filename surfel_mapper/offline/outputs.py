@@ -39,6 +39,9 @@ FORMATS = {
 }
 """File of each format in the output directory; npz and parquet are exact, to be loaded again."""
 
+TRAJECTORY = 'trajectory.tum'
+"""File of the poses of the scans in the output directory."""
+
 
 def output_directory(recording: Path, wanted: Path | None) -> Path:
     """
@@ -66,6 +69,45 @@ def output_directory(recording: Path, wanted: Path | None) -> Path:
     if not os.access(nearest, os.W_OK):
         raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
+
+
+def check_writable(path: Path) -> None:
+    """Raise FileFormatError unless a file can be created or replaced; nothing is written."""
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise FileFormatError(f'{path}: cannot be written: no directory {folder}; create it first')
+    if path.is_dir():
+        raise FileFormatError(f'{path}: cannot be written: it is a directory, expected a file')
+    if not os.access(path if path.exists() else folder, os.W_OK):
+        raise FileFormatError(f'{path}: cannot be written: Permission denied')
+
+
+def check_formats(formats: Sequence[str], output: Path) -> None:
+    """
+    Raise if a format cannot be written: its package is missing, or its path is of another kind.
+
+    Raises
+    ------
+    DependencyError
+        If pyarrow or ezdxf is needed and not installed.
+    FileFormatError
+        If a file of the output directory cannot be written.
+
+    """
+    if 'parquet' in formats:
+        from surfel_mapper.files.parquet import import_pyarrow
+
+        import_pyarrow()
+    if DXF in formats:
+        from surfel_mapper.files.model_files import import_ezdxf
+
+        import_ezdxf()
+    names = [FORMATS[name] for name in formats if name != BAG]
+    for name in [*names, TRAJECTORY, 'map.png', 'report.html', 'summary.json']:
+        if (output / name).exists():
+            check_writable(output / name)
+    if BAG in formats and (output / FORMATS[BAG]).is_file():
+        raise FileFormatError(f'{output / FORMATS[BAG]}: a file, expected a bag or nothing')
 
 
 class ScanTrajectory:
@@ -115,6 +157,21 @@ class ScanTrajectory:
         return self.matrices[:, :3, 3]
 
 
+def write_maps(
+    output: Path,
+    formats: Sequence[str],
+    mapper: Mapper,
+    trajectory: ScanTrajectory,
+    *,
+    window: bool = False,
+) -> None:
+    """Write the map in some formats, and the trajectory; npz with the window if that is kept."""
+    output.mkdir(parents=True, exist_ok=True)
+    for name in formats:
+        write_map(output / FORMATS[name], name, mapper, window=window)
+    trajectory.write(output / TRAJECTORY)
+
+
 def write_files(
     output: Path,
     formats: Sequence[str],
@@ -124,12 +181,12 @@ def write_files(
     history: History,
 ) -> list[Path]:
     """
-    Write the map in some formats, layers, picture, report and summary.
+    Write layers, picture, report and summary, after the map.
 
     Returns
     -------
     list of Path
-        The files of the formats, then picture, report and summary.
+        The files of the formats, then trajectory, picture, report and summary.
 
     """
     from surfel_mapper.files.atomic import write_json
@@ -137,9 +194,6 @@ def write_files(
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
-    output.mkdir(parents=True, exist_ok=True)
-    for name in formats:
-        write_map(output / FORMATS[name], name, mapper)
     meshes, sections = {}, []
     for layer in mapper.layers.values():
         layer.write(output, formats)
@@ -161,10 +215,11 @@ def write_files(
     draw_map(surfels, picture, title, trajectory=trajectory.positions)
     write_report(page, title, summary, surfels, history, picture, meshes, sections)
     write_json(figures, summary)
-    return [*(output / FORMATS[name] for name in formats), picture, page, figures]
+    maps = [output / FORMATS[name] for name in formats]
+    return [*maps, output / TRAJECTORY, picture, page, figures]
 
 
-def write_map(path: Path, name: str, mapper: Mapper) -> None:
+def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) -> None:
     """Write the map in one format."""
     from surfel_mapper.files import map_state, parquet, pcd, ply
 
@@ -176,4 +231,4 @@ def write_map(path: Path, name: str, mapper: Mapper) -> None:
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
     elif name == 'npz':
-        map_state.save_map(path, mapper.map, mapper.window)
+        map_state.save_map(path, mapper.map, mapper.window if window else ())

@@ -19,7 +19,6 @@ from surfel_mapper.errors import BagError, CloudFormatError
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.offline.pose_sources import TYPES
 from surfel_mapper.offline.survey import mounting, Offer, offers, Survey, survey
-from surfel_mapper.sensors.deskew import point_times
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -183,7 +182,7 @@ def choose_for_folder(
     if wanted == 'file' or (has_poses and wanted is None):
         return PoseChoice(config.replace({'pose.source': 'pose'}))
     if wanted == 'identity' or (wanted == 'registration' and request.poses_from is None):
-        return PoseChoice(config)
+        return PoseChoice(config.replace({'pose.source': wanted}))
     if wanted not in (None, 'registration'):
         raise BagError(
             f'{request.path}: a folder of scans has no messages with poses (pose.source '
@@ -231,8 +230,15 @@ def with_registration(config: Config, scans: Sequence[Scan]) -> Config:
     return config.replace(settings)
 
 
+def is_default(config: Config) -> bool:
+    """Return whether a configuration leaves source and frames of the poses open."""
+    return config.pose.source == DEFAULT.pose.source and config.frames == DEFAULT.frames
+
+
 def has_times(scan: Scan) -> bool:
     """Return whether the points of a scan carry times that differ."""
+    from surfel_mapper.sensors.deskew import point_times  # it loads the compiler
+
     try:
         times = point_times(scan)
     except CloudFormatError:

@@ -49,6 +49,8 @@ class PosePath:
         A trajectory; see read_trajectory.
     format_ : str, optional
         tum, kitti or csv.
+    trajectory : Trajectory, optional
+        The poses, if they have been read from the file.
 
     Attributes
     ----------
@@ -57,9 +59,11 @@ class PosePath:
 
     """
 
-    def __init__(self, path: Path, format_: str | None = None) -> None:
+    def __init__(
+        self, path: Path, format_: str | None = None, trajectory: Trajectory | None = None
+    ) -> None:
         self.path = path
-        self.trajectory: Trajectory = read_trajectory(path, format_)
+        self.trajectory = trajectory or read_trajectory(path, format_)
         self._next: int | None = None
 
     @property

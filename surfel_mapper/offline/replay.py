@@ -3,9 +3,10 @@
 """
 Replay: a recording into a map, its picture, a report and figures, in this process.
 
-The files are written when the whole recording is mapped; see outputs.py. A replay that maps
-nothing is an error, because an empty map looks like a result. Heavy modules are imported inside
-functions, so that ``surfel_mapper.replay`` can be named without loading rosbags or matplotlib.
+Outputs are checked before the first scan. The files are written when the whole recording is
+mapped, the map before everything that may fail after it; a viewer that fails ends alone. A replay
+that maps nothing is an error, because an empty map looks like a result. Heavy modules are imported
+inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor matplotlib early.
 """
 
 from __future__ import annotations
@@ -19,7 +20,12 @@ from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.errors import (
+    BagError,
+    ConfigError,
+    MapError,
+    SurfelMapperError,
+)
 from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
@@ -29,6 +35,7 @@ if TYPE_CHECKING:
     from surfel_mapper.offline.recording import Recording
     from surfel_mapper.offline.request import Request
     from surfel_mapper.pipeline import Mapper, Update
+    from surfel_mapper.viz.viewer import Viewer
 
 ALL_SCANS: Mapping[str, Any] = {
     'window.max_scans': 0,
@@ -73,7 +80,7 @@ class ReplayOptions:
 
     window: bool = False
     align: bool = False
-    formats: tuple[str, ...] = ('ply',)
+    formats: tuple[str, ...] = ('ply', 'npz')
     poses_out: Path | None = None
     truth: Path | None = None
     view: bool = False
@@ -153,7 +160,7 @@ def replay(
 
     """
     from surfel_mapper.memory import keep_freed_memory
-    from surfel_mapper.offline.outputs import output_directory, write_files
+    from surfel_mapper.offline.outputs import output_directory, write_files, write_maps
     from surfel_mapper.offline.recording import open_recording
     from surfel_mapper.offline.request import Request
     from surfel_mapper.viz.history import History
@@ -162,11 +169,10 @@ def replay(
     request = path if isinstance(path, Request) else Request(path=Path(path))
     settings = configured(config, options)
     directory = output_directory(request.path, None if output is None else Path(output))
+    check_outputs(directory, options)
     keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
     with open_recording(request, settings) as recording:
         mapper = started_mapper(recording.config)
-        if options.truth is not None:
-            check_truth(options.truth)
         history = History()
         with listeners(directory, options, mapper) as listening:
             listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
@@ -174,9 +180,11 @@ def replay(
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
             replay_s = time.perf_counter() - start_s
             refuse_empty(recording, mapper, was_stopped)
-            aligned = {'alignment': mapper.align().summary()} if options.align else {}
-            mapper.finish_layers()
+            with write_first(partial(write_maps, directory, options.formats, mapper, trajectory)):
+                aligned = {'alignment': mapper.align().summary()} if options.align else {}
             trajectory.follow_alignment(mapper)
+            write_maps(directory, options.formats, mapper, trajectory, window=options.window)
+            mapper.finish_layers()
         summary = {
             **recording.describe(),
             'recorded_s': recording.recorded_s,
@@ -225,6 +233,32 @@ def started_mapper(config: Config) -> Mapper:
     return mapper
 
 
+def check_outputs(directory: Path, options: ReplayOptions) -> None:
+    """Raise if an output cannot be written, shown or compared, before the first scan."""
+    from surfel_mapper.offline.outputs import check_formats, check_writable
+
+    check_formats(options.formats, directory)
+    for path in (options.poses_out, options.rrd):
+        if path is not None:
+            check_writable(path)
+    if options.view or options.rrd is not None:
+        from surfel_mapper.viz.viewer import import_rerun
+
+        import_rerun()
+    if options.truth is not None:
+        check_truth(options.truth)
+
+
+@contextmanager
+def write_first(write: Callable[[], None]) -> Iterator[None]:
+    """Write the map if a block fails, before its error goes on."""
+    try:
+        yield
+    except SurfelMapperError:
+        write()
+        raise
+
+
 @contextmanager
 def listeners(
     directory: Path, options: ReplayOptions, mapper: Mapper
@@ -234,13 +268,23 @@ def listeners(
 
     with ExitStack() as files:
         found = viewers(options, mapper, files)
-        bag = None
-        if BAG in options.formats:
-            bag = normals_bag(directory, mapper, files)
-            found.append(bag.add)
-        yield found
-        if bag is not None:
-            bag.finish()
+        if BAG not in options.formats:
+            yield found
+            return
+        bag, errors = normals_bag(directory, mapper, files), list[BagError]()
+
+        def add(update: Update) -> None:
+            try:
+                if not errors:
+                    bag.add(update)
+            except BagError as error:
+                _log.warning('%s; the rest is mapped without it', error)
+                errors.append(error)
+
+        yield [*found, add]
+        if errors:
+            raise errors[0]  # the map is written by now
+        bag.finish()
 
 
 def viewers(
@@ -253,7 +297,34 @@ def viewers(
         return []
     from surfel_mapper.viz.viewer import Viewer
 
-    return [files.enter_context(Viewer(mapper, path)).add for path in paths]
+    return [files.enter_context(shown(Viewer(mapper, path), path)) for path in paths]
+
+
+@contextmanager
+def shown(viewer: Viewer, path: Path | None) -> Iterator[Callable[[Update], None]]:
+    """
+    Give the callback of a viewer, which ends alone if it fails.
+
+    A viewer is another program that may be closed, and rerun raises errors of many types.
+    """
+    name = 'the viewer' if path is None else str(path)
+    has_failed = False
+
+    def add(update: Update) -> None:
+        nonlocal has_failed
+        if has_failed:
+            return
+        try:
+            viewer.add(update)
+        except Exception as error:
+            has_failed = True
+            _log.warning('%s has failed, the replay goes on without it: %s', name, error)
+
+    yield add
+    try:
+        viewer.__exit__(None if not has_failed else Exception, None, None)
+    except Exception as error:
+        _log.warning('%s could not be closed: %s', name, error)
 
 
 def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:

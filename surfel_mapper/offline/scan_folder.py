@@ -6,7 +6,8 @@ Scans in files, one file each, through the pipeline: a folder of them, or a sing
 With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
 registered. The time of scan i is that of pose i, if there are as many poses as scans; else the
-time in the name of its file; else, or if it has no poses, scans follow each other at 10 Hz.
+time in the name of its file; else scans follow each other at 10 Hz. Folders of data sets have
+their own layout, times and poses (datasets.py).
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.files.trajectory import nanoseconds
-from surfel_mapper.offline.pose_choice import choose_for_folder, pose_summary
+from surfel_mapper.offline.datasets import find_dataset
+from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
 from surfel_mapper.scan import Scan
@@ -60,10 +62,18 @@ class ScanFolder:
 
     cuts: tuple[str, ...] = ()
     format = 'scans in files'
+    """Name of the layout, for info."""
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
-        self.files = [self.path] if self.path.is_file() else scan_files(self.path)
+        self.dataset = find_dataset(self.path)
+        if self.dataset is not None:
+            self.files, self.format = self.dataset.files, f'{self.dataset.name} data set'
+        else:
+            self.files = [self.path] if self.path.is_file() else scan_files(self.path)
+        is_free = poses is None and request.poses_from is None
+        if self.dataset and self.dataset.trajectory and is_free and is_default(config):
+            poses = PosePath(self.dataset.poses_path or self.path, None, self.dataset.trajectory)
         self.poses = poses
         self.stamps = self._stamps()
         choice = choose_for_folder(request, config, poses is not None, self.first_scan())
@@ -135,12 +145,15 @@ class ScanFolder:
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
-        points, columns = read_scan(self.files[number])
+        read = read_scan if self.dataset is None else self.dataset.read
+        points, columns = read(self.files[number])
         return Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
 
     def _stamps(self) -> list[int]:
         """Return the time of every scan."""
         number = len(self.files)
+        if self.dataset is not None and (self.poses is None or self.poses.has_stamps):
+            return self.dataset.stamps_ns
         if self.poses is None:
             return times_in_names(self.files) or [PERIOD_NS * at for at in range(number)]
         stamps = self.poses.trajectory.stamp_ns
@@ -195,4 +208,6 @@ def is_scans(path: Path) -> bool:
         return path.suffix in SUFFIXES
     if not path.is_dir() or (path / METADATA).exists():
         return False
+    if find_dataset(path) is not None:
+        return True
     return not any(map(is_storage, path.iterdir())) and bool(scan_files(path))

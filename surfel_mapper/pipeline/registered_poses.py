@@ -182,6 +182,7 @@ class RegisteredPoses:
             'body': self.body,
             'aligned': self._num_aligned,
             'degenerate': self._num_degenerate,
+            'ambiguous': self._tracker.num_ambiguous,
             'fit': {'median': float(np.median(fits)), 'min': float(np.min(fits))},
         }
 

@@ -14,6 +14,7 @@ from surfel_mapper.alignment.tracking import Tracker
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import compose, inverse, se3_exp
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.alignment.test_registration import map_of, NOISE_M, points_on, ROOM, TRUE, VOXEL_M
 
 SECOND = 10**9
@@ -145,3 +146,50 @@ def test_a_motion_that_is_known_already_holds_from_the_first_scan_on():
     tracker.begin(SECOND, TWIST)
 
     np.testing.assert_allclose(tracker.predict(2 * SECOND), pose_at(1.0), atol=1e-12)
+
+
+def square_room(num, seed):
+    """Return points on the floor and four equal walls, which four headings fit."""
+    rng = np.random.default_rng(seed)
+    parts = [np.column_stack([rng.uniform(-4.2, 4.2, (num, 2)), rng.normal(0.1, 0.003, num)])]
+    for quarter in range(4):
+        wall = np.column_stack(
+            [
+                rng.normal(4.2, 0.003, num),
+                rng.uniform(-4.2, 4.2, num),
+                rng.uniform(0.1, 2.8, num),
+            ]
+        )
+        parts.append(wall @ heading(90.0 * quarter).T)
+    return np.concatenate(parts)
+
+
+def heading(degrees):
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(('turn_deg', 'is_ambiguous'), [(5.0, False), (25.0, False), (45.0, True)])
+def test_a_scan_that_two_places_fit_equally_well_is_refused(turn_deg, is_ambiguous):
+    start = np.eye(4)
+    start[2, 3] = 1.5
+    surfel_map = SurfelMap(VOXEL_M)
+    surfel_map.add(square_room(20_000, seed=1), origin=start[:3, 3])
+    tracker = tracker_at(start)
+
+    def track(turn_deg, number):
+        points = (square_room(3000, seed=2 + number) - start[:3, 3]) @ heading(turn_deg)
+        cells = tracker._registration.cells(points)
+        return tracker.track(cells, number * SECOND // 10, surfel_map, np.eye(4))
+
+    track(0.0, 0)
+    track(0.0, 1)
+    if is_ambiguous:
+        with pytest.raises(AlignmentError, match='its pose is ambiguous'):
+            track(turn_deg, 2)
+        np.testing.assert_allclose(tracker.pose, start, atol=2e-3)  # the last good one
+    else:
+        found = track(turn_deg, 2)
+        assert found.rival == 0.0
+        np.testing.assert_allclose(found.T_map_sensor[:3, :3], heading(turn_deg), atol=2e-3)
+    assert tracker.num_ambiguous == is_ambiguous

@@ -73,7 +73,9 @@ def test_a_file_that_is_no_cloud_is_refused_by_name(tmp_path, capsys, name):
 def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
     assert main(['extract', 'notes.md', '--output', str(tmp_path)]) == 1
     said = capsys.readouterr().err
-    assert 'a cloud ending in .ply, .pcd, .bin, or a map ending in .npz, .parquet' in said
+    assert (
+        'a cloud ending in .ply, .pcd, .bin, .las, .laz, or a map ending in .npz, .parquet' in said
+    )
 
 
 def test_a_voxel_size_of_nothing_is_refused(tmp_path, capsys):

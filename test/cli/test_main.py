@@ -58,6 +58,22 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
 
 
 @pytest.mark.parametrize(
+    ('arguments', 'says'),
+    [
+        (('repaly', 'a'), "no verb 'repaly', did you mean replay?"),
+        (('fly',), "no verb 'fly'; verbs: node, replay"),
+        (('replay', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
+        (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
+        (('info', 'a', 'b'), 'too many arguments: b'),
+        (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
+    ],
+)
+def test_a_mistyped_word_is_answered_with_the_nearest(arguments, says, capsys):
+    assert usage_code(*arguments) == 2
+    assert says in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     ('error', 'code', 'says'),
     [
         (BagError('a.bag: odd'), 1, 'surfel-mapper replay: a.bag: odd\n'),

@@ -83,10 +83,12 @@ def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch
     summary = json.loads((tmp_path / 'out' / 'summary.json').read_text(encoding='utf-8'))
     assert summary == json.loads(capsys.readouterr().out)
     assert {path.name for path in (tmp_path / 'out').iterdir()} == {
+        'map.npz',
         'map.ply',
         'map.png',
         'report.html',
         'summary.json',
+        'trajectory.tum',
     }
 
 
@@ -151,6 +153,7 @@ def test_ctrl_c_ends_the_replay_and_the_map_is_written(command, tmp_path):
         'map.png',
         'report.html',
         'summary.json',
+        'trajectory.tum',
     }
 
 

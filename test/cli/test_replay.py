@@ -14,7 +14,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from test.bags.recorded import cut, drive, NUM_SCANS, write_rosbag2
 
-FILES = {'map.ply', 'map.png', 'report.html', 'summary.json'}
+FILES = {'map.npz', 'map.ply', 'map.png', 'report.html', 'summary.json', 'trajectory.tum'}
 PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
 
 

@@ -161,7 +161,7 @@ def test_an_output_that_holds_something_else_is_left_alone(bags, tmp_path, capsy
     'option', [['--window'], ['--align'], ['--poses-out', 'x'], ['--formats', 'ply'], ['--view']]
 )
 def test_options_that_need_one_process_are_refused(bags, tmp_path, capsys, option):
-    assert main(['replay', *bags, '--output', str(tmp_path), *TF, *option]) == 1
+    assert main(['replay', *bags, '--output', str(tmp_path), *TF, *option]) == 2
     assert f'{option[0]}: not with several bags' in capsys.readouterr().err
 
 

@@ -35,5 +35,7 @@ def test_without_ros_it_is_said_how_to_get_it(tmp_path, verb):
 
 @pytest.mark.parametrize('rate', ['0', '-1', 'nan'])
 def test_a_pace_that_is_none_is_refused(tmp_path, capsys, rate):
-    assert main(['play', str(write_rosbag2(tmp_path / 'bag', drive())), '--rate', rate]) == 1
-    assert 'expected more than 0' in capsys.readouterr().err
+    with pytest.raises(SystemExit) as stopped:
+        main(['play', str(write_rosbag2(tmp_path / 'bag', drive())), '--rate', rate])
+    assert stopped.value.code == 2
+    assert 'expected a positive number' in capsys.readouterr().err

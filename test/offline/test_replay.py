@@ -9,11 +9,20 @@ import pytest
 
 from surfel_mapper import Config, replay
 from surfel_mapper.cli.main import main
-from surfel_mapper.errors import BagError, ConfigError, MapError
+from surfel_mapper.errors import (
+    AlignmentError,
+    BagError,
+    ConfigError,
+    DependencyError,
+    FileFormatError,
+    MapError,
+)
+from surfel_mapper.files import parquet
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory
-from surfel_mapper.offline.replay import ReplayOptions
+from surfel_mapper.offline.replay import ReplayOptions, started_mapper
 from surfel_mapper.offline.request import Request
+from surfel_mapper.viz import viewer
 from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
 
 
@@ -31,6 +40,8 @@ def test_a_replay_in_python_is_that_of_the_verb(bag, tmp_path):
     assert json.loads(json.dumps(result.summary)) == written
     assert [path.name for path in result.written] == [
         'map.ply',
+        'map.npz',
+        'trajectory.tum',
         'map.png',
         'report.html',
         'summary.json',
@@ -98,3 +109,99 @@ def test_wrong_options_are_refused_and_leave_nothing(bag, tmp_path, options, con
             options=ReplayOptions(**options),
         )
     assert not (tmp_path / 'out').exists()
+
+
+def contents(directory):
+    return {path.name for path in directory.iterdir()}
+
+
+@pytest.mark.parametrize('option', ['poses_out', 'rrd'])
+@pytest.mark.parametrize('place', ['none/file', 'file/file', '.'])
+def test_files_that_cannot_be_written_are_refused_before_the_first_scan(
+    bag, tmp_path, option, place
+):
+    if option == 'rrd':
+        pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    (tmp_path / 'file').touch()
+    with pytest.raises(FileFormatError, match='cannot be written'):
+        replay(
+            Request(path=bag / 'no such bag'),  # not even opened
+            output=tmp_path / 'out',
+            options=ReplayOptions(**{option: tmp_path / place}),
+        )
+    assert contents(tmp_path) == {'file'}
+
+
+def test_formats_without_their_package_are_refused_before_the_first_scan(
+    bag, tmp_path, monkeypatch
+):
+    def missing():
+        raise DependencyError('pyarrow cannot be loaded')
+
+    monkeypatch.setattr(parquet, 'import_pyarrow', missing)
+    with pytest.raises(DependencyError, match='pyarrow'):
+        replay(bag, output=tmp_path / 'out', options=ReplayOptions(formats=('parquet',)))
+    assert not (tmp_path / 'out').exists()
+
+
+def test_a_viewer_that_closes_does_not_end_the_replay(bag, tmp_path, monkeypatch, caplog):
+    pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+    calls = []
+
+    def add(self, update):
+        calls.append(update)
+        if len(calls) == 2:
+            raise RuntimeError('connection closed')
+
+    monkeypatch.setattr(viewer.Viewer, 'add', add)
+    options = ReplayOptions(rrd=tmp_path / 'a.rrd')
+
+    result = replay(bag, output=tmp_path / 'out', options=options)
+
+    assert result.summary['scans']['mapped'] == NUM_SCANS
+    assert len(calls) == 2
+    assert 'a.rrd has failed, the replay goes on without it: connection closed' in caplog.text
+
+
+def test_the_map_is_written_before_an_alignment_that_fails(bag, tmp_path):
+    config = Config.from_mapping({'window.max_scans': 1})
+    options = ReplayOptions(window=True, align=True)
+
+    with pytest.raises(AlignmentError, match='1 scans in the map'):
+        replay(bag, output=tmp_path / 'out', config=config, options=options)
+
+    assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
+    assert load_map(tmp_path / 'out')[0].num_points > 0
+
+
+def test_the_map_is_written_before_a_picture_that_fails(bag, tmp_path, monkeypatch):
+    def fail(*args, **options):
+        raise MemoryError('a large picture')
+
+    monkeypatch.setattr('surfel_mapper.viz.picture.draw_map', fail)
+    with pytest.raises(MemoryError):
+        replay(bag, output=tmp_path / 'out')
+    assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
+
+
+def test_the_default_output_goes_back_in(bag, tmp_path, capsys, caplog):
+    pytest.importorskip('pyarrow', reason='merging needs pyarrow (extra formats)')
+    out, half = tmp_path / 'out', tmp_path / 'half'
+    digest = replay(bag, output=out).summary['digest']
+    replay(Request(path=bag, start_s=0.25), output=half)
+
+    assert main(['evaluate', str(out), '--truth', str(out / 'map.npz')]) == 0
+    assert 'equal to the bit' in capsys.readouterr().out
+    for path in (out, out / 'map.npz'):
+        assert main(['extract', str(path), '--output', str(tmp_path / 'models')]) == 0
+    assert main(['extract', str(out / 'map.ply'), '--output', str(tmp_path / 'models')]) == 1
+    assert 'surfels of a map, not points of a cloud' in capsys.readouterr().err
+
+    assert main(['merge', str(out), '--output', str(tmp_path / 'one'), '--json']) == 0
+    assert json.loads(capsys.readouterr().out)['digest'] == digest
+    assert not caplog.records
+    assert main(['merge', str(half / 'map.npz'), str(out), '--output', str(tmp_path / 'two')]) == 0
+    assert '3 of its 6 scans have stamps of scans in' in caplog.text
+
+    loaded = {'map.mode': 'frozen', 'map.load': str(out), 'pose.source': 'registration'}
+    assert started_mapper(Config.from_mapping(loaded)).map.digest() == digest

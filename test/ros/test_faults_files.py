@@ -24,7 +24,7 @@ from std_srvs.srv import Trigger
 from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.ply import read_points
-from surfel_mapper.offline.outputs import ScanTrajectory, write_files
+from surfel_mapper.offline.outputs import ScanTrajectory, write_files, write_maps
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.ros.map_files import save_map
 from surfel_mapper.scan import Scan
@@ -120,7 +120,9 @@ def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypa
     output = tmp_path / 'out'
 
     def write():
-        write_files(output, ['npz', 'ply', 'pcd'], mapper, ScanTrajectory(), summary, History())
+        formats, trajectory = ['npz', 'ply', 'pcd'], ScanTrajectory()
+        write_maps(output, formats, mapper, trajectory, window=True)
+        write_files(output, formats, mapper, trajectory, summary, History())
 
     number = 0
     while ends_at(number, (signal.SIGKILL, signal.SIGTERM)[number % 2], write):
