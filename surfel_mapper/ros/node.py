@@ -155,6 +155,11 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             f'{self._config.pose.source}), maps in frame {self._config.frames.fixed} with voxels '
             f'of {self._config.map.voxel_size_m:g} m'
         )
+        if self._config.pose.source == 'identity':
+            self.get_logger().info(
+                'pose.source identity tells no position of the sensor, so normals are not '
+                'oriented towards it: their component of largest magnitude is positive'
+            )
 
     def _deactivate(self) -> None:
         self._bond.stop()

@@ -58,7 +58,7 @@ def publish(peer, node, first_ns, reliability, *, profile, promised):
     command = [sys.executable, str(Path(__file__).with_name('plain_publisher.py'))]
     command += [reliability, str(NUMBER), str(first_ns)]
     received = {}
-    peer.diagnosis({'state': 'active'})
+    peer.diagnosis({'state': 'active', 'normals': 'not oriented'})
     with subprocess.Popen(
         command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as publisher:
