@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Arrays, transforms and times as rclpy messages.
+Arrays, transforms and times as rclpy messages, for all modules that publish or answer.
 
 The bytes of a cloud go through an array.array, which takes 0.6 ms for 4 MiB; assigning a numpy
 array, which rclpy checks byte by byte, takes 270 ms.
