@@ -29,6 +29,9 @@ Floats = npt.NDArray[np.float64]
 Pairs = npt.NDArray[np.int32]
 Points = npt.NDArray[np.float32] | npt.NDArray[np.float64]
 
+ROUNDING = 1e-9
+"""Rounding of a weight matrix as a share of the largest weight of its edge."""
+
 
 @dataclass(slots=True)
 class Edge:
@@ -204,7 +207,31 @@ def _weights(ends: tuple[int, int], weights: npt.ArrayLike | None, num: int) -> 
             f'edge {ends[0]} -> {ends[1]}: weights of shape {array.shape}, '
             f'expected ({num}, 3, 3), all finite'
         )
+    _check_definite(ends, array)
     return array
+
+
+def _check_definite(ends: tuple[int, int], weights: Floats) -> None:
+    """Raise AlignmentError if a weight matrix is not symmetric or has a negative eigenvalue."""
+    if not len(weights):
+        return
+    name = f'edge {ends[0]} -> {ends[1]}: weight'
+    scale = float(np.abs(weights).max())
+    apart = np.abs(weights - weights.swapaxes(1, 2)).max(axis=(1, 2))
+    if (apart > ROUNDING * scale).any():
+        row = int(apart.argmax())
+        raise AlignmentError(f'{name} {row} is not symmetric: {weights[row].tolist()}')
+    xx, yy, zz = weights[:, 0, 0], weights[:, 1, 1], weights[:, 2, 2]
+    xy, xz, yz = weights[:, 0, 1], weights[:, 0, 2], weights[:, 1, 2]
+    minors = (yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy)
+    determinant = xx * minors[0] - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz)
+    for size, values in ((1, (xx, yy, zz)), (2, minors), (3, (determinant,))):
+        for each in values:
+            if (each < -ROUNDING * scale**size).any():
+                row = int(each.argmin())
+                raise AlignmentError(
+                    f'{name} {row} has a negative eigenvalue: {weights[row].tolist()}'
+                )
 
 
 def _check_rows(

@@ -11,7 +11,9 @@ were removed.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 import operator
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -43,18 +45,19 @@ class Surfel:
 
     __slots__ = ('_sums',)
 
-    def __init__(self) -> None:
-        self._sums = NO_POINTS
+    def __init__(self, points: Surfel | npt.ArrayLike | Iterable[npt.ArrayLike] = ()) -> None:
+        """Start with points, by default none; see from_points."""
+        self._sums = _sums_of(points)
 
     @classmethod
-    def from_points(cls, points: npt.ArrayLike) -> Surfel:
+    def from_points(cls, points: npt.ArrayLike | Iterable[npt.ArrayLike]) -> Surfel:
         """
-        Return the surfel of points.
+        Return the surfel of points; the same as ``Surfel(points)``.
 
         Parameters
         ----------
-        points : (N, 3) or (3,) of numbers, m
-            A batch, which may be empty, or a single point.
+        points : (N, 3) or (3,) of numbers, or iterable of (3,), m
+            A batch, which may be empty, an iterator over points, or a single point.
 
         Raises
         ------
@@ -62,9 +65,7 @@ class Surfel:
             If the shape differs, or a coordinate is not a number, nan or beyond 1e100.
 
         """
-        surfel = cls()
-        surfel.add(points)
-        return surfel
+        return cls(points)
 
     @classmethod
     def from_stats(
@@ -253,10 +254,15 @@ class Surfel:
         return values, vectors * np.sign(largest)
 
 
-def _sums_of(points: Surfel | npt.ArrayLike) -> PointSums:
+def _sums_of(points: Surfel | npt.ArrayLike | Iterable[npt.ArrayLike]) -> PointSums:
     """Return the sums of points or of a surfel."""
     if isinstance(points, Surfel):
         return points._sums
+    if isinstance(points, Iterator):
+        points = list(points)
+    if isinstance(points, (list, tuple)) and not points:
+        return NO_POINTS
+    points = cast('npt.ArrayLike', points)
     return PointSums.of_points(_checked('points', points).reshape(-1, 3))
 
 

@@ -179,6 +179,7 @@ class Inserter:
         self._add_times(laps)
         return Update(
             scan=prepared.scan,
+            filtered=prepared.filtered,
             stamp_ns=prepared.scan.stamp_ns,
             frame_id=map_frame(config),
             T_map_sensor=inserted.T_map_sensor,
@@ -230,6 +231,7 @@ class Inserter:
         self._add_times(laps)
         return Update(
             scan=prepared.scan,
+            filtered=prepared.filtered,
             stamp_ns=prepared.scan.stamp_ns,
             frame_id=map_frame(config),
             T_map_sensor=prepared.T_map_sensor,

@@ -29,6 +29,9 @@ class Update:
     ----------
     scan : Scan
         Deskewed, before the filters.
+    filtered : Scan
+        The scan after the filters, with the columns that they added; without filters the scan
+        itself.
     stamp_ns : int
         Stamp of the scan.
     frame_id : str
@@ -58,6 +61,7 @@ class Update:
     """
 
     scan: Scan
+    filtered: Scan
     stamp_ns: int
     frame_id: str
     T_map_sensor: npt.NDArray[np.float64]

@@ -26,6 +26,7 @@ from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
 from surfel_mapper.config import Config
+from surfel_mapper.filters.columns import as_fields
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -84,6 +85,7 @@ class Outputs:
         self._changed = node.create_publisher(PointCloud2, '~/changed', CHANGES)
         self._removed = node.create_publisher(PointCloud2, '~/removed', CHANGES)
         self._scan_normals = node.create_publisher(PointCloud2, '~/scan_normals', 10)
+        self._filtered = node.create_publisher(PointCloud2, '~/filtered', 10)
         self._markers = node.create_publisher(MarkerArray, '~/markers', LATCHED)
         self._stamp_ns = 0
         # an empty map is published too: it replaces the latched one of a node that was killed
@@ -105,6 +107,8 @@ class Outputs:
             self._changes.reset()
         if self._scan_normals.get_subscription_count():
             self._publish_scan_normals(update)
+        if self._filtered.get_subscription_count():
+            self._publish_filtered(update.filtered)
 
     def publish_aligned(self, aligned: Alignment) -> None:
         """Publish the result of ~/align; called in the mapping thread."""
@@ -201,6 +205,10 @@ class Outputs:
         min_points = self._mapper.config.map.min_points
         content = scan_with_normals(scan, update.T_map_sensor, surfel_map, min_points)
         self._scan_normals.publish(cloud_message(content, scan.stamp_ns, scan.frame_id))
+
+    def _publish_filtered(self, scan: Scan) -> None:
+        content = from_columns(as_fields(scan))
+        self._filtered.publish(cloud_message(content, scan.stamp_ns, scan.frame_id))
 
     def _publish_normals(self) -> int:
         surfels = self._mapper.map.surfels(self._changes.min_points)

@@ -46,6 +46,26 @@ def pair():
         (lambda lum: lum.correspondences(1, 0), 'no edge 1 -> 0'),
         (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
         (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
+        (
+            lambda lum: setattr(lum, 'max_iterations', 2.5),
+            'max_iterations 2.5, expected an integer',
+        ),
+        (
+            lambda lum: lum.set_correspondences(0, 1, [[0, 0]], [np.eye(3) + np.eye(3, k=1)]),
+            'edge 0 -> 1: weight 0 is not symmetric',
+        ),
+        (
+            lambda lum: lum.set_correspondences(
+                0, 1, [[0, 0], [1, 1]], [np.eye(3), np.diag([1.0, -0.1, 1.0])]
+            ),
+            'edge 0 -> 1: weight 1 has a negative eigenvalue',
+        ),
+        (
+            lambda lum: lum.set_correspondences(
+                0, 1, [[0, 0]], [[[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]]
+            ),
+            'weight 0 has a negative eigenvalue',
+        ),
         (lambda lum: setattr(lum, 'convergence_threshold', np.nan), 'convergence_threshold nan'),
         (lambda _: LUM(jacobian='numeric'), "jacobian 'numeric'"),
         (lambda lum: setattr(lum, 'jacobian', 'PCL'), "jacobian 'PCL', expected one of"),

@@ -117,3 +117,24 @@ def test_diagnostics_have_points_and_times_of_every_filter(tmp_path):
     assert values['filters.1 remove_nan.points_in'] == '500'
     assert values['filters.1 remove_nan.points_out'] == '500'
     assert float(values['filters.1 remove_nan.milliseconds.median']) >= 0.0
+
+
+def test_an_update_has_the_filtered_scan_with_the_columns_added(tmp_path):
+    chain = '- range_limit: {max_m: 4.0}\n- surface_normal\n'
+    points = cloud()
+    (update,) = insert(mapper_with(tmp_path, chain), points)
+    expected = Chain.from_yaml(chain).apply(points)
+    np.testing.assert_array_equal(update.filtered.points, expected.points)
+    np.testing.assert_array_equal(update.filtered.columns['normals'], expected.columns['normals'])
+    assert len(update.scan) == len(points)
+    (update,) = insert(mapper_with(tmp_path, ''), points)
+    assert update.filtered is update.scan
+
+
+def test_a_scan_with_points_that_are_not_finite_is_mapped_and_they_are_counted(tmp_path):
+    points = cloud()
+    points[:7, 2] = np.inf
+    mapper = mapper_with(tmp_path, '- voxel_grid')
+    (update,) = insert(mapper, points)
+    assert len(update.filtered) > 0
+    assert mapper.counters.summary()['filters']['1 voxel_grid']['not_finite'] == 7

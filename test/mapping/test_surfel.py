@@ -3,6 +3,8 @@
 """Surfel against exact rational arithmetic, and on known shapes."""
 
 from fractions import Fraction
+from pathlib import Path
+import re
 
 from hypothesis import given
 from hypothesis import strategies as st
@@ -242,3 +244,25 @@ def test_very_large_and_very_small_shapes_are_shapes(scale):
 
 def test_below_what_can_be_squared_points_count_as_equal():
     assert_promises(Surfel.from_points(grid([[2, 2, 1], [-2, 1, 2]]) * 1e-200))
+
+
+def test_a_surfel_is_made_of_arrays_lists_iterators_or_nothing():
+    points = np.random.default_rng(3).normal(size=(20, 3))
+    expected = Surfel.from_points(points)
+    for each in (points, points.tolist(), iter(points), (p for p in points), map(list, points)):
+        assert Surfel(each) == expected
+    assert Surfel(expected) == expected
+    for empty in ((), [], iter([]), np.empty((0, 3))):
+        assert Surfel(empty).empty
+        assert Surfel.from_points(empty) == Surfel()
+    surfel = Surfel(points)
+    surfel.remove(iter(points[:5]))
+    surfel.add(iter([]))
+    assert surfel.num_points == 15
+
+
+def test_the_page_about_surfels_runs():
+    page = (Path(__file__).parents[2] / 'docs/surfel.md').read_text(encoding='utf-8')
+    code = re.findall(r'```python\n(.*?)```', page, re.DOTALL)
+    assert len(code) == 3
+    exec('\n'.join(code), {})  # asserts the statements of the page

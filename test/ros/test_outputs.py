@@ -20,6 +20,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper import MapMirror
+from surfel_mapper.filters import Chain
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.messages.scan_normals import ADDED
@@ -172,6 +173,24 @@ def test_surfels_have_mean_intensity_if_configured(start, peer):
     assert 'intensity' in scan.columns
     # the intensity of a point is its y, and the sensor is not turned
     np.testing.assert_allclose(scan.columns['intensity'], scan.points[:, 1], atol=0.01)
+
+
+def test_filtered_is_the_scan_after_the_chain_with_the_columns_added(start, peer, tmp_path):
+    chain = '- range_limit: {min_m: 2}\n- surface_normal: {keep_eigen_values: 1}\n'
+    (tmp_path / 'chain.yaml').write_text(chain)
+    node = start_node(start, peer, filters=tmp_path / 'chain.yaml')
+    messages = drive(2)
+    found = peer.collect(PointCloud2, f'{BASE}/filtered')
+    send(peer, messages)
+    peer.spin_until(lambda: len(found) == 2, what=lambda: node.output)
+    for (sent, _), message in zip(messages, found, strict=True):
+        assert message.header == sent.header
+        expected = Chain.load(tmp_path / 'chain.yaml').apply(to_scan(sent))
+        scan = to_scan(message)
+        np.testing.assert_array_equal(scan.points, expected.points)
+        assert 0 < len(scan) < len(to_scan(sent))
+        np.testing.assert_array_equal(scan.columns['normal_y'], expected.columns['normals'][:, 1])
+        np.testing.assert_array_equal(scan.columns['eigValues'], expected.columns['eigValues'])
 
 
 def test_scan_normals_keep_every_field_of_the_cloud(start, peer):
