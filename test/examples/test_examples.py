@@ -141,3 +141,12 @@ def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     printed = run('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
     assert printed.startswith('2 shards')
     assert f'digest {digest_of(street / "mapped")}' in printed
+
+
+def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path):
+    text = run('filter_picture.py', 'filters.png', folder=tmp_path)
+    before, after, ground = map(
+        int, re.search(r'(\d+) -> (\d+) points, (\d+) ground', text).groups()
+    )
+    assert 0 < ground < after < before
+    assert (tmp_path / 'filters.png').read_bytes().startswith(b'\x89PNG')
