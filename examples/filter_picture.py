@@ -21,7 +21,7 @@ from surfel_mapper.simulation import Lidar, Simulation, World
 CHAIN = """
 - range_limit: {min_m: 2, max_m: 25}
 - voxel_grid: {size_x_m: 0.3, size_y_m: 0.3, size_z_m: 0.3}
-- ground: {up: sensor, voxel_size_m: 3.0, min_planarity: 0.02}
+- ground: {up: sensor, voxel_size_m: 1.5, min_planarity: 0.02}
 """
 
 GREY, TEAL, AMBER = '#5f6b73', '#1b7f79', '#c9803a'
