@@ -115,7 +115,7 @@ def test_a_list_cannot_be_changed_while_running(make):
     [
         ('map.voxelsize_m:=0.5', 'map.voxelsize_m: no such setting; did you mean'),
         ('voxel_size_m:=0.5', 'did you mean map.voxel_size_m?'),
-        ('map.voxel_size_m:=-1.0', r'map.voxel_size_m: -1.0, expected a value in \[0.001, 1000\]'),
+        ('map.voxel_size_m:=-1.0', r'map.voxel_size_m: -1, expected a value in \[0.001, 1000\]'),
         ('map.voxel_size_m:=.nan', 'expected a finite number'),
         ('map.min_points:=2.5', 'map.min_points: 2.5, expected a whole number'),
         ('map.min_points:=[]', 'map.min_points'),
