@@ -55,7 +55,12 @@ class Checkpoints:
         every_s = mapper.config.output.checkpoint_s
         if not every_s or now_s - self._saved_s < every_s or mapper.map.version == self._version:
             return None
-        self._saved_s, version = now_s, mapper.map.version
+        return self.save()
+
+    def save(self) -> Path:
+        """Save the map now; see save_if_due."""
+        mapper = self._mapper
+        self._saved_s, version = time.monotonic(), mapper.map.version
         newest, before = checkpoint_paths(mapper.config.output)
         newest.parent.mkdir(parents=True, exist_ok=True)
         for path in (newest, before):

@@ -95,6 +95,7 @@ class TaskQueue:
     """Functions for the main thread to call, and errors for it to raise."""
 
     def __init__(self) -> None:
+        self.has_failed = False
         self._items: SimpleQueue[Task | BaseException] = SimpleQueue()
         self._lock = threading.Lock()
         self._closed = False
@@ -111,6 +112,7 @@ class TaskQueue:
 
     def fail(self, error: BaseException) -> None:
         """Queue an error for the main thread to raise."""
+        self.has_failed = True
         self._items.put(error)
 
     def run(self, check: Callable[[], None]) -> None:

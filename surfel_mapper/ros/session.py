@@ -124,8 +124,12 @@ class Session:
         if self._compiler.ident is not None:
             self._compiler.join()
         self.thread.stop()
-        self.mapper.finish()
         log = self._node.get_logger()
+        with self.mapper.guarded('the end of the input'):
+            self.mapper.finish()
+        if self._tasks.has_failed and self.mapper.map.num_voxels:
+            with self.mapper.guarded('a checkpoint'):
+                log.error(f'the node fails and ends; its map is in {self._checkpoints.save()}')
         if save:
             try:
                 log.info(f'saved {save_map(self.mapper)}')

@@ -10,7 +10,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from std_msgs.msg import Int64
 
+from surfel_mapper.files.map_state import load_map
 from test.layers.test_extending import install, POINTS
+from test.ros.driving import PERIOD_NS
 from test.ros.live import cloud, LATCHED, odometry, START_NS
 from test.ros.test_outputs import BASE, start_node
 
@@ -23,3 +25,19 @@ def test_a_layer_from_outside_is_published(start, peer, tmp_path):
     peer.publish('/points', cloud(START_NS, POINTS))
     peer.spin_until(lambda: numbers and numbers[-1].data == 2)
     node.check()
+
+
+def test_a_node_that_cannot_go_on_saves_its_map(start, peer, tmp_path):
+    install(tmp_path)
+    module = tmp_path / 'heights.py'
+    code = module.read_text('utf-8')
+    broken = "if len(self.lowest): raise SystemExit('broken')\n        T, size_m ="
+    module.write_text(code.replace('T, size_m =', broken), encoding='utf-8')
+    node = start_node(start, peer, **{'layers.heights.enabled': 'true'})
+    for stamp_ns in (START_NS, START_NS + PERIOD_NS):
+        peer.publish('/odom', odometry(stamp_ns, (0.0, 0.0, 0.0)))
+        peer.publish('/points', cloud(stamp_ns, POINTS))
+    assert node.wait() != 0
+    (saved,) = tmp_path.rglob('*.checkpoint.npz')
+    assert str(saved) in node.output
+    assert load_map(saved)[0].num_voxels == 3
