@@ -24,8 +24,19 @@ A caller that wants to continue with the next scan catches SurfelMapperError.
 """
 
 
+def one_line(text: object) -> str:
+    """Return text with control characters escaped: one line, without terminal sequences."""
+    string = str(text)
+    if string.isprintable():
+        return string
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in string)
+
+
 class SurfelMapperError(Exception):
-    """Base of all errors of this package."""
+    """Base of all errors of this package; the message is one line, see one_line."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
 
 
 class ConfigError(SurfelMapperError, ValueError):
@@ -85,4 +96,7 @@ class ClusterError(SurfelMapperError):
 
 
 class DependencyError(SurfelMapperError, ImportError):
-    """A package that the requested feature needs is not installed."""
+    """A package that the requested feature needs is not installed; may have several lines."""
+
+    def __str__(self) -> str:
+        return '\n'.join(map(one_line, str(self.args[0]).split('\n')))

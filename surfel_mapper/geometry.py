@@ -28,6 +28,9 @@ Transform = npt.NDArray[np.float64]
 MAX_NORM_ERROR = 1e-3
 """Tolerance of the norm of a quaternion: larger deviations are not rounding but errors."""
 
+MAX_SKEW = 1e-4
+"""Tolerance of the orthonormality of a rotation; matrices of float32 are within 1e-6."""
+
 SMALL_ANGLE_SQ = 1e-8
 """Squared angle, rad^2, below which two terms of a series are exact to float64."""
 
@@ -106,6 +109,40 @@ def inverse(T_a_b: Transform) -> Transform:
         rows.append([*r, -((r[0] * x + r[1] * y) + r[2] * z)])
     rows.append([0.0, 0.0, 0.0, 1.0])
     return np.array(rows)
+
+
+def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
+    """
+    Raise ValueError unless a matrix is a rigid transform.
+
+    Parameters
+    ----------
+    name : str
+        Name of the matrix, for the error.
+    T_a_b : (4, 4) float
+        Finite, rotation orthonormal within 1e-4 and not mirrored, last row 0 0 0 1. So a
+        transposed transform is refused.
+
+    """
+    matrix = np.asarray(T_a_b)
+    if matrix.shape != (4, 4) or matrix.dtype.kind not in 'fiu':
+        raise ValueError(f'{name}: {matrix.dtype} {matrix.shape}, expected float (4, 4)')
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()
+    products = (
+        a * a + d * d + g * g - 1.0,
+        b * b + e * e + h * h - 1.0,
+        c * c + f * f + i * i - 1.0,
+        a * b + d * e + g * h,
+        a * c + d * f + g * i,
+        b * c + e * f + h * i,
+    )
+    turn = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    is_rotation = all(abs(value) <= MAX_SKEW for value in products) and turn > 0.0
+    if not (is_rotation and math.isfinite(x + y + z) and last == [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(
+            f'{name}: {matrix.tolist()}, expected a rigid transform, rotation and translation '
+            'above a last row 0 0 0 1'
+        )
 
 
 def interpolate(T0: Transform, T1: Transform, alpha: float) -> Transform:

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
-    {'errors'},
+    {'budget', 'errors'},
     {'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},

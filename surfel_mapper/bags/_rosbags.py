@@ -124,7 +124,17 @@ def bound_chunks(reader: Any, path: Path, *, ros1: bool) -> None:
 
 
 def is_fully_indexed(storage: Any) -> bool:
-    """Return whether the chunk indexes of an mcap file account for every message it states."""
+    """
+    Return whether the index of an mcap or ROS 1 file accounts for every message it states.
+
+    rosbags skips messages without an index entry or connection record: one changed byte in a
+    connection record of a ROS 1 bag lost its topic.
+    """
+    if hasattr(storage, 'chunk_infos'):
+        counts: Counter[int] = Counter()
+        for info in storage.chunk_infos:
+            counts.update(info.connection_counts)
+        return counts == Counter({c.id: c.msgcount for c in storage.connections if c.msgcount})
     chunks = getattr(getattr(storage, 'storage', None), 'chunks', None)
     if chunks is None:
         return True

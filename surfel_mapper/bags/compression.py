@@ -26,7 +26,7 @@ MAX_UNPACKED_BYTES = 1 << 30
 FLOOR_BYTES = 1 << 26
 """Always allow 64 MiB, whatever the ratio: a chunk of black images packs very small."""
 
-MAX_RATIO = 1000
+MAX_RATIO = 100
 """Limit of the compression ratio above FLOOR_BYTES."""
 
 ZSTD_HEAD_BYTES = 18
@@ -52,21 +52,20 @@ def unpacked(packed: bytes, compression: str, size: int) -> bytes:
     if not compression or compression == 'none':
         return packed[:size]
     machine = decompressor(compression)
-    parts, done = [], 0
+    content = bytearray()
     for start in range(0, len(packed), PIECE_BYTES):
         piece = packed[start : start + PIECE_BYTES]
         while True:
             try:
-                parts.append(machine.decompress(piece, min(size - done, PIECE_BYTES * 16)))
+                content += machine.decompress(piece, min(size - len(content), PIECE_BYTES * 16))
             except Exception:  # each library has errors of its own
-                return b''.join(parts)  # the part before the damage; callers compare the size
-            done += len(parts[-1])
-            if machine.eof or done >= size:
-                return b''.join(parts)
+                return bytes(content)  # the part before the damage; callers compare the size
+            if machine.eof or len(content) >= size:
+                return bytes(content)
             if machine.needs_input:
                 break
             piece = b''
-    return b''.join(parts)
+    return bytes(content)
 
 
 def unpacked_message(packed: bytes | memoryview) -> bytes:

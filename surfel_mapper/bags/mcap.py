@@ -17,7 +17,7 @@ import struct
 from zlib import crc32
 
 from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.bags.salvage import Chunk, FoundMessage, Place, SalvagedChunks
+from surfel_mapper.bags.salvage import Chunk, FoundMessage, SalvagedChunks
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
 
@@ -47,7 +47,7 @@ class SalvagedMcap(SalvagedChunks):
                 if kind == CHUNK:
                     yield from self._in_chunk(start, min(end, self.size) - start, is_whole)
                 elif is_whole:
-                    yield from self._note(kind, None, start, size)
+                    yield from self._note(kind, -1, start, size)
             except (struct.error, ValueError, KeyError):
                 is_whole = False
             if not is_whole:
@@ -68,12 +68,13 @@ class SalvagedMcap(SalvagedChunks):
         if is_whole and after + 8 + packed_size > size:
             raise ValueError('chunk longer than its record')
         left = min(packed_size, size - after - 8)
-        chunk = Chunk(start + after + 8, left, compression, unpacked_size)
+        chunk = self._add_chunk(Chunk(start + after + 8, left, compression, unpacked_size))
         records = self._unpacked(chunk)
         if is_whole and (
             len(records) != unpacked_size or (checksum and crc32(records) != checksum)
         ):
-            raise ValueError('chunk with a wrong checksum or size')
+            self.skipped_at.append(start)
+            return
         at = 0
         while at + RECORD.size <= len(records):
             kind, length = RECORD.unpack_from(records, at)
@@ -83,14 +84,12 @@ class SalvagedMcap(SalvagedChunks):
             yield from self._note(kind, chunk, at, length)
             at += length
 
-    def _note(
-        self, kind: int, chunk: Chunk | None, start: int, size: int
-    ) -> Iterator[FoundMessage]:
+    def _note(self, kind: int, chunk: int, start: int, size: int) -> Iterator[FoundMessage]:
         """Yield the message in a record, or keep its schema or channel."""
         if kind not in (SCHEMA, CHANNEL, MESSAGE):
             return
         wanted = min(size, MESSAGE_HEAD.size) if kind == MESSAGE else size
-        content = self._read(Place(chunk, start, wanted))
+        content = self._read((chunk, start, wanted))
         if kind == SCHEMA:
             (key,) = struct.unpack_from('<H', content)
             name, at = text(content, 2)
@@ -100,9 +99,11 @@ class SalvagedMcap(SalvagedChunks):
             self._note_channel(content)
         else:
             channel, _, record_ns, _ = MESSAGE_HEAD.unpack(content)
+            if record_ns >= 2**63:
+                raise ValueError(f'record time of {record_ns} ns')
             if channel not in self._by_id:
                 raise ValueError(f'message of the unknown channel {channel}')
-            place = Place(chunk, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size)
+            place = (chunk, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size, 0)
             yield FoundMessage(record_ns, channel, place)
 
     def _note_channel(self, content: bytes) -> None:

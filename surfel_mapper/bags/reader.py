@@ -16,6 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 import heapq
+from itertools import islice
 import logging
 from pathlib import Path
 import tempfile
@@ -32,7 +33,7 @@ from surfel_mapper.bags._rosbags import (
 from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
 from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
 from surfel_mapper.bags.salvage import SalvagedFile
-from surfel_mapper.bags.storage import damaged, described, open_storage
+from surfel_mapper.bags.storage import damaged, described, open_storage, salvage, suffix
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, DependencyError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
@@ -186,11 +187,8 @@ class BagReader:
                 continue
             files.callback(storage.close)
             self._storages.append((path, storage))
-            if isinstance(storage, SalvagedFile) and storage.cut_at is not None:
-                self.cuts.append(
-                    f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
-                    f'{storage.size}; the {storage.message_count} messages found are read'
-                )
+            if isinstance(storage, SalvagedFile):
+                self._note_losses(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
                 self.cuts.append(
@@ -251,10 +249,44 @@ class BagReader:
             except DependencyError:
                 raise
             except Exception as error:
-                raise damaged(path, f'damaged after {done} messages', error) from error
+                salvaged = self._salvaged(path, storage)
+                if salvaged is None:
+                    raise damaged(path, f'damaged after {done} messages', error) from error
+                storage, topics = salvaged, {(c.topic, c.msgtype) for c in wanted}
+                wanted = [c for c in salvaged.connections if (c.topic, c.msgtype) in topics]
+                # all chunks before the damaged one are intact, so the order is the same
+                messages = islice(salvaged.messages(wanted, start_ns, stop_ns), done, None)
+                continue
             done += 1
             type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
             yield BagMessage(connection.topic, type_, record_ns, raw)
+
+    def _salvaged(self, path: Path, storage: Storage) -> SalvagedFile | None:
+        """Return an mcap file with a damaged chunk read without its index; None for others."""
+        if isinstance(storage, SalvagedFile) or suffix(path) != '.mcap' or is_packed(path):
+            return None
+        salvaged = salvage(path, path)
+        if salvaged is None:
+            return None
+        self._files.callback(salvaged.close)
+        self._note_losses(path, salvaged)
+        for cut in self.cuts[-2:]:
+            log.warning(cut)
+        return salvaged
+
+    def _note_losses(self, path: Path, storage: SalvagedFile) -> None:
+        """Add what a salvaged file lacks to ``cuts``."""
+        found = f'the {storage.message_count} messages found are read'
+        if storage.cut_at is not None:
+            self.cuts.append(
+                f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
+                f'{storage.size}; {found}'
+            )
+        if storage.skipped_at:
+            self.cuts.append(
+                f'{path}: {len(storage.skipped_at)} chunks with a wrong checksum are skipped, the '
+                f'first at byte {storage.skipped_at[0]}; {found}'
+            )
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare the number of messages read of each topic with the index."""

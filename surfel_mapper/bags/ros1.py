@@ -17,7 +17,7 @@ from collections.abc import Iterator
 import struct
 
 from surfel_mapper.bags._rosbags import ros1_connection
-from surfel_mapper.bags.salvage import Chunk, FoundMessage, Place, SalvagedChunks
+from surfel_mapper.bags.salvage import Chunk, FoundMessage, SalvagedChunks
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
@@ -37,13 +37,13 @@ class SalvagedRos1(SalvagedChunks):
         at, has_index = len(self.MAGIC), False
         while at < self.size:
             try:
-                fields, start, size = self._record(None, at)
+                fields, start, size = self._record(-1, at)
                 kind = fields['op'][0]
                 is_whole = start + size <= self.size
                 if kind == CHUNK:
                     yield from self._in_chunk(fields, start, min(size, self.size - start))
                 elif is_whole:
-                    yield from self._note(fields, None, start, size)
+                    yield from self._note(fields, -1, start, size)
             except (struct.error, ValueError, KeyError, IndexError):
                 is_whole = False
             if not is_whole:
@@ -57,7 +57,8 @@ class SalvagedRos1(SalvagedChunks):
     def _in_chunk(self, fields: Fields, start: int, size: int) -> Iterator[FoundMessage]:
         """Yield the messages in a chunk of which ``size`` bytes are in the file."""
         (unpacked_size,) = struct.unpack('<I', fields['size'])
-        chunk = Chunk(start, size, fields['compression'].decode(), unpacked_size)
+        place = Chunk(start, size, fields['compression'].decode(), unpacked_size)
+        chunk = self._add_chunk(place)
         records, at = self._unpacked(chunk), 0
         while at < len(records):
             try:
@@ -69,31 +70,27 @@ class SalvagedRos1(SalvagedChunks):
             yield from self._note(inner, chunk, inner_start, inner_size)
             at = inner_start + inner_size
 
-    def _record(self, chunk: Chunk | None, at: int) -> tuple[Fields, int, int]:
+    def _record(self, chunk: int, at: int) -> tuple[Fields, int, int]:
         """Return the header of a record, and offset and length of its data."""
-        (length,) = struct.unpack('<I', self._read(Place(chunk, at, 4)))
+        (length,) = struct.unpack('<I', self._read((chunk, at, 4)))
         if length > MOST_HEADER_BYTES:
             raise ValueError(f'header of {length} bytes')
-        head = self._read(Place(chunk, at + 4, length + 4))
+        head = self._read((chunk, at + 4, length + 4))
         (size,) = struct.unpack('<I', head[length:])
         return header_fields(head[:length]), at + 8 + length, size
 
-    def _note(
-        self, fields: Fields, chunk: Chunk | None, start: int, size: int
-    ) -> Iterator[FoundMessage]:
+    def _note(self, fields: Fields, chunk: int, start: int, size: int) -> Iterator[FoundMessage]:
         """Yield the message in a record, or keep its connection."""
         kind = fields['op'][0]
         if kind == CONNECTION:
-            content = header_fields(self._read(Place(chunk, start, size)))
+            content = header_fields(self._read((chunk, start, size)))
             self._note_connection(fields, content)
         elif kind == MESSAGE:
             (connection,) = struct.unpack('<I', fields['conn'])
             if connection not in self._by_id:
                 raise ValueError(f'message of the unknown connection {connection}')
             seconds, nanoseconds = struct.unpack('<II', fields['time'])
-            yield FoundMessage(
-                seconds * 10**9 + nanoseconds, connection, Place(chunk, start, size)
-            )
+            yield FoundMessage(seconds * 10**9 + nanoseconds, connection, (chunk, start, size, 0))
 
     def _note_connection(self, fields: Fields, content: Fields) -> None:
         """Keep the connection in a record."""

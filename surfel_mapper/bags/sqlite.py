@@ -19,6 +19,9 @@ from pathlib import Path
 import struct
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
 from surfel_mapper.bags._rosbags import ros2_connection
 from surfel_mapper.bags.salvage import FoundMessage, SalvagedFile
 
@@ -57,10 +60,14 @@ class SalvagedSqlite(SalvagedFile):
         self._num_pages = self.size // self._page_size
         if num_pages > self._num_pages or self.size % self._page_size:
             self.cut_at = self._num_pages * self._page_size
-        messages: list[FoundMessage] = []
         for page in range(self._num_pages):
-            messages += self._in_page(page)
-        yield from (entry for entry in messages if entry.connection in self._by_id)
+            self._budget.check_time()
+            yield from self._in_page(page)
+
+    def _sorted_index(self) -> npt.NDArray[np.int64]:
+        """Return the index of the messages whose topic was found, on whichever page it was."""
+        index = super()._sorted_index()
+        return index[np.isin(index[:, 1], list(self._by_id))]
 
     def _in_page(self, page: int) -> Iterator[FoundMessage]:
         """Yield the messages in a page, if it is a leaf; keep its topics."""
@@ -99,6 +106,8 @@ class SalvagedSqlite(SalvagedFile):
         header_size, types_at = varint(content, at)
         if at + local > len(content) or header_size > local:
             raise ValueError('row longer than its page')
+        if size > self.size:
+            raise ValueError('row longer than the file')
         types = []
         while types_at < at + header_size:
             kind, types_at = varint(content, types_at)
@@ -127,12 +136,12 @@ class SalvagedSqlite(SalvagedFile):
                 rowid, topic, type_, self, encoding=encoding, qos=qos
             )
 
-    def _check_chain(self, place: tuple[int, int, int, int]) -> None:
+    def _check_chain(self, place: tuple[int, ...]) -> None:
         """Raise ValueError if an overflow page of a message is not in the file."""
         for _ in self._chain(place):
             pass
 
-    def _chain(self, place: tuple[int, int, int, int]) -> Iterator[int]:
+    def _chain(self, place: tuple[int, ...]) -> Iterator[int]:
         """Yield the offsets of the overflow pages of a row."""
         start, local, size, _ = place
         link = start + local
@@ -143,7 +152,7 @@ class SalvagedSqlite(SalvagedFile):
             link = (page - 1) * self._page_size
             yield link
 
-    def _read(self, place: tuple[int, int, int, int]) -> bytes:
+    def _read(self, place: tuple[int, ...]) -> bytes:
         """Return the blob of a message."""
         start, local, size, skipped = place
         parts = [self._at(start, local)]

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+import os
 from pathlib import Path
 import shutil
 import tempfile
@@ -22,6 +23,7 @@ import numpy as np
 from surfel_mapper.bags._rosbags import jazzy_types, latched_profile, new_writer
 from surfel_mapper.bags.paths import METADATA
 from surfel_mapper.errors import BagError
+from surfel_mapper.files.atomic import sync_directory
 from surfel_mapper.messages.pointcloud2 import CloudBytes
 from surfel_mapper.messages.poses import StampedPose
 
@@ -210,12 +212,17 @@ class BagWriter:
         replaced = self._hidden / 'replaced'
         if self.path.exists():
             self.path.rename(replaced)
+        for file in self.directory.iterdir():
+            with open(file, 'rb') as written:
+                os.fsync(written.fileno())
+        sync_directory(self.directory)
         try:
             self.directory.rename(self.path)
         except OSError:
             if replaced.exists():
                 replaced.rename(self.path)
             raise
+        sync_directory(self.path.parent)
 
     def _write_message(
         self, topic: str, record_ns: int, message: Any, *, latched: bool = False

@@ -4,8 +4,9 @@
 Reading of YAML files, in time and memory bounded by their size.
 
 A YAML alias (``*name``) repeats an anchored node (``&name``). A few lines of nested aliases expand
-to a tree that no memory holds, so an alias inside of an anchored node is refused. So is nesting
-deeper than any setting, which would exhaust the recursion of the parser.
+to a tree that no memory holds, so an alias inside of an anchored node is refused, and aliases
+count as the nodes that they expand to. Nesting deeper than any setting, which would exhaust the
+recursion of the parser, is refused too. Only regular files of at most 1 MiB are read.
 
 Alone in its module because chains of filters and bags are read by it too, not only settings.
 """
@@ -15,7 +16,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from surfel_mapper.budget import read_small_file
+
 MAX_DEPTH = 50
+
+MAX_EXPANDED = 100_000
+"""Limit of the nodes that the aliases of a file expand to; a chain of filters has some hundred."""
 
 
 def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
@@ -34,10 +40,11 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
     OSError
         If the file cannot be read.
     ValueError
-        If it is not YAML, is nested too deeply, or has an alias inside of an anchored node.
+        If it is not a regular file of at most 1 MiB, not YAML, is nested too deeply, or has
+        aliases that expand to too much.
 
     """
-    return parse_yaml(Path(path).read_text(encoding='utf-8'), as_text=as_text)
+    return parse_yaml(read_small_file(path).decode(), as_text=as_text)
 
 
 def parse_yaml(text: str, *, as_text: bool = False) -> Any:
@@ -55,18 +62,30 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
 
 
 def check_nesting(text: str) -> None:
-    """Raise ValueError if YAML is nested too deeply or has an alias inside of an anchored node."""
+    """Raise ValueError if YAML is nested too deeply or has aliases that expand to too much."""
     import yaml
 
-    are_named: list[bool] = []
+    open_nodes: list[tuple[str | None, int]] = []  # anchor, and number of the first node inside
+    sizes: dict[str, int] = {}
+    num_nodes = expanded = 0
     for event in yaml.parse(text, yaml.BaseLoader):
-        if isinstance(event, yaml.AliasEvent) and any(are_named):
-            raise ValueError(f'an alias inside of an anchored node{place(event.start_mark)}')
-        if isinstance(event, yaml.CollectionStartEvent):
-            are_named.append(event.anchor is not None)
+        if isinstance(event, yaml.AliasEvent):
+            if any(anchor is not None for anchor, _ in open_nodes):
+                raise ValueError(f'an alias inside of an anchored node{place(event.start_mark)}')
+            expanded += sizes.get(event.anchor, 1)
+            if expanded > MAX_EXPANDED:
+                raise ValueError(
+                    f'aliases that expand to over {MAX_EXPANDED} nodes{place(event.start_mark)}'
+                )
+        elif isinstance(event, yaml.NodeEvent):
+            num_nodes += 1
+            if isinstance(event, yaml.CollectionStartEvent):
+                open_nodes.append((event.anchor, num_nodes))
         elif isinstance(event, yaml.CollectionEndEvent):
-            are_named.pop()
-        if len(are_named) > MAX_DEPTH:
+            anchor, first = open_nodes.pop()
+            if anchor is not None:
+                sizes[anchor] = num_nodes - first + 1
+        if len(open_nodes) > MAX_DEPTH:
             raise ValueError(f'nested deeper than {MAX_DEPTH}{place(event.start_mark)}')
 
 

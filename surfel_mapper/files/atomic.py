@@ -11,7 +11,7 @@ disk, see the old file or the new one, never a part.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 import json
 import os
 from pathlib import Path
@@ -57,11 +57,23 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
             if lasting:
                 os.fsync(file.fileno())
         os.replace(temporary, target)
+        if lasting:
+            sync_directory(target.parent)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             raise cannot_write(path, error) from error
         raise
+
+
+def sync_directory(directory: Path) -> None:
+    """Wait until the names in a directory are on the disk, if the file system supports it."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        with suppress(OSError):  # some network file systems refuse
+            os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files.state import load_state, save_state
-from surfel_mapper.kernels.layout import HALF, MAX_MAP_COUNT
+from surfel_mapper.geometry import check_rigid
+from surfel_mapper.kernels.layout import MAX_MAP_COUNT
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -146,8 +147,9 @@ def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
 def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMap) -> WindowedScan:
     """Return one scan of the window."""
     pose = arrays['scans.pose'][number]
-    if pose.shape != (4, 4) or pose.dtype != np.float64 or not np.isfinite(pose).all():
-        raise ValueError(f'scan {number}: no finite (4, 4) pose')
+    if pose.dtype != np.float64:
+        raise ValueError(f'scan {number}: pose of {pose.dtype}, expected float64')
+    check_rigid(f'pose of scan {number}', pose)
     return WindowedScan(
         moments=_moments(arrays, f'scan{number}', surfel_map),
         stamp_ns=int(arrays['scans.stamp_ns'][number]),
@@ -195,8 +197,7 @@ def checked_moments(
         raise ValueError(f'{prefix}: keys, products or channels are not int64')
     if len(np.unique(key)) < len(key) or (key < 0).any():
         raise ValueError(f'{prefix}: a voxel occurs twice, or is out of range')
-    most = np.abs(parts['total']).max(axis=1, initial=0) / (HALF << surfel_map.level)
-    if (count < 1).any() or (count > MAX_MAP_COUNT).any() or (most > count).any():
+    if (count < 1).any() or (count > MAX_MAP_COUNT).any():
         raise ValueError(f'{prefix}: impossible numbers of points')
     return ScanMoments(
         voxel_size_m=surfel_map.voxel_size_m,

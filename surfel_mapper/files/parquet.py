@@ -11,7 +11,7 @@ compared, so a changed file is refused. Other tools read the columns by name.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 import json
 import os
 from pathlib import Path
@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import DependencyError, FileFormatError, MapError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments
@@ -31,6 +32,12 @@ KIND, VERSION = 'surfel_mapper surfels', 1
 
 METADATA = b'surfel_mapper'
 """Key of the attributes, as JSON, in the metadata of the schema."""
+
+ROW_BYTES = 3 * 8
+"""Memory for a number: in the table of Arrow, as a column and in the moments."""
+
+FOOTER_LIMITS = {'thrift_string_size_limit': 16 << 20, 'thrift_container_size_limit': 1 << 20}
+"""Limits of the texts and lists in the footer of a file."""
 
 INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
@@ -90,13 +97,11 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
     """
     arrow, parquet = import_pyarrow()
     try:
-        with open(path, 'rb') as file, parquet.ParquetFile(file) as content:
-            num_rows = content.metadata.num_rows
-            if num_rows > os.fstat(file.fileno()).st_size:  # no two rows are alike
-                raise FileFormatError(f'{path}: damaged: {num_rows} rows in so small a file')
+        with open(path, 'rb') as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
             names = moment_names(surfel_map)
+            check_size(content, names, path, os.fstat(file.fileno()).st_size)
             table = content.read(columns=list(names))
             columns = {name: int64_column(table, name) for name in names}
     except FileFormatError:
@@ -112,6 +117,45 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
             f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
         )
     return surfel_map
+
+
+def check_size(
+    content: Any,
+    names: tuple[str, ...],
+    path: str | Path,
+    file_size: int,
+    groups: Iterable[int] | None = None,
+) -> None:
+    """
+    Raise FileFormatError if columns have a wrong type or are too large for their file.
+
+    Tested before a row is read: a footer of some bytes can state billions of rows.
+
+    Parameters
+    ----------
+    content : ParquetFile
+        The file.
+    names : tuple of str
+        Columns to be read.
+    path : str or Path
+        Named in errors.
+    file_size : int
+        Size of the file, bytes.
+    groups : iterable of int, optional
+        Row groups to be read; by default all.
+
+    """
+    schema, footer = content.schema_arrow, content.metadata
+    for name in names:
+        types = [str(schema.field(i).type) for i in schema.get_all_field_indices(name)]
+        if types not in (['int64'], ['int32']):
+            raise FileFormatError(f'{path}: column {name}: {types or "missing"}, expected int64')
+    chosen = range(footer.num_row_groups) if groups is None else list(groups)
+    num_rows = sum(footer.row_group(group).num_rows for group in chosen)
+    num_bytes = sum(footer.row_group(group).total_byte_size for group in chosen)
+    budget = Budget(path, file_size, FileFormatError)
+    budget.take(max(num_rows, 0) * len(names) * ROW_BYTES, f'{num_rows} rows')
+    budget.take(max(num_bytes, 0), 'unpacked pages')
 
 
 def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, Any]:

@@ -29,8 +29,10 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.parquet import (
     attributes_of,
+    check_size,
     Columns,
     fill,
+    FOOTER_LIMITS,
     import_pyarrow,
     INDEX,
     int64_column,
@@ -134,6 +136,7 @@ def read_part(part: Part) -> SurfelMap:
     with _opened(part.path) as (content, attributes):
         surfel_map = map_of(attributes, None, part.path)
         names = moment_names(surfel_map)
+        check_size(content, names, part.path, Path(part.path).stat().st_size, part.groups)
         for group in part.groups:
             table = content.read_row_group(group, columns=list(names), use_threads=False)
             fill(surfel_map, {name: int64_column(table, name) for name in names}, part.path)
@@ -151,6 +154,8 @@ def split_map(path: str | Path) -> Iterator[SurfelMap]:
     """Yield the map in a Parquet file in parts, so that it need not fit into memory."""
     with _opened(path) as (content, attributes):
         names = moment_names(map_of(attributes, None, path))
+        for group in range(content.metadata.num_row_groups):
+            check_size(content, names, path, Path(path).stat().st_size, [group])
         for batch in content.iter_batches(ROWS_READ, columns=list(names)):
             surfel_map = map_of(attributes, None, path)
             fill(surfel_map, {name: int64_column(batch, name) for name in names}, path)
@@ -284,7 +289,10 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
     """
     arrow, parquet = import_pyarrow()
     try:
-        with open(path, 'rb') as file, parquet.ParquetFile(file, metadata=footer) as content:
+        with (
+            open(path, 'rb') as file,
+            parquet.ParquetFile(file, metadata=footer, **FOOTER_LIMITS) as content,
+        ):
             known = footer is not None
             stated = {} if known else read_attributes(path, content.schema_arrow.metadata or {})
             yield content, stated

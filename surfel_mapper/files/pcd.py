@@ -148,6 +148,9 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         sizes = [int(word) for word in words['SIZE']]
         counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
         num_points = int(words['POINTS'][0])
+        stated = [int(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
+        if len(stated) == 2 and stated[0] * stated[1] != num_points:
+            raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']
         fields = [
             field_of(*stated, place)
@@ -184,6 +187,11 @@ def binary_table(
         raise FileFormatError(
             f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
             'points; truncated?'
+        )
+    if left - size >= header.layout.itemsize:
+        raise FileFormatError(
+            f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
+            'points; is its header damaged?'
         )
     return np.frombuffer(file.read(size), header.layout)
 
@@ -227,7 +235,13 @@ def ascii_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDAr
     numbers = header.layout.itemsize and sum(
         int(np.prod(header.layout[name].shape)) for name in header.layout.names or ()
     )
-    words = file.read().split()
+    text = file.read()
+    if text and not text[-1:].isspace():
+        raise FileFormatError(
+            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
+            'it is complete, append an end of line'
+        )
+    words = text.split()
     if len(words) != header.num_points * numbers:
         raise FileFormatError(
             f'{path}: {len(words)} numbers, expected {header.num_points * numbers} for '

@@ -176,14 +176,19 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     """
     try:
         with open(path, 'rb') as file:
-            count, layout, is_text = read_header(path, file)
+            count, layout, is_text, is_last = read_header(path, file)
             if is_text:
-                return text_columns(path, count, layout, file)
+                return text_columns(path, count, layout, file, is_last=is_last)
             size, left = count * layout.itemsize, os.fstat(file.fileno()).st_size - file.tell()
             if size > left:
                 raise FileFormatError(
                     f'{path}: {left} bytes after the header, expected {size} for {count} '
                     'vertices; truncated?'
+                )
+            if is_last and left - size >= layout.itemsize:
+                raise FileFormatError(
+                    f'{path}: {left} bytes after the header, expected {size} for {count} '
+                    'vertices; is its header damaged?'
                 )
             table = np.frombuffer(file.read(size), layout)
     except OSError as error:
@@ -195,16 +200,24 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
 
 
 def text_columns(
-    path: str | Path, count: int, layout: np.dtype[Any], file: BinaryIO
+    path: str | Path, count: int, layout: np.dtype[Any], file: BinaryIO, *, is_last: bool
 ) -> dict[str, npt.NDArray[Any]]:
     """Return the properties of the vertices of an ascii file."""
     names = layout.names or ()
-    words = file.read().split()[: count * len(names)]
-    if len(words) < count * len(names):
+    text = file.read()
+    words = text.split(None, count * len(names))
+    rest = words[count * len(names) :]
+    if len(words) < count * len(names) or (is_last and rest and rest[0].strip()):
         raise FileFormatError(
             f'{path}: {len(words)} numbers, expected {count * len(names)} for {count} vertices; '
             'truncated?'
         )
+    if words and not rest and not text[-1:].isspace():
+        raise FileFormatError(
+            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
+            'it is complete, append an end of line'
+        )
+    del words[count * len(names) :]
     try:
         # one by one: as an array of texts every number takes the room of the longest
         table = np.array([float(word) for word in words]).reshape(count, len(names))
@@ -214,9 +227,9 @@ def text_columns(
         return {name: table[:, at].astype(layout[name]) for at, name in enumerate(names)}
 
 
-def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool]:
+def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool, bool]:
     """
-    Return the number and layout of the vertices, and whether they are text.
+    Return number and layout of the vertices, and whether they are text and the last element.
 
     The file is then at the first vertex.
     """
@@ -242,4 +255,4 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
             f'{path}: version {version}, first element {count} x {element} of {len(properties)} '
             'properties, expected 1.0 and vertices of at least one'
         )
-    return number, layout, encoding == 'ascii'
+    return number, layout, encoding == 'ascii', not after

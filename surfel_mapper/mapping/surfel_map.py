@@ -27,8 +27,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
+from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names, means
+from surfel_mapper.mapping.kernels.checks import first_impossible
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.moments import (
     coarse_moments,
@@ -192,7 +194,14 @@ class SurfelMap:
         columns : mapping of str to (N,) array, optional
             Further columns of the points; required if the map has columns.
 
+        Raises
+        ------
+        ValueError
+            If shapes or types are wrong, or T_map_sensor is not a rigid transform.
+
         """
+        if T_map_sensor is not None:
+            check_rigid('T_map_sensor', T_map_sensor)
         return self._reducer.reduce(
             points,
             T_map_sensor,
@@ -209,11 +218,12 @@ class SurfelMap:
         Raises
         ------
         MapError
-            If their voxel size differs, or a voxel would hold more than 2^31 points
-            (2^31 / 4^level in a coarser map). Nothing is changed.
+            If their voxel size differs, no points can have these moments, or a voxel would hold
+            more than 2^31 points (2^31 / 4^level in a coarser map). Nothing is changed.
 
         """
         self._check_lattice(moments)
+        self._check_possible(moments)
         self._check_counts(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)
@@ -303,20 +313,24 @@ class SurfelMap:
         Parameters
         ----------
         level : int
-            1 doubles the edge of a voxel; 0 copies the map.
+            1 doubles the edge of a voxel; 0 copies the map. The level of the result, that of
+            this map and ``level`` together, is at most 20.
         within : two (3,) int, optional
             Lowest and highest voxel index to include; by default all voxels.
 
         Raises
         ------
         ValueError
-            If the level is negative or beyond 20.
+            If the level is negative, or that of the result would be beyond 20.
         MapLimitError
             If a voxel would hold more than 2^31 / 4^level points.
 
         """
-        if not 0 <= level <= layout.INDEX_BITS - 1:
-            raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
+        highest = layout.INDEX_BITS - 1 - self.level
+        if not 0 <= level <= highest:
+            raise ValueError(
+                f'level: {level}, expected 0 to {highest} for a map of level {self.level}'
+            )
         coarse = SurfelMap(
             self.voxel_size_m * 2**level, columns=self.columns, level=self.level + level
         )
@@ -485,6 +499,17 @@ class SurfelMap:
             raise MapError(
                 f'moments with the channels {moments.channel_names}; '
                 f'this map has {self._channel_names}'
+            )
+
+    def _check_possible(self, moments: ScanMoments) -> None:
+        """Raise MapError if no points of a voxel can have these moments."""
+        key, count, total, product, view = moments.arrays
+        row = first_impossible(key, count, total, product, view, moments.view_is_sum, self.level)
+        if row >= 0:
+            raise MapError(
+                f'row {row} of the moments: key {moments.key[row]}, {moments.count[row]} points, '
+                f'sums {moments.total[row].tolist()}, products {moments.product[row].tolist()}, '
+                f'views {moments.view[row].tolist()}; expected those of points in a voxel'
             )
 
     def _check_counts(self, moments: ScanMoments) -> None:

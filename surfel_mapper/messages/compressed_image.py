@@ -23,6 +23,7 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget, FLOOR_BYTES
 from surfel_mapper.errors import CloudFormatError
 
 TRANSPORTS = ('compressed', 'compressedDepth')
@@ -33,6 +34,9 @@ DEPTH_HEADER = np.dtype([('format', '<i4'), ('quantum', '<f4', 2)])
 
 MAX_PIXELS = 1 << 26
 """Larger images are refused: 8192 x 8192 pixels."""
+
+PIXEL_BYTES = 6
+"""Memory per pixel: three channels, decoded and as an array."""
 
 ENCODINGS = {'L': 'mono8', 'RGB': 'rgb8', 'I;16': '16UC1', 'I;16B': '16UC1', 'I': '16UC1'}
 """Pillow's mode of an image, and the encoding of a message."""
@@ -60,7 +64,7 @@ def base_topic(topic: str) -> str:
     return topic.rpartition('/')[0] if is_packed(topic) else topic
 
 
-def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
+def unpacked(msg: Any, topic: str, *, exact: bool, size: tuple[int, int] | None = None) -> Any:
     """
     Return an image that may be compressed with the attributes of a sensor_msgs/Image.
 
@@ -72,6 +76,8 @@ def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
         Named in errors.
     exact : bool
         Whether to refuse JPEG, which changes values.
+    size : (int, int), optional
+        Width and height by the calibration; an image of another size is not decoded.
 
     Raises
     ------
@@ -89,9 +95,10 @@ def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
             f'{topic}: data is a {type(msg.data).__name__}, expected a buffer of bytes: {error}'
         ) from error
     if packing.startswith('compressedDepth'):
-        encoding, pixels = depth_of(data, encoding, packing, topic)
+        encoding, pixels = depth_of(data, encoding, packing, topic, size)
     else:
-        encoding, pixels = pixels_of(data, topic, ('PNG',) if exact else ('PNG', 'JPEG'))
+        formats = ('PNG',) if exact else ('PNG', 'JPEG')
+        encoding, pixels = pixels_of(data, topic, formats, size)
     return SimpleNamespace(
         header=msg.header,
         height=pixels.shape[0],
@@ -103,7 +110,9 @@ def unpacked(msg: Any, topic: str, *, exact: bool) -> Any:
     )
 
 
-def depth_of(data: bytes, encoding: str, packing: str, topic: str) -> tuple[str, npt.NDArray[Any]]:
+def depth_of(
+    data: bytes, encoding: str, packing: str, topic: str, size: tuple[int, int] | None
+) -> tuple[str, npt.NDArray[Any]]:
     """Return encoding and pixels of a compressedDepth image."""
     if packing.endswith('rvl') or encoding not in ('16UC1', '32FC1'):
         raise CloudFormatError(
@@ -113,7 +122,7 @@ def depth_of(data: bytes, encoding: str, packing: str, topic: str) -> tuple[str,
     if len(data) < DEPTH_HEADER.itemsize:
         raise CloudFormatError(f'{topic}: {len(data)} bytes, expected a header and a PNG')
     header = np.frombuffer(data, DEPTH_HEADER, 1)[0]
-    found, steps = pixels_of(data[DEPTH_HEADER.itemsize :], topic, ('PNG',))
+    found, steps = pixels_of(data[DEPTH_HEADER.itemsize :], topic, ('PNG',), size)
     if found != '16UC1':
         raise CloudFormatError(f'{topic}: a PNG of {found}, expected one of 16 bits')
     if encoding == '16UC1':
@@ -124,15 +133,16 @@ def depth_of(data: bytes, encoding: str, packing: str, topic: str) -> tuple[str,
     return encoding, np.where((steps > 0) & np.isfinite(depth), depth, np.float32(np.nan))
 
 
-def pixels_of(data: bytes, topic: str, formats: tuple[str, ...]) -> tuple[str, npt.NDArray[Any]]:
+def pixels_of(
+    data: bytes, topic: str, formats: tuple[str, ...], size: tuple[int, int] | None
+) -> tuple[str, npt.NDArray[Any]]:
     """Return encoding and pixels of a file, (H, W) or (H, W, 3), little-endian."""
     from PIL import Image
 
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
             width, height = image.size
-            if width * height > MAX_PIXELS:
-                raise ValueError(f'{width} x {height} pixels, more than {MAX_PIXELS}')
+            check_size(width, height, len(data), topic, size)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
     except (*DAMAGED, Image.DecompressionBombError) as error:
@@ -140,3 +150,19 @@ def pixels_of(data: bytes, topic: str, formats: tuple[str, ...]) -> tuple[str, n
         raise CloudFormatError(f'{topic}: not a readable {expected}: {error}') from error
     encoding = ENCODINGS[shown.mode]
     return encoding, np.ascontiguousarray(pixels, '<u2' if encoding == '16UC1' else 'u1')
+
+
+def check_size(
+    width: int, height: int, num_bytes: int, topic: str, size: tuple[int, int] | None
+) -> None:
+    """Raise CloudFormatError if an image has another size than its camera, or too many pixels."""
+    if size is not None and (width, height) != size:
+        raise CloudFormatError(
+            f'{topic}: image of {width} x {height} pixels, the calibration is for '
+            f'{size[0]} x {size[1]}'
+        )
+    if width * height > MAX_PIXELS:
+        raise CloudFormatError(f'{topic}: {width} x {height} pixels, more than {MAX_PIXELS}')
+    floor = FLOOR_BYTES if size is None else max(FLOOR_BYTES, width * height * PIXEL_BYTES)
+    budget = Budget(topic, num_bytes, CloudFormatError, floor=floor)
+    budget.take(width * height * PIXEL_BYTES, f'image of {width} x {height} pixels')

@@ -139,7 +139,8 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
         raise CloudFormatError(
             f'{topic}: no calibration; is {camera_info_topic(topic)} published?'
         )
-    msg = unpacked(image.msg, topic, exact=True)
+    size = (image.camera.width, image.camera.height)
+    msg = unpacked(image.msg, topic, exact=True, size=size)
     stamp_ns, depth = checked_stamp_ns(msg.header.stamp, topic), depth_in(msg, topic)
     try:
         points = depth_points(depth, image.camera)
@@ -280,7 +281,9 @@ def scene_image(kind: str, image: CameraImage, topic: str) -> SceneImage:
         If encoding, sizes and data do not fit together.
 
     """
-    msg = unpacked(image.msg, topic, exact=kind != COLOR)
+    camera = image.camera
+    size = None if camera is None else (camera.width, camera.height)
+    msg = unpacked(image.msg, topic, exact=kind != COLOR, size=size)
     decode = colors_in if kind == COLOR else labels_in
     return SceneImage(
         kind=kind,

@@ -16,8 +16,9 @@ three numbers long, they take 1.0 ms.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 import math
 import struct
 from typing import Any
@@ -41,6 +42,9 @@ UINT32, FLOAT32, FLOAT64 = 6, 7, 8
 
 DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', UINT32: 'u4', FLOAT32: 'f4', FLOAT64: 'f8'}
 """NumPy dtypes of the datatypes of a PointField."""
+
+MAX_FIELDS = 1024
+"""Limit of the number of fields; drivers have some ten, clouds with descriptors some hundred."""
 
 DATATYPES = {np.dtype(name): datatype for datatype, name in DTYPES.items()}
 
@@ -102,16 +106,14 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
         return Scan(points=np.empty((0, 3), np.float32), stamp_ns=stamp_ns, frame_id=frame_id)
     fields = checked_fields(msg, topic)
     xyz = [checked_coordinate(fields, name, topic) for name in 'xyz']
+    check_overlap(fields, topic)
     points = Points.of(msg, data)
+    others = {name: field for name, field in fields.items() if name not in ('x', 'y', 'z')}
     return Scan(
         points=coordinates(points, xyz),
         stamp_ns=stamp_ns,
         frame_id=frame_id,
-        columns={
-            name: column(points, field)
-            for name, field in fields.items()
-            if name not in ('x', 'y', 'z')
-        },
+        columns=MessageColumns(points, others),
         msg=msg,
     )
 
@@ -152,6 +154,8 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
 
     A count of 0 is read as 1, as old drivers and bags write it.
     """
+    if len(msg.fields) > MAX_FIELDS:
+        raise CloudFormatError(f'{topic}: {len(msg.fields)} fields, expected at most {MAX_FIELDS}')
     fields: dict[str, Field] = {}
     for found in msg.fields:
         field = Field(found.name, int(found.offset), int(found.datatype), int(found.count) or 1)
@@ -170,6 +174,23 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
         if field != first and field.name in ('x', 'y', 'z'):
             raise CloudFormatError(f'{topic}: two fields {field.name!r} that differ, expected one')
     return fields
+
+
+def check_overlap(fields: Mapping[str, Field], topic: str) -> None:
+    """
+    Raise CloudFormatError if fields share bytes of a point.
+
+    Without overlap all columns together are no larger than the message. A 3 MB message with 200
+    overlapping fields took 5.7 GB.
+    """
+    ordered = sorted(fields.values(), key=lambda field: field.offset)
+    for before, field in pairwise(ordered):
+        end = before.offset + before.count * np.dtype(DTYPES[before.datatype]).itemsize
+        if field.offset < end:
+            raise CloudFormatError(
+                f'{topic}: field {field.name!r} at byte {field.offset} of a point overlaps field '
+                f'{before.name!r}, which ends at byte {end}'
+            )
 
 
 def checked_coordinate(fields: Mapping[str, Field], name: str, topic: str) -> Field:
@@ -214,6 +235,36 @@ class Points:
             shape, strides = (*shape, count), (*strides, dtype.itemsize)
         items: npt.NDArray[Any] = np.ndarray(shape, dtype, self.data, offset, strides)
         return items
+
+
+class MessageColumns(Mapping[str, npt.NDArray[Any]]):
+    """
+    The further fields of a cloud as columns, each decoded when it is first read.
+
+    Most are views; those of other byte orders or padded rows are copies, made only if used.
+    """
+
+    __slots__ = ('_decoded', '_fields', '_points', 'num_rows')
+
+    def __init__(self, points: Points, fields: Mapping[str, Field]) -> None:
+        self._points = points
+        self._fields = fields
+        self._decoded: dict[str, npt.NDArray[Any]] = {}
+        self.num_rows = math.prod(points.shape)
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        if name not in self._decoded:
+            self._decoded[name] = column(self._points, self._fields[name])
+        return self._decoded[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._fields)
+
+    def __len__(self) -> int:
+        return len(self._fields)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._fields
 
 
 def column(points: Points, field: Field) -> npt.NDArray[Any]:
@@ -358,6 +409,8 @@ def read_cloud(reader: MessageReader) -> RawCloud:
     num_fields = reader.number('I')
     if num_fields * SMALLEST_FIELD_BYTES > reader.remaining:
         raise ValueError(f'{num_fields} fields announced, {reader.remaining} bytes left')
+    if num_fields > MAX_FIELDS:
+        raise ValueError(f'{num_fields} fields, expected at most {MAX_FIELDS}')
     return RawCloud(
         header=header,
         height=height,

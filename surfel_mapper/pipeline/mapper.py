@@ -34,6 +34,7 @@ from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.pipeline import regions
 from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.reduction import Step
@@ -448,7 +449,8 @@ class Mapper:
             are mapped; a kernel that is needed earlier is compiled by the first call.
 
         """
-        return self._inserter.warm_up_steps(self.config)
+        before, later = self._inserter.warm_up_steps(self.config)
+        return before, [*later, regions.warm_up]
 
     def summary(self) -> dict[str, Any]:
         """Return counts, times and figures of the map, for files, reports and diagnostics."""

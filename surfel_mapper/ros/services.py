@@ -25,7 +25,7 @@ from std_srvs.srv import SetBool, Trigger
 
 from surfel_mapper.errors import FileFormatError, MapError, PoseError, SurfelMapperError
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.pipeline.regions import Ball, Box, Prism, Region
+from surfel_mapper.pipeline.regions import Ball, Box, MAX_CORNERS, Prism, Region
 from surfel_mapper.ros.base_node import result_of
 from surfel_mapper.ros.map_files import load_map, save_map
 from surfel_mapper.ros.mapping_thread import MappingThread
@@ -230,9 +230,11 @@ def prism(msg: Any, mapper: Mapper) -> Prism:
     PoseError
         If the frame_id is empty, or there is no transform to the fixed frame at the stamp.
     ValueError
-        If it has fewer than three corners, or one is not finite.
+        If it has fewer than three corners or too many, or one is not finite.
 
     """
+    if len(msg.polygon.points) > MAX_CORNERS:
+        raise ValueError(f'{len(msg.polygon.points)} corners, expected at most {MAX_CORNERS}')
     if not msg.header.frame_id:
         raise PoseError('its frame_id is empty')
     stamp_ns = msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec

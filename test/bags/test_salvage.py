@@ -110,6 +110,51 @@ def test_every_message_before_the_cut_of_a_ros1_bag_is_read(tmp_path, compressio
         assert found == [raw for raw in written if raw in left]
 
 
+@pytest.mark.parametrize('indexed', [True, False])
+def test_a_chunk_of_mcap_with_a_wrong_checksum_is_skipped_and_counted(tmp_path, caplog, indexed):
+    from mcap.writer import CompressionType, Writer
+
+    path = tmp_path / 'a.mcap'
+    with open(path, 'wb') as file:
+        writer = Writer(file, chunk_size=2000, compression=CompressionType.NONE)
+        writer.start('ros2', '')
+        schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'')
+        channel = writer.register_channel('/a', 'cdr', schema)
+        for i in range(100):
+            writer.add_message(channel, i, bytes([i]) * 200, i)
+        writer.finish()
+    content = bytearray(path.read_bytes())
+    content[content.index(bytes([50]) * 200)] ^= 1
+    if not indexed:
+        del content[-200:]
+    path.write_bytes(content)
+
+    found, cuts = read_raws(path)
+
+    lost = sorted(set(range(100)) - {raw[0] for raw in found})
+    assert 50 in lost
+    assert lost == list(range(lost[0], lost[-1] + 1))  # one chunk
+    assert len(lost) < 12
+    assert [raw[0] for raw in found] == sorted(set(range(100)) - set(lost))
+    assert any('1 chunks with a wrong checksum are skipped' in cut for cut in cuts)
+    assert set(cuts) <= {record.message for record in caplog.records}
+
+
+def test_a_ros1_bag_whose_index_disagrees_with_its_chunks_is_read_from_the_chunks(tmp_path):
+    path = write_ros1(tmp_path / 'drive.bag', drive(ROS1))
+    written = [ROS1.serialize_ros1(m, type_) for _, type_, _, m in drive(ROS1)]
+    content = bytearray(path.read_bytes())
+    at = content.rindex(b'topic=/odom')
+    at = content.rindex(b'conn=', 0, at) + len('conn=')
+    content[at] ^= 64
+    path.write_bytes(content)
+
+    found, cuts = read_raws(path)
+
+    assert found == written
+    assert cuts == []
+
+
 def test_a_ros1_recording_that_was_killed_is_read(tmp_path):
     path = write_ros1(tmp_path / 'drive.bag', drive(ROS1))
     content = bytearray(path.read_bytes())

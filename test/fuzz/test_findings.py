@@ -5,27 +5,45 @@
 from __future__ import annotations
 
 import bz2
+from dataclasses import replace
 from importlib.util import find_spec
 import io
+import os
+import struct
+import time
 import tracemalloc
+from types import SimpleNamespace
 
 import numpy as np
+from PIL import Image
 import pytest
 
 from surfel_mapper.bags import compression as bag_compression
+from surfel_mapper.bags import salvage
 from surfel_mapper.bags.compression import import_zstd, unpack_file, unpacked
 from surfel_mapper.bags.paths import files_of
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.config import load_config, TsdfConfig
-from surfel_mapper.errors import BagError, ConfigError, FileFormatError, PoseError
+from surfel_mapper.errors import (
+    BagError,
+    CloudFormatError,
+    ConfigError,
+    FileFormatError,
+    MapError,
+    PoseError,
+)
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.messages.compressed_image import unpacked as unpacked_image
+from surfel_mapper.messages.pointcloud2 import Field, to_scan
 from surfel_mapper.poses import buffer as buffer_module
 from test.bags import recorded
 from test.fuzz import corpus
+from test.fuzz.memory import reset_peak, resident
 
 LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
     f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]\n' for i in range(1, 40)
@@ -218,3 +236,292 @@ def test_the_number_of_transforms_is_limited(monkeypatch):
     with pytest.raises(PoseError, match='no more are taken'):
         buffer.add('odom', 'another', 1, np.eye(4))
     buffer.add('odom', 'frame2', 2, np.eye(4))
+
+
+def cloud_of(fields, points, point_step):
+    """Return a PointCloud2 of one row."""
+    return SimpleNamespace(
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=1, nanosec=0), frame_id='lidar'),
+        height=1,
+        width=points,
+        fields=fields,
+        is_bigendian=True,
+        point_step=point_step,
+        row_step=points * point_step,
+        data=bytes(points * point_step),
+    )
+
+
+XYZ = [Field(name, 4 * place, 7, 1) for place, name in enumerate('xyz')]
+
+
+@pytest.mark.parametrize(
+    'others',
+    [
+        [Field(f'f{i}', 12, 7, 250) for i in range(200)],
+        [Field('a', 12, 8, 1), Field('b', 16, 7, 1)],
+        [Field('a', 8, 7, 1)],
+    ],
+    ids=['all', 'partly', 'z'],
+)
+def test_fields_that_overlap_are_refused_before_memory_is_allocated(others):
+    message = cloud_of([*XYZ, *others], 3000, 1012)
+    _, peak = peak_of(lambda: to_scan(message))
+    assert peak < 1_000_000  # was 1,900 times the message
+
+
+def test_too_many_fields_are_refused():
+    message = cloud_of([*XYZ, *(Field(f'f{i}', 12 + i, 2, 1) for i in range(1100))], 2, 2000)
+    with pytest.raises(CloudFormatError, match='1103 fields, expected at most 1024'):
+        to_scan(message)
+
+
+def test_columns_that_are_not_read_are_not_copied():
+    message = cloud_of([*XYZ, Field('big', 12, 8, 100)], 3000, 812)
+    tracemalloc.start()
+    try:
+        scan = to_scan(message)
+        assert tracemalloc.get_traced_memory()[0] < 100_000
+        assert scan.columns['big'].shape == (3000, 100)
+        assert tracemalloc.get_traced_memory()[0] > 2_400_000
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize('name', ['/dev/zero', 'pipe', 'large.yaml'])
+def test_settings_are_read_from_small_regular_files_only(tmp_path, name):
+    os.mkfifo(tmp_path / 'pipe')
+    (tmp_path / 'large.yaml').write_bytes(b'# ' + bytes(b'x' * (1 << 20)))
+    for read in (load_config, Chain.load):
+        error, peak = peak_of(lambda read=read: read(tmp_path / name))
+        assert isinstance(error, ConfigError)
+        assert peak < 10_000_000
+
+
+def test_yaml_aliases_count_as_the_nodes_that_they_expand_to(tmp_path):
+    path = tmp_path / 'a.yaml'
+    anchor = '- &a {range_limit: {min_m: [' + ', '.join('1' * 5000) + ']}}\n'
+    path.write_text(anchor + '- *a\n' * 30)
+    with pytest.raises(ConfigError, match='aliases that expand to over 100000 nodes'):
+        Chain.load(path)
+    path.write_text('- &a {range_limit: {min_m: 1}}\n' + '- *a\n' * 50)
+    assert len(Chain.load(path)) == 51
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('key', -1),
+        ('count', 0),
+        ('total', 2**40),
+        ('product', -1),
+        ('product', 2**50),
+        ('view', 30_000),
+    ],
+)
+def test_moments_that_no_points_have_do_not_reach_a_map(name, value):
+    surfel_map = SurfelMap(0.5)
+    before = surfel_map.digest()
+    moments = surfel_map.reduce(np.random.default_rng(1).normal(size=(100, 3)), np.eye(4))
+    forged = getattr(moments, name).astype(np.int64)
+    forged.reshape(len(forged), -1)[0, 0] = value
+    with pytest.raises(MapError, match='row 0 of the moments'):
+        surfel_map.insert(replace(moments, **{name: forged}))
+    assert surfel_map.digest() == before
+    surfel_map.insert(moments)
+
+
+def test_a_transposed_pose_is_refused():
+    T = np.eye(4)
+    T[:3, 3] = 1.0, 2.0, 3.0
+    for wrong in (T.T, 2.0 * T, np.diag([1.0, 1.0, -1.0, 1.0]), T * np.nan, T[:3]):
+        with pytest.raises(ValueError, match='T_map_sensor: '):
+            SurfelMap(0.5).reduce(np.zeros((1, 3)), wrong)
+
+
+def test_a_level_that_cannot_be_reached_is_refused_with_those_that_can():
+    coarse = SurfelMap(0.5).coarsen(18)
+    with pytest.raises(ValueError, match='level: 3, expected 0 to 2 for a map of level 18'):
+        coarse.coarsen(3)
+    assert coarse.coarsen(2).level == 20
+
+
+def mcap_of_empty_messages(num_chunks, num_messages):
+    """Return an mcap file without an index, of packed chunks with small messages."""
+
+    def record(kind, content):
+        return struct.pack('<BQ', kind, len(content)) + content
+
+    def text(content):
+        return struct.pack('<I', len(content)) + content
+
+    schema = record(3, struct.pack('<H', 1) + text(b'a/msg/A') + text(b'ros2msg') + text(b''))
+    ids = struct.pack('<HH', 1, 1)
+    channel = record(4, ids + text(b'/a') + text(b'cdr') + struct.pack('<I', 0))
+    message = record(5, struct.pack('<HIQQ', 1, 0, 5, 5))
+    records = schema + channel + message * num_messages
+    packed = import_zstd().compress(records)
+    head = struct.pack('<QQQI', 5, 5, len(records), 0) + text(b'zstd')
+    chunk = record(6, head + struct.pack('<Q', len(packed)) + packed)
+    return b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b'')) + chunk * num_chunks
+
+
+def test_chunks_of_empty_messages_are_refused_before_the_index_fills_memory(tmp_path):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(mcap_of_empty_messages(8, 1_900_000))
+    assert path.stat().st_size < 60_000
+    start_s = time.thread_time()
+    reset_peak()
+    before = resident('VmRSS')
+    with pytest.raises(BagError, match=r'a\.mcap: index of \d+ messages: needs'):
+        BagReader(path)
+    assert resident('VmHWM') - before < 300 << 20  # was 3.5 GB
+    assert time.thread_time() - start_s < 15.0  # 3 s; was 128 s
+
+
+def test_large_chunks_are_unpacked_one_at_a_time(tmp_path, monkeypatch):
+    monkeypatch.setattr(salvage, 'KEPT_BYTES', 1 << 20)
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(mcap_of_empty_messages(4, 30_000))
+    with BagReader(path) as reader:
+        assert sum(1 for _ in reader.messages()) == 4 * 30_000
+        ((_, storage),) = reader._storages
+        assert len(storage._kept) == 1
+
+
+@pytest.fixture
+def parquet_map(tmp_path):
+    pytest.importorskip('pyarrow')
+    from surfel_mapper.files.parquet import write_map
+
+    path = tmp_path / 'a.parquet'
+    write_map(path, corpus.small_map()[0])
+    return path
+
+
+def rewritten(path, change):
+    """Write a Parquet file again with a changed table."""
+    from pyarrow import parquet
+
+    table = parquet.read_table(path)
+    parquet.write_table(change(table), path, compression='zstd')
+
+
+@pytest.mark.parametrize('kind', ['float64', 'string', 'list'])
+def test_columns_of_a_wrong_type_are_refused_before_they_are_read(parquet_map, kind):
+    import pyarrow
+
+    from surfel_mapper.files.parquet import read_map
+
+    def change(table):
+        place, number = table.schema.get_field_index('sum_x'), len(table)
+        values = {'float64': [0.5], 'string': ['x' * 1_000_000], 'list': [[1]]}[kind] * number
+        return table.set_column(place, 'sum_x', pyarrow.array(values))
+
+    rewritten(parquet_map, change)
+    with pytest.raises(FileFormatError, match='column sum_x: .*expected int64'):
+        read_map(parquet_map)
+
+
+def test_rows_that_repeat_are_refused_before_they_are_read(parquet_map):
+    import pyarrow
+
+    from surfel_mapper.files.parquet import read_map
+
+    def change(table):
+        return pyarrow.concat_tables([table.slice(0, 1)] * 1).take([0] * 3_000_000)
+
+    rewritten(parquet_map, change)
+    reset_peak()
+    before = resident('VmRSS')
+    with pytest.raises(FileFormatError, match='3000000 rows: needs .* more than the limit'):
+        read_map(parquet_map)
+    assert resident('VmHWM') - before < 64 << 20
+
+
+@pytest.mark.parametrize('dtype', ['c16', 'U4', 'S4', 'O', 'M8[ns]'])
+def test_arrays_of_text_and_complex_numbers_are_not_stored(tmp_path, dtype):
+    with pytest.raises(ValueError, match='expected a name .* integers or floats'):
+        save_state(tmp_path / 'a.npz', {'a': np.zeros(3, dtype)}, {})
+
+
+def test_a_window_with_a_transposed_pose_is_refused(tmp_path):
+    path = tmp_path / 'a.npz'
+    save_map(path, *corpus.small_map())
+    arrays, attributes = load_state(path)
+    pose = np.eye(4)
+    pose[3, :3] = 1.0, 2.0, 3.0
+    save_state(path, {**arrays, 'scans.pose': pose[None]}, attributes)
+    with pytest.raises(FileFormatError, match='pose of scan 0: .* expected a rigid transform'):
+        load_map(path)
+
+
+@pytest.mark.parametrize(('name', 'value'), [('total', 2**30), ('product', -1), ('view', 2**40)])
+def test_a_file_of_sums_that_no_points_have_is_refused(tmp_path, name, value):
+    path = tmp_path / 'a.npz'
+    surfel_map, _ = corpus.small_map()
+    save_map(path, surfel_map)
+    arrays, attributes = load_state(path)
+    forged = arrays[f'map.{name}'].copy()
+    forged[0, 0] = value
+    save_state(path, {**arrays, f'map.{name}': forged}, attributes)
+    with pytest.raises(FileFormatError, match='damaged: row 0 of the moments'):
+        load_map(path)
+
+
+def png(width, height):
+    """Return a black PNG."""
+    file = io.BytesIO()
+    Image.new('L', (width, height)).save(file, 'PNG')
+    return SimpleNamespace(header=None, format='mono8; png compressed', data=file.getvalue())
+
+
+def test_images_are_refused_by_the_size_in_their_header():
+    large = png(6000, 6000)
+    assert len(large.data) < 100_000
+    error, peak = peak_of(lambda: unpacked_image(large, '/image', exact=True))
+    assert 'image of 6000 x 6000 pixels: needs 216000000 bytes' in str(error)
+    assert peak < 10_000_000
+    error, peak = peak_of(lambda: unpacked_image(large, '/image', exact=True, size=(640, 480)))
+    assert 'image of 6000 x 6000 pixels, the calibration is for 640 x 480' in str(error)
+    assert peak < 10_000_000
+
+
+def test_an_image_of_the_size_of_its_camera_is_decoded_however_well_it_is_packed():
+    image = unpacked_image(png(4000, 3000), '/image', exact=True, size=(4000, 3000))
+    assert (image.width, image.height) == (4000, 3000)
+
+
+TEXT_PLY = 'ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nend_header\n'
+TEXT_PCD = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA '
+
+
+@pytest.mark.parametrize(
+    ('name', 'content', 'problem'),
+    [
+        ('a.ply', TEXT_PLY + '1.25\n2.5', 'no end of line'),
+        ('a.pcd', TEXT_PCD + 'ascii\n1.25\n2.5', 'no end of line'),
+        ('a.ply', TEXT_PLY + '1.25\n2.5\n3.5\n', '3 numbers, expected 2'),
+        ('a.pcd', TEXT_PCD.replace('WIDTH 2', 'WIDTH 3') + 'ascii\n1\n2\n', 'WIDTH 3, HEIGHT 1'),
+        ('a.pcd', TEXT_PCD + 'binary\n' + 'x' * 12, '12 bytes after the header, expected 8'),
+        (
+            'a.ply',
+            TEXT_PLY.replace('ascii', 'binary_little_endian') + 'x' * 12,
+            '12 bytes after the header, expected 8',
+        ),
+    ],
+)
+def test_counts_are_compared_with_the_points_and_cut_numbers_are_refused(
+    tmp_path, name, content, problem
+):
+    path = tmp_path / name
+    path.write_text(content)
+    with pytest.raises(FileFormatError, match=problem):
+        (ply if name == 'a.ply' else pcd).read_points(path)
+
+
+def test_text_with_an_end_of_line_is_read(tmp_path):
+    (tmp_path / 'a.ply').write_text(TEXT_PLY + '1.25\n2.5\n')
+    (tmp_path / 'a.pcd').write_text(TEXT_PCD + 'ascii\n1.25\n2.5\n')
+    for reader, name in ((ply, 'a.ply'), (pcd, 'a.pcd')):
+        assert reader.read_points(tmp_path / name)['x'].tolist() == [1.25, 2.5]

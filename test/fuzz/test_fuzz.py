@@ -8,15 +8,14 @@ The same inputs in every run, a few thousand altogether; ``make fuzz`` searches 
 
 from __future__ import annotations
 
-import contextlib
 from importlib.util import find_spec
 import logging
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from test.fuzz.harnesses import HARNESSES
+from test.fuzz.memory import reset_peak, resident
 from test.fuzz.mutations import mutations
 
 NEEDED = {'parquet': 'pyarrow', 'pcd': 'lzf', 'mcap': 'mcap', 'map_url': 'rclpy'}
@@ -40,20 +39,6 @@ def harness(name):
     if name in NEEDED and find_spec(NEEDED[name]) is None:
         pytest.skip(f'{NEEDED[name]} is not installed')
     return HARNESSES[name]
-
-
-def resident(what):
-    """Return the resident memory (VmRSS) or its peak (VmHWM), bytes; 0 if /proc is missing."""
-    try:
-        lines = Path('/proc/self/status').read_text(encoding='ascii').splitlines()
-    except OSError:
-        return 0
-    return next((int(line.split()[1]) << 10 for line in lines if line.startswith(what)), 0)
-
-
-def reset_peak():
-    with contextlib.suppress(OSError):
-        Path('/proc/self/clear_refs').write_text('5', encoding='ascii')
 
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')

@@ -2,11 +2,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Regions: points inside, by hand and by independent tests; refused regions."""
 
+import time
+
 from matplotlib.path import Path as Polygon
 import numpy as np
 import pytest
 
-from surfel_mapper.pipeline.regions import Ball, Box, Prism
+from surfel_mapper.pipeline.regions import Ball, Box, MAX_CORNERS, Prism
 
 POINTS = np.random.default_rng(0).uniform(-2.0, 2.0, (2000, 3))
 
@@ -50,10 +52,34 @@ def test_a_prism_contains_what_is_in_its_polygon_at_any_height(corners, turned):
         (lambda: Ball((0.0, 0.0, 0.0), 0.0), 'radius 0.0 m .* positive'),
         (lambda: Ball((0.0, np.inf, 0.0), 1.0), 'expected finite'),
         (lambda: Ball((0.0, 0.0, 0.0), np.nan), 'radius nan'),
-        (lambda: Prism(((0.0, 0.0), (1.0, 1.0))), 'of 2 corners, expected 3'),
-        (lambda: Prism(((0.0, 0.0), (1.0, np.nan), (1.0, 0.0))), 'expected finite corners'),
+        (lambda: Prism(((0.0, 0.0), (1.0, 1.0))), 'of 2 corners, expected 3 to 10000'),
+        (
+            lambda: Prism(((0.0, 0.0), (1.0, np.nan), (1.0, 0.0))),
+            r'corner 1 of the polygon: .*expected finite',
+        ),
     ],
 )
 def test_a_region_that_is_none_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_points_in_polygons_agree_with_matplotlib_and_take_time_of_the_box_only():
+    rng = np.random.default_rng(5)
+    angles = np.sort(rng.uniform(0.0, 2.0 * np.pi, MAX_CORNERS))
+    radii = rng.uniform(5.0, 10.0, MAX_CORNERS)
+    corners = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=1)
+    points = rng.uniform(-12.0, 12.0, (300, 3))
+    prism = Prism(tuple(map(tuple, corners.tolist())))
+
+    expected = Polygon([*corners, corners[0]], closed=True).contains_points(points[:, :2])
+    assert np.array_equal(prism.contains(points), expected)
+
+    start_s = time.thread_time()
+    assert not prism.contains(points.repeat(1000, axis=0) + 100.0).any()
+    assert time.thread_time() - start_s < 1.0  # 40 s without the box
+
+
+def test_a_polygon_of_too_many_corners_is_refused():
+    with pytest.raises(ValueError, match='of 10001 corners, expected 3 to 10000'):
+        Prism(((0.0, 0.0),) * (MAX_CORNERS + 1))

@@ -156,7 +156,10 @@ def test_a_bag_of_ros_1_is_refused_with_how_to_convert_it(domain, capsys, tmp_pa
     assert 'rosbags-convert' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('name', ['no_such_package/msg/Thing', 'std_msgs/msg/NoSuchType', 'odd'])
+@pytest.mark.parametrize(
+    'name',
+    ['no_such_package/msg/Thing', 'std_msgs/msg/NoSuchType', 'odd', 'os/path/join', 'a.b/msg/C'],
+)
 def test_a_type_that_is_not_installed_is_named(domain, name):
     with pytest.raises(DependencyError, match=name):
         message_type(name)
@@ -172,3 +175,17 @@ def test_a_user_configuration_of_fast_dds_is_kept(monkeypatch):
 
 def test_the_profile_of_shared_memory_is_installed_beside_the_code():
     assert context.PROFILE.read_text(encoding='utf-8').startswith('<?xml')
+
+
+def test_a_type_of_a_bag_imports_no_module_from_the_working_directory(
+    domain, tmp_path, monkeypatch
+):
+    package = tmp_path / 'evil_msgs' / 'msg'
+    package.mkdir(parents=True)
+    ran = tmp_path / 'ran'
+    for folder in (package.parent, package):
+        (folder / '__init__.py').write_text(f'open({str(ran)!r}, "w")\nclass Thing: ...\n')
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(DependencyError, match='evil_msgs'):
+        message_type('evil_msgs/msg/Thing')
+    assert not ran.exists()

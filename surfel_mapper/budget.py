@@ -1,0 +1,166 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Budget: the bytes and seconds that reading one input may take.
+
+A reader of foreign bytes asks its budget before each allocation and each loop whose size the input
+states. The limit is proportional to the size of the input, with a floor that small inputs may
+always use and an upper bound of three quarters of the memory of the machine. The environment
+variable SURFEL_MAPPER_MAX_BYTES replaces it by one number for inputs of any size. Time is
+processor time of the thread, so that a busy machine refuses nothing.
+
+``read_small_file`` reads files that people write, such as settings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+import os
+from pathlib import Path
+import stat
+import time
+
+FLOOR_BYTES = 64 << 20
+"""Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
+
+BYTES_PER_BYTE = 20
+"""Memory per byte of input above the floor; a point of 16 bytes becomes 40, a voxel of 60 200."""
+
+FLOOR_S = 10.0
+"""Processor time that reading any input may take, s."""
+
+SECONDS_PER_BYTE = 1e-6
+"""Processor time per byte of input above the floor; the slowest reader (text) takes 200 ns."""
+
+VARIABLE = 'SURFEL_MAPPER_MAX_BYTES'
+"""Environment variable with the limit of memory for one input of any size, bytes."""
+
+MAX_TEXT_BYTES = 1 << 20
+"""Size limit of files that people write: settings, chains of filters, metadata.yaml."""
+
+
+class Budget:
+    """
+    The bytes and seconds that reading one input may take.
+
+    Parameters
+    ----------
+    name : str or Path
+        File or topic, named in errors.
+    size : int
+        Bytes of the input.
+    error : callable of str to Exception
+        Class of the errors of the reader.
+    ratio : int
+        Memory per byte of input.
+    floor : int
+        Memory that is always allowed, bytes.
+
+    Attributes
+    ----------
+    max_bytes, max_seconds : int, float
+        The limits.
+    used_bytes : int
+        Memory asked for and not given back, bytes.
+
+    """
+
+    def __init__(
+        self,
+        name: str | Path,
+        size: int,
+        error: Callable[[str], Exception],
+        *,
+        ratio: int = BYTES_PER_BYTE,
+        floor: int = FLOOR_BYTES,
+    ) -> None:
+        self.name = name
+        self.max_bytes = stated_limit() or min(max(floor, ratio * size), upper_bound())
+        self.max_seconds = max(FLOOR_S, SECONDS_PER_BYTE * size)
+        self.used_bytes = 0
+        self._error = error
+        self._start_s = time.thread_time()
+
+    def take(self, num_bytes: int, purpose: str) -> None:
+        """
+        Ask for memory before allocating it.
+
+        Raises
+        ------
+        Exception
+            The error of the reader, if the sum of the memory asked for exceeds the limit.
+
+        """
+        needed = self.used_bytes + num_bytes
+        if needed > self.max_bytes:
+            raise self._error(
+                f'{self.name}: {purpose}: needs {needed} bytes, more than the limit of '
+                f'{self.max_bytes} for an input of this size; is it damaged? Otherwise set '
+                f'{VARIABLE}'
+            )
+        self.used_bytes = needed
+
+    def give_back(self, num_bytes: int) -> None:
+        """Return memory that was freed."""
+        self.used_bytes -= num_bytes
+
+    def check_time(self) -> None:
+        """Raise the error of the reader if reading has taken too much processor time."""
+        seconds = time.thread_time() - self._start_s
+        if seconds > self.max_seconds:
+            raise self._error(
+                f'{self.name}: reading took {seconds:.1f} s of processor time, more than the '
+                f'limit of {self.max_seconds:.1f} s for an input of this size; is it damaged?'
+            )
+
+
+def stated_limit() -> int:
+    """
+    Return the limit in SURFEL_MAPPER_MAX_BYTES, or 0 if it is not set.
+
+    Raises
+    ------
+    ValueError
+        If it is not a positive integer.
+
+    """
+    text = os.environ.get(VARIABLE, '')
+    if text and (not text.isdecimal() or int(text) == 0):
+        raise ValueError(f'{VARIABLE}={text!r}, expected a positive number of bytes')
+    return int(text or 0)
+
+
+def upper_bound() -> int:
+    """Return three quarters of the memory of the machine, bytes; 3 GiB if that is unknown."""
+    try:
+        return os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') * 3 // 4
+    except (ValueError, OSError, AttributeError):
+        return 3 << 30
+
+
+def read_small_file(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
+    """
+    Return the content of a regular file of limited size.
+
+    Opened without blocking: a pipe without a writer does not hang, and a device is never read.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened or read.
+    ValueError
+        If it is not a regular file or larger than ``max_bytes``.
+
+    """
+    with open(path, 'rb', opener=open_without_blocking) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise ValueError('not a regular file')
+        content = file.read(max_bytes + 1)
+    if len(content) > max_bytes:
+        raise ValueError(f'larger than {max_bytes} bytes')
+    return content
+
+
+def open_without_blocking(path: str, flags: int) -> int:
+    """Open a file for ``open``; a named pipe is opened even without a writer."""
+    return os.open(path, flags | getattr(os, 'O_NONBLOCK', 0))

@@ -1,0 +1,71 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Budgets refuse before memory is allocated; only regular files of limited size are read."""
+
+import os
+
+import pytest
+
+from surfel_mapper.budget import (
+    Budget,
+    BYTES_PER_BYTE,
+    FLOOR_BYTES,
+    read_small_file,
+    upper_bound,
+    VARIABLE,
+)
+from surfel_mapper.errors import BagError, FileFormatError, one_line
+
+
+def test_small_inputs_may_use_the_floor_and_large_ones_a_multiple_of_their_size():
+    assert Budget('a', 10, BagError).max_bytes == FLOOR_BYTES
+    assert Budget('a', FLOOR_BYTES, BagError).max_bytes == BYTES_PER_BYTE * FLOOR_BYTES
+
+
+def test_the_error_of_the_reader_names_input_need_and_limit():
+    budget = Budget('a.bag', 10, BagError, floor=1000)
+    budget.take(600, 'index')
+    with pytest.raises(BagError, match=r'a\.bag: chunk: needs 1100 bytes, .* limit of 1000 .*MAX'):
+        budget.take(500, 'chunk')
+    budget.give_back(200)
+    budget.take(500, 'chunk')
+    assert budget.used_bytes == 900
+
+
+def test_a_variable_sets_the_upper_bound(monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert Budget('a', 10**18, BagError).max_bytes == upper_bound() > FLOOR_BYTES
+    monkeypatch.setenv(VARIABLE, '5000')
+    assert Budget('a', 10, BagError).max_bytes == 5000
+    for text in ('0', '-1', '1e9', 'all'):
+        monkeypatch.setenv(VARIABLE, text)
+        with pytest.raises(ValueError, match='expected a positive number'):
+            Budget('a', 10, BagError)
+
+
+def test_processor_time_is_limited(monkeypatch):
+    budget = Budget('a', 10, FileFormatError)
+    budget.check_time()
+    budget.max_seconds = -1.0
+    with pytest.raises(FileFormatError, match='s of processor time, more than the limit'):
+        budget.check_time()
+
+
+def test_only_regular_files_of_limited_size_are_read(tmp_path):
+    path = tmp_path / 'a.yaml'
+    path.write_bytes(b'x' * 100)
+    assert read_small_file(path, 100) == b'x' * 100
+    with pytest.raises(ValueError, match='larger than 99'):
+        read_small_file(path, 99)
+    os.mkfifo(tmp_path / 'pipe')
+    for other in ('/dev/zero', tmp_path / 'pipe'):
+        with pytest.raises(ValueError, match='not a regular file'):
+            read_small_file(other)
+    with pytest.raises(IsADirectoryError):
+        read_small_file(tmp_path)
+
+
+def test_messages_are_one_line_without_control_characters():
+    assert str(BagError('a\nb\x1b[31m')) == 'a\\nb\\x1b[31m'
+    assert one_line('größe 5 µs') == 'größe 5 µs'
+    assert one_line('a\u2028b\u202ec\ud800') == 'a\\u2028b\\u202ec\\ud800'
