@@ -149,7 +149,7 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
         counts = [int(word) for word in words.get('COUNT', ['1'] * len(names))]
         num_points = int(words['POINTS'][0])
         stated = [int(words[name][0]) for name in ('WIDTH', 'HEIGHT') if name in words]
-        if len(stated) == 2 and stated[0] * stated[1] != num_points:
+        if len(stated) == 2 and stated[0] * stated[1] not in (0, num_points):
             raise ValueError(f'WIDTH {stated[0]}, HEIGHT {stated[1]}, POINTS {num_points}')
         (encoding,) = words['DATA']
         fields = [

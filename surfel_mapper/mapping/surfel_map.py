@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 import math
+import operator
 from typing import Any
 
 import numpy as np
@@ -90,7 +91,7 @@ class SurfelMap:
         if level not in range(layout.INDEX_BITS):
             raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
         self.voxel_size_m = float(voxel_size_m)
-        self.level = level
+        self.level = operator.index(level)
         self.version = 0
         self.columns = columns
         self._channel_names = channel_names(columns)

@@ -117,14 +117,6 @@ def test_another_voxel_size_than_asked_for_is_refused(tmp_path):
         read_map(tmp_path / 'map.parquet', voxel_size_m=0.2)
 
 
-def test_many_rows_in_a_small_file_are_refused_before_they_are_read(tmp_path):
-    zeros = pa.array(np.zeros(10**6, np.int64))
-    pq.write_table(pa.table(dict.fromkeys('ijk', zeros)), tmp_path / 'a', compression='zstd')
-
-    with pytest.raises(FileFormatError, match='1000000 rows in so small a file'):
-        read_map(tmp_path / 'a')
-
-
 @pytest.mark.parametrize('keep', [0.0, 0.1, 0.9, 0.999])
 def test_a_truncated_file_is_refused(tmp_path, keep):
     path = tmp_path / 'map.parquet'

@@ -99,6 +99,7 @@ def test_fields_of_several_numbers_and_padding_read(tmp_path):
 
 
 HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n'
+UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
 
 
 @pytest.mark.parametrize(
@@ -118,8 +119,8 @@ HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOI
         (HEADER.replace('SIZE 4', 'SIZE 3') + 'DATA binary\n', 'field x of type F, size 3'),
         (HEADER.replace('TYPE F', 'TYPE Q') + 'DATA binary\n', 'inconsistent PCD header'),
         (HEADER.replace('COUNT 1', 'COUNT 0') + 'DATA binary\n', 'count 0'),
-        (HEADER.replace('POINTS 2', 'POINTS -2') + 'DATA binary\n', '-2 points'),
-        (HEADER.replace('POINTS 2', f'POINTS {10**30}') + 'DATA binary\n', 'expected 4000000'),
+        (UNSIZED.replace('POINTS 2', 'POINTS -2') + 'DATA binary\n', '-2 points'),
+        (UNSIZED.replace('POINTS 2', f'POINTS {10**30}') + 'DATA binary\n', 'expected 4000000'),
         (HEADER.replace('FIELDS x', 'FIELDS x x') + 'DATA binary\n', 'inconsistent PCD header'),
     ],
 )
@@ -131,7 +132,7 @@ def test_truncated_and_inconsistent_files_are_refused(tmp_path, content, says):
 
 
 def test_a_small_file_that_claims_gigabytes_is_not_unpacked(tmp_path):
-    header = HEADER.replace('POINTS 2', f'POINTS {2**29}') + 'DATA binary_compressed\n'
+    header = UNSIZED.replace('POINTS 2', f'POINTS {2**29}') + 'DATA binary_compressed\n'
     (tmp_path / 'bad.pcd').write_bytes(header.encode() + b'\x02\0\0\0\0\0\0\x80ab')
 
     with pytest.raises(FileFormatError, match='for 2147483648 bytes of points'):

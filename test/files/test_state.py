@@ -27,7 +27,6 @@ def make_arrays():
         'turned': np.arange(12.0).reshape(3, 4).T,
         'flags': rng.integers(0, 2, 10).astype(bool),
         'big_endian': np.arange(5, dtype='>u2'),
-        'names': np.array(['odom', 'base_link']),
         'empty': np.empty((0, 3), np.float32),
         'scalar': np.array(1.5),
         'not-a.number': np.array([np.nan, np.inf, -0.0]),
