@@ -214,12 +214,6 @@ def check_header(
     if dtype.str != entry['dtype'] or list(shape) != entry['shape']:
         raise ValueError(f'{info.filename}: {dtype.str} {shape}, expected {entry}')
     if not is_array_type(dtype.str):
-<<<<<<< HEAD
-        raise ValueError(f'{info.filename}: {dtype.str}, expected numbers, booleans or strings')
-    values = np.frombuffer(content, dtype, offset=stream.tell())
-    array: npt.NDArray[Any] = values.reshape(shape)
-    return array
-=======
         raise ValueError(f'{info.filename}: {dtype.str}, expected numbers or booleans')
     if math.prod(shape) * dtype.itemsize != info.file_size - start:
         raise ValueError(f'{info.filename}: {info.file_size} bytes for an array {shape}')
@@ -240,8 +234,8 @@ def read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[A
     """Return one array whose header has been checked."""
     content = read_bytes(archive, info)
     shape, dtype, start = array_header(bytes(content[:NPY_HEADER_BYTES]), info.filename)
-    return np.frombuffer(content, dtype, offset=start).reshape(shape)
->>>>>>> 51ea384 (budget: readers of foreign bytes ask before they allocate)
+    array: npt.NDArray[Any] = np.frombuffer(content, dtype, offset=start).reshape(shape)
+    return array
 
 
 def read_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:
