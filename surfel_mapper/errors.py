@@ -23,6 +23,8 @@ Exceptions of this package.
 A caller that wants to continue with the next scan catches SurfelMapperError.
 """
 
+import logging
+
 
 def one_line(text: object) -> str:
     """Return text with control characters escaped: one line, without terminal sequences."""
@@ -30,6 +32,14 @@ def one_line(text: object) -> str:
     if string.isprintable():
         return string
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in string)
+
+
+class LineFormatter(logging.Formatter):
+    """Formats a log record as one line, a traceback below it as it is."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Return the message on one line: names of topics and files come from outside."""
+        return one_line(super().formatMessage(record))
 
 
 class SurfelMapperError(Exception):

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Budgets refuse before memory is allocated; only regular files of limited size are read."""
 
+import logging
 import os
 
 import pytest
@@ -14,7 +15,7 @@ from surfel_mapper.budget import (
     upper_bound,
     VARIABLE,
 )
-from surfel_mapper.errors import BagError, FileFormatError, one_line
+from surfel_mapper.errors import BagError, FileFormatError, LineFormatter, one_line
 
 
 def test_small_inputs_may_use_the_floor_and_large_ones_a_multiple_of_their_size():
@@ -69,3 +70,10 @@ def test_messages_are_one_line_without_control_characters():
     assert str(BagError('a\nb\x1b[31m')) == 'a\\nb\\x1b[31m'
     assert one_line('größe 5 µs') == 'größe 5 µs'
     assert one_line('a\u2028b\u202ec\ud800') == 'a\\u2028b\\u202ec\\ud800'
+
+
+def test_log_lines_are_one_line_and_tracebacks_stay():
+    record = logging.LogRecord('a', logging.WARNING, '', 0, '%s', ('x\n[ERROR] forged',), None)
+    assert LineFormatter('%(message)s').format(record) == 'x\\n[ERROR] forged'
+    record.exc_text = 'Traceback\n  line'
+    assert LineFormatter('%(message)s').format(record).splitlines()[1:] == ['Traceback', '  line']

@@ -41,6 +41,9 @@ KEPT_BYTES = 64 << 20
 MESSAGE_BYTES = 100
 """Memory charged for a message: 48 bytes in the index, and as much to sort it."""
 
+INDEX_FLOOR_BYTES = 16 << 20
+"""Memory that the index of any file may take: 160,000 messages."""
+
 NUM_PLACE = 4
 """Integers that locate a message; their meaning is that of the kind of file."""
 
@@ -92,7 +95,7 @@ class SalvagedFile(ABC):
         self.size = path.stat().st_size
         self.cut_at: int | None = None
         self.skipped_at: list[int] = []
-        self._budget = Budget(path, self.size, BagError)
+        self._budget = Budget(path, self.size, BagError, floor=INDEX_FLOOR_BYTES)
         self._by_id: dict[int, Connection] = {}
         self._file = open(path, 'rb')  # noqa: SIM115 - closed by close
         try:

@@ -24,7 +24,7 @@ from types import ModuleType
 
 import surfel_mapper
 from surfel_mapper.cli._arguments import Parser, UsageError
-from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.errors import LineFormatter, one_line, SurfelMapperError
 
 VERBS = (
     'node',
@@ -57,7 +57,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown:
         args.parser.refuse_unknown(unknown)
     args.ros_args = ros_args
-    logging.basicConfig(format=f'surfel-mapper {args.verb}: %(message)s', level=logging.WARNING)
+    handler = logging.StreamHandler()
+    handler.setFormatter(LineFormatter(f'surfel-mapper {args.verb}: %(message)s'))
+    logging.basicConfig(handlers=[handler], level=logging.WARNING)
     try:
         code = int(args.run(args))
         sys.stdout.flush()
@@ -72,7 +74,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return refused(args.verb, str(error))
     except OSError as error:
         named = error.filename and error.strerror
-        return refused(args.verb, f'{error.filename}: {error.strerror}' if named else str(error))
+        message = f'{error.filename}: {error.strerror}' if named else str(error)
+        return refused(args.verb, one_line(message))
     except KeyboardInterrupt:
         print(f'surfel-mapper {args.verb}: interrupted', file=sys.stderr)
         return 130

@@ -43,7 +43,14 @@ class Slab:
     def __init__(self, num_rows: int, width: int) -> None:
         self._width = width
         self._memory = _anonymous(num_rows * width * 8)
-        self.array = self._view()
+        self._array: npt.NDArray[np.int64] | None = None
+
+    @property
+    def array(self) -> npt.NDArray[np.int64]:
+        """The rows; made again after growing, also if there was no memory for it then."""
+        if self._array is None:
+            self._array = self._view()
+        return self._array
 
     def grow(self, num_rows: int) -> None:
         """
@@ -56,14 +63,12 @@ class Slab:
 
         """
         num_bytes = num_rows * self._width * 8
-        del self.array  # a view would pin the memory
+        self._array = None  # a view would pin the memory
         try:
             self._memory.resize(num_bytes)
         except (BufferError, SystemError, OSError, ValueError):
             # a view is held elsewhere, the system has no mremap, or memory is exhausted
             self._memory = self._copied(num_bytes)
-        finally:
-            self.array = self._view()
         if num_bytes >= HUGE_FROM and hasattr(mmap, 'MADV_HUGEPAGE'):
             with contextlib.suppress(OSError):  # only a hint
                 self._memory.madvise(mmap.MADV_HUGEPAGE)

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.mapping.kernels.queries import (
     keys_in_box,
@@ -89,28 +88,34 @@ class VoxelTable:
         Raises
         ------
         MapLimitError
-            If there is no memory for the voxels; the table is unchanged.
+            If there is no memory for the voxels.
+
+        The table is unchanged after any exception, a failed allocation at any place too.
 
         """
-        found = np.empty(len(moments), np.int32)
+        found = np.full(len(moments), -1, np.int32)
         done = 0
-        while done < len(moments):
-            done = add_moments(
-                moments.arrays,
-                moments.view_is_sum,
-                self.rows,
-                self._hash.arrays,
-                self._state,
-                version,
-                done,
-                found,
-            )
-            if done < len(moments):
-                self._make_room_or_undo(moments.select(slice(done)), version)
-        if self._channels:
-            if len(self._channels.array) < len(self.rows):
-                self._channels.grow(len(self.rows))
-            self._channels.array[found] += moments.channels
+        try:
+            while done < len(moments):
+                done = add_moments(
+                    moments.arrays,
+                    moments.view_is_sum,
+                    self.rows,
+                    self._hash.arrays,
+                    self._state,
+                    version,
+                    done,
+                    found,
+                )
+                if done < len(moments):
+                    self._make_room()
+            if self._channels:
+                if len(self._channels.array) < len(self.rows):
+                    self._channels.grow(len(self.rows))
+                self._channels.array[found] += moments.channels
+        except BaseException:
+            self._undo(moments, found, version)
+            raise
         return found
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
@@ -187,15 +192,11 @@ class VoxelTable:
         num = rows_held(self.rows, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
-    def _make_room_or_undo(self, added: ScanMoments, version: int) -> None:
-        """Make room for another voxel; if that fails, subtract the moments added so far."""
-        try:
-            self._make_room()
-        except MapLimitError:
-            if self._channels:  # not added yet
-                added = replace(added, channels=np.zeros_like(added.channels))
-            self.remove(added, version)
-            raise
+    def _undo(self, moments: ScanMoments, found: npt.NDArray[np.int32], version: int) -> None:
+        """Subtract the moments that an incomplete ``add`` added; channels are added last."""
+        added = moments.select(slice(int(np.count_nonzero(found >= 0))))
+        if len(added):
+            self.remove(replace(added, channels=np.zeros_like(added.channels)), version)
 
     def _make_room(self) -> None:
         """Enlarge the array that had no room for a new voxel."""

@@ -23,7 +23,7 @@ import rclpy
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.signals import SignalHandlerOptions
 
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import ConfigError, LineFormatter
 
 PROFILE = Path(__file__).with_name('fastdds_shm.xml')
 
@@ -85,6 +85,7 @@ class NodeHandler(logging.Handler):
 
     def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()
+        self.setFormatter(LineFormatter())
         self._logger = logger
 
     def emit(self, record: logging.LogRecord) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from test.fuzz import corpus, files, messages
+from test.fuzz import corpus, files, messages, structures
 
 
 class Harness(NamedTuple):
@@ -40,6 +40,11 @@ HARNESSES = {
     'kitti_times': Harness(files.kitti_times, corpus.kitti_times, 400),
     'settings': Harness(files.settings, corpus.settings, 300),
     'chain': Harness(files.chain, corpus.chain, 300),
+    'mcap_structure': Harness(structures.mcap, corpus.noise, 60),
+    'png_structure': Harness(structures.png, corpus.noise, 200),
+    'yaml_structure': Harness(structures.yaml, corpus.noise, 60),
+    'npz_structure': Harness(structures.npz, corpus.noise, 200),
+    'parquet_structure': Harness(structures.parquet, corpus.noise, 40),
     'map_url': Harness(files.map_url, corpus.map_url, 1000),
     'map_name': Harness(files.map_name, corpus.map_url, 1000),
 }

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 import logging
+import time
 
 import numpy as np
 import pytest
@@ -18,13 +19,34 @@ from test.fuzz.harnesses import HARNESSES
 from test.fuzz.memory import reset_peak, resident
 from test.fuzz.mutations import mutations
 
-NEEDED = {'parquet': 'pyarrow', 'pcd': 'lzf', 'mcap': 'mcap', 'map_url': 'rclpy'}
+NEEDED = {
+    'parquet': 'pyarrow',
+    'parquet_structure': 'pyarrow',
+    'pcd': 'lzf',
+    'mcap': 'mcap',
+    'map_url': 'rclpy',
+}
 
 MOST_BYTES = 64 << 20
 """Memory that any input may take: the heap grows in steps, and chunks may unpack to 64 MiB."""
 
-MOST_RATIO = 300
-"""Memory per input byte: numbers in text become objects, zlib compresses a hundredfold."""
+MOST_RATIO = 20
+"""Memory per input byte."""
+
+MOST_S, MOST_S_PER_BYTE = 0.2, 100e-9
+"""Processor time that any input may take, and per input byte."""
+
+BUILDERS = {
+    'drive': 20.0,
+    'state_content': 4.0,
+    'mcap_structure': 20.0,
+    'yaml_structure': 20.0,
+    'png_structure': 2.0,
+    'npz_structure': 2.0,
+    'parquet_structure': 20.0,
+    'chain': 20.0,
+}
+"""Harnesses whose own work takes longer than the reading: factors of the time allowed."""
 
 
 @pytest.fixture(autouse=True)
@@ -43,13 +65,25 @@ def harness(name):
 
 @pytest.mark.filterwarnings('ignore::RuntimeWarning')
 @pytest.mark.parametrize('name', HARNESSES)
-def test_inputs_give_results_or_our_errors_in_bounded_memory(name):
+def test_inputs_give_results_or_our_errors_in_bounded_memory_and_time(name):
     one_input, corpus, number = harness(name)
     first, *others = mutations(corpus(), number)
     one_input(first)  # imports and compiled kernels are not counted
+    worst = [0, 0.0]
     for data in others:
-        reset_peak()
-        before = resident('VmRSS')
-        one_input(data)
-        used = resident('VmHWM') - before
+        used, seconds = cost(one_input, data)
+        limit_s = (MOST_S + MOST_S_PER_BYTE * len(data)) * BUILDERS.get(name, 1.0)
+        if seconds > limit_s:  # a collection of garbage, or a page fault, counts once
+            used, seconds = cost(one_input, data)
         assert used < MOST_BYTES + MOST_RATIO * len(data), (len(data), data[:100])
+        assert seconds < limit_s, (seconds, len(data), data[:100])
+        worst = [max(worst[0], used), max(worst[1], seconds)]
+    print(f'{name}: {len(others)} inputs, {worst[0] >> 20} MiB, {worst[1]:.3f} s')
+
+
+def cost(one_input, data):
+    """Return the memory, bytes, and the processor time, s, that an input takes."""
+    reset_peak()
+    before, start_s = resident('VmRSS'), time.process_time()
+    one_input(data)
+    return resident('VmHWM') - before, time.process_time() - start_s

@@ -1,0 +1,214 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every step of saving, and allocations of insert, remove and load, fail once in turn.
+
+Afterwards a file has the digest of the old map or of the new one, and a map in memory that of
+before or after. A step is an open, write, flush, fsync or rename; it fails with a full disk, or
+the process is killed there (SIGKILL). Allocations are those of Python (_testcapi.set_nomemory),
+sampled; memory that NumPy and kernels get from the system is not among them.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import atomic, pcd, ply
+from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+pytestmark = pytest.mark.skipif(not hasattr(os, 'fork'), reason='needs fork')
+
+
+class Steps:
+    """Counts the steps of writing a file, and fails at one of them."""
+
+    def __init__(self, monkeypatch, fail_at=None, kill=False):
+        self.done = 0
+        self._fail_at, self._kill = fail_at, kill
+        self._open, self._fsync, self._replace = open, os.fsync, os.replace
+        monkeypatch.setattr(atomic, 'open', self.open, raising=False)
+        monkeypatch.setattr(atomic.os, 'fsync', self.wrapped(os.fsync))
+        monkeypatch.setattr(atomic.os, 'replace', self.wrapped(os.replace))
+
+    def step(self):
+        self.done += 1
+        if self.done - 1 == self._fail_at:
+            if self._kill:
+                os.kill(os.getpid(), signal.SIGKILL)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def wrapped(self, function):
+        def call(*args, **kwargs):
+            self.step()
+            return function(*args, **kwargs)
+
+        return call
+
+    def open(self, *args, **kwargs):
+        self.step()
+        return StepFile(self._open(*args, **kwargs), self)
+
+
+class StepFile:
+    """A file whose writes and flushes are steps."""
+
+    def __init__(self, file, steps):
+        self._file = file
+        self._steps = steps
+
+    def write(self, content):
+        self._steps.step()
+        return self._file.write(content)
+
+    def flush(self):
+        self._steps.step()
+        self._file.flush()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self._file.close()
+
+    def __getattr__(self, name):
+        return getattr(self._file, name)
+
+
+def map_of(seed):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3)))
+    return surfel_map
+
+
+def write_parquet(path, surfel_map):
+    from surfel_mapper.files.parquet import write_map
+
+    write_map(path, surfel_map)
+
+
+WRITERS = {
+    'npz': save_map,
+    'npz packed': lambda path, surfel_map: save_map(path, surfel_map, compress=True),
+    'parquet': write_parquet,
+    'ply': lambda path, surfel_map: ply.write_surfels(path, surfel_map.surfels()),
+    'pcd': lambda path, surfel_map: pcd.write_surfels(path, surfel_map.surfels()),
+    'json': lambda path, surfel_map: atomic.write_json(path, {'digest': surfel_map.digest()}),
+}
+
+
+@pytest.mark.parametrize('kill', [False, True], ids=['full disk', 'killed'])
+@pytest.mark.parametrize('name', WRITERS)
+def test_a_save_that_fails_at_any_step_leaves_the_old_file_or_the_new(tmp_path, name, kill):
+    if name == 'parquet':
+        pytest.importorskip('pyarrow')
+    write, path = WRITERS[name], tmp_path / 'a'
+    old, new = map_of(1), map_of(2)
+    write(path, new)
+    new_bytes = path.read_bytes()
+    write(path, old)
+    old_bytes = path.read_bytes()
+    with pytest.MonkeyPatch.context() as patch:
+        steps = Steps(patch)
+        write(path, old)
+    assert steps.done >= 5
+    for number in range(steps.done):
+        failed = attempt(lambda number=number: write(path, new), number, kill)
+        found = path.read_bytes()
+        assert found in (old_bytes, new_bytes), (name, number)
+        assert failed or found == new_bytes, (name, number)  # the sync of the directory may fail
+        write(path, old)
+        left = [file for file in tmp_path.iterdir() if file != path]
+        assert kill or not left, (name, number, left)
+        for file in left:
+            file.unlink()
+
+
+def attempt(write, number, kill):
+    """Write, failing at a step; return whether that raised our error, or killed the process."""
+    if not kill:
+        with pytest.MonkeyPatch.context() as patch:
+            Steps(patch, number)
+            try:
+                write()
+            except FileFormatError:
+                return True
+        return False
+    child = os.fork()
+    if not child:
+        Steps(pytest.MonkeyPatch(), number, kill=True)
+        try:
+            write()
+        finally:
+            os._exit(0)
+    return os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+
+
+KEPT = {}
+"""Moments to remove, read before an allocation fails: numba's call for that can crash then."""
+
+
+def insert(surfel_map, moments, path):
+    surfel_map.insert(moments)
+
+
+def remove(surfel_map, moments, path):
+    surfel_map.remove(KEPT[surfel_map.num_voxels])
+
+
+def load(surfel_map, moments, path):
+    loaded, _ = load_map(path)
+    assert loaded.digest() == surfel_map.digest()
+
+
+def reduce(surfel_map, moments, path):
+    surfel_map.reduce(np.zeros((10, 3)), np.eye(4))
+
+
+@pytest.mark.parametrize('operation', [insert, remove, load, reduce])
+def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, operation):
+    testcapi = pytest.importorskip('_testcapi', reason='this Python lacks _testcapi')
+    surfel_map, path = map_of(1), tmp_path / 'a.npz'
+    save_map(path, surfel_map)
+    moments = surfel_map.reduce(np.random.default_rng(3).uniform(-9.0, 9.0, (500, 3)))
+    KEPT[surfel_map.num_voxels] = surfel_map.moments()
+    after = surfel_map.copy()
+    operation(after, moments, path)
+    allowed = {surfel_map.digest(), after.digest()}
+    failures = 0
+
+    def run():
+        operation(surfel_map, moments, path)
+
+    for number in [*range(40), *(40 + 7 * step for step in range(60))]:
+        code = in_child(testcapi, surfel_map, run, number, allowed)
+        assert code in (0, 1), (operation.__name__, number, code)
+        failures += code
+    assert failures > 5
+
+
+def in_child(testcapi, surfel_map, call, number, allowed):
+    """Return 0 if a call succeeded, 1 if it raised; 2 for another digest, or a signal negated."""
+    child = os.fork()
+    if not child:
+        code = 3
+        try:
+            failed = 0
+            testcapi.set_nomemory(number, number + 1)
+            try:
+                call()
+            except BaseException:
+                failed = 1
+            finally:
+                testcapi.remove_mem_hooks()
+            code = failed if surfel_map.digest() in allowed else 2
+        finally:
+            os._exit(code)
+    status = os.waitpid(child, 0)[1]
+    return os.waitstatus_to_exitcode(status)
