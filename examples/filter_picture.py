@@ -53,7 +53,7 @@ def main(path):
     draw(left, before, np.full(len(before), GREY), f'before: {len(before):,} points within 25 m')
     colours = np.where(is_ground, TEAL, AMBER)
     draw(right, after.points, colours, f'after: {len(after):,} points, ground in green')
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=80)
     print(f'{path}: {len(before)} -> {len(after)} points, {np.count_nonzero(is_ground)} ground')
 
 
