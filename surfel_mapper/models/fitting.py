@@ -27,8 +27,10 @@ from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.growth import estimate_noise, grow, Grown, VoxelPoints
 from surfel_mapper.models.kernels.voxel_means import (
     average_runs,
+    CHUNK,
     finite_ends,
     label_points,
     row_bits,
@@ -36,6 +38,7 @@ from surfel_mapper.models.kernels.voxel_means import (
     voxel_keys,
     voxel_runs,
 )
+from surfel_mapper.models.kernels.voxel_points import gather_voxels
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.patches import fit_patches, PatchPoints
 from surfel_mapper.models.segmentation import (
@@ -49,6 +52,12 @@ from surfel_mapper.models.segmentation import (
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+
+BLOCK_VOXELS = 4.0
+"""Edge of the blocks whose outliers are one Gaussian."""
+
+STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
+"""Names of the stages of a fit with growth."""
 
 
 def fit(
@@ -92,18 +101,128 @@ def fit(
     laps = [perf_counter()]
     thinned = thin(points.reshape(-1, 3), config.voxel_size_m)
     laps.append(perf_counter())
+    grows = not is_paper(config) and config.kinds == 'all' and len(thinned.means) > 0
+    model = (fit_points if grows else fit_means)(thinned, config, view, laps)
+    laps.append(perf_counter())
+    names = ('thin', 'cluster', 'merge', 'fit') if len(laps) == 5 else STAGES
+    times = [1e3 * (end - start) for start, end in pairwise(laps)]
+    return replace(model, milliseconds=dict(zip(names, times, strict=True)))
+
+
+def fit_means(
+    thinned: Thinned, config: ModelsConfig, view: Array, laps: list[float]
+) -> MultiModel:
+    """Fit models to one point a voxel, as in the paper."""
     clusters = segment_cloud(thinned.means, config, view)
     laps.append(perf_counter())
-    everything = config.kinds == 'all'
-    surfaces = merge_clusters(clusters, config, view) if everything else []
+    surfaces = merge_clusters(clusters, config, view) if config.kinds == 'all' else []
+    laps.append(perf_counter())
+    patches = fitted_patches(clusters, surfaces, config, view)
+    model, labels = assembled(clusters, patches, config)
+    return replace(model, labels=thinned.point_labels(labels))
+
+
+def fit_points(
+    thinned: Thinned, config: ModelsConfig, view: Array, laps: list[float]
+) -> MultiModel:
+    """Fit models to one point a voxel, and grow them over all points."""
+    voxels = thinned.by_voxel()
+    core = voxels.core()
+    if config.noise_m == config.noise_per_range_sq == 0.0:
+        noise = estimate_noise(voxels, thinned.means, core, config.voxel_size_m, view)
+        config = replace(config, noise_m=min(noise[0], 1.0), noise_per_range_sq=min(noise[1], 1.0))
+    laps.append(perf_counter())
+    rows = np.flatnonzero(core)
+    clusters = segment_cloud(thinned.means[rows], config, view)
+    laps.append(perf_counter())
+    surfaces = merge_clusters(clusters, config, view)
     laps.append(perf_counter())
     patches = fitted_patches(clusters, surfaces, config, view)
     laps.append(perf_counter())
-    names = ('thin', 'cluster', 'join', 'fit')
-    times = [1e3 * (end - start) for start, end in pairwise(laps)]
-    model, labels = assembled(clusters, patches, config)
-    stages = dict(zip(names, times, strict=True))
-    return replace(model, labels=thinned.point_labels(labels), milliseconds=stages)
+    label, group = np.full((2, len(core)), -1, np.int32)
+    at = rows[clusters.order]
+    group[at] = np.repeat(np.arange(len(clusters), dtype=np.int32), clusters.num_points)
+    group[~core] = len(clusters) + blocks_of(thinned.means[~core], config.voxel_size_m)
+    of_cluster = np.full(len(clusters), -1, np.int32)
+    for k, (_, members) in enumerate(patches):
+        of_cluster[members] = k
+    label[at] = np.repeat(of_cluster, clusters.num_points)
+    found = grow(
+        voxels,
+        thinned.means,
+        label,
+        group,
+        [patch for patch, _ in patches],
+        config.voxel_size_m,
+        config.min_surface_points,
+    )
+    laps.append(perf_counter())
+    return fit_owners(thinned, voxels, found, config, view)
+
+
+def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:
+    """Return the index of a block of BLOCK_VOXELS voxels a side for each point (N, 3)."""
+    index = np.floor(means / (BLOCK_VOXELS * size_m)).astype(np.int64)
+    found = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
+    blocks: npt.NDArray[np.int32] = found.astype(np.int32)
+    return blocks
+
+
+def fit_owners(
+    thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
+) -> MultiModel:
+    """Fit patches to the points that they own, and Gaussians to groups of the others."""
+    number = len(found.normals)
+    starts = np.searchsorted(found.owners, np.arange(number + 1))
+    first = int(starts[0])
+    middle = np.array([found.means[a:b].mean(axis=0) for a, b in pairwise(starts.tolist())])
+    middle = middle.reshape(-1, 3)
+    towards = np.einsum('ij,ij->i', found.normals, view - middle)
+    points = PatchPoints(
+        points=np.ascontiguousarray(found.means[first:]),
+        starts=starts - first,
+        normals=found.normals * np.where(towards < 0.0, -1.0, 1.0)[:, None],
+        thickness=thickness(middle, config, view),
+    )
+    patches = fit_patches(points, config, view) if number else []
+    order = [k for k, p in enumerate(patches) if p is not None and not isinstance(p, Surface)]
+    num_planes = len(order)
+    order += [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
+    kept = [replace(patch, id=i) for i, k in enumerate(order) if (patch := patches[k]) is not None]
+    ids = np.full(number, -1, np.int64)
+    ids[order] = np.arange(len(order))
+    # multi-valued surfaces and free groups are Gaussians; groups are negative owners
+    is_free = np.append(ids, -1)[np.maximum(found.owners, -1)] < 0
+    names, which, counts = np.unique(
+        found.owners[is_free], return_inverse=True, return_counts=True
+    )
+    low = min(int(found.owners.min(initial=0)), 0)
+    table = np.empty(number - low, np.int32)
+    table[-low:] = ids
+    table[names - low] = len(kept) + np.arange(len(names))
+    labels = np.full(thinned.num_points, -1, np.int32)
+    labels[voxels.rows] = table[found.owner - low]
+    mean, covariance = group_moments(found.means[is_free], which, counts)
+    return MultiModel(
+        planes=kept[:num_planes],
+        surfaces=[patch for patch in kept if isinstance(patch, Surface)],
+        gaussians=Gaussians(len(kept) + np.arange(len(names)), counts, mean, covariance),
+        labels=labels,
+        voxel_size_m=config.voxel_size_m,
+        num_thinned=len(found.means),
+        noise=(config.noise_m, config.noise_per_range_sq),
+    )
+
+
+def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array, Array]:
+    """Return mean (G, 3) and covariance (G, 3, 3) of groups of points."""
+    number = len(counts)
+    mean = np.stack([np.bincount(group, x, number) for x in points.T], axis=1) / counts[:, None]
+    away = points - mean[group]
+    covariance = np.empty((number, 3, 3))
+    for i, j in np.ndindex(3, 3):
+        covariance[:, i, j] = np.bincount(group, away[:, i] * away[:, j], number)
+    return mean, covariance / np.maximum(counts - 1, 1)[:, None, None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -119,12 +238,32 @@ class Thinned:
         Rows of the cloud by voxel; see models/kernels/voxel_means.py.
     num_points : int
         Number of all points, finite or not.
+    points : (N, 3) float32 or float64, m
+        The cloud.
+    keys : (V,) int64, optional
+        Keys of the voxels, if runs have their ranks instead.
+    bits : (3,) int64
+        Bits of x, y and z in the keys.
 
     """
 
     means: Array
     runs: Indices
     num_points: int
+    points: npt.NDArray[Any]
+    keys: Indices | None
+    bits: Indices
+
+    def by_voxel(self) -> VoxelPoints:
+        """Return the finite points by voxel, with the neighbours of voxels."""
+        number = len(self.means)
+        held = int((self.runs & (CHUNK - 1)).sum()) + len(self.runs)
+        points = np.empty((held, 3), self.points.dtype)
+        rows, starts = np.empty(held, np.int32), np.empty(number + 1, np.int64)
+        keys, to_key = np.empty(number, np.int64), row_bits(self.num_points)
+        gather_voxels(self.points, self.runs, to_key, points, rows, starts, keys)
+        full = keys if self.keys is None else self.keys[keys]
+        return VoxelPoints.of(points, rows, starts, full, self.bits)
 
     def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
         """Return labels of all points from those of the means; -1 if not finite."""
@@ -137,19 +276,21 @@ def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
     """Return the means of the points (N, 3) in each voxel."""
     points, ends = np.ascontiguousarray(points), np.empty((2, 3))
     if not finite_ends(points, ends):
-        return Thinned(np.empty((0, 3)), np.empty(0, np.int64), len(points))
+        none = np.empty(0, np.int64)
+        return Thinned(np.empty((0, 3)), none, len(points), points, None, np.zeros(3, np.int64))
     grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
     keys, to_key = np.empty(len(points), np.int64), row_bits(len(points))
     voxel_keys(points, grid.size, grid.shift, grid.base, grid.bits, keys)
-    key_bits = int(grid.bits.sum())
+    key_bits, unique = int(grid.bits.sum()), None
     if key_bits + to_key > 63:  # keys too long: renumber the occupied voxels
         held = keys >= 0
-        keys[held] = np.unique(keys[held], return_inverse=True)[1]
+        unique, keys[held] = np.unique(keys[held], return_inverse=True)
         key_bits = len(points).bit_length()
     num = voxel_runs(keys, to_key)
     runs = sorted_runs(keys[:num], key_bits, to_key)
     means = np.empty((num, 3))
-    return Thinned(means[: average_runs(points, runs, to_key, means)], runs, len(points))
+    means = means[: average_runs(points, runs, to_key, means)]
+    return Thinned(means, runs, len(points), points, unique, grid.bits)
 
 
 def fitted_patches(

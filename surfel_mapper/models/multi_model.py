@@ -191,6 +191,8 @@ class MultiModel:
         Points of the thinned cloud.
     milliseconds : dict of str to float
         Duration of each stage.
+    noise : (float, float)
+        Noise that was used, sigma = noise[0] + noise[1] range^2, m.
 
     """
 
@@ -201,6 +203,7 @@ class MultiModel:
     voxel_size_m: float
     num_thinned: int
     milliseconds: dict[str, float] = field(default_factory=dict)
+    noise: tuple[float, float] = (0.0, 0.0)
 
     @property
     def patches(self) -> list[Plane]:

@@ -15,6 +15,7 @@ from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit
 from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
+from test.bench import tabletop
 from test.models.scenes import (
     A,
     BALL,
@@ -26,6 +27,9 @@ from test.models.scenes import (
     sheet,
     VIEW,
 )
+
+TABLETOP = [(0.01, 0.98, 0.15), (0.02, 0.95, 0.25), (0.03, 0.90, 0.40)]
+"""Voxel size, m; least share of the table in one plane; largest share of objects in no patch."""
 
 
 @pytest.fixture(scope='module')
@@ -123,6 +127,40 @@ def test_real_frames_are_twice_as_precise_as_gaussians(data_folder, voxel_size_m
     assert ours[0] < 0.5 * theirs[0]
     assert ours[1] < 0.85 * theirs[1]
     assert max(ours) < 0.03
+
+
+@pytest.mark.parametrize(('size_m', 'table', 'free'), TABLETOP)
+def test_table_is_one_plane_and_objects_are_patches(data_folder, size_m, table, free):
+    found = []
+    for file in sorted((data_folder / 'data' / 'osd').glob('*.pcd')):
+        points, labels = tabletop.frame(file)
+        model = fit(points, ModelsConfig(voxel_size_m=size_m))
+        number = len(model.patches)
+        patch = np.where(model.labels < number, model.labels, -1)
+        planes = np.arange(number) < len(model.planes)
+        found.append(tabletop.figures(points, labels, patch, planes))
+    mean = {key: np.mean([one[key] for one in found]) for key in found[0]}
+    assert mean['table'] >= table
+    assert mean['free'] <= free
+    assert mean['impure'] <= 0.01
+
+
+@pytest.mark.parametrize(('sigma', 'outliers'), [(7e-3, 0.0), (15e-3, 0.0), (2e-3, 0.1)])
+def test_noisy_planes_are_found_whole_and_most_of_one_with_outliers(sigma, outliers):
+    rng = np.random.default_rng(2)
+    cloud = sheet(2.0, 2.0, 0.005, (1.0, 2.0, -3.0), (0.3, 0.2, 3.0), sigma)
+    low, high = [-1.0, -1.0, -0.1], [1.0, 1.0, 0.1]
+    others = rng.uniform(low, high, (int(outliers * len(cloud)), 3))
+    z = np.array([1.0, 2.0, -3.0]) / math.sqrt(14.0)
+    x = np.cross([1.0, 0.0, 0.0], z) / np.linalg.norm(np.cross([1.0, 0.0, 0.0], z))
+    others = others @ np.stack([x, np.cross(z, x), z]) + [0.3, 0.2, 3.0]
+    model = fit(np.concatenate([cloud, others]), ModelsConfig(voxel_size_m=A))
+    on_sheet = model.labels[: len(cloud)]
+    largest = max(model.planes, key=lambda plane: plane.num_points)
+    assert (on_sheet == largest.id).mean() > (0.8 if outliers else 0.95)
+    assert largest.normal @ z == pytest.approx(1.0, abs=1e-3)
+    if not outliers:
+        assert model.noise[0] + model.noise[1] * 9.0 == pytest.approx(sigma, rel=0.3)
 
 
 def test_an_organised_cloud_has_labels_for_all_its_points():

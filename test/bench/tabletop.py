@@ -1,0 +1,191 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Planes as people see them: labelled Kinect frames of objects on a table (OSD), by voxel size.
+
+Means over the frames of: ``table``, the share of the flat table points in one plane; ``free``, the
+share of object points in no patch; ``impure``, the share of points in patches whose label is not
+that of most points of their patch; ``pieces``, the patches that are mostly table; ``patches``;
+``residual_mm``, the root mean square distance of the points from their planes; CPU time. The flat
+table points are those within 1 cm of the plane that most table points lie on.
+
+The frames are those of the folder osd in SURFEL_MAPPER_TEST_DATA; without it there are no rows.
+Open3D's planar patches and its RANSAC planes (up to twelve, one after the other) are labelled by
+the points within a voxel of their boxes, and within 1 cm of their planes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import json
+import os
+from pathlib import Path
+import tempfile
+from time import thread_time
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import ModelsConfig
+from surfel_mapper.files.pcd import read_points
+from surfel_mapper.models import fit
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.peers import OPEN3D, PeerSpec
+from test.bench.peers.run import environment, output, PeerError, ROOT
+from test.bench.report import Row
+
+OPEN3D_TABLETOP = PeerSpec(
+    name='Open3D',
+    module='test.bench.peers.open3d_tabletop',
+    requires=OPEN3D,
+    less='planes only; labels are ours, from the boxes of its patches',
+)
+
+SIZES_M = (0.01, 0.02, 0.03)
+TABLE = 1
+"""Label of the table; objects have higher ones, 0 is unlabelled."""
+
+NEAR_M = 0.01
+RUNS = 4
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for every voxel size, ours and those of Open3D."""
+    data = os.environ.get('SURFEL_MAPPER_TEST_DATA')
+    files = sorted((Path(data) / 'data' / 'osd').glob('*.pcd')) if data else []
+    if not files:
+        return []
+    frames = [frame(file) for file in files]
+    rows: list[Row] = []
+    with one_core():
+        for size_m in SIZES_M:
+            found = [ours(points, labels, size_m) for points, labels in frames]
+            rows.append(mean_row('surfel_mapper', size_m, found))
+        if options.peers:
+            rows += peer_rows(frames, options.cache)
+    return rows
+
+
+def frame(file: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
+    """Return points (N, 3), m, and labels (N,) of a frame."""
+    table = read_points(file)
+    points = np.stack([table['x'], table['y'], table['z']], axis=-1).reshape(-1, 3)
+    return points.astype(np.float32), np.asarray(table['label']).reshape(-1).astype(np.int64)
+
+
+def ours(
+    points: npt.NDArray[np.float32], labels: npt.NDArray[np.int64], size_m: float
+) -> dict[str, float]:
+    """Return the figures of one frame."""
+    times = []
+    for _ in range(RUNS):
+        start = thread_time()
+        model = fit(points, ModelsConfig(voxel_size_m=size_m))
+        times.append((thread_time() - start) * 1e3)
+    number = len(model.patches)
+    patch = np.where(model.labels < number, model.labels, -1)
+    planes = np.arange(number) < len(model.planes)
+    return {**figures(points, labels, patch, planes), 'cpu_ms': min(times)}
+
+
+def figures(
+    points: npt.NDArray[np.float32],
+    labels: npt.NDArray[np.int64],
+    patch: npt.NDArray[np.integer],
+    planes: npt.NDArray[np.bool_],
+) -> dict[str, float]:
+    """
+    Compare patches with labels.
+
+    Parameters
+    ----------
+    points, labels : (N, 3), (N,)
+        The frame.
+    patch : (N,) int
+        Index of the patch of each point, -1 for none.
+    planes : (K,) bool
+        Which patches are planes.
+
+    """
+    held = np.isfinite(points).all(axis=1) & (labels > 0)
+    points, labels, patch = points[held].astype(np.float64), labels[held], patch[held]
+    normal, offset = table_plane(points[labels == TABLE])
+    flat = (labels == TABLE) & (np.abs(points @ normal + offset) < NEAR_M)
+    on_plane = np.append(planes, False)[patch]
+    in_planes = np.bincount(patch[flat & on_plane], minlength=1)
+    votes = np.zeros((len(planes), int(labels.max()) + 1), np.int64)
+    np.add.at(votes, (patch[patch >= 0], labels[patch >= 0]), 1)
+    used = votes[votes.sum(axis=1) > 0]
+    squares, total = 0.0, 0
+    for k in np.flatnonzero(planes):
+        own = points[patch == k]
+        if len(own) > 3:
+            squares += float(np.linalg.eigvalsh(np.cov(own.T))[0]) * len(own)
+            total += len(own)
+    return {
+        'table': float(in_planes.max() / flat.sum()),
+        'free': float((patch[labels > TABLE] < 0).mean()),
+        'impure': 1.0 - float(used.max(axis=1).sum() / max(used.sum(), 1)),
+        'pieces': float((used.argmax(axis=1) == TABLE).sum()),
+        'patches': float(len(used)),
+        'residual_mm': 1e3 * float(np.sqrt(squares / max(total, 1))),
+    }
+
+
+def table_plane(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
+    """Return the plane, of 300 through three points each, that most points lie on."""
+    rng, sample = np.random.default_rng(0), points[::20]
+    best, most = (np.array([0.0, 0.0, 1.0]), 0.0), -1
+    for a, b, c in points[rng.integers(len(points), size=(300, 3))]:
+        normal = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(normal))
+        if length < 1e-6:
+            continue
+        normal = normal / length
+        near = int((np.abs((sample - a) @ normal) < NEAR_M).sum())
+        if near > most:
+            best, most = (normal, -float(normal @ a)), near
+    return best
+
+
+def mean_row(name: str, size_m: float, found: Sequence[dict[str, float]]) -> Row:
+    """Return the means over frames as a row."""
+    means = {key: float(np.mean([one[key] for one in found])) for key in found[0]}
+    return {'cloud': 'tabletop', 'who': name, 'voxel_m': size_m, **means}
+
+
+def peer_rows(
+    frames: Sequence[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]], cache: Path
+) -> list[Row]:
+    """Return rows of Open3D's planar patches at every voxel size, and of its RANSAC planes."""
+    rows: list[Row] = []
+    for name, sizes in (('planar patches', SIZES_M), ('RANSAC', (0.01,))):
+        for size_m in sizes:
+            who = f'{OPEN3D_TABLETOP.name} {name}'
+            try:
+                found = [peer(points, labels, name, size_m, cache) for points, labels in frames]
+            except PeerError as error:
+                return [{'cloud': 'tabletop', 'who': f'{who}, not measured: {error}'}]
+            rows.append(mean_row(who, size_m, found))
+    return rows
+
+
+def peer(
+    points: npt.NDArray[np.float32],
+    labels: npt.NDArray[np.int64],
+    method: str,
+    size_m: float,
+    cache: Path,
+) -> dict[str, float]:
+    """Return the figures of one frame."""
+    python = environment(OPEN3D_TABLETOP, cache)
+    with tempfile.TemporaryDirectory() as scratch:
+        source, result = Path(scratch) / 'points.npy', Path(scratch) / 'patch.npy'
+        np.save(source, points)
+        arguments = ('-m', OPEN3D_TABLETOP.module, str(source), str(result), method, str(size_m))
+        one_thread = {**os.environ, 'OMP_NUM_THREADS': '1'}
+        said = output([str(python), *arguments], cwd=ROOT, env=one_thread)
+        patch = np.load(result)
+    planes = np.ones(int(patch.max(initial=-1)) + 1, np.bool_)
+    return {**figures(points, labels, patch, planes), 'cpu_ms': json.loads(said.splitlines()[-1])}

@@ -1,0 +1,204 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Voxel neighbours, noise and region growing against brute force and known scenes."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from surfel_mapper.models.fitting import thin
+from surfel_mapper.models.growth import estimate_noise, line_above_zero
+from surfel_mapper.models.kernels.growth import (
+    assign_points,
+    classify_free,
+    count_contacts,
+    find_facets,
+    grow_patches,
+    sample_distances,
+    SLOTS,
+)
+from surfel_mapper.models.kernels.voxel_points import (
+    block_noise,
+    find_core,
+    neighbours_of,
+    owner_means,
+)
+from test.kernels.modes import both
+
+SIZE = 0.1
+
+
+def corner(step=0.02, sigma=0.0):
+    """Return points on three faces of a cube seen from inside, and the face of each."""
+    u, v = np.meshgrid(np.arange(0.01, 0.6, step), np.arange(0.01, 0.6, step))
+    zero, rng = np.zeros(u.size), np.random.default_rng(1)
+    flat = u.ravel(), v.ravel(), zero
+    faces = [np.stack(np.roll(flat, k, axis=0), axis=1) for k in range(3)]
+    points = np.add(np.concatenate(faces), [0.03, 0.04, 0.05])
+    points += sigma * rng.standard_normal(points.shape)
+    return points, np.repeat([2, 0, 1], u.size)
+
+
+def by_voxel(points, size=SIZE):
+    thinned = thin(points, size)
+    return thinned, thinned.by_voxel()
+
+
+@both
+def test_neighbours_equal_brute_force(call):
+    points = np.random.default_rng(2).uniform(0.0, 1.0, (150, 3)) * [1.0, 0.3, 0.6]
+    thinned, voxels = by_voxel(points)
+    index = np.floor(thinned.means / SIZE).astype(int)
+    found = np.empty(26, np.int64)
+    for i in range(len(index)):
+        num = call(neighbours_of, i, *voxels.lattice, found)
+        near = np.abs(index - index[i]).max(axis=1) == 1
+        assert sorted(found[:num].tolist()) == np.flatnonzero(near).tolist()
+
+
+@pytest.mark.parametrize('reach', [1.0, 1e4])  # with 1e4 m keys are ranks
+def test_points_by_voxel_are_all_finite_points(reach):
+    points = np.random.default_rng(3).uniform(-reach, reach, (400, 3)).astype(np.float32)
+    points[::7] = np.nan
+    thinned, voxels = by_voxel(points, 0.02)
+    finite = np.isfinite(points).all(axis=1)
+    assert sorted(voxels.rows.tolist()) == np.flatnonzero(finite).tolist()
+    np.testing.assert_array_equal(voxels.points, points[voxels.rows])
+    which = np.repeat(np.arange(len(thinned.means)), np.diff(voxels.starts))
+    means = [voxels.points[which == k].astype(float).mean(axis=0) for k in range(5)]
+    np.testing.assert_allclose(thinned.means[:5], means, rtol=1e-12)
+    assert (np.diff(voxels.lattice[0]) > 0).all()
+
+
+@both
+def test_means_by_voxel_and_owner_equal_numpy(call):
+    points, _ = corner()
+    _, voxels = by_voxel(points)
+    owner = np.random.default_rng(4).integers(-3, 4, len(points)).astype(np.int32)
+    owners, means = np.empty(len(points), np.int32), np.empty((len(points), 3))
+    num = call(owner_means, voxels.points, voxels.starts, owner, owners, means)
+    which = np.repeat(np.arange(len(voxels.starts) - 1), np.diff(voxels.starts))
+    pairs = np.stack([which, owner], axis=1)
+    unique = np.unique(pairs, axis=0)
+    assert num == len(unique)
+    expected = {
+        (int(k), *np.round(voxels.points[(pairs == (v, k)).all(axis=1)].mean(axis=0), 9))
+        for v, k in unique
+    }
+    assert {(int(k), *np.round(m, 9)) for k, m in zip(owners[:num], means, strict=False)} == (
+        expected
+    )
+
+
+@both
+def test_sparse_voxels_are_no_core(call):
+    dense = np.random.default_rng(5).uniform(0.0, 0.1, (200, 3))
+    points = np.concatenate([dense, [[0.15, 0.05, 0.05]], [[0.95, 0.05, 0.05]]])
+    _, voxels = by_voxel(points)
+    core = np.empty(3, bool)
+    call(find_core, voxels.starts, *voxels.lattice, 0.1, 8, core)
+    assert core.tolist() == [True, False, True]  # the last one has no dense neighbour
+
+
+@both
+@pytest.mark.parametrize('radius', [0.6, 1e3])
+def test_noise_of_blocks_is_that_of_the_points_on_planes_and_spheres(call, radius):
+    rng = np.random.default_rng(6)
+    xy = rng.uniform(-0.2, 0.2, (9000, 2))
+    z = np.sqrt(radius**2 - (xy**2).sum(axis=1)) - radius
+    points = np.column_stack([xy, z + 0.004 * rng.standard_normal(len(xy))])
+    _, voxels = by_voxel(points, 0.05)
+    full = np.flatnonzero(np.diff(voxels.starts) > 30)[:40]
+    sigma = np.empty(len(full))
+    call(block_noise, voxels.points, voxels.starts, *voxels.lattice, full, 120, sigma)
+    assert np.median(sigma) == pytest.approx(0.004, rel=0.15)
+
+
+def test_noise_grows_with_the_square_of_the_range():
+    rng, parts = np.random.default_rng(7), []
+    for far in (1.0, 2.0, 3.0, 4.0):
+        xy = rng.uniform(-0.6, 0.6, (40_000, 2))
+        z = far + 1.5e-3 * far**2 * rng.standard_normal(len(xy))
+        parts.append(np.column_stack([xy, z]))
+    points = np.concatenate(parts)
+    thinned, voxels = by_voxel(points, 0.06)
+    core = np.ones(len(thinned.means), bool)
+    n0, n2 = estimate_noise(voxels, thinned.means, core, 0.06, np.zeros(3))
+    for far in (2.0, 3.0, 4.0):
+        assert n0 + n2 * far**2 == pytest.approx(1.5e-3 * far**2, rel=0.4)
+
+
+def test_line_above_zero_is_clamped():
+    x = np.array([1.0, 2.0, 3.0])
+    assert line_above_zero(x, 2.0 + 3.0 * x) == pytest.approx((2.0, 3.0))
+    assert line_above_zero(x, 3.0 - 0.5 * x)[1] == 0.0
+    assert line_above_zero(x, 2.0 * x - 0.5)[0] == 0.0
+
+
+@both
+def test_points_of_a_corner_go_to_the_face_that_they_lie_on(call):
+    points, face = corner()
+    thinned, voxels = by_voxel(points)
+    face = face[voxels.rows]
+    # only the voxels in the middle of the faces are labelled
+    middle = (thinned.means > 0.25).sum(axis=1) == 2
+    label = np.where(middle, thinned.means.argmin(axis=1), -1).astype(np.int32)
+    planes = np.column_stack([np.eye(3), [-0.03, -0.04, -0.05]])
+    tangent = planes[label]
+    tolerance, number = np.full(3, 0.005), len(label)
+    candidate = np.full((number, SLOTS), -1, np.int32)
+    candidate_plane = np.empty((number, SLOTS, 4))
+    state = voxels.points, voxels.starts
+    free = np.zeros(number, bool), np.zeros((number, 3)), 0.8
+    call(
+        grow_patches,
+        *state,
+        voxels.lattice,
+        label,
+        tangent,
+        tolerance,
+        free,
+        candidate,
+        candidate_plane,
+    )
+    owner = np.empty(len(face), np.int32)
+    call(assign_points, *state, label, tangent, tolerance, candidate, candidate_plane, owner)
+    away = np.abs(voxels.points @ planes[:, :3].T + planes[:, 3])
+    assert (away[np.arange(len(owner)), owner] <= away.min(axis=1) + 1e-12).all()
+    assert (owner == face).mean() > 0.99  # points on edges are on both faces
+    contacts = np.zeros((3, 3), np.int32)
+    call(count_contacts, voxels.starts, voxels.lattice, owner, contacts)
+    assert (contacts == contacts.T).all()
+    assert (contacts[~np.eye(3, dtype=bool)] > 0).all()
+
+    who, distance = np.empty(len(face), np.int32), np.empty(len(face))
+    num = call(sample_distances, *state, label, tangent, 1, who, distance)
+    assert num == np.diff(voxels.starts)[label >= 0].sum()
+    np.testing.assert_allclose(distance[:num], 0.0, atol=1e-12)
+
+
+@both
+def test_facets_of_a_corner_are_its_faces(call):
+    points, face = corner(step=0.03, sigma=1e-3)
+    _, voxels = by_voxel(points)
+    face, number = face[voxels.rows], len(voxels.starts) - 1
+    owner = np.full(len(face), -1, np.int32)
+    count, flat = np.empty(number, np.int64), np.empty(number, bool)
+    mean, normal = np.zeros((number, 3)), np.zeros((number, 3))
+    state = voxels.points, voxels.starts
+    call(classify_free, *state, owner, 0.02, count, flat, mean, normal)
+    np.testing.assert_array_equal(count, np.diff(voxels.starts))
+    assert flat.any()
+    planes = np.empty((10, 4))
+    free, rules = (count, flat, mean, normal), (0.005, 3, 30, math.cos(math.radians(25)), 0.1)
+    num = call(find_facets, *state, voxels.lattice, free, rules, owner, planes, 0)
+    assert num == 3
+    for k in range(3):
+        own = face[owner == k]
+        side = np.bincount(own).argmax()
+        assert (own == side).mean() > 0.95
+        assert abs(planes[k, side]) > 0.999
+    assert (owner >= 0).mean() > 0.97
