@@ -120,7 +120,7 @@ def requirements():
 def test_every_dependency_has_a_lower_bound():
     found = list(requirements())
     assert len(found) > 15
-    unbound = [name for name in found if not re.match(r'[\w.\[\]-]+>=\d', name)]
+    unbound = [name for name in found if not re.match(r'[\w.\[\]-]+[>=]=\d', name)]
     assert unbound == []
 
 
