@@ -73,7 +73,7 @@ lint: $(LINT_STAMP) $(STAMP)  ## style, format, types, layers
 	$(LINT)/bin/ruff check
 	$(LINT)/bin/ruff format --check
 	$(LINT)/bin/mypy
-	$(BIN)/python -m pytest -q test/test_layering.py
+	$(BIN)/python -m pytest -q test/test_layering.py test/test_language.py
 
 format: $(LINT_STAMP)  ## write every file in the one format, imports sorted
 	$(LINT)/bin/ruff check --fix
