@@ -21,7 +21,7 @@ LIMITS = {
     r'\bwhat (is|was|are|were|it|they|there|each|has|have|had|came|comes|follows|belongs|becomes'
     r'|does|did|stands?|the|a|an|no|can|may)\b(?![^.]*\?)': 2.0,
     r'\bwhere (it|there|they|that|these|those|he|one|none|nothing|somebody)\b': 5.0,
-    r'\bso (many|much|few)\b': 0.0,
+    r'\bso (many|much|few)\b': 0.5,
     r'\b(whoever|whatever|whom|nobody|somebody|anybody|theirs)\b': 2.0,
     r'\b(that|those) which\b': 0.5,
     r'\bhangs? together\b': 0.0,
@@ -37,7 +37,11 @@ FIRST_WORDS = re.compile(r'test_(what|where|who|whoever|of|it|they|that|those|so
 
 def sources() -> list[Path]:
     """Return the Python files of the project."""
-    return [path for top in ('surfel_mapper', 'test', 'examples') for path in (ROOT / top).rglob('*.py')]
+    return [
+        path
+        for top in ('surfel_mapper', 'test', 'examples')
+        for path in (ROOT / top).rglob('*.py')
+    ]
 
 
 def pages() -> list[Path]:
@@ -62,7 +66,9 @@ def texts(path: Path) -> list[tuple[int, str]]:
     if path.suffix != '.py':
         return [(number, line) for number, line in enumerate(text.splitlines(), 1)]
     tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    comments = [(token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT]
+    comments = [
+        (token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT
+    ]
     tree = ast.parse(text)
     strings = [
         (node.lineno, node.value)

@@ -42,7 +42,7 @@ Show = Callable[[int, int], None]
 @dataclass(slots=True)
 class FilteredClouds:
     """
-    What a chain did to clouds.
+    Counts and times of a chain over all clouds.
 
     Attributes
     ----------
@@ -153,7 +153,7 @@ def outputs_of(inputs: list[Path], output: Path) -> Iterator[tuple[Path, Path]]:
 
 
 class _Work:
-    """The chain, what it did so far, and the progress."""
+    """The chain, its counts so far, and the progress."""
 
     def __init__(
         self, chain: Chain, topics: Sequence[str], pose: Transform | None, show: Show

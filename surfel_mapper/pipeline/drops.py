@@ -29,7 +29,7 @@ INTERNAL = 'internal_error'
 """Cause of drops by errors that no stage expects, out of memory among them."""
 
 REMEDIES = {
-    'bad_cloud': 'the log says what is wrong with them',
+    'bad_cloud': 'the log describes the damage',
     'empty_frame_id': 'set the frame in the driver of the sensor',
     'filter': 'compare the filters with the fields of the clouds',
     'filtered_out': 'are the limits of the filters too narrow?',

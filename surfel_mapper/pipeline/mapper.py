@@ -102,7 +102,7 @@ class Mapper:
     if not TYPE_CHECKING:  # names that mypy shall not take for granted
 
         def __getattr__(self, name: str) -> Any:
-            """Return what a layer offers, None if it is switched off: ``mapper.tsdf``."""
+            """Return the result of a layer, None if it is switched off: ``mapper.tsdf``."""
             if name in layer_names():
                 return self.layers[name].public if name in self.layers else None
             raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')

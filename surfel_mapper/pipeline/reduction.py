@@ -167,7 +167,7 @@ def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
 
 
 def compile_wide_sums(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile adding and removing voxels of so many points that their sums need 64 bits."""
+    """Compile adding and removing voxels whose sums need 64 bits."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {n: np.zeros(NARROW_COUNT) for n in CHANNELS}
     moments = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=columns)

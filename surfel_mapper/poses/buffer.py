@@ -140,7 +140,7 @@ class TransformBuffer:
         PoseNotYetError
             If a frame was never seen, no edges lead from one to the other, or the newest
             transform of an edge between them is older than the stamp, or the stamp is in a gap
-            longer than ``max_gap_s``: what is missing may still come.
+            longer than ``max_gap_s``: the missing transforms may still come.
         PoseError
             If the stamp is before the oldest transform held of an edge between them.
 

@@ -33,7 +33,7 @@ BEFORE = {
 
 
 def fail_once(monkeypatch, cls, name, error):
-    """Have the next call of a method raise an error."""
+    """Make the next call of a method raise an error."""
     work = getattr(cls, name)
 
     def failing(self, *args, **kwargs):

@@ -72,7 +72,7 @@ def test_the_section_names_every_patch_with_its_numbers(seen):
     assert f'<dt>Gaussians</dt><dd>{len(model.gaussians)}</dd>' in text
 
 
-def test_of_many_patches_the_largest_are_named(seen):
+def test_the_largest_of_many_patches_are_named(seen):
     model, shapes = seen
     many = [
         replace(shape, patch=replace(shape.patch, id=100 * k + shape.patch.id))
