@@ -66,9 +66,10 @@ def dangers_of_call(call):
     return [a for a in arguments if a in ('eval', 'exec')]
 
 
-@pytest.mark.parametrize('path', SOURCES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_no_source_unpickles_evaluates_or_starts_programs(path):
-    assert dangers(path.read_text(encoding='utf-8')) == []
+def test_no_source_unpickles_evaluates_or_starts_programs():
+    found = {path: dangers(path.read_text(encoding='utf-8')) for path in SOURCES}
+    assert {path.name: faults for path, faults in found.items() if faults} == {}
+    assert len(found) > 100
 
 
 @pytest.mark.parametrize(
