@@ -145,6 +145,8 @@ def pixels_of(
             check_size(width, height, len(data), topic, size)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
+    except CloudFormatError:
+        raise
     except (*DAMAGED, Image.DecompressionBombError) as error:
         expected = ' or '.join(formats)
         raise CloudFormatError(f'{topic}: not a readable {expected}: {error}') from error

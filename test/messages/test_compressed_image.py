@@ -107,11 +107,11 @@ def test_depth_in_metres_has_the_resolution_of_its_quantised_inverse():
     [
         (packed_depth(DEPTH_MM, '16UC1; compressedDepth rvl'), 'expected a png of 16UC1'),
         (packed_depth(DEPTH_MM, '8UC3; compressedDepth png'), 'format 8UC3; compressedDepth png'),
-        (packed_depth(SMOOTH), 'a PNG of rgb8, expected one of 16 bits'),
+        (packed_depth(SMOOTH[:3, :4].copy()), 'a PNG of rgb8, expected one of 16 bits'),
         (SimpleNamespace(**{**vars(packed_depth(DEPTH_MM)), 'data': b'123'}), '3 bytes, expected'),
         (SimpleNamespace(**{**vars(packed_depth(DEPTH_MM)), 'data': 7}), 'data is a int'),
-        (packed(SMOOTH, 'png'), "encoding 'rgb8', expected 16UC1 or 32FC1"),
-        (packed(DEPTH_MM.T.copy(), 'png'), r'shape \(4, 3\), expected \(3, 4\)'),
+        (packed(SMOOTH[:3, :4].copy(), 'png'), "encoding 'rgb8', expected 16UC1 or 32FC1"),
+        (packed(DEPTH_MM.T.copy(), 'png'), r'image of 3 x 4 pixels, the calibration is for 4 x 3'),
     ],
 )
 def test_an_image_without_depth_is_refused_by_topic(message, said):
@@ -148,7 +148,7 @@ def test_an_image_of_too_many_pixels_is_refused_before_decoding(side):
     message.data = (
         message.data[:12] + header + zlib.crc32(header).to_bytes(4, 'big') + message.data[33:]
     )
-    with pytest.raises(CloudFormatError, match='not a readable PNG: '):
+    with pytest.raises(CloudFormatError, match='9000 x 9000 pixels, more than'):
         unpacked(message, TOPIC, exact=True)
 
 
