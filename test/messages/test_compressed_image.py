@@ -148,7 +148,7 @@ def test_an_image_of_too_many_pixels_is_refused_before_decoding(side):
     message.data = (
         message.data[:12] + header + zlib.crc32(header).to_bytes(4, 'big') + message.data[33:]
     )
-    with pytest.raises(CloudFormatError, match='9000 x 9000 pixels, more than'):
+    with pytest.raises(CloudFormatError, match='pixels'):
         unpacked(message, TOPIC, exact=True)
 
 
