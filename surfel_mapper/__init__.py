@@ -16,6 +16,7 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config, load_config
+    from surfel_mapper.layers.distance_field import DistanceField
     from surfel_mapper.mapping.moments import ScanMoments
     from surfel_mapper.mapping.surfel import Surfel
     from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -30,6 +31,7 @@ __version__ = '0.1.0'
 
 __all__ = [
     'Config',
+    'DistanceField',
     'MapMirror',
     'Mapper',
     'Scan',
@@ -45,6 +47,7 @@ __all__ = [
 
 _HOMES = {
     'Config': 'config',
+    'DistanceField': 'layers.distance_field',
     'MapMirror': 'messages.map_cloud',
     'Mapper': 'pipeline',
     'Scan': 'scan',

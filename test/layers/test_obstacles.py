@@ -7,7 +7,7 @@ import pytest
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.layers.distance_field.obstacles import distance_field, slice_at
+from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, slice_at
 from surfel_mapper.tsdf.blocks import BlockMap
 from test.tsdf.test_mesh import blocks_of, centers, VOXEL_M
 
@@ -48,7 +48,7 @@ def test_a_slice_where_nothing_was_seen_is_empty(scene):
 
 def test_distances_are_those_to_the_nearest_obstacle(scene):
     blocks, distance, weight, places = scene
-    field = distance_field(blocks)
+    field = obstacle_distances(blocks)
     occupied = places[states_of(distance, weight) == 100]
     expected = np.linalg.norm(places.reshape(-1, 1, 3) - occupied, axis=-1).min(axis=1)
     assert np.abs(field.distance_m.ravel() - expected).max() <= 1e-6
@@ -59,23 +59,23 @@ def test_distances_are_those_to_the_nearest_obstacle(scene):
 
 def test_a_box_counts_the_obstacles_in_it_alone(scene):
     blocks, *_ = scene
-    free = distance_field(blocks, (0.0, 0.8, 0.0), (0.2, 0.9, 0.3))
+    free = obstacle_distances(blocks, (0.0, 0.8, 0.0), (0.2, 0.9, 0.3))
     assert free.distance_m.shape == (2, 1, 3)
     assert np.isinf(free.distance_m).all()
     assert free.known.all()
-    beyond = distance_field(blocks, (5.0, 5.0, 5.0), (5.3, 5.3, 5.3))
+    beyond = obstacle_distances(blocks, (5.0, 5.0, 5.0), (5.3, 5.3, 5.3))
     assert not beyond.known.any()
 
 
 def test_an_empty_field_has_no_distances():
-    assert distance_field(BlockMap(TsdfConfig())).distance_m.shape == (0, 0, 0)
+    assert obstacle_distances(BlockMap(TsdfConfig())).distance_m.shape == (0, 0, 0)
 
 
 def test_boxes_that_are_none_or_too_large_are_refused(scene):
     blocks, *_ = scene
     with pytest.raises(ValueError, match='expected low below high'):
-        distance_field(blocks, (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))
+        obstacle_distances(blocks, (0.0, 0.0, 0.0), (1.0, -1.0, 1.0))
     with pytest.raises(MapLimitError, match='voxels; at most'):
-        distance_field(blocks, (-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
+        obstacle_distances(blocks, (-1e3, -1e3, -1e3), (1e3, 1e3, 1e3))
     with pytest.raises(ValueError, match=r'height 9.0 m, expected one within \[0, 0.8\)'):
-        distance_field(blocks).at_height(9.0)
+        obstacle_distances(blocks).at_height(9.0)

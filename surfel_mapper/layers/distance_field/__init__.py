@@ -2,7 +2,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """The truncated signed distance field: fused from scans, published as mesh and slice."""
 
+from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.layer import TsdfLayer
-from surfel_mapper.layers.distance_field.obstacles import distance_field, DistanceField, slice_at
+from surfel_mapper.layers.distance_field.obstacles import (
+    obstacle_distances,
+    ObstacleDistances,
+    slice_at,
+)
 
-__all__ = ['DistanceField', 'TsdfLayer', 'distance_field', 'slice_at']
+__all__ = ['DistanceField', 'ObstacleDistances', 'TsdfLayer', 'obstacle_distances', 'slice_at']

@@ -21,6 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.files.ply import write_mesh
+from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.obstacles import slice_at
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
@@ -139,6 +140,11 @@ class TsdfLayer(Layer):
         self._num_refused += done.num_refused
         self._num_labels_lost += done.num_labels_lost
         return done
+
+    @property
+    def field(self) -> DistanceField:
+        """The field, to query, save or fuse into; valid until the layer is cleared."""
+        return DistanceField(blocks=self.blocks)
 
     def mesh(self) -> Mesh:
         """Return the surface; blocks that have not changed since the last call cost little."""

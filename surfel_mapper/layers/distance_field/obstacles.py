@@ -30,7 +30,7 @@ COSTS = np.array([UNSEEN, 0, OBSTACLE], np.int8)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DistanceField:
+class ObstacleDistances:
     """
     Euclidean distances to the nearest occupied voxel of a box.
 
@@ -94,11 +94,11 @@ def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
     return CostGrid(resolution_m=size_m, origin=origin, cost=COSTS[found.T])
 
 
-def distance_field(
+def obstacle_distances(
     blocks: BlockMap,
     low_m: npt.ArrayLike | None = None,
     high_m: npt.ArrayLike | None = None,
-) -> DistanceField:
+) -> ObstacleDistances:
     """
     Return the distance to the nearest occupied voxel in a box.
 
@@ -131,7 +131,7 @@ def distance_field(
     distance = np.full(found.shape, np.inf, np.float32)
     if occupied.any():
         distance = distance_transform_edt(~occupied, sampling=size_m).astype(np.float32)
-    return DistanceField(
+    return ObstacleDistances(
         voxel_size_m=size_m,
         origin=np.asarray(low * size_m, np.float64),
         distance_m=distance,

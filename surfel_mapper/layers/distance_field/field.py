@@ -1,0 +1,205 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+DistanceField: a truncated signed distance field to fuse, query, mesh, save and load.
+
+The one class that users of the library need; the layer of a mapper offers its own as
+``mapper.tsdf.field``. It holds no voxels itself: see tsdf/blocks.py for the storage.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
+from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.integrator import Integrated, Integrator
+from surfel_mapper.tsdf.mesh import Mesh, Mesher
+from surfel_mapper.tsdf.point_integrator import PointIntegrator
+from surfel_mapper.tsdf.queries import labels_at, sample, states
+from surfel_mapper.tsdf.range_image import from_depth, from_points
+from surfel_mapper.tsdf.sensors import CameraModel, Sensor
+
+
+class DistanceField:
+    """
+    A truncated signed distance field.
+
+    Attributes
+    ----------
+    config : TsdfConfig
+        The settings.
+    blocks : BlockMap
+        The voxels.
+
+    Parameters
+    ----------
+    config : TsdfConfig, optional
+        The settings ``layers.tsdf.*``; defaults if not given.
+    blocks : BlockMap, optional
+        Existing voxels, whose settings then count; empty by default.
+
+    """
+
+    def __init__(
+        self, config: TsdfConfig | None = None, *, blocks: BlockMap | None = None
+    ) -> None:
+        self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
+        self.config = self.blocks.config
+        self._mesher = Mesher(self.blocks)
+
+    def __len__(self) -> int:
+        """Return the number of blocks."""
+        return self.blocks.num_blocks
+
+    def add(
+        self,
+        points: npt.NDArray[Any],
+        T_map_sensor: npt.NDArray[np.float64],
+        *,
+        sensor: Sensor | None = None,
+        stamp_ns: int = 0,
+        colors: npt.NDArray[np.uint8] | None = None,
+        labels: npt.NDArray[Any] | None = None,
+    ) -> Integrated:
+        """
+        Fuse the points of a scan.
+
+        Parameters
+        ----------
+        points : (N, 3) float32 or float64
+            In the frame of the sensor, m; non-finite points are skipped.
+        T_map_sensor : (4, 4) float64
+            Pose of the sensor in the map frame.
+        sensor : LidarModel or CameraModel, optional
+            Model by which the points become a range image, which is faster; without it they are
+            fused point by point, for any cloud.
+        stamp_ns : int
+            Stamp of the scan, ns.
+        colors : (N, 3 or 4) uint8, optional
+            Red, green, blue of each point; a fourth channel of 0 means unknown.
+        labels : (N,) int, optional
+            Label of each point, -1 for unknown.
+
+        Raises
+        ------
+        CloudFormatError, PoseError, MapLimitError
+            If a shape does not match, the pose is not rigid, or the map cannot hold the scan; the
+            field is unchanged.
+
+        """
+        if sensor is None:
+            by_points = PointIntegrator(self.blocks)
+            return by_points.integrate(
+                points, T_map_sensor, stamp_ns, colors=colors, labels=labels
+            )
+        image = from_points(sensor, points, colors=colors, labels=labels)
+        return Integrator(self.blocks).integrate(image, T_map_sensor, stamp_ns)
+
+    def add_depth(
+        self,
+        depth: npt.NDArray[Any],
+        camera: CameraModel,
+        T_map_camera: npt.NDArray[np.float64],
+        *,
+        stamp_ns: int = 0,
+        color: npt.ArrayLike | None = None,
+        label: npt.ArrayLike | None = None,
+    ) -> Integrated:
+        """
+        Fuse a depth image.
+
+        Parameters
+        ----------
+        depth : (rows, columns) float32, float64 in m, or uint16 in mm
+            Depth along z; 0 and nan mean unknown, inf free up to max_range_m.
+        camera : CameraModel
+            Model of the camera, z ahead.
+        T_map_camera : (4, 4) float64
+            Pose of the camera in the map frame.
+        stamp_ns : int
+            Stamp of the image, ns.
+        color : (rows, columns, 3 or 4) uint8, optional
+            Red, green, blue of each pixel.
+        label : (rows, columns) int, optional
+            Label of each pixel, -1 for unknown.
+
+        Raises
+        ------
+        CloudFormatError, PoseError, MapLimitError
+            As add.
+
+        """
+        image = from_depth(camera, depth).with_images(color=color, label=label)
+        return Integrator(self.blocks).integrate(image, T_map_camera, stamp_ns)
+
+    def sample(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Return the signed distances at (P, 3) points, map frame, (P,) m; nan if unknown."""
+        return sample(self.blocks, points).distance
+
+    def gradient(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """Return the gradients of the distance at (P, 3) points, (P, 3); nan if unknown."""
+        return sample(self.blocks, points).gradient
+
+    def labels_at(
+        self, points: npt.ArrayLike
+    ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.float32]]:
+        """
+        Return the labels at (P, 3) points, map frame, and their weights; -1 and 0 if unknown.
+
+        Raises
+        ------
+        ValueError
+            If the field keeps no labels (``semantics: none``).
+
+        """
+        return labels_at(self.blocks, points)
+
+    def states(self, points: npt.ArrayLike) -> npt.NDArray[np.uint8]:
+        """Return the states at (P, 3) points: UNKNOWN, FREE or OCCUPIED of tsdf.queries, (P,)."""
+        return states(self.blocks, points)
+
+    def obstacle_distances(
+        self, low_m: npt.ArrayLike | None = None, high_m: npt.ArrayLike | None = None
+    ) -> ObstacleDistances:
+        """Return the Euclidean distances to obstacles in a box; see obstacle_distances."""
+        return obstacle_distances(self.blocks, low_m, high_m)
+
+    def mesh(self) -> Mesh:
+        """Return the surface as triangles; only changed blocks are meshed again."""
+        self._mesher.update()
+        return self._mesher.mesh()
+
+    def save(self, path: str | Path, *, compress: bool = False) -> None:
+        """
+        Write the field to a file, whole or not at all.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be written.
+
+        """
+        save_tsdf(path, self.blocks, compress=compress)
+
+    @classmethod
+    def load(cls, path: str | Path, config: TsdfConfig) -> DistanceField:
+        """
+        Return a saved field, which continues as if it had never stopped.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be read, is damaged, or has another voxel size, block, truncation
+            or channels than the configuration.
+        MapLimitError
+            If it does not fit into max_blocks.
+
+        """
+        return cls(blocks=load_tsdf(path, config))

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""DistanceField: fused, queried, meshed, saved and loaded by one class."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper import DistanceField
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.tsdf.queries import FREE, OCCUPIED, UNKNOWN
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
+
+CONFIG = TsdfConfig(
+    voxel_size_m=0.1, truncation_m=0.3, color=True, semantics='majority', num_labels=5
+)
+LIDAR = LidarModel(rows=64, columns=360, vertical_fov_deg=60.0)
+SPHERE = 2.0 * LIDAR.directions.reshape(-1, 3)
+
+
+@pytest.mark.parametrize('sensor', [LIDAR, None], ids=['range image', 'point by point'])
+def test_field_of_a_sphere_has_its_distances_gradients_colours_and_labels(sensor):
+    field = DistanceField(CONFIG)
+    done = field.add(
+        SPHERE,
+        np.eye(4),
+        sensor=sensor,
+        colors=np.tile(np.array([10, 20, 30], np.uint8), (len(SPHERE), 1)),
+        labels=np.full(len(SPHERE), 3),
+    )
+    assert done.num_updated == len(field) > 0
+
+    turn = np.linspace(0.0, 2.0 * np.pi, 50)
+    ahead = np.stack([np.cos(turn), np.sin(turn), np.zeros(50)], axis=1)
+    np.testing.assert_allclose(field.sample(1.95 * ahead), 0.05, atol=0.02)
+    np.testing.assert_allclose(field.gradient(2.0 * ahead), -ahead, atol=0.15)
+    assert set(field.labels_at(2.0 * ahead)[0]) == {3}
+    assert set(field.states(1.5 * ahead)) == {FREE}
+    assert set(field.states(2.08 * ahead)) == {OCCUPIED}
+    assert set(field.states(9.0 * ahead)) == {UNKNOWN}
+    mesh = field.mesh()
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 2.0).max() < 0.05
+    assert set(map(tuple, mesh.colors.tolist())) == {(10, 20, 30)}
+    box = field.obstacle_distances((-1.0, -1.0, -0.2), (2.5, 1.0, 0.2))
+    middle = box.distance_m[10, 10, 2]  # of the sensor's own voxel
+    assert middle == pytest.approx(2.0, abs=0.2)
+
+
+def test_depth_image_is_fused_with_its_colours():
+    camera = CameraModel(columns=80, rows=60, fx=70.0, fy=70.0, cx=40.0, cy=30.0)
+    field = DistanceField(CONFIG)
+    color = np.full((60, 80, 3), 77, np.uint8)
+    field.add_depth(np.full((60, 80), 1.55, np.float32), camera, np.eye(4), color=color)
+    mesh = field.mesh()
+    assert np.abs(mesh.vertices[:, 2] - 1.55).max() < 1e-3
+    assert (mesh.colors == 77).all()
+
+
+def test_loaded_field_equals_the_saved_one(tmp_path):
+    field = DistanceField(CONFIG)
+    field.add(SPHERE, np.eye(4))
+    field.save(tmp_path / 'field.npz')
+    other = DistanceField.load(tmp_path / 'field.npz', CONFIG)
+    assert len(other) == len(field)
+    np.testing.assert_array_equal(other.sample(SPHERE), field.sample(SPHERE))
+    with pytest.raises(FileFormatError, match='voxel_size_m'):
+        DistanceField.load(tmp_path / 'field.npz', TsdfConfig(voxel_size_m=0.2))
