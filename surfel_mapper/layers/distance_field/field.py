@@ -168,7 +168,22 @@ class DistanceField:
     def obstacle_distances(
         self, low_m: npt.ArrayLike | None = None, high_m: npt.ArrayLike | None = None
     ) -> ObstacleDistances:
-        """Return the Euclidean distances to obstacles in a box; see obstacle_distances."""
+        """
+        Return the Euclidean distances to obstacles in a box.
+
+        Parameters
+        ----------
+        low_m, high_m : (3,) float, optional
+            Corners of the box, map frame, m; by default it spans all blocks.
+
+        Raises
+        ------
+        ValueError
+            If a corner is not (3,) or low is not below high.
+        MapLimitError
+            If the box has too many voxels.
+
+        """
         return obstacle_distances(self.blocks, low_m, high_m)
 
     def mesh(self) -> Mesh:
