@@ -10,6 +10,7 @@ the rates in the docstrings of well-kept Python libraries; a failure lists every
 from __future__ import annotations
 
 import ast
+from functools import cache
 import io
 from pathlib import Path
 import re
@@ -60,6 +61,7 @@ def docstrings(tree: ast.Module) -> list[tuple[int, str]]:
     ]
 
 
+@cache
 def texts(path: Path) -> list[tuple[int, str]]:
     """Return line and text of everything that a reader reads as English in a file."""
     text = path.read_text(encoding='utf-8')

@@ -12,6 +12,8 @@ lies on.
 The tolerance of a patch follows from the distances of its own points, so it needs no model of the
 sensor; thresholds of the bisection use the noise that is estimated from blocks of voxels.
 
+One module of 350 lines: growth, facets and merging share the table of patches and its noise.
+
 Source: Besl and Jain 1988 (region growing from seeds); the rest is our own.
 """
 

@@ -91,10 +91,8 @@ def test_the_readme_names_every_verb():
 
 def test_the_readme_names_every_topic_and_service_of_the_node():
     readme = README.read_text(encoding='utf-8')
-    sources = ''.join(
-        path.read_text(encoding='utf-8') for path in (ROOT / 'surfel_mapper/ros').glob('*.py')
-    )
-    names = set(re.findall(r"'(~/[a-z_]+)'", sources))
+    sources = everything('surfel_mapper/ros/*.py', 'surfel_mapper/layers/**/*.py')
+    names = set(re.findall(r"'(~/[a-z_]+[a-z])'", sources))
     assert len(names) > 15
     assert sorted(name for name in names if f'`{name}`' not in readme) == []
 

@@ -12,6 +12,8 @@ of the free points that are left.
 Voxels, points, starts, keys, to_y, to_z and first are those of voxel_points.py. A plane is four
 numbers: unit normal and offset, with distance normal . p + offset.
 
+One module of 380 lines: both kinds of growth share the test of a point against a patch.
+
 Source: Besl and Jain 1988 (region growing from seeds).
 """
 
