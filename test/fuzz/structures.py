@@ -161,7 +161,7 @@ def parquet(data: bytes) -> None:
     path.write_bytes(corpus.parquet()[0])
     table = pq.read_table(path)
     if source.chance(2):
-        table = table.take(np.zeros(source.pick((1, 1000, 100_000, 500_000)), np.int64))
+        table = table.take(np.zeros(source.pick((1, 1000, 20_000, 170_000)), np.int64))
     if source.chance(2):
         name = source.pick(table.column_names)
         values = source.pick(([None], ['x' * 1000], [[1]], [0.5], [True])) * len(table)
