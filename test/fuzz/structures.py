@@ -167,6 +167,7 @@ def parquet(data: bytes) -> None:
         values = source.pick(([None], ['x' * 1000], [[1]], [0.5], [True])) * len(table)
         table = table.set_column(table.column_names.index(name), name, pyarrow.array(values))
     options = {'compression': source.pick(('zstd', 'snappy', 'none'))}
-    pq.write_table(table, path, row_group_size=source.pick((10, 1_000_000)), **options)
+    groups = source.pick((1, min(len(table), 100)))
+    pq.write_table(table, path, row_group_size=-(-len(table) // groups), **options)
     with contextlib.suppress(SurfelMapperError):
         read_map(path)
