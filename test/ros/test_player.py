@@ -141,13 +141,18 @@ def test_a_missing_subscriber_is_reported_with_a_remedy(domain, capsys, bag):
     [
         (['--topics', '/nothing'], 'no topic /nothing; its topics: /odom, /points'),
         (['--topics', '/points', '--wait-for', '/odom'], 'no topic /odom to wait for'),
-        (['--rate', '0'], 'rate: 0.0, expected more than 0'),
         (['--ros-args', '--nonsense'], '--nonsense'),
     ],
 )
 def test_invalid_arguments_are_refused(domain, capsys, bag, arguments, message):
     assert main(['play', str(bag), *arguments]) == 1
     assert message in capsys.readouterr().err
+
+
+def test_a_rate_of_zero_is_wrong_usage(domain, capsys, bag):
+    with pytest.raises(SystemExit, match='2'):
+        main(['play', str(bag), '--rate', '0'])
+    assert '--rate' in capsys.readouterr().err
 
 
 def test_a_bag_of_ros_1_is_refused_with_how_to_convert_it(domain, capsys, tmp_path):
