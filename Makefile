@@ -11,7 +11,7 @@ TEST_PROCESSES ?= 2
 FUZZ_SECONDS ?= 60
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 BOUNDSCHECKED := $(addprefix test/,kernels mapping filters alignment models sensors tsdf layers \
-	messages simulation viz/kernels)
+	messages simulation viz/kernels pipeline/test_regions.py)
 
 VENV := .venv
 BIN := $(VENV)/bin

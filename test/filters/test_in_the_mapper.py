@@ -27,6 +27,7 @@ def mapper_with(tmp_path, chain, mount=(0.0, 0.0, 1.0, *LEVEL)):
         Config.from_mapping(
             {
                 'pose.source': 'odometry',
+                'pose.max_gap_s': 5.0,  # the two poses below
                 'frames.base_to_sensor': mount,
                 'filters': str(path),
                 'map.min_points': 1,

@@ -50,10 +50,11 @@ def run(package, **environment):
         'from surfel_mapper.kernels.caller import twice\n'
         'print(twice(0), sum(twice.stats.cache_hits.values()))'
     )
+    inherited = {name: os.environ[name] for name in os.environ if name != 'NUMBA_CACHE_DIR'}
     done = subprocess.run(
         [sys.executable, '-c', program],
         cwd=package,
-        env={**os.environ, 'PYTHONPATH': str(package), **environment},
+        env={**inherited, 'PYTHONPATH': str(package), **environment},
         capture_output=True,
         text=True,
         check=True,
