@@ -53,7 +53,7 @@ def test_files_come_in_the_order_of_their_numbers(tmp_path):
         ('a.bin', lambda path: path.write_bytes(bytes(17)), '17 bytes, expected 16 for every'),
         ('a.pcd.bin', lambda path: path.write_bytes(bytes(16)), '16 bytes, expected 20 for every'),
         ('a.bin', lambda path: None, 'cannot be read'),
-        ('a.las', lambda path: path.touch(), 'expected a scan ending in .ply, .pcd, .bin'),
+        ('a.xyz', lambda path: path.touch(), 'expected a scan ending in .ply, .pcd, .bin'),
         ('a.ply', lambda path: ply.write_points(path, {'x': POINTS[:, 0]}), 'no y, z among x'),
         (
             'a.pcd',

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from array import array
 from functools import partial
 
 import numpy as np
@@ -85,8 +86,13 @@ def test_a_mirror_equals_the_map_of_the_node(start, peer, tmp_path, columns):
 
 def with_intensity(points):
     """Return a cloud whose intensity is its y."""
-    field = type(points.fields[1])(name='intensity', offset=4, datatype=7, count=1)
+    old = np.frombuffer(points.data, np.uint8).reshape(-1, points.point_step)
+    start, offset = points.fields[1].offset, points.point_step
+    field = type(points.fields[1])(name='intensity', offset=offset, datatype=7, count=1)
     points.fields = [*points.fields, field]
+    points.point_step = offset + 4
+    points.row_step = points.width * points.point_step
+    points.data = array('B', np.hstack([old, old[:, start : start + 4]]).tobytes())
     return points
 
 

@@ -138,7 +138,7 @@ def test_clear_polygon_accepts_any_known_frame(peer, node):
     assert after < before
     peer.diagnosis({'voxels': after})
     assert digest(peer) == twin.map.digest()
-    assert "in frame 'odom' ignored: polygon of 2 corners, expected 3 or more" in node.output
+    assert "in frame 'odom' ignored: polygon of 2 corners, expected 3 " in node.output
     assert f'voxels in the polygon on {NODE}/clear_polygon in frame base_link' in node.output
 
 
@@ -147,7 +147,7 @@ def test_clear_polygon_accepts_any_known_frame(peer, node):
     [
         ((0.0, 0.0), '', PoseError, 'frame_id is empty'),
         ((0.0, 0.0), 'elsewhere', PoseError, 'elsewhere'),
-        ((float('nan'), 0.0), 'odom', ValueError, 'finite corners'),
+        ((float('nan'), 0.0), 'odom', ValueError, 'finite numbers'),
     ],
 )
 def test_an_invalid_polygon_is_refused(corner, frame_id, error, reason):
