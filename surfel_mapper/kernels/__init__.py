@@ -11,14 +11,16 @@ If numba finds no writable cache directory, it refuses to load any kernel; the k
 cached in a temporary directory and compiled at every start.
 
 numba recompiles a kernel if its own file changed, but not if a kernel that it calls did: after an
-update, cached kernels could disagree on the layout of a table. So any change in any folder of
-kernels discards the whole cache.
+update, cached kernels could disagree on the layout of a table. So a change in a module of kernels
+discards the cached kernels of that module and of all that import it, directly or not.
 """
 
 import atexit
+from collections.abc import Iterable
 import hashlib
 import logging
 from pathlib import Path
+import re
 import shutil
 import tempfile
 from types import FunctionType
@@ -43,10 +45,37 @@ except ImportError as error:
 
 _log = logging.getLogger(__name__)
 
-STAMP = 'kernels.sha256'
-"""File beside the cached kernels: hash of the sources that they were compiled from."""
+STAMPS = 'sources.sha256'
+"""File beside the cached kernels: by module, the hash of the sources that they come from."""
 
 _PACKAGE = Path(__file__).parents[1]
+
+
+def _source_digests() -> dict[str, str]:
+    """Return by module of kernels the hash of its source and of all kernels that it imports."""
+    sources = {
+        '.'.join(path.relative_to(_PACKAGE.parent).with_suffix('').parts): path.read_bytes()
+        for path in sorted(_PACKAGE.glob('**/kernels/*.py'))
+        if path.name != '__init__.py'
+    }
+    imports = {module: _imported(source, sources) for module, source in sources.items()}
+    digests = {}
+    for module in sources:
+        needed, new = {module}, {module}
+        while new:
+            new = {name for each in new for name in imports[each]} - needed
+            needed |= new
+        joined = b''.join(sources[name] for name in sorted(needed))
+        digests[module] = hashlib.sha256(joined).hexdigest()
+    return digests
+
+
+def _imported(source: bytes, modules: Iterable[str]) -> set[str]:
+    """Return the modules that a source imports; importing a folder may mean any module in it."""
+    lines = re.findall(rb'^\s*(?:from|import) (surfel_mapper[.\w]*)', source, re.MULTILINE)
+    names = {line.decode() for line in lines}
+    folders = {name for name in names if name.endswith('.kernels')}
+    return {name for name in modules if name in names or name.rpartition('.')[0] in folders}
 
 
 def _probe() -> None:
@@ -61,23 +90,30 @@ def _cache_of(folder: Path) -> Path:
     return Path(path)
 
 
-def _discard_stale(directory: Path, digest: bytes) -> None:
-    """Remove the cached kernels of a directory if they were compiled from other sources."""
-    stamp = directory / STAMP
+def _discard_stale(directory: Path, digests: dict[str, str]) -> None:
+    """Remove the cached kernels of a directory that were compiled from other sources."""
+    stamps = directory / STAMPS
     try:
-        if stamp.exists() and stamp.read_bytes() == digest:
+        lines = stamps.read_text().splitlines() if stamps.exists() else []
+        kept = dict(line.split()[::-1] for line in lines if len(line.split()) == 2)
+        if kept == digests:
             return
-        for kept in directory.glob('*.nb[ci]'):
-            kept.unlink(missing_ok=True)  # another process may do the same
-        stamp.write_bytes(digest)
+        unchanged = {name for name, digest in digests.items() if kept.get(name) == digest}
+        for file in directory.glob('*.nb[ci]'):  # hashing.find_row-100.py311.nbi
+            if file.name.partition('.')[0] not in unchanged:
+                file.unlink(missing_ok=True)  # another process may do the same
+        stamps.write_text(''.join(f'{digest}  {name}\n' for name, digest in digests.items()))
     except OSError as error:
-        _log.warning('%s: kernels may be compiled at every start: %s', stamp, error)
+        _log.warning('%s: kernels may be compiled at every start: %s', stamps, error)
 
 
 def _prepare_cache() -> None:
     """Discard stale kernels; if there is no writable cache, use a temporary directory."""
     try:
-        caches = [_cache_of(each.parent) for each in _PACKAGE.glob('**/kernels/__init__.py')]
+        caches = {
+            '.'.join(folder.relative_to(_PACKAGE.parent).parts): _cache_of(folder)
+            for folder in (init.parent for init in _PACKAGE.glob('**/kernels/__init__.py'))
+        }
     except RuntimeError:
         directory = tempfile.mkdtemp(prefix='surfel_mapper-kernels-')
         atexit.register(shutil.rmtree, directory, ignore_errors=True)
@@ -87,10 +123,14 @@ def _prepare_cache() -> None:
             'minute: set NUMBA_CACHE_DIR to a writable directory'
         )
         return
-    sources = sorted(_PACKAGE.glob('**/kernels/*.py'))
-    digest = hashlib.sha256(b''.join(each.read_bytes() for each in sources)).digest()
-    for cache in caches:
-        _discard_stale(cache, digest)
+    digests = _source_digests()
+    for folder, cache in caches.items():
+        own = {
+            name.rpartition('.')[2]: digest
+            for name, digest in digests.items()
+            if name.rpartition('.')[0] == folder
+        }
+        _discard_stale(cache, own)
 
 
 if not _numba.config.DISABLE_JIT:  # type: ignore[attr-defined]

@@ -32,6 +32,14 @@ def twice(number):
     return added(added(number))
 """
 
+INDEPENDENT = """from numba import njit
+
+
+@njit(cache=True)
+def half(number):
+    return number // 2
+"""
+
 
 @pytest.fixture
 def package(tmp_path):
@@ -41,14 +49,17 @@ def package(tmp_path):
         shutil.copy(PACKAGE / name, tmp_path / 'surfel_mapper' / name)
     (tmp_path / 'surfel_mapper/kernels/callee.py').write_text(CALLEE.format(1))
     (tmp_path / 'surfel_mapper/kernels/caller.py').write_text(CALLER)
+    (tmp_path / 'surfel_mapper/kernels/independent.py').write_text(INDEPENDENT)
     return tmp_path
 
 
 def run(package, **environment):
-    """Return result, number of cache loads and log of the kernel, run in a separate process."""
+    """Return a result, the numbers of cache loads of two kernels and the log of a new process."""
     program = (
         'from surfel_mapper.kernels.caller import twice\n'
-        'print(twice(0), sum(twice.stats.cache_hits.values()))'
+        'from surfel_mapper.kernels.independent import half\n'
+        'half(2)\n'
+        'print(twice(0), *(sum(each.stats.cache_hits.values()) for each in (twice, half)))'
     )
     inherited = {name: os.environ[name] for name in os.environ if name != 'NUMBA_CACHE_DIR'}
     done = subprocess.run(
@@ -66,15 +77,15 @@ def run(package, **environment):
 @pytest.mark.parametrize('elsewhere', [False, True])
 def test_a_kernel_is_cached_until_one_that_it_calls_changes(package, elsewhere):
     environment = {'NUMBA_CACHE_DIR': str(package / 'kept')} if elsewhere else {}
-    assert run(package, **environment) == ([2, 0], '')
-    assert run(package, **environment) == ([2, 1], '')
+    assert run(package, **environment) == ([2, 0, 0], '')
+    assert run(package, **environment) == ([2, 1, 1], '')
     (package / 'surfel_mapper/kernels/callee.py').write_text(CALLEE.format(10))
-    assert run(package, **environment) == ([20, 0], '')
-    assert run(package, **environment) == ([20, 1], '')
+    assert run(package, **environment) == ([20, 0, 1], '')
+    assert run(package, **environment) == ([20, 1, 1], '')
 
 
 def test_kernels_are_compiled_if_their_hash_cannot_be_stored(package):
-    (package / 'surfel_mapper/kernels/__pycache__/kernels.sha256').mkdir(parents=True)
+    (package / 'surfel_mapper/kernels/__pycache__/sources.sha256').mkdir(parents=True)
     answer, log = run(package)
-    assert answer == [2, 0]
-    assert 'kernels.sha256: kernels may be compiled at every start' in log
+    assert answer == [2, 0, 0]
+    assert 'sources.sha256: kernels may be compiled at every start' in log
