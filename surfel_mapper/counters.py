@@ -10,7 +10,7 @@ diagnostics add up: scans received = mapped + gated + localised + dropped + wait
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 import time
@@ -112,7 +112,7 @@ class Counters:
         try:
             yield
         finally:
-            self.add_time(stage, (time.perf_counter() - start) * 1e3)
+            self.add_times({stage: (time.perf_counter() - start) * 1e3})
 
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
@@ -122,9 +122,10 @@ class Counters:
             frame_id = OTHERS
         self.dropped_by_frame.setdefault(frame_id, Counter())[cause] += number
 
-    def add_time(self, stage: str, milliseconds: float) -> None:
-        """Add the time of a scan in a stage."""
-        self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(milliseconds)
+    def add_times(self, milliseconds: Mapping[str, float]) -> None:
+        """Add the times of a scan by stage."""
+        for stage, time_ms in milliseconds.items():
+            self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(time_ms)
 
     def add_filter(
         self,

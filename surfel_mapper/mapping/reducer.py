@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised
@@ -66,27 +67,14 @@ class Scratch:
         self.keys = np.empty(num_voxels, np.int64)
         self.sums = np.empty((num_voxels, 10))
 
-    @property
-    def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """Table, keys and sums as the kernels take them."""
-        return self.table, self.keys, self.sums
-
     def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
         """Sum points by voxel, enlarging the memory if needed; return the number of voxels."""
         while True:
-            num = reduce_points(xyz, *quantisation, self.arrays, self.left_out)
+            arrays = self.table, self.keys, self.sums
+            num = reduce_points(xyz, *quantisation, arrays, self.left_out)
             if num >= 0:
                 return int(num)
             self.reserve(2 * len(self.keys))
-
-    def clear(self) -> None:
-        """Empty the table: filling it is faster than visiting the scattered entries in use."""
-        self.table.fill(-1)
-
-    def causes(self) -> dict[str, int]:
-        """Return the number of points left out, by cause; only causes that occurred."""
-        counts = {name: int(self.left_out[row]) for name, row in CAUSES.items()}
-        return {name: number for name, number in counts.items() if number}
 
 
 class Reducer:
@@ -123,15 +111,16 @@ class Reducer:
         Raises
         ------
         ValueError
-            If shapes or types are wrong, pose or origin are not finite, or a column is missing.
+            If shapes or types are wrong, the pose is not a rigid transform, the origin is not
+            finite, or a column is missing.
         MapLimitError
             If a voxel gets more than 2^23 points of one scan.
 
         """
         points = as_points(points)
+        if T_map_sensor is not None:
+            check_rigid('T_map_sensor', T_map_sensor)
         pose = np.eye(4) if T_map_sensor is None else np.asarray(T_map_sensor, np.float64)
-        if pose.shape != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError('T_map_sensor: expected a finite (4, 4) transform')
         seen_from = np.full(3, np.nan) if origin is None else np.asarray(origin, np.float64)
         if seen_from.shape != (3,) or (origin is not None and not np.isfinite(seen_from).all()):
             raise ValueError('origin: expected the finite position of the sensor, x y z')
@@ -144,13 +133,13 @@ class Reducer:
         except IndexError:  # all in use by other threads
             scratch = Scratch()
         num = scratch.fill(points.T, quantisation)
-        scratch.clear()
+        scratch.table.fill(-1)  # faster than visiting the scattered entries in use
         moments = self._pack(scratch, num, np.ascontiguousarray(seen_from))
         if values is not None:
             build_table(moments.key, scratch.table)
             sums = np.empty((num, values.shape[1]), np.int64)
             sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
-            scratch.clear()
+            scratch.table.fill(-1)
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
         self._idle.append(scratch)
         return moments
@@ -164,6 +153,7 @@ class Reducer:
                 f'{largest:.0f} points in one voxel of one scan; '
                 f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
             )
+        counts = scratch.left_out
         moments = ScanMoments(
             voxel_size_m=self.voxel_size_m,
             key=key,
@@ -171,7 +161,7 @@ class Reducer:
             total=np.empty((num, 3), np.int32 if largest < NARROW_COUNT else np.int64),
             product=np.empty((num, 6), np.int64),
             view=np.empty((num, 3), np.int16),
-            left_out=scratch.causes(),
+            left_out={cause: int(counts[row]) for cause, row in CAUSES.items() if counts[row]},
         )
         pack_sums(sums, moments.count, moments.total, moments.product)
         look_back(key, origin, self.voxel_size_m, moments.view)

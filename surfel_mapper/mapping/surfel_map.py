@@ -28,11 +28,10 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
-from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names, means
-from surfel_mapper.mapping.kernels.checks import first_impossible
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
+from surfel_mapper.mapping.kernels.voxels import first_impossible
 from surfel_mapper.mapping.moments import (
     coarse_moments,
     digest_of,
@@ -201,8 +200,6 @@ class SurfelMap:
             If shapes or types are wrong, or T_map_sensor is not a rigid transform.
 
         """
-        if T_map_sensor is not None:
-            check_rigid('T_map_sensor', T_map_sensor)
         return self._reducer.reduce(
             points,
             T_map_sensor,
@@ -228,7 +225,7 @@ class SurfelMap:
         self._check_counts(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)
-        self._changes.add(self.version, rows, self.num_voxels)
+        self._changes.add(self.version, rows, self._table.num_voxels)
         object.__setattr__(moments, 'rows', rows)
 
     def remove(self, moments: ScanMoments, min_points: int = 1) -> npt.NDArray[np.int32]:
@@ -266,7 +263,7 @@ class SurfelMap:
                 'removed; were these moments added to this map, and only removed once?'
             )
         self.version += 1
-        self._changes.add(self.version, rows, self.num_voxels)
+        self._changes.add(self.version, rows, self._table.num_voxels)
         return unpack_keys(fallen)
 
     def merge(self, other: SurfelMap) -> None:
@@ -372,7 +369,7 @@ class SurfelMap:
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
         """Return the keys (K,) of the voxels of at least min_points points, in any order."""
         rows = self._table.changed_after(-1, min_points)
-        return np.asarray(self._table.rows[rows, layout.KEY])
+        return np.asarray(self._table.rows.array[rows, layout.KEY])
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
@@ -386,12 +383,12 @@ class SurfelMap:
         """Return the covariances of rows (K,): (K, 6), xx xy xz yy yz zz, m^2."""
         found = np.empty((len(rows), 6))
         bits = layout.BITS + self.level
-        derive_covariances(self._table.rows, rows, self.voxel_size_m, bits, found)
+        derive_covariances(self._table.rows.array, rows, self.voxel_size_m, bits, found)
         return found
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the voxel keys of rows (K,), -1 for empty rows."""
-        slab = self._table.rows
+        slab = self._table.rows.array
         keys = np.where(slab[rows, layout.COUNT] > 0, slab[rows, layout.KEY], -1)
         return np.asarray(keys, np.int64)
 
@@ -401,7 +398,7 @@ class SurfelMap:
 
         Rows from before the map was cleared (``cleared_at``, a version) are not included.
         """
-        changed = self._changes.since(since, self._table.rows, 0)
+        changed = self._changes.since(since, self._table.rows.array, 0)
         return self._table.emptied_or_changed_after(since) if changed is None else changed
 
     def index(self, min_points: int = 1) -> SurfelIndex:
@@ -422,7 +419,7 @@ class SurfelMap:
         """
         if since is None:
             since, self._reported = self._reported, self.version
-        changed = self._changes.since(since, self._table.rows, max(min_points, 1))
+        changed = self._changes.since(since, self._table.rows.array, max(min_points, 1))
         if changed is None:
             changed = self._table.changed_after(since, min_points)
         return self._derive(changed)
@@ -442,11 +439,11 @@ class SurfelMap:
         else:
             chosen = self._table.find(np.unique(pack_keys(voxel_index)))
             chosen = chosen[chosen >= 0]
-        return self._moments_of(chosen[np.argsort(self._table.rows[chosen, layout.KEY])])
+        return self._moments_of(chosen[np.argsort(self._table.rows.array[chosen, layout.KEY])])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of rows, in the given order; a copy."""
-        rows = self._table.rows[chosen]
+        rows = self._table.rows.array[chosen]
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
             level=self.level,
@@ -484,7 +481,7 @@ class SurfelMap:
 
     def _derive(self, chosen: npt.NDArray[np.int32]) -> Surfels:
         bits = layout.BITS + self.level
-        surfels = derive(self._table.rows, chosen, self.voxel_size_m, bits, self._threads)
+        surfels = derive(self._table.rows.array, chosen, self.voxel_size_m, bits, self._threads)
         if not self._channel_names:
             return surfels
         sums = self._table.channels(chosen)
@@ -516,10 +513,10 @@ class SurfelMap:
     def _check_counts(self, moments: ScanMoments) -> None:
         """Raise MapLimitError if a voxel would hold more points than the integers allow."""
         limit = layout.MAX_MAP_COUNT >> (2 * self.level)
-        if self.num_points + moments.num_points <= limit:
+        if self._table.num_points + moments.num_points <= limit:
             return  # usual: even all points in one voxel would be allowed
         found = self._table.find(moments.key)
-        held = np.where(found >= 0, self._table.rows[found, layout.COUNT], 0)
+        held = np.where(found >= 0, self._table.rows.array[found, layout.COUNT], 0)
         largest = int((held + moments.count).max(initial=0))
         if largest > limit:
             raise MapLimitError(

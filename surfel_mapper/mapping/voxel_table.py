@@ -52,23 +52,23 @@ class VoxelTable:
     num_channels : int
         Number of channels that are summed beside the moments, in rows of their own.
 
+    Attributes
+    ----------
+    rows : Slab
+        The rows, 16 int64 each.
+
     """
 
     def __init__(self, num_channels: int = 0) -> None:
-        self._rows = Slab(1024, layout.ROW)
+        self.rows = Slab(1024, layout.ROW)
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
 
     @property
-    def rows(self) -> npt.NDArray[np.int64]:
-        """The rows, (R, 16) int64; valid until the table grows."""
-        return self._rows.array
-
-    @property
     def num_voxels(self) -> int:
         """Number of voxels that hold at least one point."""
-        return self._hash.num_keys
+        return int(self._state[hashing.VOXELS])
 
     @property
     def num_points(self) -> int:
@@ -93,25 +93,26 @@ class VoxelTable:
         The table is unchanged after any exception, a failed allocation at any place too.
 
         """
-        found = np.full(len(moments), -1, np.int32)
+        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
+        found = np.full(num, -1, np.int32)
         done = 0
         try:
-            while done < len(moments):
+            while done < num:
                 done = add_moments(
-                    moments.arrays,
-                    moments.view_is_sum,
-                    self.rows,
+                    arrays,
+                    view_is_sum,
+                    self.rows.array,
                     self._hash.arrays,
                     self._state,
                     version,
                     done,
                     found,
                 )
-                if done < len(moments):
+                if done < num:
                     self._make_room()
             if self._channels:
-                if len(self._channels.array) < len(self.rows):
-                    self._channels.grow(len(self.rows))
+                if len(self._channels.array) < len(self.rows.array):
+                    self._channels.grow(len(self.rows.array))
                 self._channels.array[found] += moments.channels
         except BaseException:
             self._undo(moments, found, version)
@@ -121,14 +122,8 @@ class VoxelTable:
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key, -1 if not found."""
         found = np.empty(len(key), np.int32)
-        find_rows(key, self.rows, self._hash.arrays, self._state, found)
+        find_rows(key, self.rows.array, self._hash.arrays, self._state, found)
         return found
-
-    def hints(self, moments: ScanMoments) -> npt.NDArray[np.int32]:
-        """Return the likely row of each voxel of moments, to be confirmed."""
-        if moments.rows is None or len(moments.rows) != len(moments):
-            return self.find(moments.key)
-        return np.array(moments.rows, np.int32)
 
     def remove(
         self, moments: ScanMoments, version: int, min_points: int = 1
@@ -146,12 +141,16 @@ class VoxelTable:
             The keys of the voxels that fell below min_points.
 
         """
-        rows = self.hints(moments)
-        fallen = np.empty(len(moments), np.int64)
+        arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
+        if moments.rows is None or len(moments.rows) != num:
+            rows = self.find(moments.key)
+        else:
+            rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
+        fallen = np.empty(num, np.int64)
         missing, num_fallen = remove_moments(
-            moments.arrays,
-            moments.view_is_sum,
-            self.rows,
+            arrays,
+            view_is_sum,
+            self.rows.array,
             self._hash.arrays,
             self._state,
             version,
@@ -172,24 +171,25 @@ class VoxelTable:
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
         """Return the rows of at least min_points points that were changed after a version."""
         used = self._hash.rows_used
-        return np.asarray(rows_changed_after(self.rows, used, version, max(min_points, 1)))
+        return np.asarray(rows_changed_after(self.rows.array, used, version, max(min_points, 1)))
 
     def emptied_or_changed_after(self, version: int) -> npt.NDArray[Any]:
         """Return the rows changed after a version, including emptied ones."""
-        return np.asarray(rows_changed_after(self.rows, self._hash.rows_used, version, 0))
+        used = self._hash.rows_used
+        return np.asarray(rows_changed_after(self.rows.array, used, version, 0))
 
     def keys_in_box(
         self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.int64]:
         """Return the keys of the voxels with indices from low to high, (3,) each."""
         used = self._hash.rows_used
-        return np.asarray(keys_in_box(self.rows, used, low, high), np.int64)
+        return np.asarray(keys_in_box(self.rows.array, used, low, high), np.int64)
 
     def thinned(self, min_points: int, at_most: int) -> npt.NDArray[np.int32]:
         """Return at most at_most rows of at least min_points points, sorted."""
         used = self._hash.rows_used
         chosen, mixed = np.empty(used, np.int32), np.empty(used, np.uint64)
-        num = rows_held(self.rows, used, max(min_points, 1), chosen, mixed)
+        num = rows_held(self.rows.array, used, max(min_points, 1), chosen, mixed)
         return np.asarray(chosen[smallest(mixed[:num], at_most)])
 
     def _undo(self, moments: ScanMoments, found: npt.NDArray[np.int32], version: int) -> None:
@@ -200,8 +200,9 @@ class VoxelTable:
 
     def _make_room(self) -> None:
         """Enlarge the array that had no room for a new voxel."""
-        if self._hash.lacks_row(len(self.rows)):
-            self._rows.grow(2 * len(self.rows))
+        num_rows = len(self.rows.array)
+        if self._hash.lacks_row(num_rows):
+            self.rows.grow(2 * num_rows)
         else:
             self._hash.grow()
 

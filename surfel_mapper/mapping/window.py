@@ -140,11 +140,6 @@ class SlidingWindow:
         return self._nbytes
 
     @property
-    def total_bytes(self) -> int:
-        """Size of the voxels that hold points and of the kept scans, bytes."""
-        return self._map.num_voxels * VOXEL_BYTES + self._nbytes
-
-    @property
     def newest(self) -> WindowedScan | None:
         """The scan added last, None if empty."""
         return self._scans[-1][0] if self._scans else None
@@ -306,13 +301,15 @@ class SlidingWindow:
         config = self.config
         (oldest, travelled_m), (newest, _) = self._scans[0], self._scans[-1]
         age_ns = newest.stamp_ns - oldest.stamp_ns
+        num_voxels = self._map.num_voxels
+        total_bytes = num_voxels * VOXEL_BYTES + self._nbytes
         limits = {
             'max_scans': (len(self._scans), config.max_scans),
             'max_age_s': (age_ns, round(config.max_age_s * 1e9)),
             'max_distance_m': (self._travelled_m - travelled_m, config.max_distance_m),
             'max_bytes': (self._nbytes, config.max_bytes),
-            'max_voxels': (self._map.num_voxels, self.max_voxels),
-            'max_total_bytes': (self.total_bytes, self.max_total_bytes),
+            'max_voxels': (num_voxels, self.max_voxels),
+            'max_total_bytes': (total_bytes, self.max_total_bytes),
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')

@@ -82,6 +82,10 @@ class MessageReader:
         self._at += size
         return int(value)
 
+    def numbers(self, codes: str) -> tuple[int, ...]:
+        """Return the next integers, one for each format character of struct."""
+        return tuple([self.number(code) for code in codes])
+
     def floats(self, number: int) -> tuple[float, ...]:
         """Return the next ``number`` float64."""
         layout = f'{self._order}{number}d'

@@ -100,8 +100,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
 
     """
     stamp_ns = checked_stamp_ns(msg.header.stamp, topic)
-    data = checked_data(msg, topic)
     frame_id = frame_name(msg.header.frame_id)
+    data = checked_data(msg, topic)
     if int(msg.height) * int(msg.width) == 0:
         return Scan(points=np.empty((0, 3), np.float32), stamp_ns=stamp_ns, frame_id=frame_id)
     fields = checked_fields(msg, topic)
@@ -395,38 +395,34 @@ def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'po
 
     """
     try:
-        return read_cloud(MessageReader(raw, ros1=ros1))
+        return _read_cloud(MessageReader(raw, ros1=ros1))
     except (struct.error, UnicodeDecodeError, ValueError) as error:
         raise CloudFormatError(
             f'{topic}: {len(raw)} bytes that are not a whole PointCloud2: {error}'
         ) from error
 
 
-def read_cloud(reader: MessageReader) -> RawCloud:
-    """Return the PointCloud2 at a reader; the arguments are read in the order of the message."""
+def _read_cloud(reader: MessageReader) -> RawCloud:
+    """Return the next PointCloud2."""
     header = read_header(reader)
-    height, width = reader.number('I'), reader.number('I')
-    num_fields = reader.number('I')
+    height, width, num_fields = reader.numbers('III')
     if num_fields * SMALLEST_FIELD_BYTES > reader.remaining:
         raise ValueError(f'{num_fields} fields announced, {reader.remaining} bytes left')
     if num_fields > MAX_FIELDS:
         raise ValueError(f'{num_fields} fields, expected at most {MAX_FIELDS}')
+    fields = [Field(reader.string(), *reader.numbers('IBI')) for _ in range(num_fields)]
+    is_bigendian, point_step, row_step = reader.numbers('BII')
     return RawCloud(
         header=header,
         height=height,
         width=width,
-        fields=[read_field(reader) for _ in range(num_fields)],
-        is_bigendian=bool(reader.number('B')),
-        point_step=reader.number('I'),
-        row_step=reader.number('I'),
+        fields=fields,
+        is_bigendian=bool(is_bigendian),
+        point_step=point_step,
+        row_step=row_step,
         data=np.frombuffer(reader.sequence(), np.uint8),
         is_dense=bool(reader.number('B')),
     )
-
-
-def read_field(reader: MessageReader) -> Field:
-    """Return the PointField at a reader."""
-    return Field(reader.string(), reader.number('I'), reader.number('B'), reader.number('I'))
 
 
 WORD_BYTES = 4

@@ -9,6 +9,7 @@ beside this one or a part below.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 import logging
 
@@ -21,6 +22,7 @@ from surfel_mapper.errors import AlignmentError, MapError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow
@@ -32,7 +34,7 @@ from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
 from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
-from surfel_mapper.pipeline.update import removed_voxels, Update
+from surfel_mapper.pipeline.update import Update
 from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
 from surfel_mapper.scan import Scan
 
@@ -58,8 +60,8 @@ class Inserter:
         See Mapper.
     preparation : Preparation
         The stages before reduction.
-    images : ScanImages
-        The images that scans are joined with.
+    images : ScanImages or None
+        The images that scans are joined with, if a layer wants any.
     derives : bool
         Whether updates hold the surfels that changed; False leaves them empty and saves the time.
 
@@ -78,7 +80,8 @@ class Inserter:
         )
         self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
         self.layers = LayerStack(config, around, drops)
-        self.images = ScanImages(self.layers.images)
+        wanted = self.layers.images
+        self.images = ScanImages(wanted) if wanted.topics else None
         self.preparation = Preparation(
             config,
             poses,
@@ -125,9 +128,11 @@ class Inserter:
 
     def reduces_ahead(self, config: Config) -> bool:
         """Return whether another thread reduces a scan while the one before is inserted."""
-        is_frozen = config.map.mode == 'frozen'
-        is_trivial = self.preparation.is_trivial(config)
-        return self._reduction.has_thread and is_trivial and not is_frozen
+        return (
+            self._reduction.has_thread
+            and config.map.mode != 'frozen'
+            and self.preparation.is_trivial(config)
+        )
 
     def begin(self, scan: Scan, pose: Transform, config: Config) -> None:
         """Begin to reduce the scan that is inserted next, in another thread."""
@@ -176,7 +181,8 @@ class Inserter:
         self._count(inserted)
         changed = self._changed_since(version, removed, config)
         laps.end('normals')
-        self._add_times(laps)
+        milliseconds = laps.milliseconds
+        self._drops.counters.add_times(milliseconds)
         return Update(
             scan=prepared.scan,
             filtered=prepared.filtered,
@@ -187,7 +193,7 @@ class Inserter:
             changed=changed,
             removed_voxel_index=removed_voxels(removed, alignment, changed),
             evictions=inserted.evictions,
-            milliseconds=laps.milliseconds,
+            milliseconds=milliseconds,
             layers=results,
             alignment=alignment,
             registration=prepared.registration,
@@ -227,8 +233,9 @@ class Inserter:
 
     def _localised(self, prepared: Prepared, config: Config, laps: Laps) -> Update:
         """Return the pose of a scan in a frozen map, which takes no scan."""
+        milliseconds = laps.milliseconds
         self._drops.counters.localised += 1
-        self._add_times(laps)
+        self._drops.counters.add_times(milliseconds)
         return Update(
             scan=prepared.scan,
             filtered=prepared.filtered,
@@ -239,7 +246,7 @@ class Inserter:
             changed=self.map.surfels_changed(self.map.version),
             removed_voxel_index=np.empty((0, 3), np.int32),
             evictions=(),
-            milliseconds=laps.milliseconds,
+            milliseconds=milliseconds,
             registration=prepared.registration,
         )
 
@@ -283,11 +290,20 @@ class Inserter:
         counters.points += inserted.num_points
         counters.evicted.update(eviction.limit for eviction in inserted.evictions)
 
-    def _add_times(self, laps: Laps) -> None:
-        for stage, milliseconds in laps.milliseconds.items():
-            self._drops.counters.add_time(stage, milliseconds)
-
 
 def map_frame(config: Config) -> str:
     """Return the frame of the map: that of the poses, unless alignment gives it its own."""
     return config.align.map_frame or config.frames.fixed
+
+
+def removed_voxels(
+    removed: Sequence[npt.NDArray[np.int32]],
+    alignment: Alignment | None,
+    changed: Surfels,
+) -> npt.NDArray[np.int32]:
+    """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
+    if alignment is None:
+        return np.concatenate(removed)
+    gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
+    left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
+    return left

@@ -74,6 +74,8 @@ class LayerStack:
         """Return the voxels (E, 3) that layers want cleared after a scan, each once."""
         found = []
         for layer in self:
+            if type(layer).voxels_to_clear is Layer.voxels_to_clear:
+                continue
             try:
                 voxels = layer.voxels_to_clear(inserted)
             except Exception as error:  # MemoryError too
@@ -82,9 +84,8 @@ class LayerStack:
             if len(voxels):
                 found.append(voxels)
                 self._drops.counters.voxels_cleared[layer.name] += len(voxels)
-            if type(layer).voxels_to_clear is not Layer.voxels_to_clear:
-                laps.end(layer.name)
-                self._failures.pop(layer.name, None)
+            laps.end(layer.name)
+            self._failures.pop(layer.name, None)
         if len(found) < 2:
             return found[0] if found else np.empty((0, 3), np.int32)
         return np.unique(np.concatenate(found), axis=0)
@@ -93,6 +94,8 @@ class LayerStack:
         """Pass a scan to all layers; return their results by name."""
         results = {}
         for layer in self:
+            if type(layer).follow is Layer.follow:
+                continue
             try:
                 result = layer.follow(inserted)
             except Exception as error:  # MemoryError too

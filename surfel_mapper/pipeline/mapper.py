@@ -166,7 +166,7 @@ class Mapper:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
             self._drops.scan(scan, 'no_points', 'it has no points')
-        elif missing := missing_columns(scan.columns, self.map.columns):
+        elif self.map.columns and (missing := missing_columns(scan.columns, self.map.columns)):
             reason = f'its points have no {" and no ".join(missing)}'
             self._drops.scan(scan, 'missing_column', reason)
         elif (timed := self._timed(scan)) is not None:
@@ -176,7 +176,9 @@ class Mapper:
 
     def _accept(self, scan: Scan) -> None:
         """Queue a scan; if time was set back, clear the map first."""
-        if (back_s := self._queue.back_s(scan)) > self.config.input.reset_after_s:
+        newest_ns = self._queue.newest_ns
+        back_s = 0.0 if newest_ns is None else (newest_ns - scan.stamp_ns) / 1e9
+        if back_s > self.config.input.reset_after_s:
             self._start_anew(scan, back_s)
         self._poses.mount(scan.frame_id)
         self._queue.push(scan)
@@ -235,11 +237,13 @@ class Mapper:
 
     def add_image(self, image: SceneImage) -> None:
         """Add an image that gives scans colours or labels; see layers.tsdf.color_topic."""
-        self._inserter.images.add(image)
+        if self._inserter.images is not None:
+            self._inserter.images.add(image)
 
     def end_images(self) -> None:
         """Stop waiting for images: no more come."""
-        self._inserter.images.ended = True
+        if self._inserter.images is not None:
+            self._inserter.images.ended = True
 
     def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
         """
@@ -258,11 +262,11 @@ class Mapper:
         ahead = self._inserter.reduces_ahead(self.config)
         keeps = int(more_follows and ahead)
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
-            update = self._insert(*self._queue.pop_posed())
+            update = self._insert(*self._queue.posed.popleft())
             if update is not None:
                 yield update
-        if self._queue.next_posed is not None:
-            self._inserter.begin(*self._queue.next_posed, self.config)
+        if self._queue.posed:
+            self._inserter.begin(*self._queue.posed[0], self.config)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """
@@ -489,7 +493,8 @@ class Mapper:
         """Map a scan whose pose is there; None if it is left out."""
         num_mapped = self.counters.mapped + self.counters.localised + self.counters.gated
         try:
-            return self._inserter.insert(scan, pose, self.config, self._queue.next_posed)
+            following = self._queue.posed[0] if self._queue.posed else None
+            return self._inserter.insert(scan, pose, self.config, following)
         except Exception as error:  # MemoryError too: the next scan may fit
             _log.debug('scan at %d ns', scan.stamp_ns, exc_info=True)
             if self.counters.mapped + self.counters.localised + self.counters.gated == num_mapped:

@@ -73,8 +73,8 @@ class Preparation:
         The map that scans are registered to, and the window, for the motion gate.
     aligner : WindowAligner
         Corrects the poses that come in.
-    images : ScanImages
-        The images that scans are joined with.
+    images : ScanImages, optional
+        The images that scans are joined with, if a layer wants any.
     needs_free_rays : bool
         Whether layers need the directions in which the sensor met nothing.
     drops : Drops
@@ -88,7 +88,7 @@ class Preparation:
         poses: ScanPoses,
         around: Surroundings,
         aligner: WindowAligner,
-        images: ScanImages,
+        images: ScanImages | None,
         needs_free_rays: bool,
         drops: Drops,
     ) -> None:
@@ -103,13 +103,13 @@ class Preparation:
 
     def is_trivial(self, config: Config) -> bool:
         """Return whether scans are mapped as they came, at the poses that came."""
-        is_changed = (
-            len(self.chain)
+        return not (
+            self.chain.filters
             or config.deskew.enabled
             or self._needs_free_rays
-            or self._images.are_wanted
+            or self._images is not None
+            or self._poses.registered is not None
         )
-        return not is_changed and self._poses.registered is None
 
     def load_filters(self, path: str) -> None:
         """
@@ -156,11 +156,14 @@ class Preparation:
         if times is not None:
             scan = self._poses.deskewed(scan, times)
             laps.end('deskew')
-        if self._needs_free_rays or self._images.are_wanted:
-            scan = self._with_surroundings(scan)
+        if self._needs_free_rays and scan.free is None:
+            scan = replace(scan, free=free_directions(scan))
+        if self._images is not None:
+            scan = self._with_images(scan, self._images)
+        if self._needs_free_rays or self._images is not None:
             laps.end('images')
         filtered: Scan | None = scan
-        if len(self.chain):
+        if self.chain.filters:
             filtered = self._filter(scan, pose)
             laps.end('filter')
         if filtered is None:
@@ -198,12 +201,10 @@ class Preparation:
         T_map_sensor = self._aligner.to_map(pose)
         return replace(prepared, T_map_sensor=T_map_sensor, registration=registration)
 
-    def _with_surroundings(self, scan: Scan) -> Scan:
-        """Return a scan with free rays and columns from images, before points are filtered."""
-        if scan.free is None and self._needs_free_rays:
-            scan = replace(scan, free=free_directions(scan))
+    def _with_images(self, scan: Scan, images: ScanImages) -> Scan:
+        """Return a scan with columns from images, before points are filtered."""
         try:
-            scan, missing = self._images.joined(
+            scan, missing = images.joined(
                 scan, lambda image: self._poses.seen_from(image.frame_id, image.stamp_ns, scan)
             )
         except (CloudFormatError, PoseError) as error:
@@ -213,13 +214,14 @@ class Preparation:
             self._drops.warn(
                 f'no_{kind}_image',
                 f'scan at {scan.stamp_ns / 1e9:.6f} s: no {kind} image within '
-                f'{self._images.wanted.tolerance_s:g} s; {self._images.wanted.setting} '
-                'allows more',
+                f'{images.wanted.tolerance_s:g} s; {images.wanted.setting} allows more',
             )
         return scan
 
     def _is_gated(self, pose: Transform, gate: WindowConfig) -> bool:
         """Return whether the motion gate leaves out a scan at a pose, and count it."""
+        if not (gate.gate_distance_m or gate.gate_angle_deg):
+            return False
         last = self._around.window.newest
         if last is None or not stands_still(last.T_map_sensor, pose, gate):
             return False
@@ -246,9 +248,7 @@ class Preparation:
 
 
 def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowConfig) -> bool:
-    """Return whether two poses are nearer than the motion gate asks; False without a gate."""
-    if not (gate.gate_distance_m or gate.gate_angle_deg):
-        return False
+    """Return whether two poses are nearer to each other than the limits of the motion gate."""
     motion = compose(inverse(T_map_last), T_map_sensor)
     distance_m = float(np.sqrt((motion[:3, 3] ** 2).sum()))
     angle_deg = float(np.degrees(rotation_angle(motion)))

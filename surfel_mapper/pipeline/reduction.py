@@ -40,6 +40,11 @@ class Begun(NamedTuple):
     config: Config
     result: Future[WindowedScan]
 
+    def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
+        """Return whether a scan is this one, at the same pose and with the same settings."""
+        same = self.scan is scan and self.config is config
+        return same and np.array_equal(self.T_map_sensor, T_map_sensor)
+
 
 class Reduction:
     """
@@ -52,21 +57,24 @@ class Reduction:
     threads : int
         With fewer than two no reduction is begun ahead of time.
 
+    Attributes
+    ----------
+    has_thread : bool
+        Whether there is a thread beside the caller's.
+
     """
 
     def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
         self._map = surfel_map
         self._pool = pool(threads)
+        self.has_thread = self._pool is not None
         self._begun: Begun | None = None
-
-    @property
-    def has_thread(self) -> bool:
-        """Whether there is a thread beside the caller's."""
-        return self._pool is not None
 
     def begin(self, scan: Scan, T_map_sensor: Transform, config: Config) -> None:
         """Begin to reduce a scan in the other thread, unless that was begun before."""
-        if self._pool is None or self._is_begun(scan, T_map_sensor, config):
+        if self._pool is None:
+            return
+        if self._begun is not None and self._begun.is_of(scan, T_map_sensor, config):
             return
         result = self._pool.submit(reduced, scan, T_map_sensor, self._map, config)
         self._begun = Begun(scan, T_map_sensor, config, result)
@@ -81,20 +89,10 @@ class Reduction:
             If a voxel gets more than 2^23 points, or a point is out of the reach of the map.
 
         """
-        is_begun = self._is_begun(scan, T_map_sensor, config)
         begun, self._begun = self._begun, None
-        if begun is not None and is_begun:
+        if begun is not None and begun.is_of(scan, T_map_sensor, config):
             return begun.result.result()
         return reduced(scan, T_map_sensor, self._map, config)
-
-    def _is_begun(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
-        begun = self._begun
-        return (
-            begun is not None
-            and begun.scan is scan
-            and begun.config is config
-            and np.array_equal(begun.T_map_sensor, T_map_sensor)
-        )
 
 
 def reduced(

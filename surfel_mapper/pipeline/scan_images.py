@@ -56,11 +56,6 @@ class ScanImages:
         }
         self._tolerance_ns = round(wanted.tolerance_s * 1e9)
 
-    @property
-    def are_wanted(self) -> bool:
-        """Whether a layer wants images."""
-        return bool(self._images)
-
     def add(self, image: SceneImage) -> None:
         """Add an image; one older than the last drops all before it."""
         images = self._images[image.kind]

@@ -78,12 +78,14 @@ class ScanPoses:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
 
     def mount(self, frame_id: str) -> None:
-        """Enter the configured extrinsics of a sensor when its frame is first seen."""
+        """Add the configured extrinsics of a sensor when its frame is first seen."""
+        if frame_id in self._mounted:
+            return
+        if len(self._mounted) >= MAX_EDGES:  # frame names may change without end
+            self._mounted.clear()
+        self._mounted.add(frame_id)
         values, base = self._config.frames.mount_of(frame_id), self._config.frames.base
-        if values and frame_id != base and frame_id not in self._mounted:
-            if len(self._mounted) >= MAX_EDGES:  # frame names may change without end
-                self._mounted.clear()
-            self._mounted.add(frame_id)
+        if values and frame_id != base:
             self.add(base, frame_id, 0, values[:3], values[3:], static=True)
 
     def of(self, scan: Scan, following: Scan | None = None) -> Transform:

@@ -38,20 +38,27 @@ class ScanQueue:
         Scans that may wait; of more, the oldest is dropped.
     poses : ScanPoses
         The poses of the sensors.
-    images : ScanImages
-        Scans wait for their images as well.
+    images : ScanImages, optional
+        Scans wait for these images as well.
     drops : Drops
         Counts the scans that are dropped.
 
+    Attributes
+    ----------
+    posed : deque of (Scan, (4, 4) float64)
+        The next scans to map, and their T_fixed_sensor.
+
     """
 
-    def __init__(self, max_scans: int, poses: ScanPoses, images: ScanImages, drops: Drops) -> None:
+    def __init__(
+        self, max_scans: int, poses: ScanPoses, images: ScanImages | None, drops: Drops
+    ) -> None:
         self._max_scans = max_scans
         self._poses = poses
         self._images = images
         self._drops = drops
         self._scans: deque[Scan] = deque()
-        self._posed: deque[PosedScan] = deque()
+        self.posed: deque[PosedScan] = deque()
         self._newest_ns: dict[str, int] = {}
 
     @property
@@ -68,16 +75,6 @@ class ScanQueue:
     def waiting(self) -> list[tuple[str, int]]:
         """Frame and stamp of every scan that waits, in order."""
         return [(scan.frame_id, scan.stamp_ns) for scan in self._scans]
-
-    @property
-    def next_posed(self) -> PosedScan | None:
-        """The scan that is mapped next; None if none has its pose yet."""
-        return self._posed[0] if self._posed else None
-
-    def back_s(self, scan: Scan) -> float:
-        """Return by how much the stamp of a scan is before the newest one, s; 0 if it is not."""
-        newest_ns = self.newest_ns
-        return 0.0 if newest_ns is None else max(newest_ns - scan.stamp_ns, 0) / 1e9
 
     def push(self, scan: Scan) -> None:
         """Add a scan, unless its stamp is not newer than the last of its frame."""
@@ -97,15 +94,11 @@ class ScanQueue:
             reason = f'{self._max_scans} newer scans wait for their poses'
             self._drops.scan(self._scans.popleft(), 'queue_full', reason)
 
-    def pop_posed(self) -> PosedScan:
-        """Remove and return the scan that is mapped next."""
-        return self._posed.popleft()
-
     def fill_posed(self, number: int, config: PoseConfig) -> int:
-        """Fill the buffer to a number of posed scans, if poses are there; return its size."""
-        while len(self._posed) < number and (found := self._next(config)) is not None:
-            self._posed.append(found)
-        return len(self._posed)
+        """Fill ``posed`` to a number of scans, if their poses are there; return its length."""
+        while len(self.posed) < number and (found := self._next(config)) is not None:
+            self.posed.append(found)
+        return len(self.posed)
 
     def drop_waiting(self, cause: str, reason: str) -> None:
         """Drop every scan that waits for its pose."""
@@ -114,8 +107,8 @@ class ScanQueue:
 
     def drop_all(self, cause: str, reason: str) -> None:
         """Drop every scan, with its pose or without."""
-        while self._posed:
-            self._drops.scan(self._posed.popleft()[0], cause, reason)
+        while self.posed:
+            self._drops.scan(self.posed.popleft()[0], cause, reason)
         self.drop_waiting(cause, reason)
 
     def forget_stamps(self) -> None:
@@ -126,9 +119,11 @@ class ScanQueue:
         """Remove the next scan whose pose is there; drop those before it that get none."""
         while self._scans:
             scan = self._scans[0]
-            waited_s = (self._now_ns() - scan.end_ns) / 1e9
+            stamps = (self.newest_ns, self._poses.transforms.newest_ns)
+            newest_ns = max(stamp for stamp in stamps if stamp is not None)
+            waited_s = (newest_ns - scan.end_ns) / 1e9
             may_wait = waited_s <= config.max_wait_s
-            if may_wait and self._images.is_waiting(scan):
+            if may_wait and self._images is not None and self._images.is_waiting(scan):
                 return None
             try:
                 pose = self._poses.of(scan, self._scans[1] if len(self._scans) > 1 else None)
@@ -142,8 +137,3 @@ class ScanQueue:
                 return self._scans.popleft(), pose
             self._drops.scan(self._scans.popleft(), 'no_pose', reason)
         return None
-
-    def _now_ns(self) -> int:
-        """Return the newest stamp of all data."""
-        stamps = (self.newest_ns, self._poses.transforms.newest_ns)
-        return max(stamp for stamp in stamps if stamp is not None)

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TYPE_CHECKING
 
@@ -13,7 +13,6 @@ import numpy.typing as npt
 
 from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.layers import names as layer_names
-from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import Eviction
 from surfel_mapper.pipeline.window_aligner import Alignment
@@ -81,16 +80,3 @@ class Update:
             if name in layer_names():
                 return self.layers.get(name)
             raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
-
-
-def removed_voxels(
-    removed: Sequence[npt.NDArray[np.int32]],
-    alignment: Alignment | None,
-    changed: Surfels,
-) -> npt.NDArray[np.int32]:
-    """Return the voxels (K, 3) that were surfels before the scan and are none after it."""
-    if alignment is None:
-        return np.concatenate(removed)
-    gone = np.unique(np.concatenate([*removed, alignment.removed_voxel_index]), axis=0)
-    left: npt.NDArray[np.int32] = gone[~np.isin(pack_keys(gone), pack_keys(changed.voxel_index))]
-    return left

@@ -145,15 +145,19 @@ class TransformBuffer:
             If the stamp is before the oldest transform held of an edge between them.
 
         """
-        asked = f'{target} <- {source} at {seconds(stamp_ns)} s'
         up, down = list(self._edges_above(source)), list(self._edges_above(target))
         # Both lists end at the root; edges that they share at the end cancel.
         while up and down and up[-1] is down[-1]:
             up.pop()
             down.pop()
         if (up[-1].parent if up else source) != (down[-1].parent if down else target):
-            raise PoseNotYetError(f'{asked}: {self._why_not_connected(target, source)}')
-        _check_held(asked, [*up, *down], stamp_ns, self.max_gap_s)
+            raise PoseNotYetError(
+                f'{_request(target, source, stamp_ns)}: {self._why_not_connected(target, source)}'
+            )
+        try:
+            _check_held([*up, *down], stamp_ns, self.max_gap_s)
+        except PoseError as error:
+            raise type(error)(f'{_request(target, source, stamp_ns)}: {error}') from None
         T_common_source, T_common_target = _chained(up, stamp_ns), _chained(down, stamp_ns)
         if T_common_target is None:
             return np.eye(4) if T_common_source is None else np.array(T_common_source)
@@ -237,20 +241,25 @@ class TransformBuffer:
         return f'no transforms lead from one to the other yet; frames seen: {names}'
 
 
-def _check_held(asked: str, edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
+def _request(target: str, source: str, stamp_ns: int) -> str:
+    """Return the request of a lookup, for errors."""
+    return f'{target} <- {source} at {seconds(stamp_ns)} s'
+
+
+def _check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None:
     """Raise if a dynamic edge has no transforms around a stamp; too old comes before too new."""
     dynamic = [edge for edge in edges if not edge.is_static]
     for edge in dynamic:
         if stamp_ns < edge.stamps[0]:
-            raise PoseError(f'{asked}: older than all of {edge}')
+            raise PoseError(f'older than all of {edge}')
     for edge in dynamic:
         if stamp_ns > edge.stamps[-1]:
-            raise PoseNotYetError(f'{asked}: newer than all of {edge}')
+            raise PoseNotYetError(f'newer than all of {edge}')
     for edge in dynamic:
         gap_s = edge.gap_ns(stamp_ns) / NS_PER_S
         if gap_s > max_gap_s:
             raise PoseNotYetError(
-                f'{asked}: in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s '
+                f'in a gap of {gap_s:.3f} s of {edge}, longer than {max_gap_s:g} s '
                 '(pose.max_gap_s)'
             )
 

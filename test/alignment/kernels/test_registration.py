@@ -134,7 +134,7 @@ def test_the_voxels_in_a_box_are_found(call):
     surfel_map.remove(gone)
     low, high = np.array([-3, -8, 0]), np.array([2, 8, 4])
 
-    rows = surfel_map._table.rows
+    rows = surfel_map._table.rows.array
     found = call(keys_in_box, rows, used, low, high)
 
     index = surfel_map.moments().voxel_index
