@@ -19,6 +19,7 @@ from surfel_mapper.filters import Chain
 from surfel_mapper.messages.pointcloud2 import from_columns, to_scan
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.offline.filtering import filter_clouds
+from test.bags.recorded import drive, ROS1, write_ros1
 
 CHAIN = '- range_limit: {min_m: 1}\n- surface_normal: {num_neighbours: 5}\n'
 
@@ -108,6 +109,30 @@ def test_a_bag_is_filtered_and_keeps_its_other_messages(tmp_path, bag):
     np.testing.assert_array_equal(scans[2].columns['ring'], rings)
     np.testing.assert_array_equal(scans[2].columns['normal_z'], scan.columns['normals'][:, 2])
     assert (done.scans, done.refused) == (3, 0)
+
+
+@pytest.mark.parametrize('compression', [None, 'BZ2'])
+def test_a_ros_1_bag_becomes_a_bag_of_its_filtered_clouds(tmp_path, caplog, compression):
+    entries = drive(ROS1)
+    write_ros1(tmp_path / 'drive.bag', entries, compression)
+    done = filter_clouds(
+        Chain.from_yaml('- range_limit: {max_m: 3}'), [tmp_path / 'drive.bag'], tmp_path / 'out'
+    )
+    clouds = [message for topic, _, _, message in entries if topic == '/points']
+    assert (done.scans, done.refused) == (len(clouds), 0)
+    assert 'a ROS 1 bag; only its clouds are written' in caplog.text
+    with BagReader(tmp_path / 'out') as after:
+        assert [topic.name for topic in after.topics] == ['/points']
+        scans = [to_scan(after.decode(message)) for message in after.messages()]
+    for scan, cloud in zip(scans, clouds, strict=True):
+        rows = np.frombuffer(cloud.data.tobytes(), '<f4').reshape(-1, 4)
+        near = rows[np.linalg.norm(rows[:, :3].astype(np.float64), axis=1) <= 3.0]
+        assert 0 < len(near) < len(rows)
+        np.testing.assert_array_equal(scan.points, near[:, :3])
+        np.testing.assert_array_equal(scan.columns['intensity'], near[:, 3])
+        stamp = cloud.header.stamp
+        assert scan.stamp_ns == stamp.sec * 10**9 + stamp.nanosec
+        assert scan.frame_id == cloud.header.frame_id
 
 
 def test_scans_that_a_filter_refuses_are_left_out_and_counted(tmp_path, bag, caplog):
