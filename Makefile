@@ -84,10 +84,13 @@ docs: $(DOCS_STAMP)  ## build site/ from docs/ and the docstrings, without a war
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict  # its theme's advertisement
 	@echo 'site/index.html'
 
-dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/, and install the wheel into an empty environment
+dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/; run tests of the sdist, and the wheel in an empty environment
 	rm -rf dist build
 	$(BIN)/python -m build --outdir dist
 	@check=$$(mktemp -d) && trap 'rm -rf "$$check"' EXIT && \
+	tar -xzf dist/*.tar.gz -C "$$check" --strip-components=1 --one-top-level=sdist && \
+	PYTHONPATH="$$check/sdist" $(BIN)/python -m pytest -q -p no:cacheprovider \
+		--rootdir "$$check/sdist" -c "$$check/sdist/setup.cfg" "$$check"/sdist/test/test_p*.py && \
 	$(PYTHON) -m venv "$$check/venv" && \
 	"$$check/venv/bin/python" -m pip install -q --disable-pip-version-check dist/*.whl && \
 	cd "$$check" && venv/bin/surfel-mapper simulate street --output street --scans 3 --columns 256 && \

@@ -44,7 +44,8 @@ def test_workflows_run_targets_of_the_makefile():
         for job in yaml.safe_load(path.read_text(encoding='utf-8'))['jobs'].values():
             for step in job['steps']:
                 words = step.get('run', '').split()
-                named |= {word for word in words[1:] if words[0] == 'make' and '=' not in word}
+                if words[:1] == ['make']:
+                    named |= {word for word in words[1:] if '=' not in word}
     assert named
     assert named <= targets
 
@@ -53,6 +54,18 @@ def test_the_changelog_begins_with_what_is_to_come_or_with_this_version():
     changelog = (ROOT / 'CHANGELOG.rst').read_text(encoding='utf-8')
     headings = re.findall(r'^(.+)\n-{3,}$', changelog, flags=re.MULTILINE)
     assert headings[0] == 'Forthcoming' or headings[0].startswith(surfel_mapper.__version__)
+
+
+def test_pixi_and_docker_state_the_bounds_of_setup():
+    required = re.search(r'REQUIRED = \[(.*?)\n\]', SETUP, flags=re.DOTALL).group(1)
+    bounds = dict(re.findall(r"^ *'([A-Za-z]+)([^']+)'", required, flags=re.MULTILINE))
+    pixi = (ROOT / 'pixi.toml').read_text(encoding='utf-8')
+    stated = dict(re.findall(r'^(\w[\w-]*) = "([^"]+)"$', pixi, flags=re.MULTILINE))
+    stated['matplotlib'] = stated.pop('matplotlib-base')  # without the widgets of a desktop
+    assert {name.lower(): bound for name, bound in bounds.items()}.items() <= stated.items()
+    docker = (ROOT / 'Dockerfile').read_text(encoding='utf-8')
+    pinned = dict(re.findall(r"'(numba|rosbags)([^']+)'", docker))
+    assert pinned == {name: bounds[name] for name in ('numba', 'rosbags')}
 
 
 def test_everything_pip_requires_is_known_to_rosdep_too():

@@ -1,0 +1,40 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+
+# Two images, each of one target:
+#     docker build --target robot -t surfel_mapper:robot .        ROS 2 Jazzy from apt, the node
+#     docker build --target desktop -t surfel_mapper:desktop .    bags and scans, no ROS
+# `--net=host --ipc=host` lets the node see the topics of the machine; a folder of bags and maps
+# is mounted at /data. `develop` is the image of .devcontainer.
+
+FROM ros:jazzy-ros-base AS robot
+SHELL ["/bin/bash", "-o", "pipefail", "-c"]
+# numba and rosbags have no apt packages on Ubuntu 24.04, and packages of the system stay as they are.
+RUN apt-get update && apt-get install -y --no-install-recommends \
+        python3-matplotlib python3-numpy python3-pil python3-scipy python3-tqdm python3-venv \
+        python3-yaml ros-jazzy-launch-ros ros-jazzy-nav-msgs ros-jazzy-tf2-msgs \
+        ros-jazzy-visualization-msgs \
+    && rm -rf /var/lib/apt/lists/* \
+    && python3 -m venv --system-site-packages /opt/surfel_mapper_venv \
+    && /opt/surfel_mapper_venv/bin/pip install --no-cache-dir 'numba>=0.61' 'rosbags>=0.11.7,<0.12'
+COPY . /ros2_ws/src/surfel_mapper
+WORKDIR /ros2_ws
+RUN source /opt/ros/jazzy/setup.bash && colcon build --packages-select surfel_mapper
+ENV PATH=/opt/surfel_mapper_venv/bin:$PATH NUMBA_CACHE_DIR=/var/cache/surfel_mapper
+WORKDIR /data
+ENTRYPOINT ["/bin/bash", "-c", \
+    "source /opt/ros/jazzy/setup.bash && source /ros2_ws/install/setup.bash && exec \"$@\"", "--"]
+CMD ["ros2", "launch", "surfel_mapper", "mapper.launch.py"]
+
+FROM python:3.12-slim AS develop
+# make, git and a browser: for the tests, and for those that open report.html
+RUN apt-get update && apt-get install -y --no-install-recommends chromium git make \
+    && rm -rf /var/lib/apt/lists/*
+
+FROM python:3.12-slim AS desktop
+COPY . /src
+RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src
+ENV NUMBA_CACHE_DIR=/var/cache/surfel_mapper
+WORKDIR /data
+ENTRYPOINT ["surfel-mapper"]
+CMD ["--help"]
