@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from surfel_mapper.alignment import LUM
@@ -50,6 +49,8 @@ def test_accuracy_does_not_fall_one_kilometre_from_the_origin():
 
 
 def test_result_is_the_least_squares_of_the_gaps_over_their_variance():
+    from scipy.optimize import least_squares  # seconds to import
+
     # with one edge the optimum is that of the pairs themselves, which scipy finds its own way
     rng = np.random.default_rng(6)
     lum = make(rng, random_transforms(rng, 2, 1.0), [(0, 1)], sigma=0.1, max_iterations=50)

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Workers that come, go and die change nothing in the map; real Dask clusters of this machine."""
 
+from importlib.util import find_spec
 import os
 import signal
 import subprocess
@@ -15,7 +16,9 @@ from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.errors import ClusterError
 from test.cluster.bags import in_one_go, shards_of, written
 
-distributed = pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
+pytestmark = pytest.mark.skipif(
+    find_spec('distributed') is None, reason='dask is not installed (extra cluster)'
+)
 
 
 def squared(number):
@@ -74,6 +77,8 @@ def test_workers_are_born_with_all_that_tasks_need(two_workers):
 
 
 def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
+    import distributed
+
     made = []
 
     class Interrupted(distributed.LocalCluster):
@@ -154,9 +159,11 @@ def test_a_task_that_kills_its_workers_is_given_up(monkeypatch):
 
 
 def test_a_scheduler_elsewhere_is_used(case, tmp_path):
+    from distributed import LocalCluster
+
     shards, digest = case
     with (
-        distributed.LocalCluster(
+        LocalCluster(
             n_workers=1, threads_per_worker=1, dashboard_address='127.0.0.1:0'
         ) as cluster,
         open_executor(scheduler=cluster.scheduler_address) as executor,
@@ -165,8 +172,10 @@ def test_a_scheduler_elsewhere_is_used(case, tmp_path):
 
 
 def test_a_scheduler_without_workers_is_refused():
+    from distributed import LocalCluster
+
     with (
-        distributed.LocalCluster(n_workers=0, dashboard_address='127.0.0.1:0') as cluster,
+        LocalCluster(n_workers=0, dashboard_address='127.0.0.1:0') as cluster,
         pytest.raises(ClusterError, match='no workers'),
         open_executor(scheduler=cluster.scheduler_address),
     ):

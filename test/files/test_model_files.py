@@ -102,18 +102,20 @@ def test_a_missing_directory_is_refused(model, tmp_path):
         write_json(tmp_path / 'none' / 'models.json', model)
 
 
-ezdxf = pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
+@pytest.fixture(scope='module')
+def ezdxf():
+    return pytest.importorskip('ezdxf', reason='ezdxf is not installed (extra formats)')
 
 
 @pytest.fixture(scope='module')
-def written(tmp_path_factory):
+def written(tmp_path_factory, ezdxf):
     model = fit(room(160, 120)[0], ModelsConfig(voxel_size_m=A), VIEW)
     path = tmp_path_factory.mktemp('dxf') / 'models.dxf'
     write_dxf(path, model)
     return model, ezdxf.readfile(path)
 
 
-def test_the_drawing_is_in_metres_and_passes_the_audit(written):
+def test_the_drawing_is_in_metres_and_passes_the_audit(ezdxf, written):
     drawing = written[1]
     assert drawing.units == ezdxf.units.M
     audit = drawing.audit()
@@ -140,7 +142,7 @@ def test_outlines_are_closed_rings_and_faces_have_their_area(written, kind):
         assert areas(corners).sum() == pytest.approx(shape.area_m2)
 
 
-def test_empty_models_give_an_empty_drawing(tmp_path):
+def test_empty_models_give_an_empty_drawing(ezdxf, tmp_path):
     write_dxf(tmp_path / 'a.dxf', fit(np.empty((0, 3))))
     assert len(ezdxf.readfile(tmp_path / 'a.dxf').modelspace()) == 0
 

@@ -9,7 +9,10 @@ from surfel_mapper import SurfelMap
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.pcd import read_points, write_points, write_surfels
 
-pypcd4 = pytest.importorskip('pypcd4')
+
+@pytest.fixture(scope='module')
+def pypcd4():
+    return pytest.importorskip('pypcd4', reason='pypcd4 is not installed (extra test)')
 
 
 def some_surfels(columns=()):
@@ -21,7 +24,7 @@ def some_surfels(columns=()):
     return surfel_map.surfels()
 
 
-def test_surfels_are_read_back_equal_by_pypcd4(tmp_path):
+def test_surfels_are_read_back_equal_by_pypcd4(pypcd4, tmp_path):
     surfels = some_surfels(('intensity', 'rgb'))
     write_surfels(tmp_path / 'map.pcd', surfels)
 
@@ -61,7 +64,7 @@ def test_surfels_are_read_back_equal_here(tmp_path):
 
 
 @pytest.mark.parametrize('encoding', ['ascii', 'binary', 'binary_compressed'])
-def test_files_of_pypcd4_read_equal(tmp_path, encoding):
+def test_files_of_pypcd4_read_equal(pypcd4, tmp_path, encoding):
     rng = np.random.default_rng(2)
     points = rng.normal(size=(500, 3)).astype(np.float32)
     points[3] = np.nan

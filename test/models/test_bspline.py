@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.interpolate import BSpline
 
 from surfel_mapper.models.bspline import (
     axis_degree,
@@ -37,6 +36,8 @@ def test_knots_are_clamped_ascending_and_of_the_right_number(cells, degree):
 
 @pytest.mark.parametrize('cells', SIZES)
 def test_basis_functions_equal_scipy_and_sum_to_one(cells):
+    from scipy.interpolate import BSpline  # seconds to import
+
     degree = axis_degree(cells, 3)
     knot, u = knots(cells, degree), np.linspace(0.0, 1.0, 57)
     first, values, slopes = basis(u, knot, degree)
@@ -135,6 +136,8 @@ def test_slopes_are_the_derivatives_of_the_heights():
 
 @pytest.mark.parametrize('cells', [(1, 2), (4, 5), (12, 3)])
 def test_greville_points_make_the_same_surface_a_nurbs_patch(cells):
+    from scipy.interpolate import BSpline  # seconds to import
+
     start, xy, z = scene(lambda x, y: x**2 - y, cells)
     field = fit_pspline(start, xy, z, np.ones(len(z)), 1e-2)
     control = field.greville()

@@ -4,7 +4,6 @@
 
 import time
 
-from matplotlib.path import Path as Polygon
 import numpy as np
 import pytest
 
@@ -29,6 +28,12 @@ def test_a_ball_contains_what_is_within_its_radius():
     assert np.array_equal(Ball((0.5, 0.0, -0.5), 1.2).contains(POINTS), distances <= 1.2)
 
 
+def in_polygon(corners, points):
+    from matplotlib.path import Path  # seconds to import
+
+    return Path([*corners, corners[0]], closed=True).contains_points(points[:, :2])
+
+
 @pytest.mark.parametrize(
     'corners',
     [
@@ -39,7 +44,7 @@ def test_a_ball_contains_what_is_within_its_radius():
 )
 @pytest.mark.parametrize('turned', [1, -1])
 def test_a_prism_contains_what_is_in_its_polygon_at_any_height(corners, turned):
-    expected = Polygon([*corners, corners[0]], closed=True).contains_points(POINTS[:, :2])
+    expected = in_polygon(corners, POINTS)
     assert np.array_equal(Prism(corners[::turned]).contains(POINTS), expected)
     assert expected.any()
 
@@ -72,7 +77,7 @@ def test_points_in_polygons_agree_with_matplotlib_and_take_time_of_the_box_only(
     points = rng.uniform(-12.0, 12.0, (300, 3))
     prism = Prism(tuple(map(tuple, corners.tolist())))
 
-    expected = Polygon([*corners, corners[0]], closed=True).contains_points(points[:, :2])
+    expected = in_polygon(corners, points)
     assert np.array_equal(prism.contains(points), expected)
 
     start_s = time.thread_time()

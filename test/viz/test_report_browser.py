@@ -4,26 +4,30 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 import io
 import os
 import shutil
 import time
 
-from matplotlib.image import imread
 import numpy as np
+from PIL import Image
 import pytest
 
 from test.viz.test_mesh import sphere
 from test.viz.test_report import plane, report
 
-playwright = pytest.importorskip(
-    'playwright.sync_api', reason='playwright is not installed (extra test)'
-)
-
 NAMES = ('chromium', 'chromium-browser', 'google-chrome')
 BROWSER = next(filter(None, map(shutil.which, NAMES)), None)
 
-pytestmark = pytest.mark.skipif(BROWSER is None, reason='no chromium on the PATH')
+pytestmark = [
+    pytest.mark.skipif(
+        BROWSER is None, reason=f'no browser on the PATH: none of {", ".join(NAMES)}'
+    ),
+    pytest.mark.skipif(
+        find_spec('playwright') is None, reason='playwright is not installed (extra test)'
+    ),
+]
 
 SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """WebGL without a graphics card."""
@@ -36,7 +40,9 @@ WAIT_S = 180.0
 def browser():
     # root, as in containers, cannot have the sandbox
     root = ('--no-sandbox',) if os.geteuid() == 0 else ()
-    with playwright.sync_playwright() as started:
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as started:
         chromium = started.chromium.launch(
             executable_path=BROWSER, args=[*SOFTWARE_GL, *root], timeout=1000 * WAIT_S
         )
@@ -76,7 +82,8 @@ def settle(page):
 def pixels(page):
     """Return the picture on the canvas, without what lies over it."""
     page.add_style_tag(content='.tools, .scale { visibility: hidden; }')
-    return imread(io.BytesIO(page.locator('#surfels').screenshot()))[..., :3]
+    shot = Image.open(io.BytesIO(page.locator('#surfels').screenshot()))
+    return np.asarray(shot.convert('RGB')) / np.float32(255.0)
 
 
 def picture_when(page, is_so):

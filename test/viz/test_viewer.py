@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recordings for rerun hold all entities and pass the verification of rerun."""
 
+from importlib.util import find_spec
 import subprocess
 import sys
 
@@ -15,7 +16,9 @@ from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
 
-pytest.importorskip('rerun', reason='rerun is not installed (extra viewer)')
+pytestmark = pytest.mark.skipif(
+    find_spec('rerun') is None, reason='rerun is not installed (extra viewer)'
+)
 
 ENTITIES = ('/map/surfels', '/map/changed', '/map/trajectory', '/map/window', '/map/sensor/scan')
 

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.stats import multivariate_normal
 
 from surfel_mapper.models.kernels.bisection import (
     cluster_moments,
@@ -78,6 +77,8 @@ def nearer_second(points, centres):
 
 
 def test_mixture_equals_textbook_expectation_maximisation():
+    from scipy.stats import multivariate_normal  # seconds to import
+
     points = two_sheets(180, 4)
     mean = points.mean(axis=1)
     share = (points[0] > np.median(points[0])).astype(np.float64)
