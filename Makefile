@@ -69,11 +69,11 @@ fuzz: $(STAMP)  ## search for inputs that break readers, a minute of each; FUZZ_
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
-lint: $(LINT_STAMP) $(STAMP)  ## style, format, types, layers
+lint: $(LINT_STAMP)  ## style, format, types, layers, language; needs no ROS
 	$(LINT)/bin/ruff check
 	$(LINT)/bin/ruff format --check
 	$(LINT)/bin/mypy
-	$(BIN)/python -m pytest -q test/test_layering.py test/test_language.py
+	$(LINT)/bin/python -m pytest -q test/test_layering.py test/test_language.py
 
 format: $(LINT_STAMP)  ## write every file in the one format, imports sorted
 	$(LINT)/bin/ruff check --fix

@@ -61,16 +61,20 @@ VIEWER = [
     'rerun-sdk>=0.23',  # replay --view and --rrd
 ]
 
+RUNNER = [
+    'pytest>=7.4,<9',  # 9 drops what colcon test relies on
+    'pytest-timeout>=2.2',  # a test that hangs names itself
+    'hypothesis>=6.98',  # random sequences of adds and removes
+]
+
 TEST = [
+    *RUNNER,
     *FORMATS,
     *CLUSTER,
     *LAS,
     *VIEWER,
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
-    'pytest>=7.4,<9',  # 9 drops what colcon test relies on
-    'pytest-timeout>=2.2',  # a test that hangs names itself
     'pytest-xdist>=3.6',  # two processes: those of ROS wait, those of the others calculate
-    'hypothesis>=6.98',  # random sequences of adds and removes
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise
     'mcap>=1.1',  # an independent writer of what we read
@@ -79,6 +83,7 @@ TEST = [
 # Pinned, so that every machine reaches the same verdict; `make lint` keeps them in an environment
 # of their own, because the types of numpy differ from one version to the next.
 LINT = [
+    *RUNNER,  # the tests of layers and language, which need neither ROS nor the other extras
     'ruff==0.17.6',  # style and format; its rules are in .ruff.toml
     'mypy==2.4.1',  # types; configured in setup.cfg
     'numpy==2.2.6',  # the newest for all of Python 3.10 to 3.13
