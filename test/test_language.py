@@ -15,6 +15,7 @@ import io
 from pathlib import Path
 import re
 import tokenize
+from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,43 +51,57 @@ def pages() -> list[Path]:
     return [*ROOT.glob('*.md'), *ROOT.glob('*.rst'), *(ROOT / 'docs').rglob('*.md')]
 
 
-def docstrings(tree: ast.Module) -> list[tuple[int, str]]:
-    """Return line and text of every docstring, those under constants and fields included."""
-    return [
-        (node.lineno, node.value.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Expr)
-        and isinstance(node.value, ast.Constant)
-        and isinstance(node.value.value, str)
-    ]
+class Source(NamedTuple):
+    """Comments, docstrings, all strings and function names of a Python file, with their lines."""
+
+    comments: list[tuple[int, str]]
+    docstrings: list[tuple[int, str]]
+    """Those under constants and fields included."""
+
+    strings: list[tuple[int, str]]
+    functions: list[tuple[int, str]]
 
 
 @cache
+def parsed(path: Path) -> Source:
+    """Parse a Python file, once for all tests."""
+    text = path.read_text(encoding='utf-8')
+    lines = io.StringIO(text).readline
+    comments = [
+        (token.start[0], token.string)
+        for token in tokenize.generate_tokens(lines)
+        if token.type == tokenize.COMMENT
+    ]
+    docstrings, strings, functions = [], [], []
+    for node in ast.walk(ast.parse(text)):
+        match node:
+            case ast.Expr(value=ast.Constant(value=str(string))):
+                docstrings.append((node.lineno, string))
+            case ast.Constant(value=str(string)):
+                strings.append((node.lineno, string))
+            case ast.FunctionDef(name=name):
+                functions.append((node.lineno, name))
+    return Source(comments, docstrings, strings, functions)
+
+
 def texts(path: Path) -> list[tuple[int, str]]:
     """Return line and text of everything that a reader reads as English in a file."""
-    text = path.read_text(encoding='utf-8')
     if path.suffix != '.py':
-        return [(number, line) for number, line in enumerate(text.splitlines(), 1)]
-    tokens = tokenize.generate_tokens(io.StringIO(text).readline)
-    comments = [
-        (token.start[0], token.string) for token in tokens if token.type == tokenize.COMMENT
-    ]
-    tree = ast.parse(text)
-    strings = [
-        (node.lineno, node.value)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and ' ' in node.value
-    ]
-    return comments + strings
+        return list(enumerate(path.read_text(encoding='utf-8').splitlines(), 1))
+    source = parsed(path)
+    return source.comments + [(line, string) for line, string in source.strings if ' ' in string]
 
 
 def hits(pattern: str, paths: list[Path]) -> list[str]:
     """Return place and line of every match of a pattern."""
+    search = re.compile(pattern).search
     found = []
     for path in paths:
         for number, text in texts(path):
+            if not search(text):  # as no pattern spans lines, no line matches either
+                continue
             for offset, line in enumerate(text.splitlines()):
-                if re.search(pattern, line):
+                if search(line):
                     found.append(f'{path.relative_to(ROOT)}:{number + offset}: {line.strip()}')
     return found
 
@@ -112,7 +127,7 @@ def test_docstrings_open_with_a_verb_or_a_noun():
     found = [
         f'{path.relative_to(ROOT)}:{line}: {text.strip().splitlines()[0]}'
         for path in sources()
-        for line, text in docstrings(ast.parse(path.read_text(encoding='utf-8')))
+        for line, text in parsed(path).docstrings
         if OPENINGS.match(text.strip())
     ]
     assert not found, '\n'.join(found)
@@ -120,9 +135,9 @@ def test_docstrings_open_with_a_verb_or_a_noun():
 
 def test_names_of_tests_state_a_fact():
     found = [
-        f'{path.relative_to(ROOT)}:{node.lineno}: {node.name}'
+        f'{path.relative_to(ROOT)}:{line}: {name}'
         for path in (ROOT / 'test').rglob('*.py')
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-        if isinstance(node, ast.FunctionDef) and FIRST_WORDS.match(node.name)
+        for line, name in parsed(path).functions
+        if FIRST_WORDS.match(name)
     ]
     assert not found, '\n'.join(found)
