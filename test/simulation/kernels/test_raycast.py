@@ -5,7 +5,8 @@
 import numpy as np
 import pytest
 
-from surfel_mapper.simulation import Primitive, World
+from surfel_mapper.simulation.primitives import Primitive
+from surfel_mapper.simulation.world import World
 from test.simulation.kernels.raycast_twin import cast_twin, distances_twin
 
 SQRT_HALF = np.sqrt(0.5)
