@@ -56,7 +56,7 @@ class Source(NamedTuple):
 
     comments: list[tuple[int, str]]
     docstrings: list[tuple[int, str]]
-    """Those under constants and fields included."""
+    """The texts under constants and fields are among them."""
 
     strings: list[tuple[int, str]]
     functions: list[tuple[int, str]]
