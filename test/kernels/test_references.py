@@ -34,7 +34,6 @@ REFERENCES = {
     'kernels/symmetric3.py': 'kernels/test_symmetric3.py',
     'kernels/voxel_grid.py': 'filters/test_grids.py',
     'layers/dynamic_objects/kernels/free_space.py': 'layers/test_free_space.py',
-    'mapping/kernels/checks.py': 'mapping/kernels/test_checks.py',
     'mapping/kernels/queries.py': 'mapping/kernels/test_queries.py',
     'mapping/kernels/reduction.py': 'mapping/kernels/test_reduction.py',
     'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.layout import HALF, VIEW_SCALE
-from surfel_mapper.mapping.kernels.checks import first_impossible
+from surfel_mapper.mapping.kernels.voxels import first_impossible
 from test.kernels.modes import both
 
 SQUARES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
