@@ -24,7 +24,7 @@ FLOOR_BYTES = 64 << 20
 """Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
 
 BYTES_PER_BYTE = 20
-"""Memory per byte of input above the floor; a point of 16 bytes becomes 40, a voxel of 60 200."""
+"""Memory per byte of input above the floor; 16 bytes of a point become 40, 60 of a voxel 200."""
 
 FLOOR_S = 10.0
 """Processor time that reading any input may take, s."""
@@ -61,7 +61,7 @@ class Budget:
     max_bytes, max_seconds : int, float
         The limits.
     used_bytes : int
-        Memory asked for and not given back, bytes.
+        Memory requested and not yet returned, bytes.
 
     """
 

@@ -16,7 +16,7 @@ from functools import cache
 import itertools
 
 PARTS = 4
-"""Number of parts a thread into which rows are divided; an idle thread takes the next part."""
+"""Number of parts per thread into which rows are divided; an idle thread takes the next part."""
 
 
 @cache
@@ -44,7 +44,7 @@ def share(work: Callable[[slice], object], num_rows: int, threads: int) -> None:
     if helpers is None:
         work(slice(0, num_rows))
         return
-    parts = iter(split(num_rows, PARTS * threads))  # handed out one by one: Python's lock
+    parts = iter(split(num_rows, PARTS * threads))  # shared; Python's lock protects it
 
     def take_parts() -> None:
         for part in parts:

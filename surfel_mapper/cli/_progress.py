@@ -23,7 +23,7 @@ EVERY_S = 10.0
 @contextmanager
 def progress(verb: str, unit: str) -> Iterator[Callable[[int, int], None]]:
     """
-    Give a function that shows how much is done of a total.
+    Yield a function that shows the progress towards a total.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class Lines:
 @contextmanager
 def stopped_by_interrupt() -> Iterator[Callable[[], bool]]:
     """
-    Give a function that returns whether Ctrl-C was pressed; pressed again, it interrupts.
+    Yield a function that returns whether Ctrl-C was pressed; a second Ctrl-C interrupts.
 
     Mapping can thus end between two scans and its result be written. Outside of the main thread
     signals cannot be caught, and nothing changes.

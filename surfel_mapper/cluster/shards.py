@@ -100,7 +100,7 @@ class ShardResult:
     positions : (P, 3) float64, m
         Some positions of the sensor in the map frame.
     peak_bytes : int
-        The most memory of the process until its end.
+        Peak memory of the process until the end of the shard.
 
     """
 
@@ -231,7 +231,7 @@ class ShardStart:
 
     @classmethod
     def of(cls, mapper: ShardMapper) -> ShardStart:
-        """Return those of a mapper at present."""
+        """Return outlook and counts of a mapper."""
         return cls(mapper.outlook(), mapper.counters.summary())
 
 

@@ -5,7 +5,10 @@ Reduce: parts of many maps into one map, tile by tile.
 
 No process holds more than one tile and the part that it adds. The digest of the result is taken
 by visiting the tiles in the order of their voxels. The tiles are written to a directory beside
-the one wanted, which takes its name when all are done; until then an earlier map stays whole.
+the target, which takes its name when all are done; until then an earlier map stays whole.
+
+One module of 390 lines: the work on a tile and the order of the tiles share the layout of the
+directories.
 """
 
 from __future__ import annotations

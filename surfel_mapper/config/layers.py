@@ -123,7 +123,7 @@ class TsdfConfig(Stage):
     )
     max_difference_ratio: float = setting(
         0.0,
-        'Adaptive: nor those that differ by more than this share of the range.',
+        'Adaptive: pixels that differ by more than this share of the range are not interpolated.',
         low=0.0,
         high=10.0,
     )
@@ -161,7 +161,9 @@ class TsdfConfig(Stage):
     extra_distance_m: float = setting(
         0.0, 'Depth behind the band in which voxels take -truncation_m, m.', low=0.0, high=1e3
     )
-    extra_labels: tuple[float, ...] = setting((), 'Labels whose voxels take it; empty: all.')
+    extra_labels: tuple[float, ...] = setting(
+        (), 'Labels to which extra_distance_m applies; empty: all.'
+    )
     skip_extra_channels: bool = setting(
         False, 'Write neither colours nor labels to voxels behind the band.'
     )
@@ -196,7 +198,7 @@ class TsdfConfig(Stage):
         (), 'Labels of moving objects: they free space and leave no surface.'
     )
     invalid_labels: tuple[float, ...] = setting(
-        (), 'Labels treated in the same way: sky, the robot.'
+        (), 'Further labels that free space and leave no surface: sky, the robot.'
     )
     mesh_rate_hz: float = setting(
         1.0,
@@ -252,6 +254,21 @@ class TsdfConfig(Stage):
                 'another where label_topic is given',
             ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
+            *self._sensor_conditions(),
+        )
+        for name, holds, expected in checks:
+            if not holds:
+                raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
+        for name in ('extra_labels', 'dynamic_labels', 'invalid_labels'):
+            for label in getattr(self, name):
+                if not (label.is_integer() and 0 <= label <= MAX_LABEL):
+                    raise ConfigError(
+                        f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
+                    )
+
+    def _sensor_conditions(self) -> tuple[tuple[str, bool, str], ...]:
+        """Return the conditions on the model of the sensor: setting, whether met, expectation."""
+        return (
             (
                 'sensor_fov_deg',
                 not self.sensor_fov_deg
@@ -278,15 +295,6 @@ class TsdfConfig(Stage):
             ),
             ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
         )
-        for name, holds, expected in checks:
-            if not holds:
-                raise ConfigError(f'{stage}.{name}: {getattr(self, name)}, expected {expected}')
-        for name in ('extra_labels', 'dynamic_labels', 'invalid_labels'):
-            for label in getattr(self, name):
-                if not (label.is_integer() and 0 <= label <= MAX_LABEL):
-                    raise ConfigError(
-                        f'{stage}.{name}: {label}, expected whole numbers from 0 to {MAX_LABEL}'
-                    )
 
     @property
     def image_topics(self) -> dict[str, str]:
@@ -371,7 +379,7 @@ class ModelsConfig(Stage):
     )
     arc_offset_voxels: float = setting(
         0.5,
-        'Distance of their middles from a common arc, at most, in voxels.',
+        'Distance of the middles of neighbours from a common arc, at most, in voxels.',
         low=0.01,
         high=100.0,
     )

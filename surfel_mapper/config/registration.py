@@ -185,7 +185,7 @@ class AlignConfig(Stage):
     )
     move_deg: float = setting(
         0.01,
-        'Scans that it turns by more are moved in the map too, deg.',
+        'Scans that the alignment turns by more are moved in the map, deg.',
         low=0.0,
         high=180.0,
         live=True,

@@ -5,6 +5,8 @@ Settings of the pipeline's stages: input, deskewing, frames, poses, map, window 
 
 Every map has these stages; settings of optional layers are in layers.py, those of registration
 and alignment in registration.py.
+
+One module of 410 lines: a list of settings, with no other code than their checks.
 """
 
 from __future__ import annotations
@@ -400,7 +402,11 @@ class DiagnosticsConfig(Stage):
         live=True,
     )
     error_latency_s: float = setting(
-        1.0, 'Report an error if it exceeds this, s; 0: never.', low=0.0, high=1e6, live=True
+        1.0,
+        'Report an error if that percentile exceeds this, s; 0: never.',
+        low=0.0,
+        high=1e6,
+        live=True,
     )
     warn_dropped_ratio: float = setting(
         0.0,
@@ -410,5 +416,9 @@ class DiagnosticsConfig(Stage):
         live=True,
     )
     error_dropped_ratio: float = setting(
-        0.5, 'Report an error if a larger share was dropped.', low=0.0, high=1.0, live=True
+        0.5,
+        'Report an error if a larger share of these clouds was dropped.',
+        low=0.0,
+        high=1.0,
+        live=True,
     )

@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How good a map is: beside a world of known surfaces, a cloud, or another map."""
+"""Errors of a map against a world of known surfaces, a cloud, or another map."""

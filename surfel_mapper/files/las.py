@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-LAS and LAZ files of points, by laspy (an extra: formats of 30 point records and a compression).
+LAS and LAZ files of points, read by laspy (an extra: the formats have 30 kinds of records).
 
 On its own because it alone imports laspy. Coordinates are scaled integers, often of a map
 projection, so they are returned as float64.

@@ -31,9 +31,10 @@ from surfel_mapper.filters.base import (
     with_columns,
     with_points,
 )
-from surfel_mapper.filters.columns import DENSITIES, MergedColumns, PointGroups
+from surfel_mapper.filters.columns import DENSITIES
 from surfel_mapper.filters.descriptors import TIME_COLUMNS, times_of
 from surfel_mapper.filters.kernels.boxes import cut
+from surfel_mapper.filters.merging import MergedColumns, PointGroups
 from surfel_mapper.filters.neighbours import coordinates, Ids, Points
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import as_matrices, eigen, EIGEN_OF, Moments, ShapeFilter, shares

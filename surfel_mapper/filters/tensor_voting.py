@@ -7,10 +7,10 @@ Every neighbour casts a vote, a symmetric matrix that is large in the directions
 no continuation of the point. Of the eigenvalues l1 >= l2 >= l3 of the sum, l1 - l2 is the saliency
 of a surface (stick, along the normal), l2 - l3 that of a curve (plate, across the tangent) and l3
 that of a junction (ball), each over the number of neighbours. libpointmatcher confuses saliencies
-and eigenvalues when Saliency labels points; here the label is the largest saliency. Under its name
-the votes are its own: in the first round a point votes for its nearest neighbours, which differ
-from those that have it among theirs; a vote of the second round is no symmetric matrix, and only
-its lower triangle counts.
+and eigenvalues when Saliency labels points; here the label is the largest saliency. Under
+libpointmatcher's name a filter votes as libpointmatcher does: in the first round a point votes for
+its nearest neighbours, which differ from those that have it among theirs; a vote of the second
+round is no symmetric matrix, and only its lower triangle counts.
 
 SpectralDecomposition thins surfaces, curves and junctions to an even density each. If nothing is
 known of the neighbours, the eigenvalues of their votes have known ratios for points spread evenly

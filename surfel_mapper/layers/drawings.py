@@ -76,9 +76,9 @@ class EllipsoidsDrawing:
     R_map_axes : (K, 3, 3) float64
         Directions of the half axes, as columns.
     color : tuple of float
-        Of all.
+        Colour of all ellipsoids.
     weights : (K,) int64
-        Where there is no room for all, those of larger weight are drawn.
+        If a viewer limits the number, the ellipsoids of largest weight are drawn.
 
     """
 
@@ -140,12 +140,12 @@ class Table:
     Attributes
     ----------
     titles : sequence of str
-        Of the columns.
+        Titles of the columns.
     num_texts : int
         Columns, from the left, that hold text; the others hold numbers, set to the right.
     rows : sequence of sequence of str
     colors : (R, 3) float64
-        Of a swatch before each row.
+        Colour of the swatch before each row.
 
     """
 
@@ -164,11 +164,11 @@ class Section:
     ----------
     title : str
     figures : mapping of str to str
-        Numbers by their names.
+        Figures, as text, by name.
     picture : PointsPicture, optional
     table : Table, optional
     note : str
-        Below the table.
+        Text below the table.
 
     """
 

@@ -3,9 +3,9 @@
 """
 Layer: a representation beside the surfels that follows the scans.
 
-The pipeline, the node, a replay, the report and the viewer loop over the layers that are
-switched on, by these methods, and name none. A layer is below ROS and below the pictures: it
-publishes serialised messages with the name of their type, and describes pictures as arrays.
+The pipeline, the node, a replay, the report and the viewer call these methods of all layers that
+are switched on, and name no layer. A layer is below ROS and below the pictures: it publishes
+serialised messages with the name of their type, and describes pictures as arrays.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class InsertedScan:
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Moment:
     """
-    Stamp, frame and place of the messages that are published between two scans.
+    Stamp, frame and sensor pose of the messages that are published between two scans.
 
     Attributes
     ----------
@@ -125,12 +125,13 @@ class Publication:
     is_eager : bool
         Published without subscribers too, so that later ones find a latched message.
     version : callable, optional
-        Published at its rate only if this value differs from the last time.
+        Returns a value; a topic with a rate is published only if the value has changed.
     prepare : callable, optional
-        One step of the work for a new subscriber; returns True when ``messages`` is quick.
-        Other scans are mapped between two steps.
+        Does one step of the work for a new subscriber; returns True once ``messages`` is fast.
+        Scans are mapped between two steps.
     all_messages : callable, optional
-        As ``messages``, for a new subscriber, if those depend on what was published before.
+        Replaces ``messages`` for a new subscriber, if ``messages`` returns changes since its last
+        call.
 
     """
 
@@ -169,15 +170,14 @@ class Images:
 
 class Layer:
     """
-    Base class of layers; a layer overrides what it needs.
+    Base class of layers, whose methods do nothing unless a layer overrides them.
 
     Attributes
     ----------
     name : str
         Name of its time per scan, of its summary, and of its result in an Update.
     needs_free_rays : bool
-        Whether scans shall come with the directions in which the sensor met nothing
-        (``Scan.free``).
+        Whether scans need the directions of rays without a return (``Scan.free``).
 
     Parameters
     ----------
@@ -202,12 +202,12 @@ class Layer:
 
     @property
     def images(self) -> Images:
-        """The images that scans shall be joined with; none by default."""
+        """The images to join with scans; none by default."""
         return Images()
 
     def voxels_to_clear(self, inserted: InsertedScan) -> npt.NDArray[np.int32]:
         """
-        Return the indices (E, 3) of the voxels that the map shall empty after a scan.
+        Return the indices (E, 3) of the voxels to clear after a scan.
 
         Called before the alignment of the window and before surfels are derived.
         """
@@ -233,7 +233,7 @@ class Layer:
         return None
 
     def finish(self) -> None:
-        """Take what still waits, at the end of a recording."""
+        """Process scans that still wait, at the end of a recording."""
 
     def clear(self) -> None:
         """Forget all scans."""
@@ -242,7 +242,7 @@ class Layer:
         """Compile the kernels, for points of every type."""
 
     def reconfigure(self, config: Config) -> None:
-        """Take new settings, of which only live ones differ."""
+        """Apply new settings; only live ones differ."""
         self.config = config
 
     def summary(self) -> dict[str, Any]:

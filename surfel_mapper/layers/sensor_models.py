@@ -4,8 +4,8 @@
 The camera or lidar of each scan, and its measurements: points and free rays.
 
 The model of a lidar is fitted to the first scan of its frame and checked on every scan. If a scan
-does not fit, the model is fitted again, at growing intervals while nothing fits; until then the
-frame has no model, and layers do without one.
+does not fit, the model is fitted again, at growing intervals while no model fits. In between the
+frame has no model, and layers work without one.
 """
 
 from __future__ import annotations
@@ -216,6 +216,6 @@ def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
 
 
 def two_beams(dtype: Any) -> npt.NDArray[Any]:
-    """Return the points of a lidar of two beams in a round room, by which layers compile."""
+    """Return simulated points of a lidar of two beams in a round room, to compile kernels with."""
     lidar = LidarModel(rows=2, columns=64, vertical_fov_deg=10.0)
     return np.asarray(3.0 * lidar.directions.reshape(-1, 3), dtype)

@@ -90,7 +90,7 @@ class VoxelTable:
         MapLimitError
             If there is no memory for the voxels.
 
-        The table is unchanged after any exception, a failed allocation at any place too.
+        The table is unchanged after any exception, including a failed allocation anywhere.
 
         """
         arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)

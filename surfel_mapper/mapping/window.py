@@ -101,7 +101,7 @@ class SlidingWindow:
         Scans are evicted while the voxels and the kept scans need more bytes; 0 means no such
         limit.
     keeps_scans : bool
-        Whether that limit alone is a reason to keep scans.
+        Whether scans are kept for the sake of that limit alone.
 
     """
 

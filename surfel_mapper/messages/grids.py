@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""nav_msgs/OccupancyGrid as bytes. It stands alone: no other message is like it."""
+"""nav_msgs/OccupancyGrid as bytes. On its own: it shares no code with other messages."""
 
 from __future__ import annotations
 

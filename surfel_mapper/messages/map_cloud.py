@@ -7,9 +7,9 @@ A PointField has no 64-bit integer. So each integer is a field of two uint32, th
 first: its bytes in little-endian order. The number of points is ``num_points``, the voxel three
 int32; the sums of the map's channels follow under their names.
 
-``~/changed`` states the present moments of all voxels that a scan changed, not the difference, so
-a message applied twice, or after a newer full map, does no harm. ``~/normals`` regularly states
-the full map: it starts a copy, and mends one that has missed a change. Both carry the moments if
+``~/changed`` holds the present moments of all voxels that a scan changed, not the difference, so a
+message applied twice, or after a newer full map, does no harm. ``~/normals`` regularly holds the
+full map: it starts a copy, and repairs one that has missed a change. Both carry the moments if
 ``publish.moments`` is set.
 """
 
@@ -210,7 +210,7 @@ class MapMirror:
         Raises
         ------
         CloudFormatError
-            If it has no moments, or those of other voxels; the copy is unchanged then.
+            If it has no moments, or moments of another voxel size; the copy is unchanged then.
 
         """
         stamp_ns, moments = self._read(msg)

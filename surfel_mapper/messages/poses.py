@@ -96,24 +96,17 @@ def raw_poses(
 
     """
     try:
-        return list(read_poses(kind, MessageReader(raw, ros1=ros1), base))
+        reader, poses = MessageReader(raw, ros1=ros1), []
+        number = reader.number('I') if kind == TF else 1
+        if number > 1 and number * SMALLEST_TRANSFORM_BYTES > reader.remaining:
+            raise ValueError(f'{number} transforms announced, {reader.remaining} bytes left')
+        for _ in range(number):
+            header = read_header(reader)
+            child = frame_name(reader.string() if kind in (TF, ODOMETRY) else base)
+            parent, at_ns = frame_name(header.frame_id), stamp_ns(header)
+            poses.append(StampedPose(parent, child, at_ns, reader.floats(3), reader.floats(4)))
+        return poses
     except (struct.error, ValueError) as error:
         raise PoseError(
             f'{topic}: {len(raw)} bytes that are not a message of {kind}: {error}'
         ) from error
-
-
-def read_poses(kind: str, reader: MessageReader, base: str) -> Iterator[StampedPose]:
-    """Yield the poses of the message at a reader."""
-    number = 1
-    if kind == TF:
-        number = reader.number('I')
-        if number * SMALLEST_TRANSFORM_BYTES > reader.remaining:
-            raise ValueError(f'{number} transforms announced, {reader.remaining} bytes left')
-    for _ in range(number):
-        header = read_header(reader)
-        child = reader.string() if kind in (TF, ODOMETRY) else base
-        xyz, q_xyzw = reader.floats(3), reader.floats(4)
-        yield StampedPose(
-            frame_name(header.frame_id), frame_name(child), stamp_ns(header), xyz, q_xyzw
-        )

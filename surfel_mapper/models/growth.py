@@ -46,6 +46,9 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Owners = npt.NDArray[np.int32]
 
+FreeSurfels = tuple[Indices, npt.NDArray[np.bool_], Array, Array]
+"""Number, flatness, mean and normal of the free points of every voxel, (V, ...) each."""
+
 CORE_SHARE, CORE_POINTS = 0.12, 8
 """Sparse voxels have a smaller share of the points of their densest neighbour."""
 
@@ -226,44 +229,66 @@ def grow(
     """
     tangent = tangents(means, label, patches)
     tolerance = tolerances(voxels, label, tangent, len(patches), size_m)
-    usual = float(np.median(tolerance)) if len(tolerance) else 0.1 * size_m
-    counts = np.diff(voxels.starts)
-    owner = np.repeat(label, counts)
-    free = free_surfels(voxels, owner, size_m, usual)
-    candidate = np.full((len(label), SLOTS), -1, np.int32)
-    planes = np.empty((len(label), SLOTS, 4))
-    state = voxels.points, voxels.starts
-    flat = free[1], free[3], math.cos(math.radians(GROWTH_ANGLE_DEG))
-    grow_patches(*state, voxels.lattice, label, tangent, tolerance, flat, candidate, planes)
-    assign_points(*state, label, tangent, tolerance, candidate, planes, owner)
-    found = np.empty((len(patches) + MOST_FACETS, 4))
-    for k, patch in enumerate(patches):
-        found[k] = (*patch.normal, patch.offset_m)
+    median_m = float(np.median(tolerance)) if len(tolerance) else 0.1 * size_m
+    owner = np.repeat(label, np.diff(voxels.starts))
+    free = free_surfels(voxels, owner, size_m, median_m)
+    extend_patches(voxels, label, (tangent, tolerance), free, owner)
+    free = free_surfels(voxels, owner, size_m, median_m)
     rules = (
-        usual,
+        median_m,
         FACET_VOXELS,
         max(FACET_POINTS, least_points),
         math.cos(math.radians(FACET_ANGLE_DEG)),
         FACET_WIDTH_VOXELS * size_m,
     )
-    free = free_surfels(voxels, owner, size_m, usual)
-    num = find_facets(*state, voxels.lattice, free, rules, owner, found, len(patches))
+    num = add_facets(voxels, patches, free, rules, owner)
     contacts = np.zeros((num, num), np.int32)
     count_contacts(voxels.starts, voxels.lattice, owner, contacts)
     curved = [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
     contacts[curved], contacts[:, curved] = 0, 0
     is_free = owner < 0
-    owner[is_free] = np.repeat(-1 - group, counts)[is_free]
+    owner[is_free] = np.repeat(-1 - group, np.diff(voxels.starts))[is_free]
     pair_means, owners = voxels.by_owner(owner)
     on_patch = owners >= 0
     moments = owner_moments(pair_means[on_patch], owners[on_patch], num)
-    root = coplanar(moments, contacts, usual)
+    root = coplanar(moments, contacts, median_m)
     names, index = np.unique(root, return_inverse=True)
     new: Owners = index.astype(np.int32)
     owner, owners = renamed(owner, new), renamed(owners, new)
     order = np.argsort(owners, kind='stable')
     normals = np.array([plane_of(moments[root == k].sum(axis=0))[0] for k in names])
     return Grown(owner, pair_means[order], owners[order], normals.reshape(-1, 3))
+
+
+def extend_patches(
+    voxels: VoxelPoints,
+    label: Owners,
+    shape: tuple[Array, Array],
+    free: FreeSurfels,
+    owner: Owners,
+) -> None:
+    """Grow patches, given as tangents and tolerances, over touching voxels; write the owners."""
+    candidate = np.full((len(label), SLOTS), -1, np.int32)
+    planes = np.empty((len(label), SLOTS, 4))
+    state = voxels.points, voxels.starts
+    flat = free[1], free[3], math.cos(math.radians(GROWTH_ANGLE_DEG))
+    grow_patches(*state, voxels.lattice, label, *shape, flat, candidate, planes)
+    assign_points(*state, label, *shape, candidate, planes, owner)
+
+
+def add_facets(
+    voxels: VoxelPoints,
+    patches: list[Plane],
+    free: FreeSurfels,
+    rules: tuple[float, ...],
+    owner: Owners,
+) -> int:
+    """Grow facets from free points and write the owners; return the number of all patches."""
+    found = np.empty((len(patches) + MOST_FACETS, 4))
+    for k, patch in enumerate(patches):
+        found[k] = (*patch.normal, patch.offset_m)
+    state = voxels.points, voxels.starts, voxels.lattice
+    return int(find_facets(*state, free, rules, owner, found, len(patches)))
 
 
 def renamed(owner: Owners, index: Owners) -> Owners:
@@ -310,7 +335,7 @@ def tolerances(
 
 def free_surfels(
     voxels: VoxelPoints, owner: Owners, size_m: float, tolerance_m: float
-) -> tuple[Indices, npt.NDArray[np.bool_], Array, Array]:
+) -> FreeSurfels:
     """Return number, flatness, mean and normal of the free points of every voxel."""
     number = len(voxels.starts) - 1
     count, flat = np.empty(number, np.int64), np.empty(number, np.bool_)

@@ -91,7 +91,7 @@ class SurfelGraph:
         offset_m = max(self.thickness_m, 3.0 * config.noise_m)
         self.limit_m = math.hypot(self.thickness_m, 6.0 * config.noise_m)
         variance = (self.limit_m / 6.0) ** 2
-        far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # twice the diagonal, and some
+        far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # just over twice the diagonal
         self._class_rules = (float(config.min_points), variance, size_m)
         self._link_rules = (
             math.cos(math.radians(config.max_angle_deg)),
@@ -153,6 +153,23 @@ class SurfelGraph:
         relinked.append(self.component[here[was_flat != is_flat]])
         touched = self.component[here]
         self.component[here[~is_flat]] = -1
+        relinked.append(self._relinked(here, marked, num))
+        rehosted, old_hosts, new_hosts = self._rehosted(here, near)
+        return GraphChange(
+            num_voxels=len(here) + len(gone.key),
+            rows=np.concatenate([here, rehosted]),
+            relinked=unique_components(relinked),
+            touched=unique_components([touched, self.component[old_hosts[old_hosts >= 0]]]),
+            hosts=new_hosts[new_hosts >= 0],
+            gone=gone.remaining,
+        )
+
+    def _relinked(self, here: Rows, marked: Rows, num: int) -> Rows:
+        """
+        Link changed voxels; return the components of all voxels whose links changed.
+
+        The first ``num`` rows of ``marked`` are those that ``unlink`` has marked already.
+        """
         self._is_here[here] = True
         state = (self.kind, self.position, self.normal)
         num = update_links(
@@ -167,16 +184,7 @@ class SurfelGraph:
             num,
         )
         self._is_here[here] = self._marks[marked[:num]] = False
-        relinked.append(self.component[marked[:num]])
-        rehosted, old_hosts, new_hosts = self._rehosted(here, near)
-        return GraphChange(
-            num_voxels=len(here) + len(gone.key),
-            rows=np.concatenate([here, rehosted]),
-            relinked=unique_components(relinked),
-            touched=unique_components([touched, self.component[old_hosts[old_hosts >= 0]]]),
-            hosts=new_hosts[new_hosts >= 0],
-            gone=gone.remaining,
-        )
+        return self.component[marked[:num]]
 
     def surfels(self) -> Surfels:
         """Return all voxels as surfels, in the order of their rows."""

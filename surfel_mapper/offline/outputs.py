@@ -3,7 +3,7 @@
 """
 The files that a replay writes, each whole or not at all; summary.json last.
 
-So if summary.json is new, the others are.
+So if summary.json is new, all other files are too.
 """
 
 from __future__ import annotations

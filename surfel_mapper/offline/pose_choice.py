@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from surfel_mapper.scan import Scan
 
 SAMPLE_NS = 3_000_000_000
-"""Length of the sample of a bag; four times as long until it contains a cloud."""
+"""Length of the sample of a bag, quadrupled until it contains a cloud."""
 
 DEFAULT = Config()
 
@@ -118,7 +118,9 @@ def choose_by_sample(
         return PoseChoice(config.replace(best.settings), f'{best.poses} has them ({text})')
     if wanted is not None or not found.stamps:
         return PoseChoice(config)
-    why = f'{made[0].poses}: {made[0].missing}' if made and made[0].missing else 'not one moves'
+    why = (
+        f'{made[0].poses}: {made[0].missing}' if made and made[0].missing else 'none of them moves'
+    )
     scans = first_scans(reader, topics)
     reason = f'no topic gives the poses of the clouds ({why})'
     return PoseChoice(with_registration(config, scans), reason)

@@ -7,6 +7,8 @@ Outputs are checked before the first scan. The files are written when the whole 
 mapped, the map before everything that may fail after it; a viewer that fails ends alone. A replay
 that maps nothing is an error, because an empty map looks like a result. Heavy modules are imported
 inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor matplotlib early.
+
+One module of 400 lines: a replay reads from top to bottom as check, start, map, write.
 """
 
 from __future__ import annotations
@@ -251,7 +253,7 @@ def check_outputs(directory: Path, options: ReplayOptions) -> None:
 
 @contextmanager
 def write_first(write: Callable[[], None]) -> Iterator[None]:
-    """Write the map if a block fails, before its error goes on."""
+    """Write the map if a block fails, and then raise its error."""
     try:
         yield
     except SurfelMapperError:
@@ -263,7 +265,7 @@ def write_first(write: Callable[[], None]) -> Iterator[None]:
 def listeners(
     directory: Path, options: ReplayOptions, mapper: Mapper
 ) -> Iterator[list[Callable[[Update], None]]]:
-    """Open the bag of normals and the viewers that were asked for; give their callbacks."""
+    """Open the bag of normals and the viewers that were asked for; yield their callbacks."""
     from surfel_mapper.offline.outputs import BAG
 
     with ExitStack() as files:
@@ -303,7 +305,7 @@ def viewers(
 @contextmanager
 def shown(viewer: Viewer, path: Path | None) -> Iterator[Callable[[Update], None]]:
     """
-    Give the callback of a viewer, which ends alone if it fails.
+    Yield the callback of a viewer; if the viewer fails, the replay goes on without it.
 
     A viewer is another program that may be closed, and rerun raises errors of many types.
     """

@@ -10,7 +10,7 @@ Only the headers of clouds are read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
@@ -144,9 +144,10 @@ def survey(
 
     """
     found = Survey({topic.name: TopicSurvey(topic) for topic in reader.topics})
+    static = static_topics(reader.topics)
     for message in reader.messages(surveyed_topics(reader), None, stop_ns):
         try:
-            frames = note_message(found, reader, message)
+            frames = note_message(found, reader, message, static)
         except (BagError, CloudFormatError, PoseError):
             found.undecodable += 1
             frames = []
@@ -160,7 +161,9 @@ def surveyed_topics(reader: BagReader) -> list[str]:
     return [topic.name for topic in reader.topics if topic.type in (CLOUD, *SOURCES)]
 
 
-def note_message(found: Survey, reader: BagReader, message: BagMessage) -> list[str]:
+def note_message(
+    found: Survey, reader: BagReader, message: BagMessage, static: Collection[str]
+) -> list[str]:
     """Add a message to a survey and return the frames that it names."""
     if message.type == CLOUD:
         decoded = reader.decode(message)
@@ -169,7 +172,7 @@ def note_message(found: Survey, reader: BagReader, message: BagMessage) -> list[
         return [frame]
     kind, base = SOURCES[message.type], DEFAULTS.frames.base
     poses = raw_poses(kind, message.raw, base, message.topic, ros1=reader.is_ros1)
-    if message.topic in static_topics(reader.topics):
+    if message.topic in static:
         found.static += poses
     else:
         found.poses.setdefault(message.topic, []).extend(poses)

@@ -3,8 +3,8 @@
 """
 Checkpoints of a map: saved every ``output.checkpoint_s``, and found again after a restart.
 
-A checkpoint is a file as ~/save_map writes it, whole or not at all. The one before is kept, so
-that at any moment, also while one is written, a whole one is there.
+A checkpoint is a file as ~/save_map writes it, whole or not at all. The previous one is kept, so
+that a complete checkpoint exists at any moment, also while one is written.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ _log = logging.getLogger(__name__)
 
 class Checkpoints:
     """
-    Saves the map of a mapper now and then.
+    Saves the map of a mapper every ``output.checkpoint_s`` into ``output.directory``.
 
     Parameters
     ----------
     mapper : Mapper
-        Its settings say how often, and where.
+        The mapper; its settings give the period and the directory.
 
     """
 
@@ -85,7 +85,7 @@ def load_start(mapper: Mapper) -> None:
     Give a mapper the map that ``map.load`` names, if any.
 
     A file is loaded without its window, so its surfels stay. ``latest`` continues with the newest
-    map or checkpoint in ``output.directory`` and its window; a damaged one is passed over with a
+    map or checkpoint in ``output.directory`` and its window; a damaged one is skipped with a
     warning, and without any the map starts empty.
 
     Raises

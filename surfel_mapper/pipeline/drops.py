@@ -37,11 +37,11 @@ REMEDIES = {
     'short (window.max_bytes, layers.tsdf.max_blocks)',
     'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',
-    'no_pose': 'compare frames.fixed and the frame of the clouds with what pose.source gives, '
-    'and their stamps; a sensor that no transform places needs frames.base_to_sensor; '
+    'no_pose': 'compare frames.fixed, the frame of the clouds and their stamps with the data of '
+    'pose.source; a sensor without a transform needs frames.base_to_sensor; '
     'pose.max_wait_s waits longer',
     'no_valid_points': 'compare input.min_range_m and input.max_range_m with the sensor',
-    'odd_stamp': 'is the clock of this sensor right? Two messages in a row that agree set time',
+    'odd_stamp': 'is the clock of this sensor right?',
     'overload': 'larger voxels (map.voxel_size_m) or a shorter range (input.max_range_m) map '
     'faster',
     'queue_full': 'poses come late; pose.max_waiting_scans lets more scans wait',

@@ -53,7 +53,7 @@ _log = logging.getLogger(__name__)
 
 class Mapper:
     """
-    Maps scans at the poses that belong to them.
+    Maps scans at their poses.
 
     Parameters
     ----------
@@ -69,8 +69,8 @@ class Mapper:
     window : SlidingWindow
         The scans that the map holds.
     layers : mapping of str to Layer
-        The layers that are switched on, by name. What a layer offers to users is also an
-        attribute of its name, None if it is switched off: ``mapper.tsdf``, ``mapper.models``.
+        The layers that are switched on, by name. The public object of each is also an attribute of
+        the mapper (``mapper.tsdf``, ``mapper.models``), None if the layer is switched off.
     transforms : TransformBuffer
         The tree of frames.
     counters : Counters
@@ -99,7 +99,7 @@ class Mapper:
         self.window = self._inserter.window
         self.layers = self._inserter.layers.by_name
 
-    if not TYPE_CHECKING:  # names that mypy shall not take for granted
+    if not TYPE_CHECKING:  # hidden from mypy: the names depend on the registry
 
         def __getattr__(self, name: str) -> Any:
             """Return the result of a layer, None if it is switched off: ``mapper.tsdf``."""
@@ -226,7 +226,7 @@ class Mapper:
         """
         Return a context that counts and logs an unexpected error of its block, and goes on.
 
-        For what a node does with messages, requests and timers: ``messages_ignored`` counts
+        A node wraps its work on messages, requests and timers in it. ``messages_ignored`` counts
         such errors, MemoryError too, as ``internal_error``.
         """
         return self._drops.guarded(task)
@@ -255,8 +255,8 @@ class Mapper:
         ----------
         more_follows : bool
             Whether more input comes at once, as from a bag. Then the newest scan may be left for
-            the next call, while another thread (``map.threads``) reduces it. What is mapped is
-            the same to the bit. Call it once without at the end.
+            the next call, while another thread (``map.threads``) reduces it. The map is the same
+            to the bit. Call it once with False at the end.
 
         """
         ahead = self._inserter.reduces_ahead(self.config)
@@ -446,7 +446,7 @@ class Mapper:
         Returns
         -------
         before : list of callable
-            Compile the kernels of the first scan, as the settings let expect it.
+            Compile the kernels that the first scan needs by the settings.
         later : list of callable
             Compile all others: those of evictions, of points of another type, of voxels of 65536
             points. They change nothing of the mapper, so another thread may call them while scans

@@ -113,7 +113,7 @@ class Preparation:
 
     def load_filters(self, path: str) -> None:
         """
-        Load the chain of filters of a file, if it is another than before.
+        Load the chain of filters of a file, if its path has changed.
 
         Raises
         ------
@@ -196,7 +196,7 @@ class Preparation:
             self._drops.warn(
                 'degenerate',
                 f'scan at {scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
-                'cannot be told from its points; there the prediction is kept',
+                'are not determined by its points; the prediction is kept in these',
             )
         T_map_sensor = self._aligner.to_map(pose)
         return replace(prepared, T_map_sensor=T_map_sensor, registration=registration)

@@ -112,7 +112,7 @@ class ScanQueue:
         self.drop_waiting(cause, reason)
 
     def forget_stamps(self) -> None:
-        """Take any stamp next, as after time was set back."""
+        """Forget the newest stamps, as after time was set back."""
         self._newest_ns.clear()
 
     def _next(self, config: PoseConfig) -> PosedScan | None:

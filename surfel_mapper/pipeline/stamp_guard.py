@@ -5,8 +5,8 @@ StampGuard: one message with an odd stamp does not set time back or forward.
 
 A stamp is odd if it is before the newest of its source by more than ``input.reset_after_s``, or
 ahead of all data by more than MAX_AHEAD_S. The message is held until the next one, of any source,
-agrees with its stamp; then both are used, and time is where they say. Otherwise it is dropped.
-The clock is not asked, so that a replay decides as the node did.
+agrees with its stamp; then both are used, and time continues from their stamps. Otherwise it is
+dropped. The clock is not read, so that a replay decides as the node did.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 MAX_AHEAD_S = 60.0
-"""Longest pause of all sources before the first message after it needs a second one, s."""
+"""A message whose stamp is further ahead of all data needs a second one that agrees, s."""
 
 
 class HeldMessage(NamedTuple):

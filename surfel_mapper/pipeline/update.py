@@ -73,7 +73,7 @@ class Update:
     registration: RegistrationResult | None = None
     layers: Mapping[str, Any] = field(default_factory=dict)
 
-    if not TYPE_CHECKING:  # names that mypy shall not take for granted
+    if not TYPE_CHECKING:  # hidden from mypy: the names depend on the registry
 
         def __getattr__(self, name: str) -> Any:
             """Return the result of a layer, None if it had none."""

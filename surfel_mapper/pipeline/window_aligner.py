@@ -50,7 +50,7 @@ class Alignment:
     num_moved : int
         Scans that were moved.
     largest_m, largest_deg : float
-        The most that a scan was moved and turned by.
+        Largest translation and rotation of a scan.
     removed_voxel_index : (K, 3) int32
         Voxels that were surfels and have too few points now.
 
@@ -66,7 +66,7 @@ class Alignment:
     removed_voxel_index: npt.NDArray[np.int32]
 
     def summary(self) -> dict[str, Any]:
-        """Return it as plain numbers and as a sentence."""
+        """Return the result as plain numbers, with a sentence."""
         gaps = [gap for gap in self.solution.residuals.values() if math.isfinite(gap)]
         return {
             'scans': len(self.stamps_ns),

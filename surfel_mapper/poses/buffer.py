@@ -265,7 +265,7 @@ def _check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None
 
 
 def _within(stamps: list[int], start_ns: int, end_ns: int) -> list[int]:
-    """Return those of ascending stamps that are in a span, ends included."""
+    """Return the ascending stamps within a span, ends included."""
     return stamps[bisect_left(stamps, start_ns) : bisect_right(stamps, end_ns)]
 
 

@@ -4,9 +4,9 @@
 The node's end of a bond with Nav2's lifecycle manager, which watches active nodes by heartbeats.
 
 The manager expects a heartbeat on ``bond`` under the name of the node soon after activation
-(``bond_timeout``), and brings the robot to a stop if it ceases. This end only has to send; whether
-the manager lives is of no concern to a mapper. So the message class is all it needs, from the
-package ``bond`` that Nav2 depends on. A module of its own because nothing else knows of it.
+(``bond_timeout``), and brings the robot to a stop if it ceases. This end only sends, and ignores
+the heartbeats of the manager. So it needs only the message class, from the package ``bond`` that
+Nav2 depends on. On its own because no other module sends heartbeats.
 
 Source: bond_core, bond/msg/Status.msg and the state machine of bondcpp.
 """

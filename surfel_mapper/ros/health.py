@@ -114,6 +114,6 @@ def _latency(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
             yield (
                 level,
                 f'{latency_s:.3f} s from stamp to publication (99th percentile), above '
-                f'{limit_s:g} s: the milliseconds by stage say where, queue whether clouds wait',
+                f'{limit_s:g} s: milliseconds names the slow stage, queue the clouds that wait',
             )
             return

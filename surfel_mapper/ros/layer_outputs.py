@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The topics of the layers, whichever layers there are.
+The topics of all layers that are switched on.
 
 A layer describes its topics (layers/layer.py); they are published here, at their rates or when
 the layer has followed a scan. Messages are made in the mapping thread, between two scans, and for
@@ -171,7 +171,7 @@ class LayerTopic:
             self._publish()
 
     def expire(self) -> None:
-        """Take the content as not published yet."""
+        """Mark the content as not published yet."""
         self._published = None
 
     def _is_read(self) -> bool:

@@ -115,19 +115,7 @@ class PointIntegrator:
         try:
             slots = np.full(len(blocks.head), -1, np.int64)
             slots[there] = np.arange(len(there))
-            sums = np.zeros((len(there), blocks.voxels_per_block, 3), np.float32)
-            common = (
-                config.voxel_size_m,
-                self._bits,
-                self._settings(),
-                POWERS[config.weight_mode],
-                blocks.lookup,
-                slots,
-                sums,
-            )
-            kernels.sum_surfaces(surfaces, origin, *common)
-            if config.carve:
-                kernels.sum_free(places, origin, *common)
+            sums = self._sums(surfaces, places, origin, slots, len(there))
             observed = np.empty(len(there), np.int64)
             kernels.fuse_sums(
                 there, sums, stamp_ns, config.max_weight, blocks.field, blocks.stamps, observed
@@ -148,6 +136,26 @@ class PointIntegrator:
             num_voxels=int(observed.sum()),
             num_labels_lost=lost,
         )
+
+    def _sums(
+        self, surfaces: Float64, places: Float64, origin: Float64, slots: Int64, num_blocks: int
+    ) -> Float32:
+        """Return the weighted sums of the rays in each voxel, (num_blocks, N, 3)."""
+        config, blocks = self.blocks.config, self.blocks
+        sums = np.zeros((num_blocks, blocks.voxels_per_block, 3), np.float32)
+        common = (
+            config.voxel_size_m,
+            self._bits,
+            self._settings(),
+            POWERS[config.weight_mode],
+            blocks.lookup,
+            slots,
+            sums,
+        )
+        kernels.sum_surfaces(surfaces, origin, *common)
+        if config.carve:
+            kernels.sum_free(places, origin, *common)
+        return sums
 
     def _touched(
         self, local: Float64, ranges: Float64, surfaces: Float64, T_map_sensor: Float64

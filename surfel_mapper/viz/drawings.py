@@ -3,8 +3,8 @@
 """
 The drawings of layers: meshes for the page of a report, a picture of points, a section of HTML.
 
-Layers describe shapes and tables as arrays (layers/drawings.py); only this folder knows how they
-are drawn. A picture is seen without perspective and painted from far to near.
+Layers describe shapes and tables as arrays (layers/drawings.py); only this folder draws them. A
+picture is seen without perspective and painted from far to near.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ def turning_view(
         choice = f'<label>show <select id="shown">{kinds}</select></label>'
     for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES:
-            note += f' {len(mesh):,} triangles of the {name} are made fewer.'
+            note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
     data = json.dumps(view_data(shown, trajectory, layers)).replace('<', '\\u003c')
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
@@ -69,7 +69,7 @@ def turning_view(
         f'<div id="picture" hidden>{fallback}</div>'
         f'<div class="tools">{choice}'
         f'<label>colour <select id="colouring">{colours}</select></label>'
-        '<label><input type="checkbox" id="hide" checked> hide what faces away</label>'
+        '<label><input type="checkbox" id="hide" checked> hide surfels that face away</label>'
         '<button id="reset">reset</button></div>'
         '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
         f'<span id="most">1</span></div></div><p class="none">{note}</p>'

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
 NEW = 0.25
-"""Share of the map that has to come or leave before the whole map is logged again."""
+"""Share of the map that has to change before the whole map is logged again."""
 
 MAX_POINTS = 20_000
 """Limit of the points logged of a scan; larger scans are subsampled."""

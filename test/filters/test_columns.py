@@ -13,7 +13,8 @@ import pytest
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.base import generator, select, with_columns, with_points
 from surfel_mapper.filters.chain import Chain
-from surfel_mapper.filters.columns import Kind, kind_of, LazyColumns, MergedColumns, PointGroups
+from surfel_mapper.filters.columns import LazyColumns
+from surfel_mapper.filters.merging import Kind, kind_of, MergedColumns, PointGroups
 from surfel_mapper.scan import PointTimes
 from test.filters.examples import random_scan, scan_of
 

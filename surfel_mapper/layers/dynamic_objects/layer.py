@@ -46,7 +46,7 @@ class DynamicObjectsLayer(Layer):
 
     def voxels_to_clear(self, inserted: InsertedScan) -> npt.NDArray[np.int32]:
         """
-        Count the voxels that a scan sees through; return those to be cleared, (E, 3).
+        Count the voxels that a scan sees through; return the voxels to clear, (E, 3).
 
         Raises
         ------

@@ -4,8 +4,8 @@
 The models of a map as a layer: planes, B-spline surfaces and Gaussians that follow the map.
 
 They follow by the stamps of the scans, never by the clock, so that a bag replayed at any speed
-gives the same updates. A change counts once however often it happened in between, so a longer
-period costs less.
+gives the same updates. A voxel that changed several times between two updates is processed once,
+so a longer period costs less.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ModelsLayer(Layer):
         return self.models
 
     def clear(self) -> None:
-        """Forget the models and when they followed the map last."""
+        """Forget the models and the time of their last update."""
         self.models.clear()
         self._last_ns = None
 
@@ -84,7 +84,7 @@ class ModelsLayer(Layer):
         return self.models.update()
 
     def finish(self) -> None:
-        """Update the models to the map as it is, alignments included."""
+        """Update the models to the present map, alignments included."""
         self.models.update()
 
     def warm_up(self) -> None:
@@ -92,7 +92,7 @@ class ModelsLayer(Layer):
         self.models.warm_up()
 
     def summary(self) -> dict[str, Any]:
-        """Return how many models there are, and their size."""
+        """Return the numbers of models and their size."""
         return self.models.summary()
 
     def publications(self) -> Sequence[Publication]:
@@ -172,7 +172,7 @@ class ModelsLayer(Layer):
         return [cloud_bytes(from_columns(columns), stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
 
     def _all_outlines(self, now: Moment) -> Iterable[bytes]:
-        self._published = dict.fromkeys(self._published, 0)  # those removed are told once more
+        self._published = dict.fromkeys(self._published, 0)  # and removed ones, empty
         return self._changed_outlines(now)
 
     def _changed_outlines(self, now: Moment) -> Iterable[bytes]:

@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Moments of a range of points, and the frame of a cluster from its eigenvectors."""
+"""
+Moments of a range of points, and the frame of a cluster from its eigenvectors.
+
+On its own because bisection and patches share it.
+"""
 
 from numba import njit
 import numpy as np

@@ -56,14 +56,14 @@ def plane_distance(points, i, plane):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def sample_distances(points, starts, label, tangent, stride, who, distance):
+def sample_distances(points, starts, label, tangent, stride, patch, distance):
     """
     Sample distances of points from their patches; return how many there are.
 
     label    (V,) int32, patch of each voxel, -1 for none
     tangent  (V, 4) float64, plane of the patch there
     stride   every stride-th point of patches is used
-    who      (P,) int32, distance (P,) float64, out
+    patch    (P,) int32, distance (P,) float64, out
     """
     num = skip = 0
     for v in range(len(label)):
@@ -71,7 +71,7 @@ def sample_distances(points, starts, label, tangent, stride, who, distance):
             continue
         for i in range(starts[v], starts[v + 1]):
             if skip == 0:
-                who[num], distance[num] = label[v], plane_distance(points, i, tangent[v])
+                patch[num], distance[num] = label[v], plane_distance(points, i, tangent[v])
                 num += 1
             skip = (skip + 1) % stride
     return num

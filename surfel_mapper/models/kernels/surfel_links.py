@@ -45,7 +45,7 @@ def set_link(i, j, h, is_joined, links, marks, marked, num):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def mark(row, marks, marked, num):
-    """Append a row to a list unless it is in it; return the length of the list."""
+    """Append a row to a list unless it is there already; return the length of the list."""
     if not marks[row]:
         marks[row] = True
         marked[num] = row

@@ -3,8 +3,8 @@
 """
 Pixels of a depth image to points.
 
-One pass over the image that leaves out what has no depth; as array operations it takes four, over
-all pixels, and as many temporary images.
+One pass over the image that skips pixels without depth; array operations need four passes over all
+pixels and four temporary images. Apart from the kernels of deskewing, which need no images.
 """
 
 from numba import njit
