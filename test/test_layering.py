@@ -13,6 +13,7 @@ import ast
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+import re
 import sys
 
 import pytest
@@ -201,6 +202,28 @@ def test_no_two_classes_share_a_name():
             if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
                 homes.setdefault(node.name, []).append(module)
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
+
+
+SHORT, LONG = 70, 350
+"""Lines of a module outside of which its docstring says why it stands alone, or is one."""
+
+WHY_SHORT = re.compile(r'\balone\b|\bon its own\b|\bapart from\b', re.IGNORECASE)
+
+WHY_LONG = re.compile(r'\bone module\b|module is long|longer than other', re.IGNORECASE)
+
+
+def test_short_and_long_modules_say_why():
+    found = []
+    for module, path in MODULES.items():
+        text = path.read_text(encoding='utf-8')
+        lines, docstring = text.count('\n'), ast.get_docstring(ast.parse(text)) or ''
+        if module.endswith('__init__.py'):
+            continue
+        if lines < SHORT and not WHY_SHORT.search(docstring):
+            found.append(f'{module}: {lines} lines; merge it, or say why it is on its own')
+        if lines > LONG and not WHY_LONG.search(docstring):
+            found.append(f'{module}: {lines} lines; split it, or say why it is one module')
+    assert not found, '\n'.join(found)
 
 
 def test_every_folder_has_a_docstring():

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 import itertools
 import math
+from typing import Any
 
 import numpy as np
 
@@ -167,18 +168,23 @@ UNHELD = 1e-9
 """Least eigenvalue, as a share of the largest, above rounding: a constrained motion."""
 
 
-@register(libpointmatcher='NormalSpaceDataPointsFilter')
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NormalSpace(Filter):
-    """Keep a number of points with normals spread over all directions; needs normals."""
-
-    num_points: int = parameter(
+def num_points_parameter() -> Any:
+    """Declare the number of points that stay, under the name that libpointmatcher uses."""
+    return parameter(
         5000,
         'Number of points that stay.',
         low=1,
         high=UINT32_MAX,
         libpointmatcher='nbSample',
     )
+
+
+@register(libpointmatcher='NormalSpaceDataPointsFilter')
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NormalSpace(Filter):
+    """Keep a number of points with normals spread over all directions; needs normals."""
+
+    num_points: int = num_points_parameter()
     seed: int = parameter(
         1, 'Seed of the random numbers.', low=0, high=UINT32_MAX, libpointmatcher='seed'
     )
@@ -236,13 +242,7 @@ def buckets(normals: Points, step_rad: float) -> Ids:
 class CovarianceSampling(FiniteFilter):
     """Keep a number of points that constrain all six rigid motions; needs normals."""
 
-    num_points: int = parameter(
-        5000,
-        'Number of points that stay.',
-        low=1,
-        high=UINT32_MAX,
-        libpointmatcher='nbSample',
-    )
+    num_points: int = num_points_parameter()
     torque_norm: int = parameter(
         1,
         'Length that scales rotations, 0: 1 m; 1: the mean distance of the points from their '

@@ -277,7 +277,7 @@ class Inserter:
             removed += self._unreported[1]
         try:
             changed = self.map.surfels_changed(version, config.map.min_points)
-        except Exception:
+        except Exception:  # MemoryError; the caller counts it
             self._unreported = version, removed
             raise
         self._unreported = None

@@ -48,7 +48,9 @@ def main(reliability: str, number: str, first_ns: str) -> None:
     publisher = node.create_publisher(PointCloud2, '/points', qos)
     while not publisher.get_subscription_count():
         time.sleep(0.05)
-    time.sleep(1.0)  # until the subscriber knows the publisher too
+    # The subscriber must know the publisher too, or it misses best-effort clouds. DDS does not
+    # tell a publisher when that is; it takes milliseconds, on a busy machine tens of them.
+    time.sleep(1.0)
     stamp_ns = int(first_ns)
     for size in sys.stdin:
         message = cloud(stamp_ns, int(size))

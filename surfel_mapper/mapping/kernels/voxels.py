@@ -14,6 +14,8 @@ sum becomes S + n d, the second moment M + d S^T + S d^T + n d d^T.
 Moments come from files, messages and callers too. Sums beyond the range of a voxel would overflow
 the integers of the map or give negative eigenvalues later, far from the cause; so moments that no
 points can have are found before they are added, in 20 us for 10,000 voxels.
+
+One module of 355 lines: all work on the moments of a scan and the rows of the same voxels.
 """
 
 from numba import njit
