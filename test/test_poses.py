@@ -10,6 +10,7 @@ matrices from the root to each of two frames and solves for what lies between, w
 """
 
 import math
+import sys
 
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -19,6 +20,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from surfel_mapper.errors import PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, pose_matrix
+from surfel_mapper.poses import buffer as buffer_module
 from surfel_mapper.poses import TransformBuffer
 
 S = 1_000_000_000
@@ -294,6 +296,82 @@ def test_the_edge_between_two_known_trees_may_still_come():
 
     buffer.add('odom', 'base', EPOCH, some_pose(3))
     buffer.lookup('map', 'lidar', EPOCH)
+
+
+def lines_of(function):
+    """Return the number of lines of the buffer that a call executes."""
+    lines = 0
+
+    def trace(frame, event, arg):
+        nonlocal lines
+        if frame.f_code.co_filename != buffer_module.__file__:
+            return None
+        lines += event == 'line'
+        return trace
+
+    sys.settrace(trace)
+    try:
+        function()
+    finally:
+        sys.settrace(None)
+    return lines
+
+
+@pytest.mark.parametrize('source', ['base', 'wheel_3', 'unknown'])
+def test_a_lookup_that_fails_costs_the_same_with_ten_thousand_frames(source):
+    costs = []
+    for num_frames in (10, 10_000):
+        buffer = TransformBuffer()
+        for k in range(num_frames // 2):
+            buffer.add_static('base', f'wheel_{k}', moved(1.0))
+            buffer.add(f'tree_{k}', f'leaf_{k}', EPOCH, moved(1.0))
+        costs.append(lines_of(lambda b=buffer: not_yet(b, 'odom', source, EPOCH)))
+        assert lines_of(lambda b=buffer: b.newest_ns) < 5
+    assert costs[0] == costs[1]
+
+
+def test_the_depth_of_the_tree_is_limited_upwards_and_downwards(monkeypatch):
+    monkeypatch.setattr(buffer_module, 'MAX_DEPTH', 4)
+    buffer = TransformBuffer()
+    for parent, child in [('c', 'd'), ('b', 'c'), ('d', 'e'), ('a', 'b')]:
+        buffer.add('x' + parent, 'x' + child, EPOCH, moved(1.0))
+    before = buffer.held()
+    for parent, child in [('xe', 'new'), ('new', 'xa')]:
+        with pytest.raises(PoseError, match='over 4 transforms from a frame to its root'):
+            buffer.add(parent, child, EPOCH, moved(1.0))
+    assert buffer.held() == before
+    buffer.add_static('xd', 'new', moved(1.0))
+    buffer.clear()
+    buffer.add('xe', 'new2', EPOCH, moved(1.0))  # the heights are those of the edges left
+
+
+def test_the_number_of_transforms_is_limited_and_the_longest_edge_pays(monkeypatch):
+    monkeypatch.setattr(buffer_module, 'MAX_TRANSFORMS', 100)
+    buffer = TransformBuffer(history_s=1e6)
+    for k in range(60):
+        buffer.add('odom', 'flood', EPOCH + k, moved(k))
+    for k in range(41):
+        buffer.add('odom', 'base', EPOCH + k, moved(k))
+    held = {child: stamps for child, _, stamps, _ in buffer.held()}
+    assert held['base'] == [EPOCH + k for k in range(41)]
+    assert held['flood'] == [EPOCH + k for k in range(30, 60)]
+    assert (buffer.num_transforms, buffer.num_forgotten) == (71, 30)
+    assert buffer.newest_ns == EPOCH + 59
+
+
+@pytest.mark.parametrize('seed', range(5))
+def test_number_and_newest_of_transforms_are_those_held(seed):
+    rng = np.random.default_rng(seed)
+    buffer = TransformBuffer(history_s=2e-7, reset_after_s=3e-7)
+    for _ in range(300):
+        child = f'f{rng.integers(4)}'
+        buffer.add('odom', child, EPOCH + int(rng.integers(1000)), moved(1.0))
+        stamps = [stamp for _, _, held, _ in buffer.held() for stamp in held]
+        assert buffer.num_transforms == len(stamps)
+        assert buffer.newest_ns == max(stamps)
+        if rng.random() < 0.02:
+            buffer.clear()
+            assert (buffer.num_transforms, buffer.newest_ns) == (0, None)
 
 
 def test_many_frames_are_not_all_named():

@@ -29,6 +29,9 @@ Result = TypeVar('Result')
 CONNECT_S = 20
 """Time in which a scheduler has to answer, s."""
 
+LOOPBACK = '127.0.0.1'
+"""Address of a cluster on this machine."""
+
 LOSSES = 5
 """A task is given up after this many workers died at it."""
 
@@ -171,6 +174,23 @@ def start_forkserver() -> str:
     return 'forkserver'
 
 
+def temporary_security() -> Any:
+    """
+    Return keys for a cluster on this machine, which live in memory and end with it.
+
+    Without them every user of the machine could connect and run code.
+    """
+    from distributed import Security
+
+    try:
+        return Security.temporary()
+    except ImportError as error:
+        raise DependencyError(
+            f'cryptography cannot be loaded ({error}). It encrypts what workers exchange; install '
+            "it with `pip install 'surfel_mapper[cluster]'` or `pip install cryptography`"
+        ) from error
+
+
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Set environment variables in a block, for the processes that are started there."""
@@ -258,7 +278,9 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
                         LocalCluster(
                             n_workers=workers,
                             threads_per_worker=1,
-                            dashboard_address='127.0.0.1:0',
+                            host=LOOPBACK,
+                            security=temporary_security(),
+                            dashboard_address=f'{LOOPBACK}:0',
                         )
                     )
                     client = started.enter_context(Client(cluster))

@@ -20,7 +20,7 @@ from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
-from surfel_mapper.poses import MAX_EDGES, TransformBuffer
+from surfel_mapper.poses import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewed
 
@@ -67,7 +67,8 @@ class ScanPoses:
     def add(
         self, parent: str, child: str, stamp_ns: int, xyz: Any, q_xyzw: Any, *, static: bool
     ) -> None:
-        """Add the pose of one frame in another; a bad one is counted and warned about."""
+        """Add the pose of one frame in another; bad ones and too many are counted and logged."""
+        forgotten = self.transforms.num_forgotten
         try:
             transform = pose_matrix(xyz, q_xyzw)
             if static:
@@ -76,6 +77,9 @@ class ScanPoses:
                 self.transforms.add(parent, child, stamp_ns, transform)
         except (PoseError, ValueError) as error:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
+        if number := self.transforms.num_forgotten - forgotten:
+            reason = f'{number} old transforms dropped: over {MAX_TRANSFORMS} are held'
+            self._drops.message('too_many_transforms', reason, number)
 
     def mount(self, frame_id: str) -> None:
         """Add the configured extrinsics of a sensor when its frame is first seen."""

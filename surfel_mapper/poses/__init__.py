@@ -2,6 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The tree of coordinate frames over time."""
 
-from surfel_mapper.poses.buffer import MAX_EDGES, TransformBuffer
+from surfel_mapper.poses.buffer import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
 
-__all__ = ['MAX_EDGES', 'TransformBuffer']
+__all__ = ['MAX_EDGES', 'MAX_TRANSFORMS', 'TransformBuffer']

@@ -12,12 +12,16 @@ of a sweep.
 
 Callers act on two kinds of failure: after PoseNotYetError later data may answer the lookup, so the
 scan should wait; after any other PoseError none can, so it should be dropped.
+
+Frames and stamps come from messages, so the numbers of edges and transforms and the depth of the
+tree are limited, and a lookup costs the same however many other frames there are.
 """
 
 from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator
+from itertools import islice
 import math
 
 import numpy as np
@@ -29,6 +33,12 @@ from surfel_mapper.poses.pose_track import NS_PER_S, PoseTrack, rigid, seconds
 MAX_EDGES = 10_000
 """Largest number of edges; a robot has some hundred, and new names must not fill the memory."""
 
+MAX_DEPTH = 100
+"""Limit of the edges from a frame up to its root; an arm on a truck has some twenty."""
+
+MAX_TRANSFORMS = 500_000
+"""Limit of the transforms of all dynamic edges, 170 MB; 80 joints at 100 Hz have 480,000 in 60 s."""
+
 MAX_NAMES = 12
 """Number of frames named in a message."""
 
@@ -36,6 +46,8 @@ MAX_NAMES = 12
 class TransformBuffer:
     """
     The transforms between coordinate frames over time.
+
+    Beyond MAX_TRANSFORMS the older half of the edge that has the most is dropped.
 
     Parameters
     ----------
@@ -52,6 +64,10 @@ class TransformBuffer:
     ----------
     max_gap_s : float
         May be changed at any time.
+    num_transforms : int
+        Transforms held of all dynamic edges.
+    num_forgotten : int
+        Transforms dropped so far because there were too many.
 
     Raises
     ------
@@ -72,13 +88,16 @@ class TransformBuffer:
         self._history_ns = round(history_s * NS_PER_S)
         self._reset_after_ns = round(reset_after_s * NS_PER_S)
         self.max_gap_s = max_gap_s
+        self.num_transforms = 0
+        self.num_forgotten = 0
         self._edges: dict[str, PoseTrack] = {}
+        self._heights: dict[str, int] = {}  # of every frame: edges down to its lowest descendant
+        self._newest: PoseTrack | None = None
 
     @property
     def newest_ns(self) -> int | None:
         """Newest stamp of any dynamic edge; None while there is none."""
-        newest = [edge.stamps[-1] for edge in self._edges.values() if not edge.is_static]
-        return max(newest, default=None)
+        return None if self._newest is None else self._newest.stamps[-1]
 
     def newest_of(self, child: str) -> int | None:
         """Return the newest stamp of the edge above a frame; None if it is static or unknown."""
@@ -102,7 +121,8 @@ class TransformBuffer:
         ------
         PoseError
             If a name is empty, the transform is not rigid or not finite, the child has another
-            parent or a static transform already, or the edge would close a loop. The buffer
+            parent or a static transform already, the edge would close a loop, or there would be
+            more than MAX_EDGES edges, or more than MAX_DEPTH from a frame to its root. The buffer
             is unchanged then.
 
         """
@@ -110,18 +130,26 @@ class TransformBuffer:
         if edge is None or edge.is_static or edge.parent != parent:
             edge = self._edge(parent, child, is_static=False)
         transform = rigid(parent, child, T_parent_child)
+        before, is_back = len(edge.stamps), False
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
-            edge.stamps.clear()
-            edge.transforms.clear()
+            edge.forget_oldest(before)
+            is_back = edge is self._newest
         edge.insert(stamp_ns, transform)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
-        self._edges[child] = edge
+        self.num_transforms += len(edge.stamps) - before
+        self._enter(edge)
+        if is_back:
+            self._newest = self._edge_of_newest()
+        elif self._newest is None or edge.stamps[-1] > self._newest.stamps[-1]:
+            self._newest = edge
+        if self.num_transforms > MAX_TRANSFORMS:
+            self._forget_half_of_longest()
 
     def add_static(self, parent: str, child: str, T_parent_child: Transform) -> None:
         """Set the transform of an edge for all time, in the place of an earlier one; see add."""
         edge = self._edge(parent, child, is_static=True)
         edge.transforms = [rigid(parent, child, T_parent_child)]
-        self._edges[child] = edge
+        self._enter(edge)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """
@@ -198,7 +226,36 @@ class TransformBuffer:
 
     def clear(self) -> None:
         """Drop the dynamic edges; static ones stay."""
-        self._edges = {child: edge for child, edge in self._edges.items() if edge.is_static}
+        static = [edge for edge in self._edges.values() if edge.is_static]
+        self._edges, self._heights, self._newest = {}, {}, None
+        self.num_transforms = 0
+        for edge in static:
+            self._enter(edge)
+
+    def _enter(self, edge: PoseTrack) -> None:
+        """Keep an edge; a new one may raise the heights of the frames above it."""
+        if edge.child in self._edges:
+            return
+        self._edges[edge.child] = edge
+        height = self._heights.setdefault(edge.child, 0)
+        for above in self._edges_above(edge.child):
+            height += 1
+            if self._heights.get(above.parent, -1) >= height:
+                return
+            self._heights[above.parent] = height
+
+    def _edge_of_newest(self) -> PoseTrack | None:
+        """Return the dynamic edge with the newest stamp."""
+        dynamic = [edge for edge in self._edges.values() if not edge.is_static]
+        return max(dynamic, key=lambda edge: edge.stamps[-1], default=None)
+
+    def _forget_half_of_longest(self) -> None:
+        """Drop the older half of the edge with the most transforms."""
+        longest = max(self._edges.values(), key=lambda edge: len(edge.stamps))
+        dropped = len(longest.stamps) // 2
+        longest.forget_oldest(dropped)
+        self.num_transforms -= dropped
+        self.num_forgotten += dropped
 
     def _edge(self, parent: str, child: str, *, is_static: bool) -> PoseTrack:
         """Return the edge of a child, or a new one; refuse edges that form no tree."""
@@ -216,6 +273,8 @@ class TransformBuffer:
                 raise PoseError(f'{name}: closes the loop {loop}')
             if len(self._edges) >= MAX_EDGES:
                 raise PoseError(f'{name}: {MAX_EDGES} frames are known, no more are taken')
+            if len(below) + 1 + self._heights.get(child, 0) > MAX_DEPTH:
+                raise PoseError(f'{name}: over {MAX_DEPTH} transforms from a frame to its root')
             return PoseTrack(parent, child, is_static)
         if edge.parent != parent:
             raise PoseError(f'{name}: {child!r} has the parent {edge.parent!r} already')
@@ -233,8 +292,9 @@ class TransformBuffer:
 
     def _why_not_connected(self, target: str, source: str) -> str:
         """Return which of two frames is unknown, or that they are in two trees."""
-        seen = set(self._edges) | {edge.parent for edge in self._edges.values()}
-        names = ', '.join(sorted(seen)[:MAX_NAMES]) + (', ...' if len(seen) > MAX_NAMES else '')
+        seen = self._heights
+        first = sorted(islice(seen, MAX_NAMES))
+        names = ', '.join(first) + (', ...' if len(seen) > MAX_NAMES else '')
         unseen = ' and '.join(frame for frame in (target, source) if frame not in seen)
         if unseen:
             return f'no transform of {unseen} yet; frames seen: {names or "none"}'

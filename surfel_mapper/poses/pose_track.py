@@ -56,8 +56,11 @@ class PoseTrack:
     def forget_before(self, stamp_ns: int) -> None:
         """Drop the transforms older than a stamp."""
         if self.stamps and self.stamps[0] < stamp_ns:
-            row = bisect_left(self.stamps, stamp_ns)
-            del self.stamps[:row], self.transforms[:row]
+            self.forget_oldest(bisect_left(self.stamps, stamp_ns))
+
+    def forget_oldest(self, number: int) -> None:
+        """Drop the oldest transforms."""
+        del self.stamps[:number], self.transforms[:number]
 
     def gap_ns(self, stamp_ns: int) -> int:
         """Return how far apart the transforms around a stamp held are; 0 at a stored stamp."""

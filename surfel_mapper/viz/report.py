@@ -3,17 +3,22 @@
 """
 report.html: one page about a map, with an interactive 3D view, plots and tables.
 
-The file is self-contained, and a content security policy forbids the page to load anything else.
-Names from bags are untrusted: all text is escaped.
+The file is self-contained, and a content security policy forbids the page to load anything else,
+and to run or apply inline scripts and styles but the two of page/, whose hashes it states. So
+styles of single elements, as matplotlib writes them, become rules of the style sheet. Names from
+bags are untrusted: all text is escaped.
 """
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
+import hashlib
 from html import escape
 from importlib.resources import files
 import json
 from pathlib import Path
+import re
 from typing import Any
 
 import numpy as np
@@ -27,7 +32,14 @@ from surfel_mapper.viz.charts import histogram, lines, named_bars, short
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.turning_view import turning_view
 
-POLICY = "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; img-src data:"
+POLICY = (
+    "default-src 'none'; style-src {style}; script-src {script}; img-src data:; base-uri 'none'; "
+    "form-action 'none'"
+)
+"""Content security policy, to be filled with the hashes of the style sheet and the script."""
+
+TAG = re.compile(r'<[a-z][^<>]*>')
+INLINE_STYLE = re.compile(r' style="([^"]*)"')
 
 
 def write_report(
@@ -90,14 +102,39 @@ def page(title: str, body: str) -> str:
     folder = files('surfel_mapper.viz') / 'page'
     style = (folder / 'report.css').read_text(encoding='utf-8')
     script = (folder / 'view.js').read_text(encoding='utf-8')
+    body, rules = without_inline_styles(body)
+    style += rules
+    policy = POLICY.format(style=source_hash(style), script=source_hash(script))
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         f'<link rel="icon" href="data:,"><title>{escape(title)}</title>'
         f'<style>{style}</style></head>\n<body>{body}'
         f'<footer>made by surfel_mapper</footer>\n<script>{script}</script></body></html>\n'
     )
+
+
+def without_inline_styles(body: str) -> tuple[str, str]:
+    """
+    Return a page whose elements have no style attributes, and their rules as a style sheet.
+
+    Only tags are searched: text may hold quotes, but no angle brackets, since it is escaped.
+    """
+    numbers: dict[str, int] = {}
+
+    def numbered(style: re.Match[str]) -> str:
+        return f' data-style="{numbers.setdefault(style[1], len(numbers))}"'
+
+    body = TAG.sub(lambda tag: INLINE_STYLE.sub(numbered, tag[0]), body)
+    rules = (f'[data-style="{number}"] {{ {style} }}\n' for style, number in numbers.items())
+    return body, ''.join(rules)
+
+
+def source_hash(content: str) -> str:
+    """Return the hash of a style sheet or script for a content security policy."""
+    digest = hashlib.sha256(content.encode()).digest()
+    return f"'sha256-{base64.b64encode(digest).decode()}'"
 
 
 def about(summary: Mapping[str, Any]) -> str:

@@ -35,6 +35,12 @@ MAX_POINTS = 20_000
 
 POINT_RADIUS_M = 0.02
 
+PORT = 9876
+"""Port of the window, that of rerun; one that is open there already is used."""
+
+LOOPBACK = '127.0.0.1'
+"""Address on which the window listens; rerun's own default is every interface."""
+
 RED, ORANGE = (219, 41, 33), (240, 150, 40)
 
 
@@ -65,7 +71,10 @@ class Viewer:
         self._logged_voxels = self._removed = 0
         self._stream: Any = self._rerun.RecordingStream('surfel_mapper')
         if path is None:
-            self._stream.spawn()
+            import rerun_bindings  # spawn of rerun itself takes no address
+
+            rerun_bindings.spawn(port=PORT, extra_args=['--bind', LOOPBACK])
+            self._stream.connect_grpc(f'rerun+http://{LOOPBACK}:{PORT}/proxy')
         else:
             check_writable(Path(path))
             self._stream.save(str(path))

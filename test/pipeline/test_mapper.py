@@ -18,6 +18,7 @@ from surfel_mapper.errors import ConfigError
 from surfel_mapper.geometry import compose, interpolate, pose_matrix
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.poses import buffer as buffer_module
 from test.pipeline.made_scans import (
     add_pose,
     assert_counts_add_up,
@@ -124,6 +125,14 @@ def test_a_bad_pose_is_counted_and_changes_nothing(xyz, q_xyzw, parent, child):
     insert(mapper, scan)
     assert dict(mapper.counters.messages_ignored) == {'bad_pose': 1}
     assert mapper.map.digest() == digest_of((scan, pose_matrix((2.0, 0, 0), LEVEL)))
+
+
+def test_transforms_that_are_too_many_are_counted(monkeypatch):
+    monkeypatch.setattr(buffer_module, 'MAX_TRANSFORMS', 10)
+    mapper = mapper_with()
+    for k in range(11):
+        add_pose(mapper, 1.0 + 0.1 * k, 1.0)
+    assert dict(mapper.counters.messages_ignored) == {'too_many_transforms': 5}
 
 
 # While it runs

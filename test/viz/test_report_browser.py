@@ -32,6 +32,11 @@ pytestmark = [
 SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """WebGL without a graphics card."""
 
+HIDE = """() => {
+  for (const part of document.querySelectorAll('.tools, .scale')) part.style.visibility = 'hidden';
+}"""
+"""As a script's property: the policy of the page blocks further style sheets."""
+
 WAIT_S = 180.0
 """At most, for what takes a second on an idle machine."""
 
@@ -81,7 +86,7 @@ def settle(page):
 
 def pixels(page):
     """Return the picture on the canvas, without what lies over it."""
-    page.add_style_tag(content='.tools, .scale { visibility: hidden; }')
+    page.evaluate(HIDE)
     shot = Image.open(io.BytesIO(page.locator('#surfels').screenshot()))
     return np.asarray(shot.convert('RGB')) / np.float32(255.0)
 
@@ -183,4 +188,51 @@ def test_without_webgl_the_page_says_so(browser, tmp_path):
     assert page.get_by_text('This browser has no WebGL 2.').is_visible()
     assert not page.locator('#surfels').is_visible()
     assert errors == []
+    page.close()
+
+
+INJECTED = (
+    '<script>document.title = "injected"</script>',
+    '<img src="data:," onerror="document.title = \'injected\'">',
+    '<p id="injected" style="color: rgb(1 2 3)">injected</p>',
+    '<style>h1 { color: rgb(1 2 3) }</style>',
+    '<base href="https://example.invalid/">',
+    '<img src="https://example.invalid/a.png">',
+)
+
+
+@pytest.mark.parametrize('injected', INJECTED)
+def test_the_policy_blocks_what_is_injected_into_the_page(browser, tmp_path, injected):
+    report(tmp_path, plane(30))
+    path = tmp_path / 'report.html'
+    text = path.read_text(encoding='utf-8')
+    path.write_text(text.replace('<h1>', f'{injected}<h1>', 1), encoding='utf-8')
+    complaints, page = [], new_page(browser)
+    page.on('console', lambda message: complaints.append(message.text))
+    page.goto(path.as_uri())
+    picture_when(page, is_drawn)
+
+    assert page.title() != 'injected'
+    colours = [
+        page.locator(part).first.evaluate('part => getComputedStyle(part).color')
+        for part in ('#injected', 'h1')
+        if page.locator(part).count()
+    ]
+    assert 'rgb(1, 2, 3)' not in colours
+    assert any('Content Security Policy' in complaint for complaint in complaints), complaints
+    assert page.evaluate('document.baseURI').startswith('file:')
+    page.close()
+
+
+def test_plots_and_swatches_keep_their_styles(browser, tmp_path):
+    report(tmp_path, plane(30), sections=['<p id="swatch" style="color: rgb(1 2 3)">a</p>'])
+    page = new_page(browser)
+    page.goto((tmp_path / 'report.html').as_uri())
+    assert page.locator('[style]').count() == page.locator('.ramp, .tools').count() - 1  # script's
+    colour = page.locator('#swatch').evaluate('part => getComputedStyle(part).color')
+    assert colour == 'rgb(1, 2, 3)'
+    bars = page.locator('svg path[data-style]').evaluate_all(
+        'parts => parts.map((part) => getComputedStyle(part).fill)'
+    )
+    assert 'rgb(59, 111, 140)' in bars  # --bar
     page.close()

@@ -3,6 +3,11 @@
 """Recordings for rerun hold all entities and pass the verification of rerun."""
 
 from importlib.util import find_spec
+import os
+from pathlib import Path
+import shutil
+import signal
+import socket
 import subprocess
 import sys
 
@@ -12,6 +17,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.viz import viewer as viewer_module
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
@@ -62,3 +68,41 @@ def test_the_mesh_of_a_tsdf_is_recorded(tmp_path):
         for update in insert(mapper, 1):
             viewer.add(update)
     assert '/map/mesh' in rerun('print', tmp_path / 'a.rrd').stdout
+
+
+WINDOW = """#!/bin/sh
+echo $$ > '{pid}'
+exec '{rerun}' --serve-grpc "$@"
+"""
+"""A rerun without a window: this machine may have no display."""
+
+
+@pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='sockets are not shown')
+def test_the_window_listens_on_loopback_only(tmp_path, monkeypatch):
+    with socket.socket() as probe:
+        probe.bind(('127.0.0.1', 0))
+        port = probe.getsockname()[1]
+    installed = Path(sys.executable).with_name('rerun')
+    window, pid = tmp_path / 'rerun', tmp_path / 'pid'
+    window.write_text(WINDOW.format(pid=pid, rerun=shutil.which(installed) or shutil.which('rerun')))
+    window.chmod(0o755)
+    monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
+    monkeypatch.setattr(viewer_module, 'PORT', port)
+
+    with Viewer(Mapper()):
+        listening = addresses(port)
+    os.kill(int(pid.read_text()), signal.SIGTERM)
+
+    assert listening == {'127.0.0.1'}
+
+
+def addresses(port):
+    """Return the addresses at which a port is listened on, for IPv4 and IPv6."""
+    found = set()
+    for name in ('tcp', 'tcp6'):
+        for line in Path('/proc/net', name).read_text().splitlines()[1:]:
+            _, local, _, state, *_ = line.split()
+            address, _, hexadecimal = local.partition(':')
+            if state == '0A' and int(hexadecimal, 16) == port:
+                found.add(socket.inet_ntoa(bytes.fromhex(address)[::-1]) if name == 'tcp' else '::')
+    return found
