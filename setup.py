@@ -50,6 +50,7 @@ FORMATS = [
 CLUSTER = [
     'dask>=2024.4',  # bags on many processes and machines
     'distributed>=2024.4',  # likewise: its scheduler and workers
+    'cryptography>=42.0.4',  # TLS between them; earlier ones have CVE-2024-26130
     'pyarrow>=14.0.1',  # the tiles of a map as Parquet
 ]
 

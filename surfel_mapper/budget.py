@@ -14,7 +14,8 @@ processor time of the thread, so that a busy machine refuses nothing.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import stat
@@ -62,6 +63,8 @@ class Budget:
         The limits.
     used_bytes : int
         Memory requested and not yet returned, bytes.
+    used_s : float
+        Processor time spent in ``clock``, s.
 
     """
 
@@ -75,11 +78,12 @@ class Budget:
         floor: int = FLOOR_BYTES,
     ) -> None:
         self.name = name
-        self.max_bytes = stated_limit() or min(max(floor, ratio * size), upper_bound())
+        self.max_bytes = limit_for(size, ratio, floor)
         self.max_seconds = max(FLOOR_S, SECONDS_PER_BYTE * size)
         self.used_bytes = 0
+        self.used_s = 0.0
         self._error = error
-        self._start_s = time.thread_time()
+        self._start_s: float | None = None
 
     def take(self, num_bytes: int, purpose: str) -> None:
         """
@@ -104,14 +108,32 @@ class Budget:
         """Return memory that was freed."""
         self.used_bytes -= num_bytes
 
+    @contextmanager
+    def clock(self) -> Iterator[None]:
+        """Count the processor time of a with-block; callers that consume the results pay not."""
+        if self._start_s is not None:
+            yield  # in an outer block
+            return
+        self._start_s = time.thread_time()
+        try:
+            yield
+        finally:
+            self.used_s += time.thread_time() - self._start_s
+            self._start_s = None
+
     def check_time(self) -> None:
         """Raise the error of the reader if reading has taken too much processor time."""
-        seconds = time.thread_time() - self._start_s
-        if seconds > self.max_seconds:
+        running_s = 0.0 if self._start_s is None else time.thread_time() - self._start_s
+        if self.used_s + running_s > self.max_seconds:
             raise self._error(
-                f'{self.name}: reading took {seconds:.1f} s of processor time, more than the '
-                f'limit of {self.max_seconds:.1f} s for an input of this size; is it damaged?'
+                f'{self.name}: reading took over {self.max_seconds:.1f} s of processor time, the '
+                'limit for an input of this size; is it damaged?'
             )
+
+
+def limit_for(size: int, ratio: int = BYTES_PER_BYTE, floor: int = FLOOR_BYTES) -> int:
+    """Return the limit of memory for an input of a size, bytes."""
+    return stated_limit() or min(max(floor, ratio * size), upper_bound())
 
 
 def stated_limit() -> int:

@@ -97,6 +97,7 @@ MENDED = {
     'pyarrow': '14.0.1',  # CVE-2023-47248: a Parquet file ran code that it contained
     'dask': '2021.10',  # CVE-2021-42343
     'distributed': '2021.10',  # CVE-2021-42343
+    'cryptography': '42.0.4',  # CVE-2024-26130
 }
 """
 The first version without a known vulnerability that concerns this package.

@@ -3,22 +3,19 @@
 """
 The only module that imports rosbags, and the only one that uses its internals.
 
-rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public readers,
-writer and type store we rely on internals that setup.py therefore bounds to one minor version:
-the tables of chunks of its readers (`rosbag1.Reader.chunks`, the `chunks` of an mcap storage) and
-the named tuples `Connection` and `Qos`, which the salvage of damaged files fills as rosbags does.
+rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public reader of
+sqlite3, writer and type store we rely on internals that setup.py therefore bounds to one minor
+version: the named tuples `Connection` and `Qos`, which the other readers fill as rosbags does.
 """
 
 from __future__ import annotations
 
-import bz2
-from collections import Counter
 from collections.abc import Collection, Iterator
+from functools import cache
 from pathlib import Path
 import re
 from typing import Any, Literal, Protocol, TYPE_CHECKING
 
-from surfel_mapper.bags.compression import bunzip2, check_zstd
 from surfel_mapper.bags.topics import SAME_AS
 from surfel_mapper.errors import DependencyError
 
@@ -31,15 +28,12 @@ if TYPE_CHECKING:
 TRANSIENT_LOCAL = re.compile(r'durability:\s*(1|transient_local)\b', re.IGNORECASE)
 """Durability of a latched topic in the YAML of a bag: a number or a name, by its version."""
 
-CHUNK_RECORD_BYTES = 9 + 40
-"""Bytes of an mcap chunk before its packed records, without the name of the compression."""
-
 BAG_VERSION: Literal[9] = 9
 """Version of metadata.yaml that rosbag2 of Jazzy writes."""
 
 
 class Storage(Protocol):
-    """Interface that rosbags' readers and the salvaged files share."""
+    """Interface that rosbags' reader and our own share."""
 
     @property
     def connections(self) -> list[Connection]:
@@ -62,86 +56,43 @@ class Storage(Protocol):
         connections: Collection[Connection],
         start: int | None = None,
         stop: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes]]:
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
         """Yield connection, record time and bytes."""
 
     def close(self) -> None:
         """Close the file."""
 
 
-def open_indexed(path: Path, *, ros1: bool) -> Storage:
+def open_rosbag2(path: Path) -> Storage:
     """
-    Return rosbags' reader of a file, opened.
+    Return rosbags' reader of a sqlite3 file, opened.
 
     Raises
     ------
     DependencyError
         If rosbags is not installed.
     Exception
-        Of nearly any type, if the file is damaged: rosbags lets KeyError, struct.error,
-        AssertionError and others through.
+        Of nearly any type, if the file is damaged: rosbags lets KeyError, AssertionError and
+        others through.
 
     """
+    rosbag2: Any = import_rosbags().rosbag2
+    reader = rosbag2.Reader(path)
+    reader.open()
+    opened: Storage = reader
+    return opened
+
+
+def import_rosbags() -> Any:
+    """Return rosbags, with its readers of ROS 2."""
     try:
-        from rosbags import rosbag1, rosbag2
+        import rosbags.rosbag2
     except ImportError as error:
         raise DependencyError(
             f'rosbags cannot be loaded ({error}). It reads the bags; install it with '
             '`pip install rosbags`'
         ) from error
-    reader: Any = rosbag1.Reader(path) if ros1 else rosbag2.Reader(path)
-    reader.open()
-    try:
-        bound_chunks(reader, path, ros1=ros1)
-    except BaseException:
-        reader.close()
-        raise
-    opened: Storage = reader
-    return opened
-
-
-def bound_chunks(reader: Any, path: Path, *, ros1: bool) -> None:
-    """
-    Refuse packed chunks that unpack to more than is plausible; rosbags itself has no limit.
-
-    lz4 packs 255 times at most and needs no check.
-    """
-    if ros1:
-        for place, chunk in reader.chunks.items():
-            if chunk.decompressor is bz2.decompress:
-                reader.chunks[place] = chunk._replace(decompressor=bunzip2)
-        return
-    chunks = [c for c in getattr(reader.storage, 'chunks', ()) if c.compression == 'zstd']
-    with open(path, 'rb') as file:
-
-        def read(start: int, size: int) -> bytes:
-            file.seek(start)
-            return file.read(size)
-
-        for chunk in chunks:
-            head = CHUNK_RECORD_BYTES + len(chunk.compression)
-            check_zstd(read, chunk.chunk_start_offset + head, chunk.compressed_size)
-
-
-def is_fully_indexed(storage: Any) -> bool:
-    """
-    Return whether the index of an mcap or ROS 1 file accounts for every message it states.
-
-    rosbags skips messages without an index entry or connection record: one changed byte in a
-    connection record of a ROS 1 bag lost its topic.
-    """
-    if hasattr(storage, 'chunk_infos'):
-        counts: Counter[int] = Counter()
-        for info in storage.chunk_infos:
-            counts.update(info.connection_counts)
-        return counts == Counter({c.id: c.msgcount for c in storage.connections if c.msgcount})
-    chunks = getattr(getattr(storage, 'storage', None), 'chunks', None)
-    if chunks is None:
-        return True
-    indexed: Counter[int] = Counter()
-    for chunk in chunks:
-        indexed.update(chunk.channel_count)
-    return all(indexed[c.id] >= c.msgcount for c in storage.connections)
+    return rosbags
 
 
 def ros2_connection(
@@ -205,6 +156,11 @@ def ros1_connection(
     return Connection(key, topic, f'{package}/msg/{name}', stated, md5sum, 0, ext, owner)
 
 
+def is_same(a: Connection, b: Connection) -> bool:
+    """Return whether two connections have the same topic, type and serialisation."""
+    return (a.topic, a.msgtype, is_cdr(a)) == (b.topic, b.msgtype, is_cdr(b))
+
+
 def latched_profile() -> Qos:
     """Return the quality of service of a publisher that keeps its last message for latecomers."""
     from rosbags.interfaces import (
@@ -253,8 +209,9 @@ def type_name(connection: Connection) -> str:
     return f'{name} as {connection.ext.serialization_format}'  # type: ignore[union-attr]
 
 
+@cache
 def jazzy_types() -> Typestore:
-    """Return rosbags' message types of ROS 2 Jazzy."""
+    """Return rosbags' message types of ROS 2 Jazzy; made once, since that takes 0.2 s."""
     from rosbags.typesys import get_typestore, Stores
 
     return get_typestore(Stores.ROS2_JAZZY)

@@ -11,61 +11,63 @@ of zstd can be made to unpack to gigabytes. The modules for zstd and lz4 come wi
 from __future__ import annotations
 
 import bz2
-from collections.abc import Callable
 from pathlib import Path
 import sys
 from typing import Any
 
+from surfel_mapper.budget import limit_for, stated_limit
 from surfel_mapper.errors import BagError, DependencyError
 
 PIECE_BYTES = 1 << 16
 
-MAX_UNPACKED_BYTES = 1 << 30
-"""Limit of an unpacked chunk or message; real ones have some megabytes."""
+MAX_UNPACKED_BYTES = 1 << 29
+"""Limit of an unpacked chunk or message of any file; real ones have some megabytes."""
 
 FLOOR_BYTES = 1 << 26
 """Always allow 64 MiB, whatever the ratio: a chunk of black images packs very small."""
 
-MAX_RATIO = 100
-"""Limit of the compression ratio above FLOOR_BYTES."""
-
-ZSTD_HEAD_BYTES = 18
-ZSTD_BLOCK_BYTES = 1 << 17
+MAX_FILE_RATIO = 100
+"""Limit of the compression ratio of a file that is unpacked to the disk, above FLOOR_BYTES."""
 
 ZSTD_MAGIC = b'\x28\xb5\x2f\xfd'
 """How a zstd frame begins; no CDR message does."""
 
 
-def unpacked(packed: bytes, compression: str, size: int) -> bytes:
+def unpacked(packed: bytes, compression: str, size: int) -> bytes | bytearray:
     """
     Return packed bytes unpacked: ``size`` bytes, or fewer if the input ends or is damaged before.
+
+    The caller has asked its budget for ``size`` bytes. Pages are taken as they are filled, and no
+    second copy is made.
 
     Raises
     ------
     ValueError
-        If the compression is unknown, or ``size`` is not plausible for the packed size.
+        If the compression is unknown.
 
     """
-    limit = max_unpacked_bytes(len(packed))
-    if size > limit:
-        raise ValueError(f'{size} bytes of a chunk, expected at most {limit}')
     if not compression or compression == 'none':
         return packed[:size]
-    machine = decompressor(compression)
-    content = bytearray()
+    machine, content, filled = decompressor(compression), bytearray(size), 0
     for start in range(0, len(packed), PIECE_BYTES):
         piece = packed[start : start + PIECE_BYTES]
-        while True:
+        while filled < size:
+            if machine.eof:  # the next frame
+                piece, machine = machine.unused_data, decompressor(compression)
+                if not piece:
+                    break
             try:
-                content += machine.decompress(piece, min(size - len(content), PIECE_BYTES * 16))
+                part = machine.decompress(piece, min(size - filled, PIECE_BYTES * 16))
             except Exception:  # each library has errors of its own
-                return bytes(content)  # the part before the damage; callers compare the size
-            if machine.eof or len(content) >= size:
-                return bytes(content)
-            if machine.needs_input:
+                del content[filled:]  # the part before the damage; callers compare the size
+                return content
+            content[filled : filled + len(part)] = part
+            filled += len(part)
+            if machine.needs_input and not machine.eof:
                 break
             piece = b''
-    return bytes(content)
+    del content[filled:]
+    return content
 
 
 def unpacked_message(packed: bytes | memoryview) -> bytes:
@@ -108,63 +110,12 @@ def unpack_file(path: Path, target: Path) -> bool:
 
 def max_unpacked_bytes(packed_size: int) -> int:
     """Return the limit of an unpacked chunk or message, in memory."""
-    return min(max(FLOOR_BYTES, MAX_RATIO * packed_size), MAX_UNPACKED_BYTES)
+    return stated_limit() or min(limit_for(packed_size, floor=FLOOR_BYTES), MAX_UNPACKED_BYTES)
 
 
 def max_unpacked_file_bytes(packed_size: int) -> int:
     """Return the limit of an unpacked file, on the disk."""
-    return max(FLOOR_BYTES, MAX_RATIO * packed_size)
-
-
-def bunzip2(packed: bytes) -> bytes:
-    """Return bz2 unpacked, or raise ValueError if it is truncated or too large."""
-    machine, limit = bz2.BZ2Decompressor(), max_unpacked_bytes(len(packed))
-    content = machine.decompress(packed, limit)
-    if not machine.eof:
-        raise ValueError(f'chunk truncated, or larger than {limit} bytes')
-    return content
-
-
-def check_zstd(read: Callable[[int, int], bytes], start: int, size: int) -> None:
-    """
-    Refuse a zstd chunk that may unpack to more than its packed size makes plausible.
-
-    A frame consists of blocks of at most 128 KiB, and their headers give an upper bound of the
-    size without unpacking anything.
-
-    Parameters
-    ----------
-    read : callable
-        Called with offset and length, returns bytes of the file.
-    start, size : int
-        Offset and length of the chunk.
-
-    Raises
-    ------
-    ValueError
-        If it may unpack to more than ``max_unpacked_bytes``.
-
-    """
-    limit, total, end = max_unpacked_bytes(size), 0, start + size
-    at = start
-    while at < end:
-        head = read(at, ZSTD_HEAD_BYTES)
-        if head[:4] != ZSTD_MAGIC:
-            return  # rosbags refuses or skips the rest
-        flags = head[4]
-        is_single, has_checksum = flags >> 5 & 1, flags >> 2 & 1
-        at += 5 + (not is_single) + (0, 1, 2, 4)[flags & 3] + (is_single, 2, 4, 8)[flags >> 6]
-        is_last = False
-        while not is_last:
-            block = int.from_bytes(read(at, 3), 'little')
-            is_last, kind, length = bool(block & 1), block >> 1 & 3, block >> 3
-            total += length if kind < 2 else ZSTD_BLOCK_BYTES
-            at += 3 + (1 if kind == 1 else length)
-            if total > limit:
-                raise ValueError(f'chunk of {size} bytes that may unpack to over {limit}')
-            if at >= end:
-                return
-        at += 4 * has_checksum
+    return max(FLOOR_BYTES, MAX_FILE_RATIO * packed_size)
 
 
 def decompressor(compression: str) -> Any:

@@ -1,55 +1,136 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Salvage of mcap files without a complete index.
+Reading of mcap files, with and without a complete index.
 
 A file is a magic, records, and the magic again; a record is an opcode, the length of its content
 (uint64) and the content. Messages lie among the records or in chunks, which are records of
-packed records. Of a truncated chunk the messages before the cut are read too.
+packed records. The summary before the last magic repeats schemas and channels and has an entry for
+each chunk. It is used if it accounts for all messages that its statistics state; else the records
+are read from the beginning. Of a truncated chunk the messages before the cut are read too.
 
 Source: the specification of the format, mcap.dev/spec.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 import struct
 from zlib import crc32
 
-from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.bags.salvage import Chunk, FoundMessage, SalvagedChunks
+from surfel_mapper.bags._rosbags import is_same, ros2_connection
+from surfel_mapper.bags.bag_file import FoundMessage
+from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 
-FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, DATA_END = 2, 3, 4, 5, 6, 15
+FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
+STATISTICS, DATA_END = 11, 15
 
 RECORD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
+CHUNK_INDEX_HEAD = struct.Struct('<QQQQ')
+FOOTER_CONTENT = struct.Struct('<QQI')
+
+INDEX_RECORD_BYTES = 15
+"""Bytes of a message index record without its entries, of 16 bytes each."""
 
 
-class SalvagedMcap(SalvagedChunks):
-    """The messages of an mcap file, found without its index."""
+class McapFile(ChunkedFile):
+    """The messages of an mcap file."""
 
     MAGIC = b'\x89MCAP0\r\n'
 
-    def _scan(self) -> Iterator[FoundMessage]:
-        """Yield the messages up to the end of the data, or to the first damaged record."""
+    def _survey(self) -> None:
+        """Find the chunks through the summary, or else record by record."""
         self._schemas: dict[int, tuple[str, str, str]] = {}
+        try:
+            if self._read_summary():
+                return
+        except DAMAGE:
+            pass
+        for found in (self._schemas, self._by_id, self._counts, self._chunks, self.skipped_at):
+            found.clear()
+        self.start_time, self.end_time, self.skip_reason = 2**63 - 1, 0, ''
+        self._read_records()
+
+    def _read_summary(self) -> bool:
+        """Return whether the summary accounts for all messages; keep its chunks."""
+        footer_at = self.size - len(self.MAGIC) - RECORD.size - FOOTER_CONTENT.size
+        footer = self._at(max(footer_at, 0), self.size)
+        kind, size = RECORD.unpack_from(footer)
+        start, _, checksum = FOOTER_CONTENT.unpack_from(footer, RECORD.size)
+        is_footer = (kind, size) == (FOOTER, FOOTER_CONTENT.size)
+        if not is_footer or not self._ends() or not len(self.MAGIC) < start < footer_at:
+            return False
+        summary = self._at(start, footer_at - start)
+        if checksum and crc32(footer[: RECORD.size + 16], crc32(summary)) != checksum:
+            return False
+        stated = None
+        for kind, at, length in records_in(summary):
+            content = summary[at : at + length]
+            if kind == CHUNK_INDEX:
+                self._note_chunk_index(content, start)
+            elif kind == STATISTICS:
+                stated = channel_counts(content)
+            else:
+                self._note(kind, content)
+        self._check_chunks()
+        if stated is None or stated != +self._counts:
+            return False
+        self._check_connections()
+        return not self.skipped_at
+
+    def _note_chunk_index(self, content: bytes, summary_at: int) -> None:
+        """Keep the chunk that an index record describes."""
+        start_ns, end_ns, start, size = CHUNK_INDEX_HEAD.unpack_from(content)
+        (length,) = struct.unpack_from('<I', content, CHUNK_INDEX_HEAD.size)
+        at = CHUNK_INDEX_HEAD.size + 4
+        offsets = sorted(
+            (offset, key) for key, offset in struct.iter_unpack('<HQ', content[at : at + length])
+        )
+        (index_size,) = struct.unpack_from('<Q', content, at + length)
+        ends = [offset for offset, _ in offsets[1:]] + [start + size + index_size]
+        counts = {
+            key: (end - offset - INDEX_RECORD_BYTES) // 16
+            for (offset, key), end in zip(offsets, ends, strict=True)
+        }
+        if not 0 < start <= start + size <= summary_at or any(n < 0 for n in counts.values()):
+            raise ValueError('index of a chunk beyond the data')
+        if start_ns > end_ns or end_ns >= 2**63:
+            raise ValueError('index of a chunk of no span')
+        chunk = Chunk(start, size, True, start_ns, end_ns, {k: n for k, n in counts.items() if n})
+        self._chunks.append(chunk)
+        if chunk.counts:
+            self._note_chunk(chunk)
+
+    def _check_chunks(self) -> None:
+        """Raise ValueError if two chunks of the index share bytes of the file."""
+        end = 0
+        for chunk in sorted(self._chunks, key=lambda chunk: chunk.start):
+            if chunk.start < end:
+                raise ValueError('two chunks of the index overlap')
+            end = chunk.start + chunk.size
+
+    def _read_records(self) -> None:
+        """Read the records up to the end of the data, or to the first damaged one."""
         at = len(self.MAGIC)
         while True:
+            self._budget.check_time()
             head = self._at(at, RECORD.size)
             kind, size = RECORD.unpack(head.ljust(RECORD.size, b'\0'))
-            start, end = at + RECORD.size, at + RECORD.size + size
+            end = at + RECORD.size + size
             is_whole = kind > 0 and end <= self.size
             if is_whole and kind in (DATA_END, FOOTER):
                 self.cut_at = None if self._ends() else self.size
                 return
-            try:
-                if kind == CHUNK:
-                    yield from self._in_chunk(start, min(end, self.size) - start, is_whole)
-                elif is_whole:
-                    yield from self._note(kind, -1, start, size)
-            except (struct.error, ValueError, KeyError):
-                is_whole = False
+            if kind == CHUNK:
+                self._survey_chunk(Chunk(at, min(end, self.size) - at, is_whole))
+            elif is_whole:
+                try:
+                    self._note_record(kind, at + RECORD.size, size)
+                except DAMAGE:
+                    is_whole = False
             if not is_whole:
                 self.cut_at = at
                 return
@@ -59,52 +140,61 @@ class SalvagedMcap(SalvagedChunks):
         """Return whether the file ends with the magic."""
         return self._at(self.size - len(self.MAGIC), len(self.MAGIC)) == self.MAGIC
 
-    def _in_chunk(self, start: int, size: int, is_whole: bool) -> Iterator[FoundMessage]:
-        """Yield the messages in a chunk of which ``size`` bytes are in the file."""
-        head = self._at(start, min(size, 64))
-        _, _, unpacked_size, checksum = CHUNK_HEAD.unpack_from(head)
-        compression, after = text(head, CHUNK_HEAD.size)
-        (packed_size,) = struct.unpack_from('<Q', head, after)
-        if is_whole and after + 8 + packed_size > size:
-            raise ValueError('chunk longer than its record')
-        left = min(packed_size, size - after - 8)
-        chunk = self._add_chunk(Chunk(start + after + 8, left, compression, unpacked_size))
-        records = self._unpacked(chunk)
-        if is_whole and (
-            len(records) != unpacked_size or (checksum and crc32(records) != checksum)
-        ):
-            self.skipped_at.append(start)
-            return
-        at = 0
-        while at + RECORD.size <= len(records):
-            kind, length = RECORD.unpack_from(records, at)
-            at += RECORD.size
-            if at + length > len(records):
-                return  # cut off in this record
-            yield from self._note(kind, chunk, at, length)
-            at += length
+    def _note_record(self, kind: int, start: int, size: int) -> None:
+        """Keep the message, schema or channel in a record outside of chunks."""
+        if kind == MESSAGE:
+            head = self._at(start, MESSAGE_HEAD.size)
+            self._note_loose(self._found(head, 0, start, size, LOOSE))
+        elif kind in (SCHEMA, CHANNEL):
+            self._note(kind, self._at(start, size))
 
-    def _note(self, kind: int, chunk: int, start: int, size: int) -> Iterator[FoundMessage]:
-        """Yield the message in a record, or keep its schema or channel."""
-        if kind not in (SCHEMA, CHANNEL, MESSAGE):
-            return
-        wanted = min(size, MESSAGE_HEAD.size) if kind == MESSAGE else size
-        content = self._read((chunk, start, wanted))
+    def _head(self, chunk: Chunk) -> Packed:
+        """Return the head of a chunk."""
+        head = self._at(chunk.start, min(chunk.size, 128))
+        kind, size = RECORD.unpack_from(head)
+        if kind != CHUNK or (chunk.is_whole and size != chunk.size - RECORD.size):
+            raise ValueError('no chunk where the index has one')
+        at = RECORD.size
+        _, _, unpacked_size, checksum = CHUNK_HEAD.unpack_from(head, at)
+        compression, at = text(head, at + CHUNK_HEAD.size)
+        (packed_size,) = struct.unpack_from('<Q', head, at)
+        start = at + 8
+        if chunk.is_whole and start + packed_size != chunk.size:
+            raise ValueError('chunk of another size than its record')
+        left = min(packed_size, chunk.size - start)
+        return Packed(chunk.start + start, left, compression, unpacked_size, checksum)
+
+    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
+        """Yield the messages in the records of a chunk; keep or check schemas and channels."""
+        for kind, at, length in records_in(records):
+            if kind == MESSAGE:
+                yield self._found(records, at, at, length, number)
+            else:
+                self._note(kind, bytes(records[at : at + length]))
+
+    def _found(
+        self, records: bytes | bytearray, head_at: int, start: int, size: int, number: int
+    ) -> FoundMessage:
+        """Return the entry of a message, of which bytes with its head are given."""
+        channel, _, record_ns, _ = MESSAGE_HEAD.unpack_from(records, head_at)
+        if record_ns >= 2**63:
+            raise ValueError(f'record time of {record_ns} ns')
+        if channel not in self._by_id or size < MESSAGE_HEAD.size:
+            raise ValueError(f'message of the unknown channel {channel}')
+        place = (number, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size, 0)
+        return FoundMessage(record_ns, channel, place)
+
+    def _note(self, kind: int, content: bytes) -> None:
+        """Keep a schema or channel; raise ValueError if it differs from an earlier one."""
         if kind == SCHEMA:
             (key,) = struct.unpack_from('<H', content)
             name, at = text(content, 2)
             encoding, at = text(content, at)
-            self._schemas[key] = (name, encoding, text(content, at)[0])
+            schema = (name, encoding, text(content, at)[0])
+            if self._schemas.setdefault(key, schema) != schema:
+                raise ValueError(f'schema {key} is described in two ways')
         elif kind == CHANNEL:
             self._note_channel(content)
-        else:
-            channel, _, record_ns, _ = MESSAGE_HEAD.unpack(content)
-            if record_ns >= 2**63:
-                raise ValueError(f'record time of {record_ns} ns')
-            if channel not in self._by_id:
-                raise ValueError(f'message of the unknown channel {channel}')
-            place = (chunk, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size, 0)
-            yield FoundMessage(record_ns, channel, place)
 
     def _note_channel(self, content: bytes) -> None:
         """Keep the channel in a record."""
@@ -114,9 +204,28 @@ class SalvagedMcap(SalvagedChunks):
         name, kind, definition = self._schemas.get(schema, ('', '', ''))
         qos = content[at:].decode(errors='replace')
         connection = ros2_connection(
-            key, topic, name, self, encoding=encoding, qos=qos, definition=(kind, definition)
+            key, topic, name, None, encoding=encoding, qos=qos, definition=(kind, definition)
         )
-        self._by_id.setdefault(key, connection)
+        if not is_same(self._by_id.setdefault(key, connection), connection):
+            raise ValueError(f'channel {key} is described in two ways')
+
+
+def records_in(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
+    """Yield opcode, offset and length of the content of each whole record."""
+    at = 0
+    while at + RECORD.size <= len(content):
+        kind, length = RECORD.unpack_from(content, at)
+        at += RECORD.size
+        if at + length > len(content):
+            return  # cut off in this record
+        yield kind, at, length
+        at += length
+
+
+def channel_counts(statistics: bytes) -> Counter[int]:
+    """Return the number of messages of each channel by a statistics record, without zeros."""
+    (length,) = struct.unpack_from('<I', statistics, 42)
+    return +Counter(dict(struct.iter_unpack('<HQ', statistics[46 : 46 + length])))
 
 
 def text(content: bytes, at: int) -> tuple[str, int]:

@@ -16,7 +16,6 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack
 import heapq
-from itertools import islice
 import logging
 from pathlib import Path
 import tempfile
@@ -30,10 +29,11 @@ from surfel_mapper.bags._rosbags import (
     Storage,
     type_name,
 )
+from surfel_mapper.bags.bag_file import BagFile
+from surfel_mapper.bags.chunked import ChunkedFile
 from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
 from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
-from surfel_mapper.bags.salvage import SalvagedFile
-from surfel_mapper.bags.storage import damaged, described, open_storage, salvage, suffix
+from surfel_mapper.bags.storage import damaged, described, open_storage
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
 from surfel_mapper.errors import BagError, DependencyError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
@@ -82,6 +82,7 @@ class BagReader:
         self.path = Path(path)
         self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
+        self._skipped: dict[Path, int] = {}
         self._decoders: dict[str, tuple[Typestore, str]] = {}
         self._storages: list[tuple[Path, Storage]] = []
         with ExitStack() as files:
@@ -187,7 +188,7 @@ class BagReader:
                 continue
             files.callback(storage.close)
             self._storages.append((path, storage))
-            if isinstance(storage, SalvagedFile):
+            if isinstance(storage, BagFile):
                 self._note_losses(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
@@ -245,48 +246,38 @@ class BagReader:
                 if raw[:4] == ZSTD_MAGIC and not self.is_ros1:
                     raw = unpacked_message(raw)
             except StopIteration:
+                self._note_skipped(path, storage)
                 return
-            except DependencyError:
+            except (BagError, DependencyError):
                 raise
             except Exception as error:
-                salvaged = self._salvaged(path, storage)
-                if salvaged is None:
-                    raise damaged(path, f'damaged after {done} messages', error) from error
-                storage, topics = salvaged, {(c.topic, c.msgtype) for c in wanted}
-                wanted = [c for c in salvaged.connections if (c.topic, c.msgtype) in topics]
-                # all chunks before the damaged one are intact, so the order is the same
-                messages = islice(salvaged.messages(wanted, start_ns, stop_ns), done, None)
-                continue
+                raise damaged(path, f'damaged after {done} messages', error) from error
             done += 1
             type_ = SAME_AS.get(connection.msgtype, connection.msgtype)
             yield BagMessage(connection.topic, type_, record_ns, raw)
 
-    def _salvaged(self, path: Path, storage: Storage) -> SalvagedFile | None:
-        """Return an mcap file with a damaged chunk read without its index; None for others."""
-        if isinstance(storage, SalvagedFile) or suffix(path) != '.mcap' or is_packed(path):
-            return None
-        salvaged = salvage(path, path)
-        if salvaged is None:
-            return None
-        self._files.callback(salvaged.close)
-        self._note_losses(path, salvaged)
-        for cut in self.cuts[-2:]:
-            log.warning(cut)
-        return salvaged
-
-    def _note_losses(self, path: Path, storage: SalvagedFile) -> None:
-        """Add what a salvaged file lacks to ``cuts``."""
-        found = f'the {storage.message_count} messages found are read'
+    def _note_losses(self, path: Path, storage: BagFile) -> None:
+        """Add what a file lacks to ``cuts``."""
         if storage.cut_at is not None:
             self.cuts.append(
                 f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
-                f'{storage.size}; {found}'
+                f'{storage.size}; the {storage.message_count} messages found are read'
             )
-        if storage.skipped_at:
+        self._note_skipped(path, storage, log_now=False)
+
+    def _note_skipped(self, path: Path, storage: Storage, *, log_now: bool = True) -> None:
+        """Add the chunks skipped since the last call to ``cuts``."""
+        if not isinstance(storage, ChunkedFile):
+            return
+        number = len(storage.skipped_at)
+        if number > self._skipped.get(path, 0):
+            self._skipped[path] = number
             self.cuts.append(
-                f'{path}: {len(storage.skipped_at)} chunks with a wrong checksum are skipped, the '
-                f'first at byte {storage.skipped_at[0]}; {found}'
+                f'{path}: {number} damaged chunks are skipped, the first at byte '
+                f'{storage.skipped_at[0]}: {storage.skip_reason}'
             )
+            if log_now:
+                log.warning(self.cuts[-1])
 
     def _check_complete(self, read: Counter[str], names: Collection[str] | None) -> None:
         """Compare the number of messages read of each topic with the index."""

@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Salvage of ROS 1 bags whose index was never written or is cut off.
+Reading of ROS 1 bags, with and without a complete index.
 
 After a line of text come records: a header of name=value fields with its length, and data with
-its length. Messages lie in chunks, which are records of packed records. A recorder that was
-killed leaves the length of the last chunk zero, so that the records of the chunk follow as if
-they were records of the file; both are read alike.
+its length. Messages lie in chunks, which are records of packed records. The first record states
+the offset of the index, which has the connections and an entry for each chunk. It is used if it
+agrees with the chunks; else the records are read from the beginning. A recorder that was killed
+leaves the length of the last chunk zero, so that the records of the chunk follow as if they were
+records of the file; both are read alike.
 
 Source: wiki.ros.org/Bags/Format/2.0.
 """
@@ -14,10 +16,12 @@ Source: wiki.ros.org/Bags/Format/2.0.
 from __future__ import annotations
 
 from collections.abc import Iterator
+import re
 import struct
 
-from surfel_mapper.bags._rosbags import ros1_connection
-from surfel_mapper.bags.salvage import Chunk, FoundMessage, SalvagedChunks
+from surfel_mapper.bags._rosbags import is_same, ros1_connection
+from surfel_mapper.bags.bag_file import FoundMessage
+from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
@@ -27,84 +31,156 @@ MOST_HEADER_BYTES = 1 << 20
 Fields = dict[str, bytes]
 
 
-class SalvagedRos1(SalvagedChunks):
-    """The messages of a ROS 1 bag, found without its index."""
+class Ros1File(ChunkedFile):
+    """The messages of a ROS 1 bag."""
 
     MAGIC = b'#ROSBAG V2.0\n'
 
-    def _scan(self) -> Iterator[FoundMessage]:
-        """Yield the messages up to the end of the file, or to the first damaged record."""
+    def _survey(self) -> None:
+        """Find the chunks through the index, or else record by record."""
+        try:
+            if self._read_index():
+                return
+        except DAMAGE:
+            pass
+        for found in (self._by_id, self._counts, self._chunks, self.skipped_at):
+            found.clear()
+        self.start_time, self.end_time, self.skip_reason = 2**63 - 1, 0, ''
+        self._read_records()
+
+    def _read_index(self) -> bool:
+        """Return whether there is an index that agrees with the chunks; keep its chunks."""
+        fields, _, _ = self._record(len(self.MAGIC))
+        (at,) = struct.unpack('<Q', fields['index_pos'])
+        connections, chunks = (
+            struct.unpack('<I', fields[name])[0] for name in ('conn_count', 'chunk_count')
+        )
+        if not len(self.MAGIC) < at <= self.size or fields.get('encryptor'):
+            return False
+        while at < self.size:
+            self._budget.check_time()
+            fields, start, size = self._record(at)
+            kind = fields['op'][0]
+            if kind == CONNECTION:
+                self._note_connection(fields, self._at(start, size))
+            elif kind == CHUNK_INFO:
+                self._note_chunk_info(fields, self._at(start, size))
+            at = start + size
+        starts = {chunk.start for chunk in self._chunks}
+        if len(starts) != chunks or len(self._chunks) != chunks:
+            return False
+        if len(self._by_id) != connections or at != self.size:
+            return False
+        self._check_connections()
+        return not self.skipped_at
+
+    def _note_chunk_info(self, fields: Fields, content: bytes) -> None:
+        """Keep the chunk that a record of the index describes."""
+        (start,) = struct.unpack('<Q', fields['chunk_pos'])
+        counts = {key: count for key, count in struct.iter_unpack('<II', content) if count}
+        if not len(self.MAGIC) < start < self.size:
+            raise ValueError('index of a chunk beyond the data')
+        _, data, size = self._record(start)
+        is_whole = data + size <= self.size
+        span = nanoseconds(fields['start_time']), nanoseconds(fields['end_time'])
+        chunk = Chunk(start, data + size - start, is_whole, *span, counts)
+        self._chunks.append(chunk)
+        if counts:
+            self._note_chunk(chunk)
+
+    def _read_records(self) -> None:
+        """Read the records up to the end of the file, or to the first damaged one."""
         at, has_index = len(self.MAGIC), False
         while at < self.size:
+            self._budget.check_time()
             try:
-                fields, start, size = self._record(-1, at)
+                fields, start, size = self._record(at)
                 kind = fields['op'][0]
                 is_whole = start + size <= self.size
                 if kind == CHUNK:
-                    yield from self._in_chunk(fields, start, min(size, self.size - start))
-                elif is_whole:
-                    yield from self._note(fields, -1, start, size)
-            except (struct.error, ValueError, KeyError, IndexError):
+                    end = min(start + size, self.size)
+                    self._survey_chunk(Chunk(at, end - at, is_whole))
+                elif kind == CONNECTION and is_whole:
+                    self._note_connection(fields, self._at(start, size), is_new=not has_index)
+                elif kind == MESSAGE and is_whole:
+                    self._note_loose(self._found(fields, start, size, LOOSE))
+            except DAMAGE:
                 is_whole = False
             if not is_whole:
                 self.cut_at = at
                 return
-            has_index = has_index or kind == CHUNK_INFO
+            has_index = has_index or kind in (INDEX, CHUNK_INFO)
             at = start + size
         if not has_index:
             self.cut_at = self.size
 
-    def _in_chunk(self, fields: Fields, start: int, size: int) -> Iterator[FoundMessage]:
-        """Yield the messages in a chunk of which ``size`` bytes are in the file."""
-        (unpacked_size,) = struct.unpack('<I', fields['size'])
-        place = Chunk(start, size, fields['compression'].decode(), unpacked_size)
-        chunk = self._add_chunk(place)
-        records, at = self._unpacked(chunk), 0
-        while at < len(records):
-            try:
-                inner, inner_start, inner_size = self._record(chunk, at)
-            except struct.error:
-                return  # cut off in the header of this record
-            if inner_start + inner_size > len(records):
-                return
-            yield from self._note(inner, chunk, inner_start, inner_size)
-            at = inner_start + inner_size
-
-    def _record(self, chunk: int, at: int) -> tuple[Fields, int, int]:
-        """Return the header of a record, and offset and length of its data."""
-        (length,) = struct.unpack('<I', self._read((chunk, at, 4)))
+    def _record(self, at: int) -> tuple[Fields, int, int]:
+        """Return the header of a record of the file, and offset and length of its data."""
+        (length,) = struct.unpack('<I', self._at(at, 4))
         if length > MOST_HEADER_BYTES:
             raise ValueError(f'header of {length} bytes')
-        head = self._read((chunk, at + 4, length + 4))
+        head = self._at(at + 4, length + 4)
         (size,) = struct.unpack('<I', head[length:])
         return header_fields(head[:length]), at + 8 + length, size
 
-    def _note(self, fields: Fields, chunk: int, start: int, size: int) -> Iterator[FoundMessage]:
-        """Yield the message in a record, or keep its connection."""
-        kind = fields['op'][0]
-        if kind == CONNECTION:
-            content = header_fields(self._read((chunk, start, size)))
-            self._note_connection(fields, content)
-        elif kind == MESSAGE:
-            (connection,) = struct.unpack('<I', fields['conn'])
-            if connection not in self._by_id:
-                raise ValueError(f'message of the unknown connection {connection}')
-            seconds, nanoseconds = struct.unpack('<II', fields['time'])
-            yield FoundMessage(seconds * 10**9 + nanoseconds, connection, (chunk, start, size, 0))
+    def _head(self, chunk: Chunk) -> Packed:
+        """Return the head of a chunk."""
+        fields, start, size = self._record(chunk.start)
+        if fields['op'][0] != CHUNK:
+            raise ValueError('no chunk where the index has one')
+        (unpacked_size,) = struct.unpack('<I', fields['size'])
+        left = min(size, self.size - start)
+        return Packed(start, left, fields['compression'].decode(), unpacked_size)
 
-    def _note_connection(self, fields: Fields, content: Fields) -> None:
-        """Keep the connection in a record."""
+    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
+        """Yield the messages in the records of a chunk; keep or check connections."""
+        at = 0
+        while at + 4 <= len(records):
+            (length,) = struct.unpack_from('<I', records, at)
+            data = at + 8 + length
+            if length > MOST_HEADER_BYTES:
+                raise ValueError(f'header of {length} bytes')
+            if data > len(records):
+                return  # cut off in the header of this record
+            (size,) = struct.unpack_from('<I', records, data - 4)
+            if data + size > len(records):
+                return
+            fields = header_fields(bytes(records[at + 4 : data - 4]))
+            kind = fields['op'][0]
+            if kind == CONNECTION:
+                self._note_connection(fields, bytes(records[data : data + size]))
+            elif kind == MESSAGE:
+                yield self._found(fields, data, size, number)
+            at = data + size
+
+    def _found(self, fields: Fields, start: int, size: int, number: int) -> FoundMessage:
+        """Return the entry of a message."""
+        (connection,) = struct.unpack('<I', fields['conn'])
+        if connection not in self._by_id:
+            raise ValueError(f'message of the unknown connection {connection}')
+        return FoundMessage(nanoseconds(fields['time']), connection, (number, start, size, 0))
+
+    def _note_connection(self, fields: Fields, data: bytes, *, is_new: bool = True) -> None:
+        """Keep the connection in a record; raise ValueError if an earlier one differs."""
+        content = header_fields(data)
         (key,) = struct.unpack('<I', fields['conn'])
         connection = ros1_connection(
             key,
-            fields['topic'].decode(),
-            self,
+            re.sub('/+', '/', fields['topic'].decode()),
+            None,
             type_=content['type'].decode(),
             md5sum=content['md5sum'].decode(),
             definition=content['message_definition'].decode(),
             latching=int(content.get('latching') or 0),
         )
-        self._by_id.setdefault(key, connection)
+        if is_new and not is_same(self._by_id.setdefault(key, connection), connection):
+            raise ValueError(f'connection {key} is described in two ways')
+
+
+def nanoseconds(content: bytes) -> int:
+    """Return a time of a header."""
+    seconds, rest = struct.unpack('<II', content)
+    return int(seconds * 10**9 + rest)
 
 
 def header_fields(content: bytes) -> Fields:

@@ -1,7 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Salvage of truncated sqlite3 bags, page by page.
+Checks of sqlite3 bags, and salvage of truncated ones page by page.
+
+A database may define views, virtual tables and computed columns, which SQLite evaluates when they
+are read: one row of text can make endless rows of gigabytes. A bag has plain tables, so files with
+anything else are refused before a row is read.
 
 SQLite refuses a file that is shorter than its header states, and its trees lead through pages
 that may be lost while the leaves below them are intact. So the leaf pages of tables are read in
@@ -14,16 +18,24 @@ Source: sqlite.org/fileformat2.html.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from array import array
+from collections import Counter
+from collections.abc import Collection, Iterator
+from contextlib import closing
 from pathlib import Path
+import re
+import sqlite3
 import struct
-from typing import NamedTuple
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
 from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.bags.salvage import FoundMessage, SalvagedFile
+from surfel_mapper.bags.bag_file import BagFile, FoundMessage, INDEX_COLUMNS, MESSAGE_BYTES
+from surfel_mapper.errors import BagError
+
+if TYPE_CHECKING:
+    from surfel_mapper.bags._rosbags import Connection
 
 HEADER_BYTES = 100
 """Size of the file header, at the start of the first page."""
@@ -47,10 +59,39 @@ class Row(NamedTuple):
     local: int
 
 
-class SalvagedSqlite(SalvagedFile):
+class SalvagedSqlite(BagFile):
     """The messages of a sqlite3 bag, found without its trees."""
 
     MAGIC = b'SQLite format 3\0'
+
+    def _survey(self) -> None:
+        """Index the messages in all pages whose topic was found, on whichever page it was."""
+        numbers = array('q')
+        for count, found in enumerate(self._scan(), 1):
+            self._budget.take(MESSAGE_BYTES, f'index of {count} messages')
+            numbers.extend((found.record_ns, found.connection, *found.place))
+        index = np.array(numbers, np.int64).reshape(-1, INDEX_COLUMNS)
+        index = index[np.isin(index[:, 1], list(self._by_id))]
+        self._index = index[np.argsort(index[:, 0], kind='stable')]
+        self._counts = Counter(self._index[:, 1].tolist())
+        if len(self._index):
+            self._note_span(int(self._index[0, 0]), int(self._index[-1, 0]))
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield connection, record time and bytes of messages, in order of record time."""
+        wanted = {connection.id: connection for connection in connections}
+        first = 0 if start is None else int(np.searchsorted(self._index[:, 0], start))
+        for row in range(first, len(self._index)):
+            record_ns, connection, *place = self._index[row].tolist()
+            if stop is not None and record_ns >= stop:
+                return
+            if connection in wanted:
+                yield wanted[connection], record_ns, self._read(tuple(place))
 
     def _scan(self) -> Iterator[FoundMessage]:
         """Yield the messages in all pages of the file."""
@@ -63,11 +104,6 @@ class SalvagedSqlite(SalvagedFile):
         for page in range(self._num_pages):
             self._budget.check_time()
             yield from self._in_page(page)
-
-    def _sorted_index(self) -> npt.NDArray[np.int64]:
-        """Return the index of the messages whose topic was found, on whichever page it was."""
-        index = super()._sorted_index()
-        return index[np.isin(index[:, 1], list(self._by_id))]
 
     def _in_page(self, page: int) -> Iterator[FoundMessage]:
         """Yield the messages in a page, if it is a leaf; keep its topics."""
@@ -133,7 +169,7 @@ class SalvagedSqlite(SalvagedFile):
         if topic.startswith('/') and '/' in type_:
             qos = ' '.join(further[:1])
             self._by_id[rowid] = ros2_connection(
-                rowid, topic, type_, self, encoding=encoding, qos=qos
+                rowid, topic, type_, None, encoding=encoding, qos=qos
             )
 
     def _check_chain(self, place: tuple[int, ...]) -> None:
@@ -167,6 +203,34 @@ def pages(header: bytes) -> tuple[int, int]:
     if size < 512 or size & (size - 1):
         raise ValueError(f'pages of {size} bytes')
     return size, num_pages
+
+
+PLAIN = re.compile(r'\s*CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\b', re.IGNORECASE)
+"""Beginning of the definition of a table or an index, not of a view, trigger or virtual table."""
+
+
+def check_tables(path: Path) -> None:
+    """
+    Raise BagError if a database has other things than tables of stored columns and indexes.
+
+    Raises
+    ------
+    sqlite3.Error
+        If it cannot be read.
+
+    """
+    uri = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
+    with closing(sqlite3.connect(uri, uri=True)) as database:
+        rows = database.execute('SELECT type, name, sql FROM sqlite_master').fetchall()
+        for kind, name, sql in rows:
+            if kind not in ('table', 'index') or not (sql is None or PLAIN.match(str(sql))):
+                raise BagError(
+                    f'{path}: {kind} {name!r}, expected tables and indexes only; is this a bag?'
+                )
+            if kind == 'table':
+                hidden = 'SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden'
+                if database.execute(hidden, (name,)).fetchone() != (0,):
+                    raise BagError(f'{path}: table {name!r} has computed columns; is this a bag?')
 
 
 def is_short(path: Path) -> bool:

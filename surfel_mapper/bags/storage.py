@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Opening one file of a bag: through its index if that is complete, else by salvage.
+Opening one file of a bag, by its kind.
 
-rosbags raises nearly any exception on damaged files (AssertionError, KeyError, struct.error, ...);
-each becomes a BagError here. It also silently skips chunks of mcap that have no index; such files
-are salvaged too.
+mcap and ROS 1 are read by our own classes. sqlite3 is read by rosbags, after a check of its
+tables, or by our own class if it is truncated. rosbags raises nearly any exception on damaged
+files (AssertionError, KeyError, ...); each becomes a BagError here.
 """
 
 from __future__ import annotations
@@ -13,20 +13,17 @@ from __future__ import annotations
 from pathlib import Path
 import struct
 
-from surfel_mapper.bags._rosbags import is_fully_indexed, open_indexed, Storage
-from surfel_mapper.bags.mcap import SalvagedMcap
+from surfel_mapper.bags._rosbags import import_rosbags, open_rosbag2, Storage
+from surfel_mapper.bags.bag_file import BagFile
+from surfel_mapper.bags.chunked import ChunkedFile
+from surfel_mapper.bags.mcap import McapFile
 from surfel_mapper.bags.paths import is_ros1, unpacked_name
-from surfel_mapper.bags.ros1 import SalvagedRos1
-from surfel_mapper.bags.salvage import SalvagedFile
-from surfel_mapper.bags.sqlite import is_short, SalvagedSqlite
+from surfel_mapper.bags.ros1 import Ros1File
+from surfel_mapper.bags.sqlite import check_tables, is_short, SalvagedSqlite
 from surfel_mapper.errors import BagError, DependencyError
 
-SALVAGE: dict[str, type[SalvagedFile]] = {
-    '.mcap': SalvagedMcap,
-    '.db3': SalvagedSqlite,
-    '.bag': SalvagedRos1,
-}
-"""Reader without an index for each kind of file."""
+OURS: dict[str, type[BagFile]] = {'.mcap': McapFile, '.db3': SalvagedSqlite, '.bag': Ros1File}
+"""Our reader for each kind of file."""
 
 REPAIR = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
 """The tool that may repair a damaged file."""
@@ -50,45 +47,51 @@ def open_storage(path: Path, named: Path | None = None) -> Storage:
 
     """
     named = named or path
+    import_rosbags()
     try:
-        storage = open_indexed(path, ros1=is_ros1(path))
-    except DependencyError:
+        if suffix(path) == '.db3':
+            check_tables(path)
+            storage = open_rosbag2(path)
+            if not is_short(path):
+                return storage
+            storage.close()
+        return open_ours(path, named)
+    except (DependencyError, BagError):
         raise
     except Exception as error:
-        salvaged = salvage(path, named)
-        if salvaged is None:
+        if suffix(path) != '.db3':
             raise damaged(named, 'cannot be read', error) from error
-        return salvaged
-    is_whole = not is_short(path) if suffix(path) == '.db3' else is_fully_indexed(storage)
-    salvaged = None if is_whole else salvage(path, named)
-    if salvaged is None:
-        return storage
-    storage.close()
-    return salvaged
-
-
-def salvage(path: Path, named: Path) -> SalvagedFile | None:
-    """Return a file read without its index; None if it is of another kind or without messages."""
-    kind = SALVAGE[suffix(path)]
-    with open(path, 'rb') as file:
-        if file.read(len(kind.MAGIC)) != kind.MAGIC:
-            return None
     try:
-        salvaged = kind(path)
+        return open_ours(path, named)
     except (ValueError, LookupError, struct.error) as error:
         raise damaged(named, 'cannot be read', error) from error
-    if not salvaged.message_count:
-        salvaged.close()
-        return None
-    return salvaged
+
+
+def open_ours(path: Path, named: Path) -> Storage:
+    """Return a file opened by our own reader; raise ValueError or BagError if it has nothing."""
+    kind = OURS[suffix(path)]
+    with open(path, 'rb') as file:
+        if file.read(len(kind.MAGIC)) != kind.MAGIC:
+            raise ValueError(f'its first bytes are not those of {suffix(path)}')
+    storage = kind(path)
+    if storage.message_count or (storage.cut_at is None and not storage.skipped_at):
+        return storage
+    storage.close()
+    reason = storage.skip_reason if isinstance(storage, ChunkedFile) else ''
+    reason = reason or f'no whole message before byte {storage.cut_at}'
+    raise BagError(f'{named}: cannot be read: {reason}; {repair(path)}')
+
+
+def repair(path: Path) -> str:
+    """Return the advice for a damaged file."""
+    return (
+        f'if it was cut off or never closed, `{REPAIR[suffix(path)]}` may save the readable part'
+    )
 
 
 def damaged(path: Path, problem: str, error: Exception) -> BagError:
     """Return the error for a file that cannot be read."""
-    return BagError(
-        f'{path}: {problem}: {described(error)}; if it was cut off or never closed, '
-        f'`{REPAIR[suffix(path)]}` may save the readable part'
-    )
+    return BagError(f'{path}: {problem}: {described(error)}; {repair(path)}')
 
 
 def suffix(path: Path) -> str:

@@ -174,6 +174,36 @@ def start_forkserver() -> str:
     return 'forkserver'
 
 
+def start_local(workers: int | None, started: ExitStack) -> Any:
+    """
+    Start a cluster on this machine, to be ended with the stack; return its client.
+
+    Raises
+    ------
+    ClusterError
+        If a worker ends while it starts.
+
+    """
+    from distributed import Client, LocalCluster
+
+    try:
+        with interrupt_held():
+            cluster = started.enter_context(
+                LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    host=LOOPBACK,
+                    security=temporary_security(),
+                    dashboard_address=f'{LOOPBACK}:0',
+                )
+            )
+            return started.enter_context(Client(cluster))
+    except (RuntimeError, OSError) as error:
+        raise ClusterError(
+            f'a worker ended while it started ({error}); was it killed, or is memory short?'
+        ) from error
+
+
 def temporary_security() -> Any:
     """
     Return keys for a cluster on this machine, which live in memory and end with it.
@@ -245,7 +275,7 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
     Raises
     ------
     ClusterError
-        If the scheduler does not answer, or has no workers.
+        If the scheduler does not answer, or has no workers, or a worker ends while it starts.
     DependencyError
         If Dask is needed and not installed.
 
@@ -256,7 +286,7 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
     method = start_forkserver() if scheduler is None else 'spawn'
     try:
         import dask
-        from distributed import Client, LocalCluster
+        from distributed import Client
     except ImportError as error:
         raise DependencyError(
             f'dask cannot be loaded ({error}). It runs the workers; install it with '
@@ -273,22 +303,12 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
     with dask.config.set(settings):
         if scheduler is None:
             with ExitStack() as started:
-                with interrupt_held():
-                    cluster = started.enter_context(
-                        LocalCluster(
-                            n_workers=workers,
-                            threads_per_worker=1,
-                            host=LOOPBACK,
-                            security=temporary_security(),
-                            dashboard_address=f'{LOOPBACK}:0',
-                        )
-                    )
-                    client = started.enter_context(Client(cluster))
+                client = start_local(workers, started)
                 yield DaskExecutor(client)
             return
         try:
             client = Client(scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, TypeError) as error:  # the last without keys for TLS
             raise ClusterError(f'{scheduler}: no Dask scheduler answers: {error}') from error
         with client:
             if not client.scheduler_info(n_workers=-1)['workers']:

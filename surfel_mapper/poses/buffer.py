@@ -37,7 +37,7 @@ MAX_DEPTH = 100
 """Limit of the edges from a frame up to its root; an arm on a truck has some twenty."""
 
 MAX_TRANSFORMS = 500_000
-"""Limit of the transforms of all dynamic edges, 170 MB; 80 joints at 100 Hz have 480,000 in 60 s."""
+"""Limit of the transforms held, 170 MB; 80 joints at 100 Hz have 480,000 a minute."""
 
 MAX_NAMES = 12
 """Number of frames named in a message."""

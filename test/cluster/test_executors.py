@@ -3,10 +3,14 @@
 """Workers that come, go and die change nothing in the map; real Dask clusters of this machine."""
 
 from importlib.util import find_spec
+from multiprocessing import forkserver
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
@@ -95,6 +99,70 @@ def test_ctrl_c_while_workers_begin_ends_them_when_they_have_begun(monkeypatch):
     assert signal.getsignal(signal.SIGINT) is before
 
 
+def children(pid):
+    try:
+        return [*map(int, Path(f'/proc/{pid}/task/{pid}/children').read_text().split())]
+    except OSError:
+        return []
+
+
+@pytest.mark.skipif(not os.path.exists('/proc/self/status'), reason='processes are not shown')
+def test_a_worker_killed_while_it_starts_is_an_error_that_says_so():
+    """The first process that the fork server makes is a worker."""
+    killed, is_over = [], threading.Event()
+
+    def kill_first():
+        while not killed and not is_over.is_set():
+            fresh = {*children(forkserver._forkserver._forkserver_pid or 0)} - {*others}
+            for pid in fresh:
+                os.kill(pid, signal.SIGKILL)
+                killed.append(pid)
+            time.sleep(0.002)
+
+    others = children(forkserver._forkserver._forkserver_pid or 0)  # workers of other tests
+    thread = threading.Thread(target=kill_first)
+    thread.start()
+    try:
+        with (
+            pytest.raises(ClusterError, match='a worker ended while it started'),
+            open_executor(workers=2),
+        ):
+            pytest.fail('it has begun')
+    finally:
+        is_over.set()
+        thread.join()
+    assert killed
+
+
+@pytest.mark.skipif(not os.path.exists('/proc/net/tcp'), reason='sockets are not shown')
+def test_local_workers_are_encrypted_and_listen_on_loopback_only(two_workers):
+    import distributed
+
+    info = two_workers._client.scheduler_info(n_workers=-1)
+    workers = info['workers']
+    pids = {os.getpid(), *two_workers._client.run(os.getpid).values()}
+    assert all(address.startswith('tls://127.0.0.1:') for address in (info['address'], *workers))
+    assert {address for pid in pids for address in listened(pid)} == {'0100007F'}
+    with pytest.raises(OSError, match='Timed out'):
+        distributed.Client(info['address'].replace('tls:', 'tcp:'), timeout=2)
+    stranger = distributed.Security.temporary()
+    with pytest.raises(OSError, match='Timed out'):
+        distributed.Client(info['address'], timeout=2, security=stranger)
+    assert dict(two_workers.run(squared, [3])) == {0: 9}
+
+
+def listened(pid):
+    """Return the addresses at which a process listens, hexadecimal as in /proc/net/tcp."""
+    links = (os.readlink(link) for link in Path(f'/proc/{pid}/fd').iterdir() if link.is_symlink())
+    inodes = {link[8:-1] for link in links if link.startswith('socket:[')}
+    rows = [
+        line.split()
+        for name in ('tcp', 'tcp6')
+        for line in Path('/proc/net', name).read_text().splitlines()[1:]
+    ]
+    return {row[1].partition(':')[0] for row in rows if row[3] == '0A' and row[9] in inodes}
+
+
 FORKSERVER = """
 from multiprocessing import forkserver
 from pathlib import Path
@@ -169,6 +237,33 @@ def test_a_scheduler_elsewhere_is_used(case, tmp_path):
         open_executor(scheduler=cluster.scheduler_address) as executor,
     ):
         assert map_bags(shards, executor, tmp_path).map.digest == digest
+
+
+def test_a_scheduler_with_tls_is_used_with_the_keys_in_the_settings_of_dask(tmp_path):
+    import dask
+    import distributed
+
+    security = distributed.Security.temporary()
+    certificate, key = tmp_path / 'node.pem', tmp_path / 'node.key'
+    certificate.write_text(security.tls_ca_file)
+    key.write_text(security.tls_client_key)
+    settings = {
+        'distributed.comm.tls.ca-file': str(certificate),
+        'distributed.comm.tls.client.cert': str(certificate),
+        'distributed.comm.tls.client.key': str(key),
+    }
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, security=security, dashboard_address='127.0.0.1:0'
+    ) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith('tls://')
+        with dask.config.set(settings), open_executor(scheduler=address) as executor:
+            assert dict(executor.run(squared, [3])) == {0: 9}
+        with (
+            pytest.raises(ClusterError, match='no Dask scheduler answers'),
+            open_executor(scheduler=address),
+        ):
+            pytest.fail('it has begun')
 
 
 def test_a_scheduler_without_workers_is_refused():

@@ -84,7 +84,8 @@ def test_the_window_listens_on_loopback_only(tmp_path, monkeypatch):
         port = probe.getsockname()[1]
     installed = Path(sys.executable).with_name('rerun')
     window, pid = tmp_path / 'rerun', tmp_path / 'pid'
-    window.write_text(WINDOW.format(pid=pid, rerun=shutil.which(installed) or shutil.which('rerun')))
+    program = shutil.which(installed) or shutil.which('rerun')
+    window.write_text(WINDOW.format(pid=pid, rerun=program))
     window.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
     monkeypatch.setattr(viewer_module, 'PORT', port)
@@ -104,5 +105,6 @@ def addresses(port):
             _, local, _, state, *_ = line.split()
             address, _, hexadecimal = local.partition(':')
             if state == '0A' and int(hexadecimal, 16) == port:
-                found.add(socket.inet_ntoa(bytes.fromhex(address)[::-1]) if name == 'tcp' else '::')
+                ipv4 = bytes.fromhex(address)[::-1] if name == 'tcp' else None
+                found.add('::' if ipv4 is None else socket.inet_ntoa(ipv4))
     return found

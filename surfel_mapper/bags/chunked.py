@@ -1,0 +1,306 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Bags of packed chunks, mcap and ROS 1: messages by record time, chunk by chunk.
+
+The chunks are found through the index at the end of the file, if it is complete and agrees with
+itself, else by reading the records from the beginning. Of each chunk only its span and counts are
+kept. A chunk is unpacked and searched for messages when its span begins, so there is never a list
+of all messages, and one chunk at a time is unpacked if chunks are large.
+
+A few kilobytes of packed chunks can hold millions of empty messages, state gigabytes, or overlap
+in time so that each message needs another chunk unpacked. So memory, messages and processor time
+are charged to the budget of the file.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from array import array
+from collections import deque, OrderedDict
+from collections.abc import Collection, Iterator, Mapping
+import heapq
+from pathlib import Path
+import struct
+from types import MappingProxyType
+from typing import NamedTuple, TYPE_CHECKING
+from zlib import crc32
+
+import numpy as np
+
+from surfel_mapper.bags.bag_file import (
+    BagFile,
+    FoundMessage,
+    Index,
+    INDEX_COLUMNS,
+    MESSAGE_BYTES,
+)
+from surfel_mapper.bags.compression import max_unpacked_bytes, unpacked
+from surfel_mapper.budget import VARIABLE
+
+if TYPE_CHECKING:
+    from surfel_mapper.bags._rosbags import Connection
+
+KEPT_CHUNKS = 4
+"""Number of chunks kept unpacked: neighbouring chunks overlap in time."""
+
+KEPT_BYTES = 64 << 20
+"""Limit of their size together; a larger chunk is kept alone."""
+
+MAX_COPIED_BYTES = 1 << 24
+"""Size above which a message is a view into its chunk, not a copy."""
+
+CHECK_EVERY = 1024
+"""Number of messages after which the budget is asked again."""
+
+LOOSE = -1
+"""Number of the chunk of messages that are outside of chunks."""
+
+DAMAGE = (struct.error, ValueError, LookupError)
+
+
+class Packed(NamedTuple):
+    """Packed records of a chunk: place, compression, unpacked size and checksum (0: none)."""
+
+    start: int
+    size: int
+    compression: str
+    unpacked_size: int
+    checksum: int = 0
+
+
+class Chunk(NamedTuple):
+    """
+    A chunk of a file.
+
+    Attributes
+    ----------
+    start, size : int
+        Offset of its record, and bytes of it that are in the file.
+    is_whole : bool
+        Whether the file does not end in it.
+    start_ns, end_ns : int
+        Record times of its first and its last message.
+    counts : dict of int to int
+        Number of its messages by connection; 0 if not known.
+
+    """
+
+    start: int
+    size: int
+    is_whole: bool = True
+    start_ns: int = 2**63 - 1
+    end_ns: int = -1
+    counts: Mapping[int, int] = MappingProxyType({})
+
+
+class ChunkedFile(BagFile):
+    """
+    A file whose messages lie in chunks, or outside of them.
+
+    Attributes
+    ----------
+    skip_reason : str
+        Why the first of the skipped chunks cannot be read.
+
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.skip_reason = ''
+        self._chunks: list[Chunk] = []
+        self._loose = array('q')
+        self._kept: OrderedDict[int, bytes | bytearray] = OrderedDict()
+        super().__init__(path)
+
+    def messages(
+        self,
+        connections: Collection[Connection],
+        start: int | None = None,
+        stop: int | None = None,
+    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
+        """Yield connection, record time and bytes of messages, in order of record time."""
+        wanted = {connection.id: connection for connection in connections}
+        span = (-(2**63) if start is None else start, 2**63 - 1 if stop is None else stop)
+        pending = deque(self._numbers(wanted, *span))
+        indexes: dict[int, Index] = {}
+        heads: list[tuple[int, int, int]] = []  # record time, number of the chunk, row
+        while pending or heads:
+            while pending and (not heads or pending[0][0] <= heads[0][0]):
+                number = pending.popleft()[1]
+                indexes[number] = index = self._index_of(number, wanted, *span)
+                if len(index):
+                    heapq.heappush(heads, (int(index[0, 0]), number, 0))
+            if not heads:
+                continue
+            record_ns, number, row = heads[0]
+            _, connection, _, at, size, _ = indexes[number][row].tolist()
+            raw = self._message(number, at, size)
+            if row + 1 < len(indexes[number]):
+                next_ns = int(indexes[number][row + 1, 0])
+                heapq.heapreplace(heads, (next_ns, number, row + 1))
+            else:
+                heapq.heappop(heads)
+                self._budget.give_back(MESSAGE_BYTES * len(indexes.pop(number)))
+            yield wanted[connection], record_ns, raw
+
+    @abstractmethod
+    def _head(self, chunk: Chunk) -> Packed:
+        """Return the head of a chunk; raise one of DAMAGE if it is inconsistent."""
+
+    @abstractmethod
+    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
+        """Yield the messages in unpacked records, up to a cut; keep or check connections."""
+
+    def _survey_chunk(self, chunk: Chunk) -> None:
+        """Search a chunk that no index describes; keep its span and counts."""
+        number = len(self._chunks)
+        self._budget.take(MESSAGE_BYTES, f'{number + 1} chunks')
+        self._chunks.append(chunk)
+        index = self._search(number)
+        if len(index):
+            ids, counts = np.unique(index[:, 1], return_counts=True)
+            found = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+            first_ns, last_ns = int(index[:, 0].min()), int(index[:, 0].max())
+            self._chunks[number] = chunk._replace(start_ns=first_ns, end_ns=last_ns, counts=found)
+            self._note_chunk(self._chunks[number])
+        self._budget.give_back(MESSAGE_BYTES * len(index))
+
+    def _note_chunk(self, chunk: Chunk) -> None:
+        """Add the messages of a chunk to those of the file."""
+        self._counts.update(chunk.counts)
+        self._note_span(chunk.start_ns, chunk.end_ns)
+
+    def _note_loose(self, found: FoundMessage) -> None:
+        """Keep the place of a message that is outside of chunks."""
+        self._budget.take(MESSAGE_BYTES, f'index of {len(self._loose) // INDEX_COLUMNS} messages')
+        self._loose.extend((found.record_ns, found.connection, *found.place))
+        self._counts[found.connection] += 1
+        self._note_span(found.record_ns, found.record_ns)
+
+    def _check_connections(self) -> None:
+        """
+        Raise ValueError if the chunks describe connections otherwise than the index does.
+
+        Each connection is described in the first chunk with a message of it, so few are unpacked.
+        """
+        left = {key for key, count in self._counts.items() if count}
+        if not left <= self._by_id.keys():
+            raise ValueError('the index has messages of unknown connections')
+        for number, chunk in enumerate(self._chunks):
+            if left & chunk.counts.keys():
+                self._budget.give_back(MESSAGE_BYTES * len(self._search(number)))
+                left -= chunk.counts.keys()
+
+    def _numbers(self, wanted: Collection[int], start: int, stop: int) -> list[tuple[int, int]]:
+        """Return start and number of the chunks with wanted messages in a span, by start."""
+        found = [
+            (chunk.start_ns, number)
+            for number, chunk in enumerate(self._chunks)
+            if chunk.end_ns >= start
+            and chunk.start_ns < stop
+            and any(connection in wanted for connection in chunk.counts)
+        ]
+        return sorted([(-(2**63), LOOSE), *found] if self._loose else found)
+
+    def _index_of(self, number: int, wanted: Collection[int], start: int, stop: int) -> Index:
+        """Return the wanted messages of a chunk in a span, by record time."""
+        with self._budget.clock():
+            if number == LOOSE:
+                index = as_index(self._loose)
+                self._budget.take(MESSAGE_BYTES * len(index), f'{len(index)} messages')
+            else:
+                index = self._search(number)
+            times, found = index[:, 0], len(index)
+            index = index[(times >= start) & (times < stop) & np.isin(index[:, 1], list(wanted))]
+            self._budget.give_back(MESSAGE_BYTES * (found - len(index)))
+            return index[np.argsort(index[:, 0], kind='stable')]
+
+    def _search(self, number: int) -> Index:
+        """Return the messages of a chunk in its order; none, and it is skipped, if damaged."""
+        numbers, chunk = array('q'), self._chunks[number]
+        try:
+            records = self._unpacked(number)
+            for found in self._walk(number, records):
+                if len(numbers) % (INDEX_COLUMNS * CHECK_EVERY) == 0:
+                    self._budget.check_time()
+                    count = len(numbers) // INDEX_COLUMNS + CHECK_EVERY
+                    self._budget.take(CHECK_EVERY * MESSAGE_BYTES, f'index of {count} messages')
+                numbers.extend((found.record_ns, found.connection, *found.place))
+        except DAMAGE as error:
+            self._give_back_rounding(len(numbers) // INDEX_COLUMNS, 0)
+            if chunk.is_whole:
+                self._skip(chunk.start, str(error))
+            return as_index(array('q'))
+        index = as_index(numbers)
+        self._give_back_rounding(len(index), len(index))
+        return index
+
+    def _give_back_rounding(self, found: int, kept: int) -> None:
+        """Return the memory charged for messages beyond those kept; it is charged in steps."""
+        charged = -(-found // CHECK_EVERY) * CHECK_EVERY
+        self._budget.give_back(MESSAGE_BYTES * (charged - kept))
+
+    def _skip(self, start: int, reason: str) -> None:
+        """Note a chunk that cannot be read."""
+        if start not in self.skipped_at:
+            self.skipped_at.append(start)
+            self.skip_reason = self.skip_reason or reason
+
+    def _message(self, number: int, at: int, size: int) -> bytes | memoryview:
+        """Return the bytes of a message: a copy, or a view into its chunk if it is large."""
+        if number == LOOSE:
+            return self._at(at, size)
+        with self._budget.clock():
+            self._budget.check_time()
+            head = self._head(self._chunks[number])
+            if is_plain(head):
+                return self._at(head.start + at, size)
+            view = memoryview(self._unpacked(number))[at : at + size]
+        return view if size > MAX_COPIED_BYTES else bytes(view)
+
+    def _unpacked(self, number: int) -> bytes | bytearray:
+        """Return the records of a chunk, up to the cut if the file ends in it."""
+        if number in self._kept:
+            self._kept.move_to_end(number)
+            return self._kept[number]
+        chunk = self._chunks[number]
+        head = self._head(chunk)
+        while self._kept and not self._has_room(head.unpacked_size):
+            _, dropped = self._kept.popitem(last=False)
+            self._budget.give_back(len(dropped))
+        self._check_room(head)
+        packed = self._at(head.start, head.size)
+        records = unpacked(packed, head.compression, head.unpacked_size)
+        if chunk.is_whole:
+            if len(records) != head.unpacked_size:
+                raise ValueError(f'{len(records)} of {head.unpacked_size} bytes unpacked')
+            if head.checksum and crc32(records) != head.checksum:
+                raise ValueError('wrong checksum')
+        if not is_plain(head):
+            self._budget.take(len(records), 'unpacked chunk')
+            self._kept[number] = records
+        return records
+
+    def _check_room(self, head: Packed) -> None:
+        """Raise ValueError if a chunk is larger than one may be, or than its packed size."""
+        left = min(self._budget.max_bytes - self._budget.used_bytes, max_unpacked_bytes(self.size))
+        if head.unpacked_size > left:
+            raise ValueError(
+                f'a chunk needs {head.unpacked_size} bytes unpacked, more than the limit of '
+                f'{left} for this file; is it damaged? Otherwise set {VARIABLE}'
+            )
+
+    def _has_room(self, size: int) -> bool:
+        """Return whether a further chunk of this size may be kept beside the others."""
+        held = sum(map(len, self._kept.values()))
+        return len(self._kept) < KEPT_CHUNKS and held + size <= KEPT_BYTES
+
+
+def is_plain(head: Packed) -> bool:
+    """Return whether the records of a chunk are not compressed."""
+    return head.compression in ('', 'none')
+
+
+def as_index(numbers: array[int]) -> Index:
+    """Return entries of an index, one after the other, as (M, 6)."""
+    return np.array(numbers, np.int64).reshape(-1, INDEX_COLUMNS)
