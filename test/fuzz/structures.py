@@ -10,10 +10,12 @@ in footers, in aliases.
 
 from __future__ import annotations
 
+import bz2
 import contextlib
 import io
 import json
 from pathlib import Path
+import sqlite3
 import struct
 from types import SimpleNamespace
 import zipfile
@@ -55,13 +57,7 @@ def mcap(data: bytes) -> None:
         records = record(3, schema) + record(4, channel)
         records += message * source.pick((1, 10, 1000, 20_000))
         packing = source.pick((b'', b'zstd', b'lz4'))
-        packed = records
-        if packing == b'zstd':
-            packed = import_zstd().compress(records)
-        elif packing == b'lz4':
-            from lz4.frame import compress
-
-            packed = compress(records)
+        packed = packed_as(packing, records)
         size = source.pick(SIZES) if source.chance(4) else len(records)
         packed_size = source.pick(SIZES) if source.chance(6) else len(packed)
         checksum = source.number() % 2**32 if source.chance(4) else zlib.crc32(records)
@@ -72,6 +68,121 @@ def mcap(data: bytes) -> None:
     if source.chance(3):
         content = content[: len(content) - source.below(200)]
     refused(read_bag, 'structure.mcap', content)
+
+
+def ros1(data: bytes) -> None:
+    """Read a ROS 1 bag whose sizes, offsets and index may not agree with its chunks."""
+    source = Source(data)
+
+    def fields(**values: bytes) -> bytes:
+        parts = [name.encode() + b'=' + value for name, value in values.items()]
+        return b''.join(struct.pack('<I', len(part)) + part for part in parts)
+
+    def record1(content: bytes, **values: bytes) -> bytes:
+        header = fields(**values)
+        return struct.pack('<I', len(header)) + header + struct.pack('<I', len(content)) + content
+
+    def number(value: int, code: str = '<I') -> bytes:
+        if source.chance(12):
+            value = source.number() % (1 << 8 * struct.calcsize(code))
+        return struct.pack(code, value)
+
+    described = fields(
+        topic=b'/a', type=b'std_msgs/String', md5sum=b'x', message_definition=b'string data'
+    )
+    connection = record1(described, op=b'\x07', conn=struct.pack('<I', 0), topic=b'/a')
+    parts, infos = [b'#ROSBAG V2.0\n', b''], []
+    for _ in range(1 + source.below(4)):
+        count = source.pick((1, 10, 1000))
+        content = struct.pack('<I', 3) + b'abc'
+        message = record1(content, op=b'\x02', conn=number(0), time=struct.pack('<II', 5, 7))
+        records = connection + message * count
+        packing = source.pick((b'none', b'bz2', b'lz4'))
+        packed = packed_as(packing, records)
+        size = source.pick(SIZES) % 2**32 if source.chance(4) else len(records)
+        at = sum(map(len, parts)) + HEADER_BYTES
+        parts.append(
+            record1(packed, op=b'\x05', compression=packing, size=struct.pack('<I', size))
+        )
+        info = {'ver': number(1), 'chunk_pos': number(at, '<Q'), 'count': number(1)}
+        span = {'start_time': number(5, '<Q'), 'end_time': number(5, '<Q')}
+        counts = struct.pack('<I', 0) + number(count)
+        infos += [record1(counts, op=b'\x06', **info, **span)] * source.pick((1, 1, 1, 40))
+    index_at = sum(map(len, parts)) + HEADER_BYTES
+    counts = {'conn_count': number(1), 'chunk_count': number(len(infos))}
+    header = fields(op=b'\x03', index_pos=number(index_at, '<Q'), **counts)
+    padding = bytes(HEADER_BYTES - 8 - len(header))
+    parts[1] = struct.pack('<I', len(header)) + header + struct.pack('<I', len(padding)) + padding
+    content = b''.join([*parts, connection, *infos])
+    if source.chance(4):
+        content = content[: len(content) - source.below(200)]
+    refused(read_bag, 'structure.bag', content)
+
+
+HEADER_BYTES = 4096
+"""Size of the first record of a ROS 1 bag, with its padding."""
+
+
+def packed_as(packing: bytes, records: bytes) -> bytes:
+    """Return records packed in one of the ways of bags."""
+    if packing == b'zstd':
+        return import_zstd().compress(records)
+    if packing == b'bz2':
+        return bz2.compress(records)
+    if packing == b'lz4':
+        from lz4.frame import compress
+
+        return compress(records)
+    return records
+
+
+DATABASE = """
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT,
+offered_qos_profiles TEXT);
+CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
+"""
+
+STATEMENTS = (
+    'CREATE VIEW schema AS WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i FROM n) '
+    'SELECT i AS schema_version FROM n',
+    'ALTER TABLE messages ADD COLUMN more BLOB AS (zeroblob(1000000000))',
+    'CREATE TABLE schema(schema_version INTEGER)',
+    "INSERT INTO topics VALUES (2, '/b', 7, NULL, 3)",
+    "INSERT INTO topics VALUES (3, '/a', 'std_msgs/msg/String', 'cdr', '')",
+    "INSERT INTO messages VALUES (100000, 9, 'text', 4)",
+    'INSERT INTO messages VALUES (100001, NULL, NULL, NULL)',
+    'INSERT INTO messages VALUES (100002, 1, -9223372036854775808, zeroblob(100000))',
+    'CREATE INDEX by_time ON messages (timestamp)',
+    'CREATE TRIGGER t AFTER INSERT ON topics BEGIN SELECT 1; END',
+    'PRAGMA user_version = -1',
+)
+
+
+def sqlite(data: bytes) -> None:
+    """Read a sqlite3 bag with rows of other types, further objects, and pages cut or changed."""
+    source = Source(data)
+    path = Path(folder().name, 'made.db3')
+    path.unlink(missing_ok=True)
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute(f'PRAGMA page_size = {source.pick((512, 4096, 65536))}')
+        database.executescript(DATABASE)
+        row = (1, '/a', 'std_msgs/msg/String', source.pick(('cdr', 'cdr', 'json')), '')
+        database.execute('INSERT INTO topics VALUES (?, ?, ?, ?, ?)', row)
+        content = bytes(source.pick((0, 9, 5000, 100_000)))
+        stamps = (source.pick((5, 2**63 - 1, -1)) for _ in range(source.pick((0, 3, 100))))
+        for stamp in stamps:
+            database.execute('INSERT INTO messages VALUES (NULL, 1, ?, ?)', (stamp, content))
+        for _ in range(source.below(3)):
+            with contextlib.suppress(sqlite3.Error):
+                database.execute(source.pick(STATEMENTS))
+        database.commit()
+    changed = bytearray(path.read_bytes())
+    for _ in range(source.below(4)):
+        at = source.below(1 << 16) % len(changed)
+        changed[at] = source.below(256)
+    if source.chance(4):
+        del changed[source.below(1 << 16) % len(changed) :]
+    refused(read_bag, 'structure.db3', bytes(changed))
 
 
 def png(data: bytes) -> None:
