@@ -41,15 +41,10 @@ HARNESSES = {
     'settings': Harness(files.settings, corpus.settings, 300),
     'chain': Harness(files.chain, corpus.chain, 300),
     'mcap_structure': Harness(structures.mcap, corpus.noise, 60),
-<<<<<<< HEAD
-    'png_structure': Harness(structures.png, corpus.noise, 100),
-    'yaml_structure': Harness(structures.yaml, corpus.noise, 25),
-=======
     'ros1_structure': Harness(structures.ros1, corpus.noise, 100),
     'sqlite_structure': Harness(structures.sqlite, corpus.noise, 100),
-    'png_structure': Harness(structures.png, corpus.noise, 200),
-    'yaml_structure': Harness(structures.yaml, corpus.noise, 60),
->>>>>>> e60c2a5 (cluster: workers of this machine use TLS on loopback; fuzz: structures of ROS 1 and sqlite3)
+    'png_structure': Harness(structures.png, corpus.noise, 100),
+    'yaml_structure': Harness(structures.yaml, corpus.noise, 25),
     'npz_structure': Harness(structures.npz, corpus.noise, 200),
     'parquet_structure': Harness(structures.parquet, corpus.noise, 40),
     'map_url': Harness(files.map_url, corpus.map_url, 1000),
