@@ -66,6 +66,7 @@ HOMES = {
     'rcl_interfaces': ('ros/',),
     'rclpy': ('ros/',),
     'rerun': ('viz/',),
+    'rerun_bindings': ('viz/',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),
     'rosidl_runtime_py': ('ros/',),

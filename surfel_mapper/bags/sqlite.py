@@ -31,7 +31,13 @@ from typing import NamedTuple, TYPE_CHECKING
 import numpy as np
 
 from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.bags.bag_file import BagFile, FoundMessage, INDEX_COLUMNS, MESSAGE_BYTES
+from surfel_mapper.bags.bag_file import (
+    BagFile,
+    FoundMessage,
+    Index,
+    INDEX_COLUMNS,
+    MESSAGE_BYTES,
+)
 from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
@@ -70,7 +76,7 @@ class SalvagedSqlite(BagFile):
         for count, found in enumerate(self._scan(), 1):
             self._budget.take(MESSAGE_BYTES, f'index of {count} messages')
             numbers.extend((found.record_ns, found.connection, *found.place))
-        index = np.array(numbers, np.int64).reshape(-1, INDEX_COLUMNS)
+        index: Index = np.array(numbers, np.int64).reshape(-1, INDEX_COLUMNS)
         index = index[np.isin(index[:, 1], list(self._by_id))]
         self._index = index[np.argsort(index[:, 0], kind='stable')]
         self._counts = Counter(self._index[:, 1].tolist())
