@@ -194,7 +194,7 @@ def test_a_misspelt_setting_is_refused_with_the_nearest_one(name, near):
         Config.from_mapping({name: 1})
 
 
-def test_a_setting_like_no_other_is_refused_without_a_guess():
+def test_a_name_unlike_all_settings_is_refused_without_a_suggestion():
     with pytest.raises(ConfigError, match=r'^zzz: no such setting$'):
         Config.from_mapping({'zzz': 1})
 

@@ -101,7 +101,7 @@ def test_a_quaternion_a_little_off_unit_length_is_normalised():
         ([0, 0, 0], [0, 0, 1], '3 and 3 numbers'),
     ],
 )
-def test_a_pose_that_is_none_is_refused_with_what_was_found(xyz, q, named):
+def test_an_invalid_pose_is_refused_with_what_was_found(xyz, q, named):
     with pytest.raises(ValueError, match=named):
         pose_matrix(xyz, q)
 
@@ -268,7 +268,7 @@ def test_the_logarithm_keeps_all_digits_of_a_tiny_turn(axis, angle):
 
 
 @pytest.mark.parametrize('xi', [np.zeros(5), np.zeros((6, 1)), np.array([0, 0, 0, 0, 0, np.nan])])
-def test_a_twist_that_is_none_is_refused(xi):
+def test_an_invalid_twist_is_refused(xi):
     with pytest.raises(ValueError, match='expected 6 finite numbers'):
         se3_exp(xi)
 

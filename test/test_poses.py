@@ -274,7 +274,7 @@ def test_older_than_the_oldest_is_never_there_and_says_what_is():
     )
 
 
-def test_waiting_is_no_use_where_one_edge_is_too_old_and_another_not_there_yet():
+def test_a_lookup_too_old_for_one_edge_never_succeeds():
     buffer = drive()
     buffer.add('map', 'odom', EPOCH + 10 * S, moved(0.0))
 
@@ -464,7 +464,7 @@ def test_rotations_are_recognised_as_by_numpy(seed, skew):
 
 @pytest.mark.parametrize('value', [-1.0, math.nan, math.inf])
 @pytest.mark.parametrize('name', ['history_s', 'reset_after_s'])
-def test_a_duration_that_is_none_is_refused(name, value):
+def test_an_invalid_duration_is_refused(name, value):
     with pytest.raises(ValueError, match=name):
         TransformBuffer(**{name: value})
 

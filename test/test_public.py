@@ -29,11 +29,11 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
-def test_all_is_sorted_and_without_repetition():
+def test_public_names_are_sorted_and_unique():
     assert surfel_mapper.__all__ == sorted(set(surfel_mapper.__all__))
 
 
-def test_all_is_what_type_checkers_see():
+def test_type_checkers_see_the_public_names():
     tree = ast.parse(Path(surfel_mapper.__file__).read_text(encoding='utf-8'))
     typed = {
         alias.name: node.module

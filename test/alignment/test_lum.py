@@ -289,7 +289,7 @@ ANGLES = st.floats(-20.0, 20.0)
 
 
 @given(st.tuples(ANGLES, ANGLES, ANGLES))
-def test_angles_are_found_again_next_to_what_they_were(angles):
+def test_angles_nearest_to_the_reference_are_chosen(angles):
     pose = np.array([[1.0, 2.0, 3.0, *angles]])
     if abs(np.cos(angles[1])) < 1e-4:
         return  # roll and yaw are one there

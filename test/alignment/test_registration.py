@@ -166,7 +166,7 @@ def test_on_a_plain_height_and_tilt_alone_are_known():
     assert np.abs(found.T_map_sensor[:2, 3] - start[:2, 3]).max() < 0.02
 
 
-def test_against_an_empty_map_nothing_is_known():
+def test_an_empty_map_determines_no_motion():
     aligner = registration()
     start = started(1.0)
 

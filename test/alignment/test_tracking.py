@@ -36,7 +36,7 @@ def pose_at(seconds):
     return compose(TRUE, se3_exp(TWIST * seconds))
 
 
-def test_before_anything_is_known_the_sensor_stays():
+def test_before_the_first_motion_the_sensor_is_at_rest():
     tracker = tracker_at(TRUE)
 
     assert tracker.is_new
@@ -129,7 +129,7 @@ def test_after_a_scan_that_was_refused_the_next_one_is_found():
     np.testing.assert_allclose(tracker.pose, pose_at(0.3), atol=2e-3)
 
 
-def test_after_a_restart_nothing_is_known_of_the_motion():
+def test_after_a_restart_the_motion_is_unknown():
     tracker = tracker_at(TRUE)
     tracker.advance(TRUE, 0)
     tracker.advance(pose_at(0.2), SECOND // 5)

@@ -78,7 +78,7 @@ def test_an_unknown_ending_is_refused_with_the_known_ones(tmp_path, capsys):
     )
 
 
-def test_a_voxel_size_of_nothing_is_refused(tmp_path, capsys):
+def test_a_voxel_size_of_zero_is_refused(tmp_path, capsys):
     write_cloud(tmp_path / 'a.ply', sheet(1.0, 1.0, 0.1).astype(np.float32))
     arguments = [str(tmp_path / 'a.ply'), '--output', str(tmp_path / 'out')]
     assert main(['extract', *arguments, '--voxel-size', '0']) == 1

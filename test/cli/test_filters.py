@@ -34,7 +34,7 @@ def test_one_filter_is_listed_by_either_name(capsys):
     assert 'max_size_m (maxSizeByNode): 0, float in [0, inf].' in theirs
 
 
-def test_defaults_that_differ_under_the_other_name_are_told(capsys):
+def test_defaults_that_differ_under_the_other_name_are_listed(capsys):
     text = ' '.join(listed(capsys, 'voxel_grid').split())
     assert 'anchor: origin (minimum under the other name), str of origin, minimum.' in text
 

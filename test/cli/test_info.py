@@ -39,7 +39,7 @@ def test_topics_and_poses_are_printed(tmp_path, capsys, write):
     assert f'  /tf: {NUM_SCANS} of {NUM_SCANS}, in the frame odom' in lines
 
 
-def test_the_settings_printed_replay_the_bag(tmp_path, capsys):
+def test_printed_settings_replay_the_bag(tmp_path, capsys):
     path = write_rosbag2(tmp_path / 'a', drive())
     assert main(['info', str(path)]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -78,7 +78,7 @@ def test_a_bag_without_poses_says_so(tmp_path, capsys):
     assert 'no poses; clouds that are in a fixed frame map' in capsys.readouterr().out
 
 
-def test_a_mounting_that_is_missing_is_said(tmp_path, capsys):
+def test_a_missing_mounting_is_reported(tmp_path, capsys):
     path = write_rosbag2(tmp_path / 'a', [r for r in drive() if r[1] in (CLOUD, ODOMETRY)])
 
     assert main(['info', str(path)]) == 0

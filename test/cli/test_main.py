@@ -127,7 +127,7 @@ def test_help_and_refusals_load_nothing_heavy(arguments):
     assert done.stderr.splitlines()[-1] == '[]'
 
 
-def test_a_reader_that_has_gone_is_no_error(tmp_path):
+def test_a_closed_pipe_is_no_error(tmp_path):
     bag = write_rosbag2(tmp_path / 'drive', drive())
     read_end, write_end = os.pipe()
     os.close(read_end)

@@ -55,7 +55,7 @@ def test_no_line_comes_in_the_first_seconds(capsys):
     assert capsys.readouterr().err == ''
 
 
-def test_the_first_interrupt_is_told_and_the_second_interrupts():
+def test_the_first_interrupt_is_reported_and_the_second_interrupts():
     before = signal.getsignal(signal.SIGINT)
     with stopped_by_interrupt() as stopped:
         assert not stopped()

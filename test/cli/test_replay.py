@@ -180,7 +180,7 @@ def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path, c
     assert 'Errors of the poses' not in (first / 'report.html').read_text()
 
 
-def test_a_truth_that_is_none_is_refused_before_the_work(bag, tmp_path, capsys):
+def test_an_invalid_truth_is_refused_before_the_work(bag, tmp_path, capsys):
     output = tmp_path / 'out'
     assert main(['replay', str(bag), '--output', str(output), '--truth', '/nowhere']) == 1
     assert '/nowhere' in capsys.readouterr().err

@@ -127,7 +127,7 @@ def test_a_second_replay_replaces_all(bag, output, tmp_path):
         (['--poses', '/no/file'], 1, '/no/file: cannot be read: No such file'),
     ],
 )
-def test_foolish_arguments_are_refused(bag, tmp_path, capsys, arguments, code, says):
+def test_contradictory_arguments_are_refused(bag, tmp_path, capsys, arguments, code, says):
     try:
         found = main(['replay', str(bag), *arguments, '--output', str(tmp_path / 'out')])
     except SystemExit as error:

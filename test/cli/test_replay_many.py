@@ -81,7 +81,7 @@ def test_ctrl_c_leaves_the_map_of_the_shards_that_are_done(
     assert summary['digest'] == summary_of(alone[0])['digest'] == dataset_digest(tmp_path / 'map')
 
 
-def test_ctrl_c_before_a_shard_is_done_that_counts_leaves_the_earlier_map(
+def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
     bags, tmp_path, monkeypatch, capsys
 ):
     assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 0
@@ -189,7 +189,7 @@ def test_a_bag_that_ends_too_early_is_mapped_as_far_as_it_goes(bags, tmp_path, c
 
 
 @pytest.mark.parametrize('number', ['0', '-1', 'two', '1.5'])
-def test_a_number_of_workers_that_is_none_is_refused(bags, number):
+def test_an_invalid_number_of_workers_is_refused(bags, number):
     with pytest.raises(SystemExit) as exit_info:
         main(['replay', bags[0], '--workers', number])
     assert exit_info.value.code == 2

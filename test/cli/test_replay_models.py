@@ -84,7 +84,7 @@ def test_report_picture_and_recording_show_them(output):
         assert f'/map/models/{entity}' in printed
 
 
-def test_a_drawing_of_models_that_nobody_makes_is_refused(bag, tmp_path, capsys):
+def test_a_drawing_is_refused_without_models(bag, tmp_path, capsys):
     arguments = ['replay', str(bag), '--formats', 'dxf', '--output', str(tmp_path / 'out')]
     assert main(arguments) == 1
     assert 'layers.models.enabled' in capsys.readouterr().err

@@ -57,7 +57,7 @@ def test_the_poses_found_are_written(bag, tmp_path):
     assert summary['scans']['mapped'] == NUM_SCANS
 
 
-def test_a_frozen_map_is_loaded_and_only_told_where_scans_were_taken(bag, tmp_path, capsys):
+def test_a_frozen_map_gives_the_poses_of_scans(bag, tmp_path, capsys):
     save_map(tmp_path / 'room.npz', map_of(ROOM))
     start = [*TRUE[:3, 3].tolist(), *q_xyzw(TRUE).tolist()]
     text = (

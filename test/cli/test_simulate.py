@@ -79,7 +79,7 @@ def test_defaults_are_those_of_the_simulation():
     assert (simulation.num_scans, simulation.rolling) == (100, False)
 
 
-def test_a_bag_that_is_there_gives_way_only_to_overwrite(tmp_path, capsys):
+def test_an_existing_bag_is_replaced_only_with_overwrite(tmp_path, capsys):
     assert run(tmp_path / 'street', '--scans', '1') == 0
     assert run(tmp_path / 'street', '--scans', '2') == 1
     assert 'surfel-mapper simulate: ' in capsys.readouterr().err

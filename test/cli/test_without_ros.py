@@ -21,7 +21,7 @@ sys.exit(main(sys.argv[1:]))
 
 
 @pytest.mark.parametrize('verb', ['node', 'play'])
-def test_without_ros_it_is_said_how_to_get_it(tmp_path, verb):
+def test_without_ros_the_error_says_how_to_install_it(tmp_path, verb):
     words = [verb] if verb == 'node' else [verb, str(write_rosbag2(tmp_path / 'bag', drive()))]
     done = subprocess.run(
         [sys.executable, '-c', WITHOUT_ROS, *words], capture_output=True, text=True
@@ -34,7 +34,7 @@ def test_without_ros_it_is_said_how_to_get_it(tmp_path, verb):
 
 
 @pytest.mark.parametrize('rate', ['0', '-1', 'nan'])
-def test_a_pace_that_is_none_is_refused(tmp_path, capsys, rate):
+def test_an_invalid_pace_is_refused(tmp_path, capsys, rate):
     with pytest.raises(SystemExit) as stopped:
         main(['play', str(write_rosbag2(tmp_path / 'bag', drive())), '--rate', rate])
     assert stopped.value.code == 2

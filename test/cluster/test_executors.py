@@ -76,7 +76,7 @@ def test_every_task_is_answered_under_its_number(two_workers):
     assert two_workers.num_workers == 2
 
 
-def test_workers_are_born_with_all_that_tasks_need(two_workers):
+def test_workers_start_with_the_modules_of_all_tasks(two_workers):
     assert set(two_workers._client.run(what_is_there).values()) == {(True, True, '1')}
 
 

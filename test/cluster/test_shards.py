@@ -86,7 +86,7 @@ def test_every_worker_gets_as_many_shards_as_any_other(recorded_s, num_workers, 
     assert SHORTEST_S <= length_s <= LONGEST_S
 
 
-def test_bags_of_nearly_the_same_length_are_not_cut_for_what_they_differ(tmp_path):
+def test_bags_of_nearly_equal_length_are_not_cut(tmp_path):
     bag, config = written(tmp_path, 'plain')
     for shard_s, number in ((RECORDED_S * 0.995, 1), (RECORDED_S / 2 * 0.995, 2), (2.0, 3)):
         assert len(shards_of(bag, config, shard_s)) == number
@@ -160,7 +160,7 @@ def test_a_stopped_run_gives_the_map_of_the_shards_done(tmp_path):
     assert counted(mapped.counts()) == counted(expected.summary())
 
 
-def test_shards_that_nothing_leads_to_are_left_out_when_it_is_stopped(tmp_path):
+def test_shards_after_a_gap_are_left_out_when_it_is_stopped(tmp_path):
     first, config = written(tmp_path, 'plain')
     second, _ = written(tmp_path, 'faults')
     shards = shards_of(first, config, 3.0) + shards_of(second, config, 3.0)

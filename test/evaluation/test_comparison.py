@@ -82,7 +82,7 @@ def test_half_a_map_is_half_complete_however_dense_a_part_of_the_truth_is():
     assert completeness(half.position, samples, 0.4) == pytest.approx(0.5)
 
 
-def test_nothing_has_no_errors_and_no_completeness():
+def test_an_empty_map_has_no_errors_and_no_completeness():
     nothing = Discs(np.empty((0, 3)), np.empty((0, 3)))
     result = compared(nothing, CloudTruth(grid()))
     assert result['compared'] == 0

@@ -116,13 +116,13 @@ def test_a_turn_too_much_in_each_step_is_a_drift_of_rotation():
     assert drift(estimated, true)[1] == pytest.approx(math.degrees(1e-2))
 
 
-def test_drift_of_what_never_moved_is_not_a_number():
+def test_drift_without_motion_is_nan():
     still = np.tile(np.eye(4), (5, 1, 1))
 
     assert np.isnan(drift(still, still)).all()
 
 
-def test_stamps_go_with_the_nearest_and_each_only_once():
+def test_stamps_match_the_nearest_and_each_only_once():
     rows, others = common_stamps(
         np.array([0, 90, 100, 205, 1000]), np.array([1, 101, 199, 400]), max_difference_ns=10
     )
@@ -132,7 +132,7 @@ def test_stamps_go_with_the_nearest_and_each_only_once():
 
 
 @pytest.mark.parametrize(('first', 'second'), [([], [1]), ([1], []), ([5], [16])])
-def test_stamps_without_any_near_enough_have_nothing_in_common(first, second):
+def test_distant_stamps_do_not_match(first, second):
     rows, others = common_stamps(np.array(first, int), np.array(second, int), 10)
 
     assert len(rows) == len(others) == 0

@@ -71,7 +71,7 @@ def test_obj_has_an_object_for_every_patch_and_faces_within_its_vertices(model, 
             assert all(1 <= int(n) <= num_vertices for n in line.split()[1:])
 
 
-def test_ids_and_versions_of_models_that_live_are_kept(model, tmp_path):
+def test_ids_and_versions_of_live_models_are_kept(model, tmp_path):
     parquet = pytest.importorskip('pyarrow.parquet')
     live = replace(
         model,

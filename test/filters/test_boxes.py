@@ -163,7 +163,7 @@ def described(points, **settings):
     return filter_of(ELLIPSOIDS, samplingMethod=1, **flags, **settings).apply(scan_of(points))
 
 
-def test_an_ellipsoid_says_mean_covariance_weight_and_shape():
+def test_an_ellipsoid_has_mean_covariance_weight_and_shape():
     points = clusters([[1.0, 2.0, 3.0]], number=5)
     found = described(points, keepIndices=1).columns
     np.testing.assert_allclose(found['means'], [points.mean(axis=0)])
@@ -187,7 +187,7 @@ def test_rows_of_fewer_points_are_filled_up():
     np.testing.assert_array_equal(np.isnan(found['pointX']), found['pointIds'] < 0)
 
 
-def test_only_planar_boxes_stay_where_asked():
+def test_only_planar_boxes_stay_if_configured():
     line = np.linspace(0.0, 1.0, 5)[:, None] * [1.0, 0.0, 0.0]
     square = 10.0 + np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [1, 1, 0], [0.5, 0.5, 0]])
     points = np.concatenate([line, square])

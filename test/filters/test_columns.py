@@ -39,7 +39,7 @@ class Counting(Mapping):
         return len(self.columns)
 
 
-def test_rows_of_rows_are_taken_once_and_only_when_asked_for():
+def test_selected_rows_of_selected_rows_are_taken_once_when_read():
     counting = Counting()
     scan = replace(scan_of(np.arange(18.0).reshape(6, 3)), columns=counting)
     counting.asked.clear()
@@ -51,7 +51,7 @@ def test_rows_of_rows_are_taken_once_and_only_when_asked_for():
     np.testing.assert_array_equal(found.points[:, 0], [15.0, 6.0])
 
 
-def test_names_are_known_without_taking_anything():
+def test_names_are_known_without_taking_columns():
     columns = LazyColumns({'a': np.arange(3)}, np.array([1]), 1, {'c': np.ones(1)})
     assert (list(columns), len(columns)) == (['a', 'c'], 2)
     assert 'a' in columns
@@ -142,7 +142,7 @@ def test_whole_numbers_are_averaged_and_rounded(dtype):
     assert merged(np.array([1, 2, 2, 5, 2], dtype)).tolist() == [4, 2]  # 3.5 to even, 5/3
 
 
-def test_booleans_are_what_half_of_them_are():
+def test_booleans_are_true_if_half_of_them_are():
     assert merged(np.array([True, True, False, False, False])).tolist() == [True, False]
 
 
@@ -184,7 +184,7 @@ def test_colours_are_averaged_by_channel():
     assert merged(packed, name='rgb').view(np.uint32).tolist() == [0x00800080, 0x00010000]
 
 
-def test_the_first_are_kept_where_averages_are_not_wanted():
+def test_first_values_are_kept_without_averaging():
     assert merged(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), average=False).tolist() == [2.0, 1.0]
 
 
@@ -210,7 +210,7 @@ def test_the_kind_of_a_column_follows_its_name_or_its_type(name, dtype, kind):
     assert kind_of(name, np.zeros(1, dtype)) is kind
 
 
-def test_nothing_is_made_before_it_is_asked_for():
+def test_columns_are_computed_when_read():
     columns = {'a': np.arange(5.0), 'b': None}  # b could not be averaged
     found = MergedColumns(columns, GROUPS)
     assert (list(found), len(found), found.num_rows) == (['a', 'b'], 2, 2)

@@ -180,7 +180,7 @@ def test_the_edges_of_a_field_of_view_are_in_it():
     assert kept('field_of_view', points, elevation_min_deg=0, elevation_max_deg=0) == [0, 1, 2, 3]
 
 
-def test_nothing_is_seen_at_the_sensor_or_where_no_place_is():
+def test_points_at_the_sensor_or_not_finite_are_not_seen():
     points = [[0.0, 0.0, 0.0], [np.nan, 1.0, 0.0], [INF, 1.0, 0.0], [0.0, 0.0, 1.0]]
     assert kept('field_of_view', points) == [3]
 
@@ -239,7 +239,7 @@ def test_a_turned_body_box_keeps_what_numpy_says(dtype):
     assert kept_rows('body_box', scan) == np.flatnonzero(outside).tolist()
 
 
-def test_without_the_place_of_the_sensor_the_body_box_says_how_to_give_it():
+def test_the_body_box_needs_the_mount_of_the_sensor():
     scan = replace(random_scan(3), T_base_sensor=None)
     with pytest.raises(FilterError, match=r"'sensor' on the robot is not known; set frames.base"):
         filter_of('body_box').apply(scan)

@@ -94,7 +94,7 @@ def test_another_type_or_a_value_out_of_bounds_is_refused_with_what_was_expected
         read(**{name: value})
 
 
-def test_python_users_are_checked_like_chains():
+def test_parameters_in_python_are_checked_like_chains():
     with pytest.raises(ConfigError, match=r'Sample: whole: 0, expected a value in \[1, 10\]'):
         Sample(whole=0)
 

@@ -92,7 +92,7 @@ def test_an_entry_point_is_found_by_its_name(monkeypatch):
     assert OddRows in all_filters()
 
 
-def test_a_broken_entry_point_spoils_nothing_but_what_names_it(monkeypatch, caplog):
+def test_a_broken_entry_point_affects_only_chains_that_use_it(monkeypatch, caplog):
     entry_points(monkeypatch, lost='no_such_package:Filter', none=f'{__name__}:Broken')
     assert find('voxel_grid') is VoxelGrid
     assert VoxelGrid in all_filters()

@@ -42,7 +42,7 @@ def test_random_sampling_keeps_each_point_with_its_probability(probability):
     assert_even(found)
 
 
-def test_random_sampling_keeps_all_or_nothing_where_asked():
+def test_random_sampling_keeps_all_or_nothing_at_the_limits():
     assert len(rows('RandomSamplingDataPointsFilter', prob=1)) == NUMBER
     assert len(rows('RandomSamplingDataPointsFilter', prob=0)) == 0
 
@@ -65,7 +65,7 @@ def test_chance_follows_the_seed_and_the_stamp(name, settings):
 @pytest.mark.parametrize(
     ('number', 'count'), [(5, 1000), (1000, 1000), (1001, 1000), (NUMBER, 999), (3, 0)]
 )
-def test_max_point_count_keeps_so_many(number, count):
+def test_max_point_count_keeps_that_number(number, count):
     found = rows('MaxPointCountDataPointsFilter', line(number), maxCount=count)
     assert len(found) == min(number, count)
     assert (np.diff(found) > 0).all()
@@ -237,7 +237,7 @@ def stability(points, normals):
     return values / values[-1]
 
 
-def test_a_sample_resists_all_motions_that_the_scan_resists_better_than_chance_does():
+def test_covariance_sampling_constrains_motions_better_than_random_sampling():
     scan = floor_and_groove()
     stable = filter_of(COVARIANCE, nbSample=300).apply(scan)
     chance = filter_of('max_point_count', max_points=300).apply(scan)

@@ -136,7 +136,7 @@ def test_columns_are_left_out_where_not_wanted():
     assert set(filter_of(SPECTRAL, **flags, keepLambdas=0).apply(scan).columns) == bare
 
 
-def test_a_point_that_nobody_votes_for_has_no_normal():
+def test_a_point_without_votes_has_no_normal():
     found = filter_of(SALIENCY).apply(scan_of([[0.0, 0, 0], [9.0, 0, 0]])).columns
     assert np.isnan(found['normals']).all()
     assert found['surfaceness'].tolist() == [0.0, 0.0]

@@ -88,7 +88,7 @@ def test_moments_for_another_voxel_size_or_level_are_refused(operation):
 
 
 @pytest.mark.parametrize('size_m', [0.0, -0.5, math.nan, math.inf])
-def test_a_voxel_size_that_is_none_is_refused(size_m):
+def test_an_invalid_voxel_size_is_refused(size_m):
     with pytest.raises(ValueError, match='voxel_size_m'):
         SurfelMap(size_m)
 

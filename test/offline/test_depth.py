@@ -89,7 +89,7 @@ def test_images_wait_for_the_first_calibration_and_are_mapped_with_it(tmp_path):
     assert mapper.map.digest() == expected.map.digest()
 
 
-def test_a_camera_that_is_none_is_counted_and_the_next_one_taken(tmp_path):
+def test_an_invalid_camera_is_counted_and_the_next_one_taken(tmp_path):
     entries = Entries()
     camera_info(entries, START_NS - 20, focal=0.0)
     camera_info(entries, START_NS - 10)

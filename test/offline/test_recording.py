@@ -255,7 +255,7 @@ def test_two_sources_of_poses_are_refused(tmp_path, bag):
         mapped(bag, poses=pose_file(tmp_path, 'tum'), pose_topic='/odom')
 
 
-def test_a_file_of_poses_that_is_none_is_refused(tmp_path, bag):
+def test_an_invalid_file_of_poses_is_refused(tmp_path, bag):
     (tmp_path / 'poses').write_text('nothing')
 
     with pytest.raises(FileFormatError, match='poses: 1 columns in the first line'):

@@ -184,7 +184,7 @@ def test_the_map_is_written_before_a_picture_that_fails(bag, tmp_path, monkeypat
     assert contents(tmp_path / 'out') == {'map.ply', 'map.npz', 'trajectory.tum'}
 
 
-def test_the_default_output_goes_back_in(bag, tmp_path, capsys, caplog):
+def test_the_default_output_can_be_read_back(bag, tmp_path, capsys, caplog):
     pytest.importorskip('pyarrow', reason='merging needs pyarrow (extra formats)')
     out, half = tmp_path / 'out', tmp_path / 'half'
     digest = replay(bag, output=out).summary['digest']

@@ -79,7 +79,7 @@ def test_a_mounting_over_two_transforms_is_their_product(tmp_path):
     assert made[1].settings['frames.base_to_sensor'] == [1.5, 2.25, 3.125, 0.0, 0.0, 0.0, 1.0]
 
 
-def test_a_mounting_that_is_not_in_the_bag_is_said_to_be_missing(tmp_path):
+def test_a_mounting_that_is_not_in_the_bag_is_reported(tmp_path):
     path = write_rosbag2(tmp_path / 'a', [row for row in drive() if row[1] in (CLOUD, ODOMETRY)])
 
     _, (offer,) = surveyed(path)
@@ -89,7 +89,7 @@ def test_a_mounting_that_is_not_in_the_bag_is_said_to_be_missing(tmp_path):
     assert offer.missing == 'the place of lidar in base_link is not in the bag, measure it'
 
 
-def test_clouds_outside_the_poses_are_counted_out(tmp_path):
+def test_clouds_without_a_pose_are_counted(tmp_path):
     entries = drive()
     last_ns = START_NS + (NUM_SCANS - 1) * PERIOD_NS
     cut = [row for row in entries if row[1] == CLOUD or START_NS < row[2] < last_ns]

@@ -156,7 +156,7 @@ def test_aligning_again_moves_next_to_nothing(drive):
     assert mapper.map.digest() == rebuilt(mapper, drive[0]).digest()
 
 
-def test_every_so_many_scans_the_window_is_aligned(drive):
+def test_the_window_is_aligned_every_few_scans(drive):
     mapper, updates = mapped(drive, {'align.every_scans': 3})
 
     assert [update.alignment is not None for update in updates] == [False, False, True] * 2 + [

@@ -33,7 +33,7 @@ EVENT = st.one_of(
 
 @settings(max_examples=150)
 @given(st.lists(EVENT, max_size=40), st.integers(0, 3), st.sampled_from([0.0, 0.3]))
-def test_whatever_comes_in_the_counts_add_up_and_the_map_is_its_window(events, limit, gate_m):
+def test_counts_add_up_and_the_map_is_its_window_for_any_input(events, limit, gate_m):
     mapper = mapper_with(
         window__max_scans=limit + 1, window__gate_distance_m=gate_m, pose__max_waiting_scans=4
     )

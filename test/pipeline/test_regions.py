@@ -64,7 +64,7 @@ def test_a_prism_contains_what_is_in_its_polygon_at_any_height(corners, turned):
         ),
     ],
 )
-def test_a_region_that_is_none_is_refused(make, message):
+def test_an_invalid_region_is_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 

@@ -118,7 +118,7 @@ def test_two_sensors_serve_one_track():
     np.testing.assert_allclose(updates[5].T_map_sensor, compose(pose_at(5), mount), atol=5e-3)
 
 
-def test_a_second_sensor_that_sits_nobody_knows_where_is_dropped():
+def test_a_second_sensor_without_a_mount_is_dropped():
     mapper = mapper_with()
 
     feed(mapper, [scan_at(0), scan_at(1, frame_id='other'), scan_at(20)])
@@ -223,7 +223,7 @@ def test_a_frozen_map_stays_as_it_is():
     assert mapper.summary()['scans']['localised'] == 5
 
 
-def test_on_a_frozen_map_somebody_may_say_where_the_robot_is():
+def test_an_initial_pose_is_used_on_a_frozen_map():
     far_off = (40.0, -30.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     mapper = frozen(registration__start=far_off)
     assert feed(mapper, [scan_at(0)]) == []
@@ -278,6 +278,6 @@ def test_live_settings_of_the_registration_hold_from_the_next_scan_on():
         ({'registration.start': [0.0] * 7}, r'registration\.start: .* a unit quaternion'),
     ],
 )
-def test_settings_that_make_no_sense_together_are_refused(settings, message):
+def test_contradictory_settings_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         Config.from_mapping(settings)

@@ -171,6 +171,6 @@ def fields(scan):
         ({'layers.tsdf.label_topic': 'labels'}, r'semantics: none, expected another where'),
     ],
 )
-def test_topics_of_what_is_not_kept_are_refused(settings, message):
+def test_image_topics_of_channels_not_kept_are_refused(settings, message):
     with pytest.raises(ConfigError, match=message):
         mapper_with(**settings)

@@ -117,7 +117,7 @@ def test_the_limits_of_the_configuration_hold(limits, left):
     assert set(mapper.counters.evicted) <= {name.split('__')[1] for name in limits}
 
 
-def test_points_are_kept_where_asked():
+def test_points_are_kept_if_configured():
     for keep in (False, True):
         mapper = mapper_with(pose__source='identity', window__keep_points=keep)
         scan = scan_at(1.0)

@@ -164,7 +164,7 @@ def test_poses_that_were_set_back_before_the_scans_are_kept():
     assert update.T_map_sensor[0, 3] == 100.0
 
 
-def test_how_the_sensor_is_mounted_outlives_a_reset():
+def test_the_mount_of_the_sensor_survives_a_reset():
     mapper = mapper_with(pose__source='tf', frames__base_to_sensor=())
     mapper.add_pose('base_link', 'lidar', 0, (0.0, 0.0, 2.0), LEVEL, static=True)
     add_pose(mapper, 50.0)

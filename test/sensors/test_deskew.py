@@ -60,7 +60,7 @@ def test_times_before_the_stamp_are_negative_where_the_stamp_is_that_of_the_end(
     assert found.last_ns == START_NS
 
 
-def test_near_time_zero_what_is_nearer_to_the_stamp_is_meant():
+def test_near_time_zero_the_reference_nearer_to_the_stamp_is_used():
     stamp_ns = 1500 * MS
     since_start = point_times(sweep(np.array([1.5, 1.55]), 'timestamp', stamp_ns))
     since_stamp = point_times(sweep(np.array([0.0, 0.05]), 'timestamp', stamp_ns))
@@ -74,7 +74,7 @@ def test_the_field_is_recognised_by_its_name_or_named(name):
     assert point_times(sweep(times, name), field).offsets.tolist() == [0, 5]
 
 
-def test_points_that_are_none_have_no_say():
+def test_invalid_points_do_not_affect_the_times():
     times = np.array([1e300, EPOCH_S[0], np.nan, 0.0, EPOCH_S[1], np.inf])
     points = np.ones((6, 3), np.float32)
     points[0], points[3] = np.nan, 0.0
@@ -98,7 +98,7 @@ def test_points_that_are_none_have_no_say():
         (sweep(np.float32(EPOCH_S)), {}, 'float32'),
     ],
 )
-def test_times_that_make_no_sense_are_refused(scan, settings, message):
+def test_implausible_times_are_refused(scan, settings, message):
     with pytest.raises(CloudFormatError, match=message):
         point_times(scan, **settings)
 
@@ -158,7 +158,7 @@ def test_without_motion_no_point_moves():
     np.testing.assert_allclose(found.points, points, atol=1e-14)
 
 
-def test_points_without_a_return_or_too_near_stay_so_and_nan_stays_nan():
+def test_points_without_a_return_or_too_near_are_not_moved():
     points = np.array([[0, 0, 0], [0.05, 0, 0], [np.nan, 1, 1], [1, 1, np.inf], [3, 0, 0]])
     scan = with_times(points, np.full(5, 90 * MS))
     found = deskewed(scan, pose_at(moving(10)), min_range_m=0.1).points
@@ -229,7 +229,7 @@ def errors_deg(mapper, simulation):
     return np.degrees(np.arcsin(np.minimum(sine, 1.0)))
 
 
-def test_a_rolling_lidar_maps_as_truly_as_one_that_sees_all_at_once_where_deskewed():
+def test_a_deskewed_rolling_lidar_maps_like_an_instantaneous_one():
     lidar = Lidar(beams=32, columns=512)
     world = World.street(seed=0, length_m=40.0)
     rolling = Simulation(world, lidar, num_scans=4, rolling=True)

@@ -70,14 +70,14 @@ def test_without_points_at_infinity_or_without_rows_there_are_none():
     assert free_directions(scan.select(np.arange(len(scan)))) is None
 
 
-def test_rows_that_are_no_beams_tell_nothing():
+def test_rows_that_are_no_beams_give_no_directions():
     scan, _ = organised(np.inf, PATCH)
     mixed = np.random.default_rng(3).permutation(len(scan))
     shuffled = Scan(points=scan.points[mixed], stamp_ns=S, frame_id='lidar', msg=scan.msg)
     assert free_directions(shuffled) is None
 
 
-def test_a_beam_without_points_tells_nothing():
+def test_a_beam_without_points_gives_no_directions():
     where = np.zeros((32, 360), bool)
     where[3], where[:, 50] = True, True
     found = free_directions(organised(np.inf, where)[0])

@@ -31,7 +31,7 @@ def test_the_vehicle_goes_along_the_road_at_its_speed_with_gentle_curves():
     assert np.deg2rad(5.0) < max(turns) < np.deg2rad(12.0)
 
 
-def test_the_vehicle_points_where_it_goes():
+def test_the_vehicle_points_along_its_path():
     drive = Drive(start=LEVEL)
     for k in range(0, 300, 7):
         stamp_ns = START_NS + k * 10**8
@@ -52,7 +52,7 @@ def test_the_twist_is_the_motion_in_the_vehicles_frame():
     np.testing.assert_allclose(drive.twist(stamp_ns), expected, atol=1e-6 * 8.0)
 
 
-def test_a_standing_vehicle_stands():
+def test_a_vehicle_at_rest_keeps_its_pose():
     drive = Drive(start=LEVEL, speed_m_s=0.0)
     later = drive.T_odom_base(START_NS + 10**10)
     np.testing.assert_array_equal(later, drive.T_odom_base(START_NS))
@@ -126,7 +126,7 @@ def test_a_scan_does_not_depend_on_what_was_simulated_before(street):
         dict(start=(0.0, 0.0)),
     ],
 )
-def test_a_drive_that_cannot_be_is_refused_by_its_setting(setting):
+def test_an_invalid_drive_is_refused_by_its_setting(setting):
     with pytest.raises(ConfigError, match=next(iter(setting))):
         Drive(**{'start': LEVEL, **setting})
 

@@ -137,7 +137,7 @@ def test_with_a_pose_for_each_column_every_column_is_seen_from_its_own():
         dict(seed=-1),
     ],
 )
-def test_a_lidar_that_cannot_be_is_refused_by_its_setting(setting):
+def test_an_invalid_lidar_is_refused_by_its_setting(setting):
     with pytest.raises(ConfigError) as refused:
         Lidar(**setting)
     text = str(refused.value)

@@ -132,7 +132,7 @@ def test_times_are_those_of_a_real_recording(rate_hz, tmp_path):
         assert poses[-1] >= stamp_ns(message) + turn_ns - 1  # also for the last column
 
 
-def test_the_simulation_of_a_bag_can_be_had_again(bag, simulation):
+def test_the_simulation_of_a_bag_is_restored(bag, simulation):
     again = load_simulation(bag)
     assert again.world.primitives == simulation.world.primitives
     assert (again.lidar, again.drive) == (simulation.lidar, simulation.drive)
@@ -140,7 +140,7 @@ def test_the_simulation_of_a_bag_can_be_had_again(bag, simulation):
     np.testing.assert_array_equal(again.scan(2).points, simulation.scan(2).points)
 
 
-def test_progress_is_told_scan_by_scan(tmp_path):
+def test_progress_is_reported_scan_by_scan(tmp_path):
     stamps = []
     simulation = small_simulation()
     record(simulation, tmp_path / 'street', on_scan=lambda scan: stamps.append(scan.stamp_ns))

@@ -62,7 +62,7 @@ def test_normals_of_voxels_with_one_plane_are_the_true_ones(mapped):
     assert error_deg.max() < 0.03
 
 
-def test_normals_point_out_of_the_surface_wherever_it_was_not_seen_along_itself(mapped):
+def test_normals_point_out_of_surfaces_not_seen_edge_on(mapped):
     simulation, position, normal, _ = mapped
     true_normal = simulation.world.normal_at(position)
     stamps = [simulation.stamp_ns(number) for number in range(NUM_SCANS)]

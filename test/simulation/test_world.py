@@ -28,13 +28,13 @@ BALL = Primitive(kind='sphere', size_m=(1.0,), xyz=(-5.0, 0.0, 0.0))
         (dict(reflectivity=1.5), 'reflectivity: 1.5'),
     ],
 )
-def test_a_primitive_that_makes_no_sense_is_refused(changed, says):
+def test_an_invalid_primitive_is_refused(changed, says):
     good = dict(kind='box', size_m=(1.0, 2.0, 3.0))
     with pytest.raises(ValueError, match=says):
         Primitive(**{**good, **changed})
 
 
-def test_surfaces_know_their_primitive_their_flatness_and_how_they_reflect():
+def test_surfaces_have_a_primitive_flatness_and_reflectivity():
     world = World([BOX, POLE, BALL])
     surface, distance_m, normal = world.surface_at(
         [[0.9, 0.1, 0.2], [0.0, 0.0, -4.0], [5.2, 0.0, 1.0], [5.0, 0.02, 2.6], [-5.0, 0.0, 2.0]]
@@ -67,7 +67,7 @@ def test_no_surface_is_of_no_primitive():
         ([0.0, np.nan, 0.0], [[1.0, 0.0, 0.0]], 'origins: not all finite'),
     ],
 )
-def test_rays_that_are_none_are_refused(origins, directions, says):
+def test_invalid_rays_are_refused(origins, directions, says):
     with pytest.raises(ValueError, match=says):
         World([BOX]).raycast(origins, directions)
 
@@ -99,7 +99,7 @@ def test_a_street_has_every_kind_and_nothing_flat_along_the_grid():
 @pytest.mark.parametrize(
     'arguments', [dict(seed=-1), dict(length_m=0.0), dict(length_m=-5.0), dict(length_m=np.nan)]
 )
-def test_a_street_that_cannot_be_is_refused(arguments):
+def test_an_invalid_street_is_refused(arguments):
     with pytest.raises(ConfigError, match=r'seed|length_m'):
         World.street(**arguments)
 

@@ -125,7 +125,7 @@ def test_a_surface_of_one_range_has_a_zero_level(sensor):
     assert abs(np.linalg.norm(vertices, axis=1) - 2.0).max() < 0.005
 
 
-def test_between_a_near_and_a_far_wall_there_is_no_curtain_unless_all_is_mixed():
+def test_no_false_surface_joins_a_near_and_a_far_wall_unless_all_is_mixed():
     row, column = np.indices((480, 640))  # a slanted edge, so that voxels lie about it anyhow
     depth = np.where(column + 0.37 * row < 400, 1.0, 3.0)
     curtain = {}

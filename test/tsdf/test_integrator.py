@@ -104,7 +104,7 @@ def test_the_order_of_measurements_does_not_matter():
 
 @pytest.mark.parametrize('sensor', [SMALL, LIDAR], ids=['camera', 'lidar'])
 @pytest.mark.parametrize('value', [np.nan, 0.0, -1.0, -np.inf, 0.01])
-def test_pixels_that_say_nothing_change_nothing(sensor, value):
+def test_unknown_pixels_change_nothing(sensor, value):
     for allocation in ('band', 'frustum'):
         one = integrator(**SIZES, allocation=allocation)
         result = one.integrate(wall(sensor, value), np.eye(4))
@@ -131,7 +131,7 @@ def test_without_carving_only_the_band_is_touched():
     assert np.linalg.norm(carved, axis=1).min() < 0.3
 
 
-def test_blocks_placed_in_vain_go_and_those_there_stay():
+def test_new_unobserved_blocks_are_removed_and_earlier_ones_stay():
     one = integrator(**SIZES)
     one.integrate(wall(SMALL, 2.0), np.eye(4))
     before, there = field(one), one.blocks.num_blocks
@@ -147,7 +147,7 @@ def test_blocks_placed_in_vain_go_and_those_there_stay():
     assert all(np.array_equal(after[block], before[block]) for block in before)
 
 
-def test_without_allocation_only_blocks_there_change():
+def test_without_allocation_only_existing_blocks_change():
     one = integrator(**SIZES)
     assert one.integrate(wall(SMALL, 2.0), np.eye(4), allocate_blocks=False).num_updated == 0
     one.integrate(wall(SMALL, 2.0), np.eye(4))

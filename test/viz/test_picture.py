@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a map shows what faces the viewer, in the colours of planarity, to scale."""
+"""The picture of a map shows the surfels that face the viewer, coloured by planarity, to scale."""
 
 import numpy as np
 from PIL import Image
