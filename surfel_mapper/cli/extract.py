@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.drawings import draw_points
 
-    points, voxel_size_m, viewpoint = read(args)
+    points, voxel_size_m, viewpoint, origin_m = read(args)
     config = ModelsConfig(
         voxel_size_m=voxel_size_m,
         profile=args.profile,
@@ -94,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
     )
     model = fit(points, config, viewpoint)
     args.output.mkdir(parents=True, exist_ok=True)
-    write_models(args.output, model, args.formats)
+    write_models(args.output, model.translated(origin_m), args.formats)
     picture = PointsPicture(
         file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint
     )
@@ -106,8 +106,8 @@ def run(args: argparse.Namespace) -> int:
 
 def read(
     args: argparse.Namespace,
-) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64]]:
-    """Return points (N, 3), the size of voxels and the viewpoint (3,), m."""
+) -> tuple[npt.NDArray[Any], float, npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Return points (N, 3), size of voxels, viewpoint (3,) and the origin (3,) of the map, m."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.errors import FileFormatError
     from surfel_mapper.files import map_state, parquet
@@ -120,12 +120,13 @@ def read(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
             f'{", ".join(MAPS)}'
         )
+    origin_m = np.zeros(3)
     if args.cloud.suffix in MAPS:
         if args.cloud.suffix == '.npz':
             surfel_map, _ = map_state.load_map(args.cloud)
         else:
             surfel_map = parquet.read_map(args.cloud)
-        surfels = surfel_map.surfels()
+        surfels, origin_m = surfel_map.surfels(), surfel_map.origin_m
         points: npt.NDArray[Any] = surfel_points(surfels, surfel_map.voxel_size_m)
         voxel_size_m, viewpoint = 0.5 * surfel_map.voxel_size_m, above(surfels)
     else:
@@ -138,8 +139,9 @@ def read(
         points = np.ascontiguousarray(points)
         voxel_size_m, viewpoint = ModelsConfig().voxel_size_m, np.zeros(3)
     if args.viewpoint is not None:
-        viewpoint = np.array(args.viewpoint)
-    return points, args.voxel_size if args.voxel_size is not None else voxel_size_m, viewpoint
+        viewpoint = np.array(args.viewpoint) - origin_m
+    size_m = args.voxel_size if args.voxel_size is not None else voxel_size_m
+    return points, size_m, viewpoint, origin_m
 
 
 def map_in(path: Path) -> Path:

@@ -16,7 +16,8 @@ import time
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cluster.executors import never, open_executor, start_forkserver
-from surfel_mapper.errors import BagError
+from surfel_mapper.config import AUTO
+from surfel_mapper.errors import BagError, ConfigError
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
@@ -94,6 +95,11 @@ def replay_bags(
 
     """
     began = time.perf_counter()
+    if config.map.origin == AUTO:
+        raise ConfigError(
+            'map.origin: auto, expected x y z with several recordings or workers: parts of a map '
+            'would find different ones'
+        )
     if workers is not None and scheduler is None:
         start_forkserver()  # they load their modules while this process loads its own
     from surfel_mapper.cluster.map_reduce import map_bags

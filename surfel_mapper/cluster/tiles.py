@@ -33,6 +33,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
     kind_of,
+    origin_of,
     Part,
     read_part,
     split_map,
@@ -207,21 +208,28 @@ def merge_maps(
     Raises
     ------
     MapError
-        If the maps differ in voxel size or columns.
+        If the maps differ in voxel size or columns, or their origins are not a whole number of
+        voxels apart.
     FileFormatError
         If a map cannot be read, or a file not written.
+
+    Notes
+    -----
+    The result has the origin of the first map.
 
     """
     with work_directory(directory) as work:
         found: list[dict[Tile, Part]] = []
         kinds: dict[str | Path, dict[str, Any]] = {}
+        origin_m: tuple[float, ...] | None = None
         for number, source in enumerate(sources):
             place = work / str(number)
             place.mkdir()
             parts = parts_of_map(source, place)
             for part in islice((part for tiles in parts for part in tiles.values()), 1):
                 kinds[source] = kind_of(part.path)
-            found += parts
+                origin_m = origin_m or origin_of(part.path)
+            found += at_origin(parts, origin_m, place)
         check_kinds(kinds)
         warn_of_repeated_scans(sources)
         return merge_parts(parts_by_tile(found), executor, directory, min_points, on_done)
@@ -261,6 +269,19 @@ def merge_parts(
         sample=concatenated([tile.sample for tile in tiles]),
         peak_bytes=max(tile.peak_bytes for tile in tiles),
     )
+
+
+def at_origin(
+    parts: list[dict[Tile, Part]], origin_m: tuple[float, ...] | None, work: Path
+) -> list[dict[Tile, Part]]:
+    """Return the parts of a map, cut anew if the map has another origin."""
+    every = [part for tiles in parts for part in tiles.values()]
+    if origin_m is None or not every or origin_of(every[0].path) == origin_m:
+        return parts
+    return [
+        write_shard(work / f'moved-{number}.parquet', read_part(part).at_origin(origin_m))
+        for number, part in enumerate(every)
+    ]
 
 
 def parts_by_tile(parts: Iterable[Mapping[Tile, Part]]) -> dict[Tile, list[Part]]:

@@ -43,6 +43,7 @@ from surfel_mapper.config.settings import (
     Stage,
 )
 from surfel_mapper.config.stages import (
+    AUTO,
     ClearConfig,
     DeskewConfig,
     DiagnosticsConfig,
@@ -57,6 +58,7 @@ from surfel_mapper.config.stages import (
 from surfel_mapper.config.yaml_files import parse_yaml, read_yaml
 
 __all__ = [
+    'AUTO',
     'AlignConfig',
     'ClearConfig',
     'Config',

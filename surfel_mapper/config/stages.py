@@ -21,6 +21,12 @@ POSE_SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
 
 INPUT_KINDS = ('cloud', 'depth')
 
+AUTO = 'auto'
+"""Value of map.origin: found from the first pose, or point, in the fixed frame."""
+
+MAX_ORIGIN_M = 1e9
+"""Limit of a coordinate of map.origin, m: float64 resolves 0.1 micrometres there."""
+
 MARKER_COLORS = ('planarity', 'normal', 'age')
 
 
@@ -44,6 +50,12 @@ class MapConfig(Stage):
         'live: scans are added to the map; frozen: they are only aligned to the map of map.load, '
         'which does not change.',
         choices=('live', 'frozen'),
+    )
+    origin: str = setting(
+        '',
+        'Point of the fixed frame that is the origin of the map, for poses in UTM or ECEF: '
+        'text of x y z, m; auto: near the first pose. Files have the coordinates of the fixed '
+        'frame, topics those of the map. Empty: the frames are one.',
     )
     load: str = setting(
         '',
@@ -69,9 +81,28 @@ class MapConfig(Stage):
     )
 
     def check(self, stage: str) -> None:
-        """Refuse a frozen map without a map to load."""
+        """Refuse a frozen map without a map to load, and an origin that is no point."""
+        _ = self.origin_m
         if self.mode == 'frozen' and not self.load:
             raise ConfigError(f'{stage}.load: empty, expected a map to freeze (map.mode frozen)')
+
+    @property
+    def origin_m(self) -> tuple[float, ...]:
+        """The origin, x y z in m; () if it is to be found (``auto``) or not set."""
+        if self.origin in ('', AUTO):
+            return ()
+        try:
+            found = tuple(
+                float(word) for word in self.origin.strip('[]() ').replace(',', ' ').split()
+            )
+        except ValueError:
+            found = ()
+        if len(found) != 3 or not all(abs(value) < MAX_ORIGIN_M for value in found):
+            raise ConfigError(
+                f'map.origin: {self.origin!r}, expected nothing, {AUTO}, or a text of x y z in m, '
+                "each below 1e9, such as '400000 5400000 0'"
+            )
+        return found
 
     @property
     def columns(self) -> tuple[str, ...]:

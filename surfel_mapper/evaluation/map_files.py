@@ -21,7 +21,6 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet, pcd, ply
 from surfel_mapper.files.parquet_tiles import dataset_digest, tiles_in
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
 
 Floats = npt.NDArray[np.float64]
 
@@ -107,15 +106,15 @@ def load_file(path: Path, min_points: int) -> Discs:
 
 def load_tiles(directory: Path, min_points: int) -> Discs:
     """Return the surfels of a dataset, tile by tile."""
-    parts: list[Surfels] = []
+    parts: list[Discs] = []
     size_m = 0.0
     for tile in tiles_in(directory).values():
         surfel_map = parquet.read_map(tile)
-        parts.append(surfel_map.surfels(min_points))
+        parts.append(of_map(surfel_map, min_points))
         size_m = surfel_map.voxel_size_m
     return Discs(
         np.concatenate([part.position for part in parts]),
-        np.concatenate([part.normal for part in parts]),
+        np.concatenate([part.normal for part in parts if part.normal is not None]),
         size_m,
         dataset_digest(directory),
     )
@@ -124,7 +123,8 @@ def load_tiles(directory: Path, min_points: int) -> Discs:
 def of_map(surfel_map: SurfelMap, min_points: int) -> Discs:
     """Return the surfels of a map."""
     surfels = surfel_map.surfels(min_points)
-    return Discs(surfels.position, surfels.normal, surfel_map.voxel_size_m, surfel_map.digest())
+    position = surfels.position + surfel_map.origin_m
+    return Discs(position, surfels.normal, surfel_map.voxel_size_m, surfel_map.digest())
 
 
 def of_columns(path: Path, columns: Mapping[str, npt.NDArray[Any]]) -> Discs:

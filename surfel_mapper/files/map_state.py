@@ -30,6 +30,10 @@ KIND = 'surfel map'
 
 FILE = 'map.npz'
 """Name of the file in the output directory of a replay."""
+
+NO_ORIGIN = (0.0, 0.0, 0.0)
+"""Origin of maps in files of before there were origins."""
+
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 
@@ -76,6 +80,7 @@ def save_map(
         'voxel_size_m': surfel_map.voxel_size_m,
         'level': surfel_map.level,
         'columns': surfel_map.columns,
+        'origin_m': surfel_map.origin_m.tolist(),
         'digest': digest,
     }
     save_state(path, arrays, attributes, compress=compress)
@@ -122,7 +127,10 @@ def load_map(
         )
     try:
         surfel_map = SurfelMap(
-            found_m, columns=tuple(attributes['columns']), level=attributes['level']
+            found_m,
+            columns=tuple(attributes['columns']),
+            level=attributes['level'],
+            origin_m=attributes.get('origin_m', NO_ORIGIN),
         )
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
         scans = [_scan(arrays, number, surfel_map) for number in range(_num_scans(arrays))]

@@ -4,9 +4,10 @@
 Maps as Parquet, one row per voxel: derived quantities and exact moments.
 
 Every voxel has a row, sorted by voxel: its index i j k, the quantities that SurfelMap derives
-(x y z nx ny nz planarity curvature), and the exact moments as int64 (num_points, sum_*, sum_**,
-view_*). The map is rebuilt from the moments with the same digest, which is in the file and
-compared, so a changed file is refused. Other tools read the columns by name.
+(x y z nx ny nz planarity curvature; x y z plus the origin of the map, in doubles), and the exact
+moments as int64 (num_points, sum_*, sum_**, view_*). The map is rebuilt from the moments with the
+same digest, which is in the file and compared, so a changed file is refused. Other tools read the
+columns by name.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import DependencyError, FileFormatError, MapError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.map_state import checked_moments
+from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -166,6 +167,7 @@ def attributes_of(surfel_map: SurfelMap, *, digest: bool = True) -> dict[str, An
         'voxel_size_m': surfel_map.voxel_size_m,
         'level': surfel_map.level,
         'columns': surfel_map.columns,
+        'origin_m': surfel_map.origin_m.tolist(),
         **({'digest': surfel_map.digest()} if digest else {}),
     }
 
@@ -190,7 +192,7 @@ def derived_columns(surfel_map: SurfelMap) -> Columns:
     surfels = surfel_map.surfels()
     surfels = surfels.select(np.argsort(pack_keys(surfels.voxel_index)))
     return {
-        **named(('x', 'y', 'z'), surfels.position),
+        **named(('x', 'y', 'z'), surfels.position + surfel_map.origin_m),
         **named(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32)),
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
@@ -235,7 +237,12 @@ def map_of(
         raise FileFormatError(
             f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
         )
-    return SurfelMap(found_m, columns=tuple(attributes['columns']), level=attributes['level'])
+    return SurfelMap(
+        found_m,
+        columns=tuple(attributes['columns']),
+        level=attributes['level'],
+        origin_m=attributes.get('origin_m', NO_ORIGIN),
+    )
 
 
 def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:

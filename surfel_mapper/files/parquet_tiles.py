@@ -168,6 +168,12 @@ def kind_of(path: str | Path) -> dict[str, Any]:
         return {name: attributes[name] for name in KIND}
 
 
+def origin_of(path: str | Path) -> tuple[float, ...]:
+    """Return the origin of the map in a file, x y z in m."""
+    with _opened(path) as (_, attributes):
+        return tuple(map_of(attributes, None, path).origin_m.tolist())
+
+
 def dataset_digest(directory: str | Path) -> str:
     """
     Return the digest of the map in a dataset, without loading the whole map.

@@ -58,9 +58,21 @@ class PcdHeader:
     encoding: str
 
 
-def write_surfels(path: str | Path, surfels: Surfels) -> None:
+def write_surfels(
+    path: str | Path, surfels: Surfels, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)
+) -> None:
     """
     Write surfels as a binary PCD, atomically.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    surfels : Surfels
+        In the frame of the map.
+    origin_m : (3,) float, m
+        Added to the positions; if it is not 0, x y z are doubles, since float32 rounds by 0.25 m
+        at the northings of UTM.
 
     Raises
     ------
@@ -68,7 +80,11 @@ def write_surfels(path: str | Path, surfels: Surfels) -> None:
         If the file cannot be written.
 
     """
-    write_points(path, surfel_columns(surfels))
+    columns = surfel_columns(surfels)
+    if np.any(origin_m):
+        places = surfels.position + np.asarray(origin_m)
+        columns = {**columns, **dict(zip('xyz', places.T, strict=True))}
+    write_points(path, columns)
 
 
 def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> None:

@@ -58,9 +58,20 @@ ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
 MAX_HEADER_BYTES = 65536
 
 
-def write_surfels(path: str | Path, surfels: Surfels) -> None:
+def write_surfels(
+    path: str | Path, surfels: Surfels, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)
+) -> None:
     """
     Write surfels as a binary PLY, atomically.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; see replace_file.
+    surfels : Surfels
+        In the frame of the map.
+    origin_m : (3,) float, m
+        Added to the positions, in float64; see SurfelMap.
 
     Raises
     ------
@@ -69,7 +80,7 @@ def write_surfels(path: str | Path, surfels: Surfels) -> None:
 
     """
     values = {
-        **dict(zip('xyz', surfels.position.T, strict=True)),
+        **dict(zip('xyz', (surfels.position + np.asarray(origin_m)).T, strict=True)),
         **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
         'planarity': surfels.planarity.astype(np.float32),
         'curvature': surfels.curvature.astype(np.float32),
@@ -117,9 +128,11 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         file.write(table.view(np.uint8).data)
 
 
-def write_mesh(path: str | Path, mesh: Mesh) -> None:
+def write_mesh(path: str | Path, mesh: Mesh, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
     """
     Write a mesh as a binary PLY, with the colours of the vertices if it has any.
+
+    The origin, (3,) m, is added to the vertices.
 
     Raises
     ------
@@ -127,7 +140,7 @@ def write_mesh(path: str | Path, mesh: Mesh) -> None:
         If the file cannot be written.
 
     """
-    columns = dict(zip('xyz', mesh.vertices.T, strict=True))
+    columns = dict(zip('xyz', (mesh.vertices + np.asarray(origin_m)).T, strict=True))
     if len(mesh.colors):
         columns.update(zip(('red', 'green', 'blue'), mesh.colors.T, strict=True))
     layout = np.dtype([('count', 'u1'), ('corners', '<i4', (3,))])

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.layout import BITS, INDEX_BITS, INDEX_MASK, INDEX_OFFSET
 from surfel_mapper.mapping.kernels.voxels import coarsen
 
@@ -146,6 +147,25 @@ def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
     index = ((key[:, None] >> shifts) & INDEX_MASK) - INDEX_OFFSET
     return np.asarray(index, np.int32)
+
+
+def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> ScanMoments:
+    """
+    Return the same moments in voxels whose indices are larger by an offset (3,).
+
+    Raises
+    ------
+    MapLimitError
+        If a voxel would be beyond the range of the indices.
+
+    """
+    index = moments.voxel_index + voxels
+    if len(index) and not (index.min() >= -INDEX_OFFSET and index.max() < INDEX_OFFSET):
+        raise MapLimitError(
+            f'voxel indices {index.min()} to {index.max()} after a shift by {voxels.tolist()}, '
+            f'expected {-INDEX_OFFSET} to {INDEX_OFFSET - 1}; use larger voxels'
+        )
+    return replace(moments, key=pack_keys(index))
 
 
 def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:

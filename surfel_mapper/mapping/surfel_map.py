@@ -37,6 +37,7 @@ from surfel_mapper.mapping.moments import (
     digest_of,
     pack_keys,
     ScanMoments,
+    shifted_moments,
     unpack_keys,
 )
 from surfel_mapper.mapping.reducer import Reducer
@@ -46,6 +47,10 @@ from surfel_mapper.mapping.voxel_table import ChangeLog, VoxelTable
 
 Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 """Lowest and highest voxel index, (3,) each."""
+
+
+APART = 1e-3
+"""Rounding of the distance of two origins, voxels: their coordinates have at most 16 digits."""
 
 
 class SurfelMap:
@@ -66,12 +71,16 @@ class SurfelMap:
     level : int
         The lattice unit is ``voxel_size_m / 2^(16 + level)``; not 0 only in maps that
         ``coarsen`` returned, to which no scan can be added.
+    origin_m : (3,) float, m
+        Place of the origin of the map in an outer frame, such as UTM, in which files are written.
+        Points are given and surfels returned in the frame of the map, and the digest does not
+        depend on it; ``merge`` and ``subtract`` shift maps of another origin, exactly.
 
     Raises
     ------
     ValueError
         If the voxel size is not positive and finite, a column cannot be summed, threads is less
-        than 1, or the level is negative or beyond 20.
+        than 1, the level is negative or beyond 20, or the origin is not finite.
 
     """
 
@@ -82,6 +91,7 @@ class SurfelMap:
         columns: tuple[str, ...] = (),
         threads: int = 1,
         level: int = 0,
+        origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
@@ -91,6 +101,7 @@ class SurfelMap:
             raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
         self.voxel_size_m = float(voxel_size_m)
         self.level = operator.index(level)
+        self.origin_m = origin_m
         self.version = 0
         self.columns = columns
         self._channel_names = channel_names(columns)
@@ -106,6 +117,19 @@ class SurfelMap:
     def __len__(self) -> int:
         """Return the number of voxels."""
         return self.num_voxels
+
+    @property
+    def origin_m(self) -> npt.NDArray[np.float64]:
+        """Place of the origin of the map in the outer frame, (3,) m."""
+        return self._origin_m
+
+    @origin_m.setter
+    def origin_m(self, value: npt.ArrayLike) -> None:
+        origin = np.array(value, np.float64)
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f'origin_m: {origin.tolist()}, expected x y z, finite')
+        origin.setflags(write=False)
+        self._origin_m = origin
 
     @property
     def num_voxels(self) -> int:
@@ -157,7 +181,8 @@ class SurfelMap:
             limit = layout.INDEX_OFFSET * self.voxel_size_m
             raise MapLimitError(
                 f'{beyond} of {len(np.asarray(points))} points lie outside of '
-                f'[{-limit:g}, {limit:g}) m; give them in a frame near the robot'
+                f'[{-limit:g}, {limit:g}) m; subtract a point near the robot from points and '
+                'poses (map.origin in a configuration)'
             )
         self.insert(moments)
         return moments
@@ -273,10 +298,11 @@ class SurfelMap:
         Raises
         ------
         MapError
-            If the voxel sizes differ, or a voxel would hold too many points; see ``insert``.
+            If the voxel sizes differ, the origins are not a whole number of voxels apart, or a
+            voxel would hold too many points; see ``insert``.
 
         """
-        self.insert(other.moments())
+        self.insert(self._moments_here(other))
 
     def subtract(self, other: SurfelMap) -> None:
         """
@@ -290,12 +316,45 @@ class SurfelMap:
             If this map does not hold all of them. Nothing is changed.
 
         """
-        self.remove(other.moments())
+        self.remove(self._moments_here(other))
+
+    def _moments_here(self, other: SurfelMap) -> ScanMoments:
+        """Return the moments of another map in the voxels of this one."""
+        moments = other.moments()
+        if np.array_equal(self.origin_m, other.origin_m):
+            return moments
+        apart = (other.origin_m - self.origin_m) / self.voxel_size_m
+        voxels = np.rint(apart)
+        if np.abs(apart - voxels).max() > APART:
+            raise MapError(
+                f'map with origin_m {other.origin_m.tolist()}, expected one a whole number of '
+                f'voxels of {self.voxel_size_m:g} m from {self.origin_m.tolist()}'
+            )
+        return shifted_moments(moments, voxels.astype(np.int64))
+
+    def at_origin(self, origin_m: npt.ArrayLike) -> SurfelMap:
+        """
+        Return the same points in a map of another origin, (3,) m in the outer frame.
+
+        Raises
+        ------
+        MapError
+            If the origins are not a whole number of voxels apart, or a voxel would be beyond the
+            range of the indices.
+
+        """
+        other = SurfelMap(
+            self.voxel_size_m, columns=self.columns, level=self.level, origin_m=origin_m
+        )
+        other.merge(self)
+        return other
 
     def __eq__(self, other: object) -> bool:
-        """Return whether two maps are equal, to the bit."""
+        """Return whether two maps are equal, to the bit, and have one origin."""
         if not isinstance(other, SurfelMap):
             return NotImplemented
+        if not np.array_equal(self.origin_m, other.origin_m):
+            return False
         return self.num_voxels == other.num_voxels and self.digest() == other.digest()
 
     __hash__ = None  # type: ignore[assignment]  # a map is mutable
@@ -330,7 +389,10 @@ class SurfelMap:
                 f'level: {level}, expected 0 to {highest} for a map of level {self.level}'
             )
         coarse = SurfelMap(
-            self.voxel_size_m * 2**level, columns=self.columns, level=self.level + level
+            self.voxel_size_m * 2**level,
+            columns=self.columns,
+            level=self.level + level,
+            origin_m=self.origin_m,
         )
         if within:
             fine = self.moments(unpack_keys(self._table.keys_in_box(*within)))
@@ -341,7 +403,9 @@ class SurfelMap:
 
     def copy(self) -> SurfelMap:
         """Return an independent copy."""
-        other = SurfelMap(self.voxel_size_m, columns=self.columns, level=self.level)
+        other = SurfelMap(
+            self.voxel_size_m, columns=self.columns, level=self.level, origin_m=self.origin_m
+        )
         other.insert(self.moments())
         return other
 

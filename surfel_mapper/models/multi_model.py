@@ -9,7 +9,7 @@ viewpoint.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -214,6 +214,17 @@ class MultiModel:
     def size_bytes(self) -> int:
         """Bytes of all primitives when packed, without the labels."""
         return sum(patch.size_bytes for patch in self.patches) + self.gaussians.size_bytes
+
+    def translated(self, offset: npt.ArrayLike) -> MultiModel:
+        """Return the models moved by an offset (3,), m; labels and figures stay."""
+        by = np.asarray(offset, np.float64)
+        gaussians = replace(self.gaussians, mean=self.gaussians.mean + by)
+        return replace(
+            self,
+            planes=[replace(plane, mean=plane.mean + by) for plane in self.planes],
+            surfaces=[replace(surface, mean=surface.mean + by) for surface in self.surfaces],
+            gaussians=gaussians,
+        )
 
     def resample(self, step_m: float | None = None, seed: int = 0) -> Array:
         """

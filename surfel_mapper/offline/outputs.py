@@ -122,7 +122,8 @@ class ScanTrajectory:
 
     """
 
-    def __init__(self) -> None:
+    def __init__(self, mapper: Mapper) -> None:
+        self._map = mapper.map
         self.stamps_ns: list[int] = []
         self.poses: list[npt.NDArray[np.float64]] = []
 
@@ -139,14 +140,21 @@ class ScanTrajectory:
             self.poses[-place] = scan.T_map_sensor
 
     def write(self, path: Path) -> None:
-        """Write the poses as TUM text."""
+        """Write the poses in the fixed frame as TUM text."""
         from surfel_mapper.files.trajectory import write_tum
 
-        write_tum(path, self.stamps_ns, self.matrices)
+        write_tum(path, self.stamps_ns, self.in_fixed)
+
+    @property
+    def in_fixed(self) -> npt.NDArray[np.float64]:
+        """The poses with the origin of the map added: T_fixed_sensor, (S, 4, 4)."""
+        poses = self.matrices
+        poses[:, :3, 3] += self._map.origin_m
+        return poses
 
     @property
     def matrices(self) -> npt.NDArray[np.float64]:
-        """The poses as one array, (S, 4, 4)."""
+        """The poses in the map as one array, (S, 4, 4)."""
         import numpy as np
 
         return np.array(self.poses).reshape(-1, 4, 4)
@@ -225,9 +233,9 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
 
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     if name == 'ply':
-        ply.write_surfels(path, surfels)
+        ply.write_surfels(path, surfels, mapper.map.origin_m)
     elif name == 'pcd':
-        pcd.write_surfels(path, surfels)
+        pcd.write_surfels(path, surfels, mapper.map.origin_m)
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
     elif name == 'npz':

@@ -349,7 +349,7 @@ def mapped(
     """Map all scans; return their poses, and whether mapping was stopped."""
     from surfel_mapper.offline.outputs import ScanTrajectory
 
-    trajectory, total = ScanTrajectory(), recording.num_scans
+    trajectory, total = ScanTrajectory(mapper), recording.num_scans
     for update in recording.replay(mapper, stopped):
         trajectory.add(update)
         for each in listen:
@@ -396,7 +396,7 @@ def pose_errors(truth: Path | None, trajectory: ScanTrajectory) -> dict[str, Any
     try:
         errors = compare(
             stamps_ns,
-            trajectory.matrices,
+            trajectory.in_fixed,
             *true_poses(truth, stamps_ns),
             max_difference_ns=SAME_TIME_NS,
         )

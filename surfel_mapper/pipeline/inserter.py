@@ -29,6 +29,7 @@ from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.memory import machine_bytes
 from surfel_mapper.pipeline.drops import described, Drops
 from surfel_mapper.pipeline.layer_stack import LayerStack
+from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
 from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
 from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
@@ -49,6 +50,8 @@ class Inserter:
     ----------
     config : Config
         All settings; later ones are passed to each call.
+    surfel_map : SurfelMap
+        The map, empty.
     poses : ScanPoses
         The poses of the sensors.
     drops : Drops
@@ -67,12 +70,12 @@ class Inserter:
 
     """
 
-    def __init__(self, config: Config, poses: ScanPoses, drops: Drops) -> None:
+    def __init__(
+        self, config: Config, surfel_map: SurfelMap, poses: ScanPoses, drops: Drops
+    ) -> None:
         self._drops = drops
         self.derives = True
-        self.map = SurfelMap(
-            config.map.voxel_size_m, columns=config.map.columns, threads=config.map.threads
-        )
+        self.map = surfel_map
         self.window = SlidingWindow(self.map)
         self._set_limits(config)
         around = Surroundings(
@@ -292,8 +295,9 @@ class Inserter:
 
 
 def map_frame(config: Config) -> str:
-    """Return the frame of the map: that of the poses, unless alignment gives it its own."""
-    return config.align.map_frame or config.frames.fixed
+    """Return the frame of the map: that of the poses, unless it is given its own; see Mapper."""
+    fixed = config.frames.fixed
+    return config.align.map_frame or (f'{fixed}_local' if has_own_frame(config) else fixed)
 
 
 def removed_voxels(

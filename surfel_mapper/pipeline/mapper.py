@@ -37,6 +37,7 @@ from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline import regions
 from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
+from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.reduction import Step
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -88,14 +89,18 @@ class Mapper:
         self.counters = Counters()
         self._drops = Drops(self.counters)
         self._guard = StampGuard(self.config.input.reset_after_s)
-        self._poses = ScanPoses(self.config, self._drops)
-        self._inserter = Inserter(self.config, self._poses, self._drops)
+        settings = self.config.map
+        self.map = SurfelMap(
+            settings.voxel_size_m, columns=settings.columns, threads=settings.threads
+        )
+        self._origin = MapOrigin(self.config, self.map)
+        self._poses = ScanPoses(self.config, self._drops, self._origin)
+        self._inserter = Inserter(self.config, self.map, self._poses, self._drops)
         self._queue = ScanQueue(
             self.config.pose.max_waiting_scans, self._poses, self._inserter.images, self._drops
         )
         self.transforms = self._poses.transforms
         self.registered = self._poses.registered
-        self.map = self._inserter.map
         self.window = self._inserter.window
         self.layers = self._inserter.layers.by_name
 
@@ -297,7 +302,8 @@ class Mapper:
             except ValueError as error:
                 reason = str(error)
             else:
-                self.registered.restart(compose(inverse(self.T_map_fixed), T_map_body))
+                correction = self._inserter.aligner.T_map_fixed
+                self.registered.restart(compose(inverse(correction), T_map_body))
                 return True
         self._drops.message('initial_pose', f'initial pose ignored: {reason}')
         return False
@@ -340,8 +346,8 @@ class Mapper:
 
     @property
     def T_map_fixed(self) -> Transform:
-        """Transform from the fixed frame of the poses to the map: the correction by alignment."""
-        return self._inserter.aligner.T_map_fixed
+        """From the fixed frame of the poses to the map: its origin, and alignment's correction."""
+        return compose(self._inserter.aligner.T_map_fixed, self._origin.T_local_fixed)
 
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
         """
@@ -356,11 +362,17 @@ class Mapper:
         if frame_id == self.map_frame:
             return np.eye(4)
         fixed, at_ns = self.config.frames.fixed, stamp_ns or self.transforms.newest_ns or 0
+        if frame_id == fixed:
+            return self.T_map_fixed
         return self._inserter.aligner.to_map(self.transforms.lookup(fixed, frame_id, at_ns))
 
     @property
     def map_frame(self) -> str:
-        """The frame of the map: that of the poses, unless alignment gives it its own."""
+        """
+        The frame of the map: that of the poses, unless it is given its own.
+
+        ``align.map_frame`` does so; with ``map.origin`` it is ``frames.fixed`` and _local.
+        """
         return map_frame(self.config)
 
     def surfels(self, level: int = 0) -> Surfels:
@@ -400,13 +412,14 @@ class Mapper:
         Raises
         ------
         MapError
-            If it has another voxel size, level or other columns. Nothing has changed then.
+            If it has another voxel size, level, origin or other columns. Nothing has changed then.
 
         """
         for name in ('voxel_size_m', 'level', 'columns'):
             found, expected = getattr(surfel_map, name), getattr(self.map, name)
             if found != expected:
                 raise MapError(f'map with {name} {found}, expected {expected} as configured')
+        self._origin.take_from(surfel_map)
         self.clear()
         self._inserter.clear()
         self.map.insert(surfel_map.moments())
@@ -463,6 +476,7 @@ class Mapper:
             'filter_chain': self.chain.to_list(),
             **({'registration': self.registered.summary()} if self.registered else {}),
             'voxel_size_m': self.map.voxel_size_m,
+            'origin_m': self.map.origin_m.tolist(),
             'window_scans': len(self.window),
             'voxels': self.map.num_voxels,
             'surfels': len(self.map.surfels(self.config.map.min_points)),

@@ -9,20 +9,23 @@ lookups need only the tree of frames.
 
 from __future__ import annotations
 
+from collections import deque
 from functools import partial
 import math
 from typing import Any
-
-import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import PoseError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.poses import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import deskewed
+
+MAX_EARLY = 100
+"""Number of poses of the fixed frame itself that wait until ``map.origin: auto`` is known."""
 
 
 class ScanPoses:
@@ -35,19 +38,23 @@ class ScanPoses:
         Source of the poses, and mounts of the sensors.
     drops : Drops
         Counts poses that are refused.
+    origin : MapOrigin
+        Is subtracted from poses in the fixed frame.
 
     Attributes
     ----------
     transforms : TransformBuffer
-        The tree of frames.
+        The tree of frames; the origin of the fixed frame is that of the map.
     registered : RegisteredPoses, optional
         The poses by registration, if ``pose.source`` is ``registration``.
 
     """
 
-    def __init__(self, config: Config, drops: Drops) -> None:
+    def __init__(self, config: Config, drops: Drops, origin: MapOrigin) -> None:
         self._config = config
         self._drops = drops
+        self.origin = origin
+        self._early: deque[tuple[str, str, int, Transform, bool]] = deque(maxlen=MAX_EARLY)
         self._mounted: set[str] = set()
         self.transforms = TransformBuffer(reset_after_s=config.input.reset_after_s)
         self._set_max_gap(config)
@@ -70,16 +77,31 @@ class ScanPoses:
         """Add the pose of one frame in another; bad ones and too many are counted and logged."""
         forgotten = self.transforms.num_forgotten
         try:
-            transform = pose_matrix(xyz, q_xyzw)
-            if static:
-                self.transforms.add_static(parent, child, transform)
-            else:
-                self.transforms.add(parent, child, stamp_ns, transform)
+            self._add(parent, child, stamp_ns, pose_matrix(xyz, q_xyzw), static)
         except (PoseError, ValueError) as error:
             self._drops.message('bad_pose', f'pose of {child!r} in {parent!r} ignored: {error}')
         if number := self.transforms.num_forgotten - forgotten:
             reason = f'{number} old transforms dropped: over {MAX_TRANSFORMS} are held'
             self._drops.message('too_many_transforms', reason, number)
+
+    def _add(
+        self, parent: str, child: str, stamp_ns: int, transform: Transform, static: bool
+    ) -> None:
+        """Add a pose, shifted by the origin of the map if it is in the fixed frame."""
+        fixed = self._config.frames.fixed
+        if fixed in (parent, child):
+            if not self.origin.is_known and child == fixed:
+                self._early.append((parent, child, stamp_ns, transform, static))
+                return
+            if not self.origin.is_known:
+                self.origin.find(transform[:3, 3])
+                while self._early:
+                    self._add(*self._early.popleft())
+            transform = self.origin.shifted(transform, is_child=child == fixed)
+        if static:
+            self.transforms.add_static(parent, child, transform)
+        else:
+            self.transforms.add(parent, child, stamp_ns, transform)
 
     def mount(self, frame_id: str) -> None:
         """Add the configured extrinsics of a sensor when its frame is first seen."""
@@ -94,7 +116,7 @@ class ScanPoses:
 
     def of(self, scan: Scan, following: Scan | None = None) -> Transform:
         """
-        Return T_fixed_sensor at the stamp of a scan.
+        Return T_fixed_sensor at the stamp of a scan, with the origin of the map.
 
         Parameters
         ----------
@@ -112,7 +134,9 @@ class ScanPoses:
 
         """
         if self._config.pose.source == 'identity':
-            return np.eye(4)
+            if not self.origin.is_known:
+                self.origin.find_in(scan.points)
+            return self.origin.T_local_fixed
         if self.registered is not None:
             self.registered.learn_motion(scan, following)
         pose = self._at(scan.frame_id, scan.stamp_ns)

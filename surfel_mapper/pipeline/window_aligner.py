@@ -103,7 +103,8 @@ class WindowAligner:
     Attributes
     ----------
     T_map_fixed : (4, 4) float64
-        From the fixed frame of the poses that come in to the map; the identity at first.
+        From the fixed frame of the poses that come in, shifted by the origin of the map, to the
+        map; the identity at first.
 
     """
 

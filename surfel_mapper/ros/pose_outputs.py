@@ -99,8 +99,9 @@ class AlignmentOutputs:
         self._mapper = mapper
         self._path = node.create_publisher(Path, '~/path', LATCHED)
         self._transform: TransformPublisher | None = None
-        if map_frame := mapper.config.align.map_frame:
-            self._transform = TransformPublisher(node, 'align.map_frame', map_frame)
+        if mapper.map_frame != mapper.config.frames.fixed:
+            setting = 'align.map_frame' if mapper.config.align.map_frame else 'map.origin'
+            self._transform = TransformPublisher(node, setting, mapper.map_frame)
 
     def publish(self, update: Update) -> None:
         """Publish the path if a scan led to an alignment, and the transform at its stamp."""

@@ -121,7 +121,7 @@ def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypa
     output = tmp_path / 'out'
 
     def write():
-        formats, trajectory = ['npz', 'ply', 'pcd'], ScanTrajectory()
+        formats, trajectory = ['npz', 'ply', 'pcd'], ScanTrajectory(mapper)
         write_maps(output, formats, mapper, trajectory, window=True)
         write_files(output, formats, mapper, trajectory, summary, History())
 

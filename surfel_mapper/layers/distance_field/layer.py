@@ -204,7 +204,7 @@ class TsdfLayer(Layer):
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
         """Write mesh.ply."""
         path = directory / 'mesh.ply'
-        write_mesh(path, self.mesh())
+        write_mesh(path, self.mesh(), self.around.surfel_map.origin_m)
         return [path]
 
     def drawings(self) -> Sequence[Drawing]:

@@ -128,7 +128,8 @@ class ModelsLayer(Layer):
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
         """Write models.json and models.obj, and Parquet and DXF if asked for."""
         wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf') if name in formats)]
-        return write_models(directory, self.models.model, wanted, self.models.versions)
+        model = self.models.model.translated(self.around.surfel_map.origin_m)
+        return write_models(directory, model, wanted, self.models.versions)
 
     def drawings(self) -> Sequence[Drawing]:
         """Return patches and their outlines, and Gaussians as ellipsoids."""
