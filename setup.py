@@ -78,6 +78,7 @@ TEST = [
     'pytest-xdist>=3.6',  # two processes: those of ROS wait, those of the others calculate
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise
+    'pandas>=2.0',  # Surfels.to_pandas
     'mcap>=1.1',  # an independent writer of what we read
 ]
 

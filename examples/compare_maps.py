@@ -16,12 +16,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-import numpy as np
-
-from surfel_mapper import Surfels
-from surfel_mapper.files.map_state import load_map
+from surfel_mapper import diff, SurfelMap
 from surfel_mapper.files.ply import write_surfels
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.surfels import concatenated
 
 
 def main() -> None:
@@ -44,31 +41,15 @@ def main() -> None:
     )
     args = parser.parse_args()
 
-    first, _ = load_map(args.before)
-    second, _ = load_map(args.after, voxel_size_m=first.voxel_size_m)
-    if first.digest() == second.digest():
-        print(f'equal to the bit: {first.digest()}')
+    before, after = SurfelMap.load(args.before), SurfelMap.load(args.after)
+    found = diff(before, after, min_points=args.min_points, angle_deg=args.angle)
+    if found.equal:
+        print(f'equal to the bit: {after.digest()}')
         return
-    before, after = (it.surfels(min_points=args.min_points) for it in (first, second))
-    old, new = pack_keys(before.voxel_index), pack_keys(after.voxel_index)
-    _, i, j = np.intersect1d(old, new, return_indices=True)
-    cosine = np.abs(np.einsum('ij,ij->i', before.normal[i], after.normal[j]))
-    is_flat = np.minimum(before.planarity[i], after.planarity[j]) > 0.5
-    turned = j[is_flat & (cosine < np.cos(np.deg2rad(args.angle)))]
-    came = np.flatnonzero(~np.isin(new, old))
-    print(
-        f'{len(before)} surfels before, {len(after)} after, {len(i)} in the same voxels\n'
-        f'{len(came)} came, {len(before) - len(i)} went, '
-        f'{len(turned)} turned by more than {args.angle:g} deg'
-    )
+    print(found)
     if args.output:
-        write(after, np.concatenate([came, turned]), args.output)
-
-
-def write(surfels: Surfels, rows: np.ndarray, path: Path) -> None:
-    """Write some surfels."""
-    write_surfels(path, surfels.select(rows))
-    print(path)
+        write_surfels(args.output, concatenated([found.came, found.turned]), after.origin_m)
+        print(args.output)
 
 
 if __name__ == '__main__':

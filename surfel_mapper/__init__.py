@@ -16,7 +16,10 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config, load_config
+    from surfel_mapper.files.trajectory import Trajectory
+    from surfel_mapper.filters.normals import estimate_normals
     from surfel_mapper.layers.distance_field import DistanceField
+    from surfel_mapper.mapping.differences import diff
     from surfel_mapper.mapping.moments import ScanMoments
     from surfel_mapper.mapping.surfel import Surfel
     from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -40,7 +43,10 @@ __all__ = [
     'Surfel',
     'SurfelMap',
     'Surfels',
+    'Trajectory',
     '__version__',
+    'diff',
+    'estimate_normals',
     'load_config',
     'replay',
 ]
@@ -56,6 +62,9 @@ _HOMES = {
     'Surfel': 'mapping.surfel',
     'SurfelMap': 'mapping.surfel_map',
     'Surfels': 'mapping.surfels',
+    'Trajectory': 'files.trajectory',
+    'diff': 'mapping.differences',
+    'estimate_normals': 'filters.normals',
     'load_config': 'config',
     'replay': 'offline.replay',
 }

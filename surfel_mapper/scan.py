@@ -68,7 +68,8 @@ class Scan:
     Raises
     ------
     ValueError
-        If the points are not a floating point array (N, 3) or a column is not of length N.
+        If the points are not a floating point array (N, 3), the stamp is no whole number, or a
+        column is not of length N.
 
     """
 
@@ -90,6 +91,11 @@ class Scan:
             raise ValueError(f'points: {type(points).__name__}, expected an array (N, 3)')
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f'points: shape {points.shape}, expected (N, 3)')
+        if isinstance(self.stamp_ns, bool) or not isinstance(self.stamp_ns, (int, np.integer)):
+            raise ValueError(
+                f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int, such as '
+                'round(seconds * 1e9)'
+            )
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
         if getattr(self.columns, 'num_rows', None) == len(points):

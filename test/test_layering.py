@@ -60,6 +60,8 @@ HOMES = {
     'lzf': ('files/pcd',),
     'PIL': ('messages/compressed_image',),
     'matplotlib': ('viz/',),
+    'open3d': ('mapping/surfels',),
+    'pandas': ('mapping/surfels',),
     'nav_msgs': ('ros/',),
     'numba': ('kernels/',),
     'pyarrow': ('files/parquet',),

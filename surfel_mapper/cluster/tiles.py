@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import islice
 import logging
 from pathlib import Path
@@ -44,7 +44,7 @@ from surfel_mapper.files.parquet_tiles import (
     write_tile,
 )
 from surfel_mapper.files.trajectory import read_trajectory
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import concatenated, Surfels
 
 DATASET = 'map'
 """Directory of the tiles inside the output directory of a replay."""
@@ -397,16 +397,6 @@ def work_directory(directory: Path) -> Iterator[Path]:
 def is_tiles(path: Path) -> bool:
     """Return whether a path in a dataset is a directory of tiles."""
     return path.is_dir() and path.name.startswith('tile_i=')
-
-
-def concatenated(parts: Sequence[Surfels]) -> Surfels:
-    """Return the surfels of all parts."""
-    names = [each.name for each in fields(Surfels) if each.name != 'channels']
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    channels = {
-        name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels
-    }
-    return Surfels(**columns, channels=channels)
 
 
 def _counted(results: Iterator[Any], on_done: OnDone) -> Iterator[Any]:

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.geometry import pose_matrix, q_xyzw
+from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
 
 FORMATS = ('tum', 'kitti', 'csv')
 
@@ -50,7 +50,7 @@ MOST_SECONDS = 10**11
 """Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory:
     """
     Poses of one frame in another over time, by ascending stamp.
@@ -72,6 +72,67 @@ class Trajectory:
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.xyz)
+
+    def __repr__(self) -> str:
+        """Return the number of poses and their duration."""
+        if self.stamp_ns is None or not len(self):
+            return f'Trajectory({len(self)} poses)'
+        lasts_s = (self.stamp_ns[-1] - self.stamp_ns[0]) / 1e9
+        return f'Trajectory({len(self)} poses in {lasts_s:.3f} s)'
+
+    @classmethod
+    def from_matrices(
+        cls, T_fixed_sensor: npt.ArrayLike, stamp_ns: npt.ArrayLike | None = None
+    ) -> Trajectory:
+        """
+        Return the trajectory of transforms.
+
+        Parameters
+        ----------
+        T_fixed_sensor : (S, 4, 4) float
+            The poses.
+        stamp_ns : (S,) int, optional
+            Their times, nanoseconds, ascending.
+
+        Raises
+        ------
+        ValueError
+            If shapes or types are wrong, or a transform is not rigid.
+
+        """
+        poses = np.asarray(T_fixed_sensor, np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+            raise ValueError(f'T_fixed_sensor: shape {poses.shape}, expected (S, 4, 4)')
+        for row, pose in enumerate(poses):
+            check_rigid(f'T_fixed_sensor[{row}]', pose)
+        stamps = None if stamp_ns is None else np.asarray(stamp_ns)
+        if stamps is not None:
+            if stamps.dtype.kind not in 'iu':
+                raise ValueError(f'stamp_ns: {stamps.dtype}, expected whole nanoseconds (int64)')
+            if stamps.shape != poses.shape[:1] or (np.diff(stamps.astype(np.int64)) <= 0).any():
+                raise ValueError(
+                    f'stamp_ns: shape {stamps.shape}, expected ({len(poses)},), ascending'
+                )
+            stamps = stamps.astype(np.int64)
+        turns = np.array([q_xyzw(pose) for pose in poses]).reshape(-1, 4)
+        return cls(stamps, poses[:, :3, 3].copy(), turns)
+
+    @property
+    def matrices(self) -> npt.NDArray[np.float64]:
+        """The poses as transforms, (S, 4, 4)."""
+        pairs = zip(self.xyz.tolist(), self.q_xyzw.tolist(), strict=True)
+        return np.array([pose_matrix(xyz, turn) for xyz, turn in pairs]).reshape(-1, 4, 4)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Trajectory:
+        """Return the poses in a file, TUM, KITTI or CSV; raises FileFormatError."""
+        return read_trajectory(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the poses as TUM text, which evo reads; raises FileFormatError."""
+        if self.stamp_ns is None:
+            raise FileFormatError(f'{path}: poses without stamps, which TUM text needs')
+        write_tum(path, self.stamp_ns, self.matrices)
 
 
 def write_tum(

@@ -149,6 +149,26 @@ def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     return np.asarray(index, np.int32)
 
 
+MILLIMETRES = (
+    'these points lie kilometres apart, almost each in a voxel of its own: are they millimetres? '
+    'Metres are expected; multiply them by 0.001'
+)
+"""The warning about a scan that looks like millimetres."""
+
+MANY, ALONE, FAR_M = 100, 0.9, 1000.0
+"""A scan looks like millimetres if it has at least this number of points, as many voxels as this
+share of them, and a median distance from its middle of more than this, m, beyond any lidar."""
+
+
+def looks_like_millimetres(moments: ScanMoments) -> bool:
+    """Return whether the points of a scan are so far apart that their unit may be wrong."""
+    if not moments.num_voxels >= max(MANY, ALONE * moments.num_points):
+        return False
+    index = moments.voxel_index.astype(np.float64)
+    apart = np.linalg.norm(index - np.median(index, axis=0), axis=1)
+    return bool(np.median(apart) * moments.voxel_size_m > FAR_M)
+
+
 def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> ScanMoments:
     """
     Return the same moments in voxels whose indices are larger by an offset (3,).

@@ -20,8 +20,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from importlib import import_module
+import logging
 import math
 import operator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,6 +38,8 @@ from surfel_mapper.mapping.kernels.voxels import first_impossible
 from surfel_mapper.mapping.moments import (
     coarse_moments,
     digest_of,
+    looks_like_millimetres,
+    MILLIMETRES,
     pack_keys,
     ScanMoments,
     shifted_moments,
@@ -51,6 +56,31 @@ Box = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
 APART = 1e-3
 """Rounding of the distance of two origins, voxels: their coordinates have at most 16 digits."""
+
+
+_log = logging.getLogger(__name__)
+
+
+def _files() -> Any:
+    """
+    Return the module that saves and loads maps.
+
+    Files are above this level of the package; it is named here, as the package names the homes of
+    its public names, so that the class has the methods that users look for.
+    """
+    return import_module('surfel_mapper.files.maps')
+
+
+def _rebuilt(
+    voxel_size_m: float,
+    settings: dict[str, Any],
+    origin_m: npt.NDArray[np.float64],
+    moments: ScanMoments,
+) -> SurfelMap:
+    """Return the map of a pickle."""
+    surfel_map = SurfelMap(voxel_size_m, origin_m=origin_m, **settings)
+    surfel_map.insert(moments)
+    return surfel_map
 
 
 class SurfelMap:
@@ -93,6 +123,11 @@ class SurfelMap:
         level: int = 0,
         origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
+        if isinstance(voxel_size_m, bool) or not isinstance(voxel_size_m, (int, float, np.number)):
+            raise TypeError(
+                f'voxel_size_m: {voxel_size_m!r}, expected a number of metres; settings belong '
+                'to Mapper'
+            )
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         if threads < 1:
@@ -106,6 +141,7 @@ class SurfelMap:
         self.columns = columns
         self._channel_names = channel_names(columns)
         self._threads = threads
+        self._warned_of_units = False
         self._reducer = Reducer(self.voxel_size_m, columns)
         self._reset()
 
@@ -151,6 +187,7 @@ class SurfelMap:
         points: npt.ArrayLike,
         origin: npt.ArrayLike | None = None,
         *,
+        T_map_sensor: npt.ArrayLike | None = None,
         columns: Mapping[str, npt.NDArray[Any]] | None = None,
     ) -> ScanMoments:
         """
@@ -159,10 +196,12 @@ class SurfelMap:
         Parameters
         ----------
         points : (N, 3) float, m
-            In the frame of the map. Points with nan or inf are left out and counted in
-            ``left_out`` of the result.
+            In the frame of the map, or of the sensor if its pose is given. Points with nan or inf
+            are left out and counted in ``left_out`` of the result.
         origin : (3,) float, m, optional
-            Position of the sensor; normals turn towards it.
+            Position of the sensor in the map; normals turn towards it. Default: that of the pose.
+        T_map_sensor : (4, 4) float, optional
+            Pose of the sensor in the map.
         columns : mapping of str to (N,) array, optional
             Further columns of the points; required if the map has columns.
 
@@ -175,7 +214,14 @@ class SurfelMap:
             Nothing is changed.
 
         """
-        moments = self.reduce(points, origin=origin, columns=columns)
+        if T_map_sensor is not None:
+            T_map_sensor = np.asarray(T_map_sensor, np.float64)
+            if origin is None and T_map_sensor.shape == (4, 4):
+                origin = T_map_sensor[:3, 3]
+        moments = self.reduce(points, T_map_sensor, origin=origin, columns=columns)
+        if not self._warned_of_units and looks_like_millimetres(moments):
+            self._warned_of_units = True
+            _log.warning(MILLIMETRES)
         beyond = moments.left_out.get('beyond_map', 0)
         if beyond:
             limit = layout.INDEX_OFFSET * self.voxel_size_m
@@ -291,6 +337,55 @@ class SurfelMap:
         self._changes.add(self.version, rows, self._table.num_voxels)
         return unpack_keys(fallen)
 
+    @classmethod
+    def load(cls, path: str | Path) -> SurfelMap:
+        """
+        Return the map in a file, exactly as it was saved; without the scans of its window.
+
+        Parameters
+        ----------
+        path : str or Path
+            An .npz or .parquet file, or the output directory of a replay.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be read, is damaged or not exact.
+
+        """
+        found: SurfelMap = _files().load_surfel_map(Path(path))
+        return found
+
+    def save(self, path: str | Path) -> str:
+        """
+        Write the map to a file, atomically; return its digest.
+
+        Parameters
+        ----------
+        path : str or Path
+            The suffix decides: .npz and .parquet are exact, .ply and .pcd hold the surfels.
+
+        Raises
+        ------
+        FileFormatError
+            If the suffix is another, or the file cannot be written.
+
+        """
+        return str(_files().save_surfel_map(Path(path), self))
+
+    def __repr__(self) -> str:
+        """Return size and counts of the map."""
+        level = f', level {self.level}' if self.level else ''
+        return (
+            f'SurfelMap({self.voxel_size_m:g} m{level}: {self.num_points} points in '
+            f'{self.num_voxels} voxels)'
+        )
+
+    def __reduce__(self) -> Any:
+        """Pickle the exact state; ``copy`` and ``deepcopy`` use it too."""
+        settings = {'columns': self.columns, 'level': self.level, 'threads': self._threads}
+        return _rebuilt, (self.voxel_size_m, settings, self.origin_m, self.moments())
+
     def merge(self, other: SurfelMap) -> None:
         """
         Add all points of another map of equal voxel size: the exact union.
@@ -320,6 +415,8 @@ class SurfelMap:
 
     def _moments_here(self, other: SurfelMap) -> ScanMoments:
         """Return the moments of another map in the voxels of this one."""
+        if not isinstance(other, SurfelMap):
+            raise TypeError(f'a {type(other).__name__}, expected another SurfelMap')
         moments = other.moments()
         if np.array_equal(self.origin_m, other.origin_m):
             return moments
@@ -552,6 +649,11 @@ class SurfelMap:
         return replace(surfels, channels=means(sums, surfels.num_points, self._channel_names))
 
     def _check_lattice(self, moments: ScanMoments) -> None:
+        if not isinstance(moments, ScanMoments):
+            raise TypeError(
+                f'a {type(moments).__name__}, expected the ScanMoments that add or reduce '
+                'returned; points are added by add'
+            )
         if (moments.voxel_size_m, moments.level) != (self.voxel_size_m, self.level):
             raise MapError(
                 f'moments of voxel size {moments.voxel_size_m:g} m, level {moments.level}; '

@@ -9,21 +9,37 @@ does not store them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import DependencyError
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
 from surfel_mapper.threads import share
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+class OneSurfel(NamedTuple):
+    """One row of Surfels; see there for units."""
+
+    position: npt.NDArray[np.float64]
+    normal: npt.NDArray[np.float64]
+    planarity: float
+    curvature: float
+    eigenvalues: npt.NDArray[np.float64]
+    num_points: int
+    voxel_index: tuple[int, int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Surfels:
     """
     Surfels of K voxels, a row each, in the frame of the map.
+
+    ``len``, iteration and ``surfels[row]`` give single surfels, ``surfels[mask]`` and slices
+    Surfels.
 
     Attributes
     ----------
@@ -61,8 +77,115 @@ class Surfels:
         """Return the number of surfels."""
         return len(self.num_points)
 
-    def select(self, rows: npt.NDArray[Any]) -> Surfels:
-        """Return selected surfels: by a mask (K,) bool or by row indices."""
+    def __repr__(self) -> str:
+        """Return the number of surfels and the box around them."""
+        if not len(self):
+            return 'Surfels(0)'
+        low, high = (np.round(f(self.position, axis=0), 2).tolist() for f in (np.min, np.max))
+        return f'Surfels({len(self)}, from {low} to {high} m)'
+
+    def __getitem__(self, row: Any) -> Any:
+        """Return one surfel (OneSurfel) for an integer, Surfels for a slice, mask or rows."""
+        if not isinstance(row, (int, np.integer)):
+            return self.select(row)
+        if not 0 <= row < len(self):
+            raise IndexError(no_row(int(row), len(self)))
+        return OneSurfel(
+            position=self.position[row],
+            normal=self.normal[row],
+            planarity=float(self.planarity[row]),
+            curvature=float(self.curvature[row]),
+            eigenvalues=self.eigenvalues[row],
+            num_points=int(self.num_points[row]),
+            voxel_index=tuple(self.voxel_index[row].tolist()),
+        )
+
+    def __iter__(self) -> Iterator[OneSurfel]:
+        """Yield the surfels one by one."""
+        return (self[row] for row in range(len(self)))
+
+    def to_numpy(self) -> npt.NDArray[Any]:
+        """
+        Return the surfels as a structured array of shape (K,).
+
+        Fields x y z, normal_x normal_y normal_z, planarity, curvature, e0 e1 e2, num_points, i j k
+        and the channels; the names of columns of ``to_pandas``.
+        """
+        columns = self._columns()
+        table = np.empty(len(self), [(name, values.dtype) for name, values in columns.items()])
+        for name, values in columns.items():
+            table[name] = values
+        return table
+
+    def to_pandas(self) -> Any:
+        """
+        Return the surfels as a pandas DataFrame, with the columns of ``to_numpy``.
+
+        Raises
+        ------
+        DependencyError
+            If pandas is not installed.
+
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            reason = f'pandas cannot be loaded ({error}); pip install pandas'
+            raise DependencyError(reason) from error
+        return pandas.DataFrame(self._columns())
+
+    def to_open3d(self) -> Any:
+        """
+        Return the surfels as an open3d.geometry.PointCloud with normals, and colours if known.
+
+        Raises
+        ------
+        DependencyError
+            If Open3D is not installed.
+
+        """
+        try:
+            import open3d
+        except ImportError as error:
+            reason = f'Open3D cannot be loaded ({error}); pip install open3d'
+            raise DependencyError(reason) from error
+        cloud = open3d.geometry.PointCloud()
+        cloud.points = open3d.utility.Vector3dVector(self.position)
+        cloud.normals = open3d.utility.Vector3dVector(self.normal)
+        if 'red' in self.channels:
+            colours = [self.channels[name] / 255.0 for name in ('red', 'green', 'blue')]
+            cloud.colors = open3d.utility.Vector3dVector(np.stack(colours, axis=1))
+        return cloud
+
+    def _columns(self) -> dict[str, npt.NDArray[Any]]:
+        """Return all columns, (K,) each, by name."""
+        return {
+            **dict(zip('xyz', self.position.T, strict=True)),
+            **dict(zip(('normal_x', 'normal_y', 'normal_z'), self.normal.T, strict=True)),
+            'planarity': self.planarity,
+            'curvature': self.curvature,
+            **dict(zip(('e0', 'e1', 'e2'), self.eigenvalues.T, strict=True)),
+            'num_points': self.num_points,
+            **dict(zip('ijk', self.voxel_index.T, strict=True)),
+            **self.channels,
+        }
+
+    def select(self, rows: Any) -> Surfels:
+        """
+        Return selected surfels: by a slice, a mask (K,) bool or row indices.
+
+        Raises
+        ------
+        IndexError
+            If a row is negative, as ``SurfelIndex.at`` returns where there is no surfel.
+
+        """
+        if not isinstance(rows, slice):
+            rows = np.asarray(rows)
+            if rows.size == 0 and rows.dtype != np.bool_:
+                rows = rows.astype(np.int64)
+            if rows.dtype.kind == 'i' and rows.size and rows.min() < 0:
+                raise IndexError(no_row(int(rows.min()), len(self)))
         return Surfels(
             position=self.position[rows],
             normal=self.normal[rows],
@@ -86,6 +209,22 @@ class Surfels:
             self.num_points,
             self.voxel_index,
         )
+
+
+def concatenated(parts: Sequence[Surfels]) -> Surfels:
+    """Return the surfels of all parts."""
+    names = [each.name for each in fields(Surfels) if each.name != 'channels']
+    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+    channels = {
+        name: np.concatenate([part.channels[name] for part in parts]) for name in parts[0].channels
+    }
+    return Surfels(**columns, channels=channels)
+
+
+def no_row(row: int, num_surfels: int) -> str:
+    """Return the sentence that refuses a row."""
+    why = ' (index.at returns -1 where there is no surfel: leave these out)' if row == -1 else ''
+    return f'row {row} of {num_surfels} surfels{why}; expected 0 to {num_surfels - 1}'
 
 
 def derive(

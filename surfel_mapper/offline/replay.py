@@ -210,6 +210,11 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     from surfel_mapper.config import Config, load_config
     from surfel_mapper.offline.outputs import DXF, FORMATS
 
+    if config is not None and not isinstance(config, (Config, str, Path)):
+        raise ConfigError(
+            f'config: a {type(config).__name__}, expected a Config or the path of a YAML file; '
+            'Config.from_mapping(settings) takes a dict'
+        )
     settings = config if isinstance(config, Config) else load_config(config)
     unknown = [name for name in options.formats if name not in FORMATS]
     if unknown:

@@ -22,7 +22,7 @@ from surfel_mapper.errors import AlignmentError, MapError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.moments import looks_like_millimetres, MILLIMETRES, pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.mapping.window import SlidingWindow
@@ -75,6 +75,7 @@ class Inserter:
     ) -> None:
         self._drops = drops
         self.derives = True
+        self._warned_of_units = False
         self.map = surfel_map
         self.window = SlidingWindow(self.map)
         self._set_limits(config)
@@ -221,6 +222,9 @@ class Inserter:
             if not len(windowed.moments):
                 self._drops.scan(scan, 'no_valid_points', f'left out: {left_out}')
                 return None
+            if not self._warned_of_units and looks_like_millimetres(windowed.moments):
+                self._warned_of_units = True
+                _log.warning('scan in frame %s: %s', scan.frame_id, MILLIMETRES)
             evictions = self.window.insert(windowed, config.map.min_points)
         except MapError as error:
             self._drops.scan(scan, 'map_limit', str(error))

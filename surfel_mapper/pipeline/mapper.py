@@ -80,11 +80,16 @@ class Mapper:
     Raises
     ------
     ConfigError
-        If ``filters`` names a file that holds no chain.
+        If ``filters`` names a file that holds no chain, or the configuration is no Config.
 
     """
 
     def __init__(self, config: Config | None = None) -> None:
+        if config is not None and not isinstance(config, Config):
+            raise ConfigError(
+                f'a {type(config).__name__}, expected a Config: Config.from_mapping(settings), or '
+                'load_config(path)'
+            )
         self.config = config or Config()
         self.counters = Counters()
         self._drops = Drops(self.counters)
@@ -143,7 +148,17 @@ class Mapper:
         static : bool
             The pose holds for all time.
 
+        Raises
+        ------
+        ValueError
+            If the stamp is no whole number.
+
         """
+        if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, (int, np.integer)):
+            raise ValueError(
+                f'stamp_ns: {stamp_ns!r}, expected whole nanoseconds as an int, such as '
+                'round(seconds * 1e9)'
+            )
         add = partial(self._poses.add, parent, child, stamp_ns, xyz, q_xyzw, static=static)
         if static:
             add()

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.trajectory import read_trajectory, write_tum
+from surfel_mapper.files.trajectory import read_trajectory, Trajectory, write_tum
 from surfel_mapper.geometry import pose_matrix
 
 START_NS = 1_700_000_000_123_456_789
@@ -144,3 +144,44 @@ def test_binary_and_missing_files_are_refused(tmp_path, content):
 
     with pytest.raises(FileFormatError, match=r'poses\.txt: '):
         read_trajectory(path)
+
+
+def test_a_trajectory_takes_and_gives_matrices(tmp_path):
+    stamps, poses = some_poses()
+    trajectory = Trajectory.from_matrices(poses, stamps)
+    np.testing.assert_allclose(trajectory.matrices, poses, rtol=0, atol=1e-12)
+    trajectory.save(tmp_path / 'drive.tum')
+    loaded = Trajectory.load(tmp_path / 'drive.tum')
+    np.testing.assert_array_equal(loaded.stamp_ns, stamps)
+    np.testing.assert_allclose(loaded.matrices, poses, rtol=0, atol=1e-9)
+    assert repr(loaded) == 'Trajectory(20 poses in 1.900 s)'
+    assert repr(Trajectory.from_matrices(poses)) == 'Trajectory(20 poses)'
+
+
+@pytest.mark.parametrize(
+    ('poses', 'stamps', 'message'),
+    [
+        (np.eye(4), [0], r'shape \(4, 4\), expected \(S, 4, 4\)'),
+        (2.0 * np.eye(4)[None], [0], r'T_fixed_sensor\[0\]: .*a rigid transform'),
+        (np.eye(4)[None], [0.5], 'whole nanoseconds'),
+        (np.tile(np.eye(4), (2, 1, 1)), [5, 5], 'ascending'),
+    ],
+)
+def test_odd_matrices_and_stamps_are_refused(poses, stamps, message):
+    with pytest.raises(ValueError, match=message):
+        Trajectory.from_matrices(poses, stamps)
+
+
+def test_poses_without_stamps_are_not_written_as_tum(tmp_path):
+    with pytest.raises(FileFormatError, match='without stamps'):
+        Trajectory.from_matrices(np.eye(4)[None]).save(tmp_path / 'a.tum')
+
+
+def test_evo_reads_the_trajectory_as_written(tmp_path):
+    file_interface = pytest.importorskip('evo.tools.file_interface')
+    stamps, poses = some_poses()
+    Trajectory.from_matrices(poses, stamps).save(tmp_path / 'drive.tum')
+    found = file_interface.read_tum_trajectory_file(str(tmp_path / 'drive.tum'))
+    np.testing.assert_allclose(found.timestamps, stamps / 1e9, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(np.array(found.poses_se3), poses, rtol=0, atol=1e-9)
+    assert found.check()[0]

@@ -1,0 +1,44 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+SurfelMap.save and SurfelMap.load: the format of a map by the suffix of its file.
+
+(A short module of its own: it joins the formats, which do not import each other.)
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import map_state, parquet, pcd, ply
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+EXACT = ('.npz', '.parquet')
+
+SURFELS = ('.ply', '.pcd')
+
+
+def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
+    """Write a map; see SurfelMap.save."""
+    if path.suffix == '.npz':
+        return map_state.save_map(path, surfel_map)
+    if path.suffix == '.parquet':
+        return parquet.write_map(path, surfel_map)
+    if path.suffix not in SURFELS:
+        raise FileFormatError(f'{path}: expected a file ending in {", ".join(EXACT + SURFELS)}')
+    write = ply.write_surfels if path.suffix == '.ply' else pcd.write_surfels
+    write(path, surfel_map.surfels(), surfel_map.origin_m)
+    return surfel_map.digest()
+
+
+def load_surfel_map(path: Path) -> SurfelMap:
+    """Return a map; see SurfelMap.load."""
+    if path.suffix == '.parquet':
+        return parquet.read_map(path)
+    if path.suffix in SURFELS:
+        raise FileFormatError(
+            f'{path}: surfels without their moments, from which no map can be made; expected a '
+            f'file ending in {" or ".join(EXACT)}'
+        )
+    return map_state.load_map(path)[0]
