@@ -3,7 +3,7 @@
 """
 SurfelMap.save and SurfelMap.load: the format of a map by the suffix of its file.
 
-(A short module of its own: it joins the formats, which do not import each other.)
+It stands alone because it joins the formats, which do not import each other.
 """
 
 from __future__ import annotations

@@ -7,6 +7,8 @@ Stamps are converted between decimal text and nanoseconds without a float, becau
 of a float64 is only 240 ns for seconds since 1970; coordinates are written with the digits that
 restore the same float64. Poses are neither sorted nor interpolated here: a pose of the wrong time
 maps a scan to the wrong place.
+
+The formats are in one module because they share the class, the check of poses and the stamps.
 """
 
 from __future__ import annotations
