@@ -120,7 +120,7 @@ def read(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
             f'{", ".join(MAPS)}'
         )
-    origin_m = np.zeros(3)
+    origin_m: npt.NDArray[np.float64] = np.zeros(3)
     if args.cloud.suffix in MAPS:
         if args.cloud.suffix == '.npz':
             surfel_map, _ = map_state.load_map(args.cloud)
