@@ -10,8 +10,6 @@ PYTEST_ARGS ?=
 TEST_PROCESSES ?= 2
 FUZZ_SECONDS ?= 60
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
-BOUNDSCHECKED := $(addprefix test/,kernels mapping filters alignment models sensors tsdf layers \
-	messages simulation viz/kernels pipeline/test_regions.py)
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -35,19 +33,20 @@ LINT_STAMP := $(LINT)/.ready
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
 
-# Each process takes the next file of tests when it is done with one, and has a ROS domain of its
-# own; see test/conftest.py. TEST_PROCESSES=0 runs all in this process.
+# Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
+# one, and has a ROS domain of its own. TEST_PROCESSES=0 runs all in this process.
 test: $(STAMP)  ## all tests
-	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --durations=5 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \
+		--durations=5 $(PYTEST_ARGS)
 
 # Compiled code reads past the end of an array without an error. Compiled with checks it cannot;
 # the cache is a new one, because cached kernels keep the setting they were compiled with. At the
 # end every kernel has to have been compiled, that is, called by a test.
-boundscheck: $(STAMP)  ## the tests that call kernels, with every index checked
+boundscheck: $(STAMP)  ## the tests of kernels against their references, with every index checked
 	cache=$$(mktemp -d) && trap 'rm -rf "$$cache"' EXIT && \
 	export NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR="$$cache" && \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile \
-		$(BOUNDSCHECKED) $(PYTEST_ARGS) && \
+		$$($(BIN)/python -m test.kernels.references) $(PYTEST_ARGS) && \
 	$(BIN)/python -m test.kernels.reached "$$cache"
 
 versions:  ## one bag, one digest, on every Python of PYTHONS that is there

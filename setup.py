@@ -75,7 +75,7 @@ TEST = [
     *LAS,
     *VIEWER,
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
-    'pytest-xdist>=3.6',  # two processes: those of ROS wait, those of the others calculate
+    'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
     'plyfile>=1.0.1',  # an independent reader of what we write
     'pypcd4>=1.1',  # likewise
     'pandas>=2.0',  # Surfels.to_pandas

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import gc
+from itertools import zip_longest
 import os
 from pathlib import Path
 
@@ -36,6 +37,26 @@ def pytest_configure() -> None:
             'data/ and golden/ as CONTRIBUTING.md describes; unset it to skip tests of real data',
             returncode=pytest.ExitCode.USAGE_ERROR,
         )
+
+
+WAITING = ('test/ros/', 'test/docs/', 'test/examples/', 'test/cluster/')
+"""Tests of processes, which wait for each other half of their time."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """
+    Order the files so that one process calculates while the other waits, and none ends late.
+
+    Files that wait alternate with others from the beginning; those left over are short.
+    """
+    files: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.nodeid.partition('::')[0], []).append(item)
+    waiting = [name for name in files if name.startswith(WAITING)]
+    others = [name for name in files if not name.startswith(WAITING)]
+    others.sort(key=lambda name: -len(files[name]))
+    pairs = zip_longest(waiting, others)
+    items[:] = [item for pair in pairs for name in pair if name for item in files[name]]
 
 
 def pytest_collection_finish() -> None:

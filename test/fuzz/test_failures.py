@@ -186,7 +186,7 @@ def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, opera
     def run():
         operation(surfel_map, moments, path)
 
-    for number in [*range(40), *(40 + 7 * step for step in range(60))]:
+    for number in [*range(30), *(30 + 15 * step for step in range(30))]:
         code = in_child(testcapi, surfel_map, run, number, allowed)
         assert code in (0, 1), (operation.__name__, number, code)
         failures += code

@@ -9,22 +9,11 @@ import fcntl
 import itertools
 import os
 import socket
+import sys
 
 import pytest
 
-COMPILING_S = 3600.0
-"""Longest wait for all kernels to compile; a minute on an idle machine."""
-
-LAYERS = {
-    'pose.source': 'odometry',
-    'deskew.enabled': True,
-    'publish.levels': 1,
-    'map.intensity': True,
-    'window.keep_points': True,
-    'layers.tsdf.enabled': True,
-    'layers.models.enabled': True,
-}
-WITHOUT_POSES = {'pose.source': 'registration'}
+from test.ros.prefork import load, Prefork
 
 
 @contextmanager
@@ -52,13 +41,13 @@ def domain(tmp_path_factory):
 
 
 @pytest.fixture(scope='session')
-def compiled(domain, tmp_path_factory):
-    """Run nodes until all kernels are compiled, which takes longer than the tests wait."""
-    from test.ros.live import Process
-
-    folder = tmp_path_factory.mktemp('compiling')
-    with compiling_alone(folder.parent.parent):
-        compile_kernels(folder, Process)
+def prefork(domain, tmp_path_factory):
+    """Compile all kernels, then return the process of which verbs are forked, if it can."""
+    with compiling_alone(tmp_path_factory.getbasetemp().parent):
+        forking = Prefork() if sys.platform == 'linux' else load()
+    yield forking
+    if forking is not None:
+        forking.close()
 
 
 @contextmanager
@@ -69,33 +58,35 @@ def compiling_alone(folder):
         yield
 
 
-def compile_kernels(folder, Process):
-    """Run a node with every layer, then one that registers, until they are ready."""
-    for settings in (LAYERS, WITHOUT_POSES):
-        given = (('-p', f'{name}:={str(value).lower()}') for name, value in settings.items())
-        node = Process(['node', '--ros-args', *itertools.chain(*given)], folder)
-        try:
-            node.wait_for_output('ready:', COMPILING_S)
-            assert node.stop() == 0, node.output
-        finally:
-            node.kill()
-
-
-@pytest.fixture
-def start(compiled, tmp_path):
-    """Return a function that runs a verb as a process; all are killed after the test."""
+@contextmanager
+def starting(folder, prefork):
+    """Return a function that runs a verb as a process; all are killed after the with-block."""
     from test.ros.live import Process
 
     processes = []
 
     def run(*arguments):
-        processes.append(Process(arguments, tmp_path))
+        processes.append(Process(arguments, folder, prefork))
         return processes[-1]
 
     yield run
     for process in processes:
         process.kill()
         print(process.output)  # pytest shows it if the test fails
+
+
+@pytest.fixture
+def start(prefork, tmp_path):
+    """Return a function that forks a verb; see prefork.py."""
+    with starting(tmp_path, prefork) as run:
+        yield run
+
+
+@pytest.fixture
+def start_anew(prefork, tmp_path):
+    """Return a function that runs a verb in a Python of its own, which searches for layers."""
+    with starting(tmp_path, None) as run:
+        yield run
 
 
 @pytest.fixture

@@ -47,8 +47,12 @@ def reliably(*topics, value='reliable'):
 class Process:
     """A verb running as a process in a folder, which also gets its output."""
 
-    def __init__(self, arguments, folder):
+    def __init__(self, arguments, folder, prefork=None):
+        """Start the verb anew, or fork it where modules and kernels are loaded."""
         self._output = Path(folder) / f'{arguments[0]}_{time.monotonic_ns()}.txt'
+        if prefork is not None:
+            self._process = prefork.start(arguments, self._output, folder, dict(os.environ))
+            return
         with open(self._output, 'wb') as file:
             self._process = subprocess.Popen(
                 [sys.executable, '-m', 'surfel_mapper.cli.main', *map(str, arguments)],
@@ -60,7 +64,7 @@ class Process:
 
     @property
     def output(self):
-        return self._output.read_text(encoding='utf-8')
+        return self._output.read_text(encoding='utf-8') if self._output.exists() else ''
 
     def wait(self, timeout_s=TIMEOUT_S):
         return self._process.wait(timeout_s)
@@ -211,9 +215,10 @@ class Peer:
 
 
 @contextmanager
-def node_and_peer(folder, *arguments):
-    """Run a node that saves maps to a folder, and a peer, in a with-block."""
-    node = Process(['node', *arguments, '-p', f'output.directory:={folder}'], folder.parent)
+def node_and_peer(prefork, folder, *arguments):
+    """Fork a node that saves maps to a folder, and make a peer, in a with-block."""
+    arguments = ['node', *arguments, '-p', f'output.directory:={folder}']
+    node = Process(arguments, folder.parent, prefork)
     peer = Peer()
     try:
         yield node, peer

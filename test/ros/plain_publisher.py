@@ -12,9 +12,12 @@ from array import array
 import sys
 import time
 
+from lifecycle_msgs.srv import GetState
 import rclpy
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.task import Future
 from sensor_msgs.msg import PointCloud2, PointField
 
 POINT_STEP = 160
@@ -40,17 +43,31 @@ def cloud(stamp_ns: int, num_bytes: int) -> PointCloud2:
     return message
 
 
+def meet(node: Node, publisher: Publisher) -> None:
+    """
+    Return when the mapper knows the publisher, as its answer to a later client shows.
+
+    Endpoints are announced in the order of their creation. A server does not answer a client that
+    it does not know yet, so the request is repeated.
+    """
+    while not publisher.get_subscription_count():
+        time.sleep(0.05)
+    client = node.create_client(GetState, '/surfel_mapper/get_state')
+    client.wait_for_service()
+    answers: list[Future] = []
+    while not any(answer.done() for answer in answers):
+        answers.append(client.call_async(GetState.Request()))
+        rclpy.spin_until_future_complete(node, answers[-1], timeout_sec=1.0)
+    node.destroy_client(client)
+
+
 def main(reliability: str, number: str, first_ns: str) -> None:
     """Publish clouds of each size."""
     rclpy.init()
     node = Node('plain_lidar')
     qos = QoSProfile(depth=10, reliability=ReliabilityPolicy[reliability.upper()])
     publisher = node.create_publisher(PointCloud2, '/points', qos)
-    while not publisher.get_subscription_count():
-        time.sleep(0.05)
-    # The subscriber must know the publisher too, or it misses best-effort clouds. DDS does not
-    # tell a publisher when that is; it takes milliseconds, on a busy machine tens of them.
-    time.sleep(1.0)
+    meet(node, publisher)
     stamp_ns = int(first_ns)
     for size in sys.stdin:
         message = cloud(stamp_ns, int(size))

@@ -169,9 +169,9 @@ def disk(tmp_path):
 
 
 @pytest.fixture(scope='module')
-def running(compiled, tmp_path_factory):
+def running(prefork, tmp_path_factory):
     maps = tmp_path_factory.mktemp('files') / 'maps'
-    with node_and_peer(maps, *ARGUMENTS) as (node, peer):
+    with node_and_peer(prefork, maps, *ARGUMENTS) as (node, peer):
         peer.advertise('/odom', '/points')
         send(peer, drive(3))
         peer.diagnosis({'scans.mapped': 3})

@@ -112,8 +112,9 @@ class Stream:
 
 
 @pytest.fixture(scope='module')
-def running(compiled, tmp_path_factory):
-    with node_and_peer(tmp_path_factory.mktemp('faults') / 'maps', *ARGUMENTS) as pair:
+def running(prefork, tmp_path_factory):
+    maps = tmp_path_factory.mktemp('faults') / 'maps'
+    with node_and_peer(prefork, maps, *ARGUMENTS) as pair:
         yield Stream(*pair)
 
 

@@ -12,7 +12,7 @@ from test.bench.options import Options
 from test.soak import node
 
 
-def test_the_node_maps_every_scan_of_a_long_drive(compiled, tmp_path):
+def test_the_node_maps_every_scan_of_a_long_drive(prefork, tmp_path):
     options = Options(scans=5, beams=8, columns=64, cache=tmp_path)
     rows = list(node.run(250, 100, options))  # the window is full, and scans have left it
     assert [row['scans'] for row in rows] == [100, 200, 250]

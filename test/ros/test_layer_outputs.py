@@ -17,9 +17,9 @@ from test.ros.live import cloud, LATCHED, odometry, START_NS
 from test.ros.test_outputs import BASE, start_node
 
 
-def test_a_layer_from_outside_is_published(start, peer, tmp_path):
+def test_a_layer_from_outside_is_published(start_anew, peer, tmp_path):
     install(tmp_path)  # the folder in which the node runs, and so on its path
-    node = start_node(start, peer, **{'layers.heights.enabled': 'true'})
+    node = start_node(start_anew, peer, **{'layers.heights.enabled': 'true'})
     numbers = peer.collect(Int64, f'{BASE}/num_columns', LATCHED)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, POINTS))
@@ -27,13 +27,13 @@ def test_a_layer_from_outside_is_published(start, peer, tmp_path):
     node.check()
 
 
-def test_a_node_that_cannot_go_on_saves_its_map(start, peer, tmp_path):
+def test_a_node_that_cannot_go_on_saves_its_map(start_anew, peer, tmp_path):
     install(tmp_path)
     module = tmp_path / 'heights.py'
     code = module.read_text('utf-8')
     broken = "if len(self.lowest): raise SystemExit('broken')\n        T, size_m ="
     module.write_text(code.replace('T, size_m =', broken), encoding='utf-8')
-    node = start_node(start, peer, **{'layers.heights.enabled': 'true'})
+    node = start_node(start_anew, peer, **{'layers.heights.enabled': 'true'})
     for stamp_ns in (START_NS, START_NS + PERIOD_NS):
         peer.publish('/odom', odometry(stamp_ns, (0.0, 0.0, 0.0)))
         peer.publish('/points', cloud(stamp_ns, POINTS))

@@ -137,7 +137,7 @@ def test_settings_changed_before_configure_are_used(start, peer):
     assert values['window_scans'] == '2'
 
 
-def test_settings_changed_while_kernels_compile_are_used(compiled, peer, monkeypatch):
+def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypatch):
     answers = []
 
     def compile_until_set():

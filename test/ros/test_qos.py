@@ -38,7 +38,7 @@ RELIABLE = QoSProfile(depth=10)
 
 
 @pytest.fixture(scope='module')
-def node(compiled, tmp_path_factory):
+def node(prefork, tmp_path_factory):
     """Run a node with Fast DDS' defaults."""
     from test.ros.live import Process
 

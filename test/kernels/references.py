@@ -1,0 +1,70 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The test of each module of kernels that compares it with a twin or an analytic reference.
+
+`python -m test.kernels.references` lists the tests, for `make boundscheck`; test_references.py
+compares the table with the modules that there are.
+"""
+
+REFERENCES = {
+    'alignment/kernels/edges.py': 'alignment/kernels/test_edges.py',
+    'alignment/kernels/registration.py': 'alignment/kernels/test_registration.py',
+    'filters/kernels/boxes.py': 'filters/kernels/test_kernels.py',
+    'filters/kernels/limits.py': 'filters/kernels/test_kernels.py',
+    'filters/kernels/sampling.py': 'filters/test_sampling.py',
+    'filters/kernels/shapes.py': 'filters/kernels/test_kernels.py',
+    'filters/kernels/tensor_voting.py': 'filters/test_tensor_voting.py',
+    'kernels/grouping.py': 'kernels/test_grouping.py',
+    'kernels/hashing.py': 'kernels/test_hashing.py',
+    'kernels/layout.py': 'mapping/kernels/test_voxels.py',
+    'kernels/polygons.py': 'pipeline/test_regions.py',
+    'kernels/prefetch.py': 'kernels/test_prefetch.py',
+    'kernels/projection.py': 'kernels/test_projection.py',
+    'kernels/quantisation.py': 'mapping/kernels/test_reduction.py',
+    'kernels/selection.py': 'kernels/test_selection.py',
+    'kernels/symmetric3.py': 'kernels/test_symmetric3.py',
+    'kernels/voxel_grid.py': 'filters/test_grids.py',
+    'layers/dynamic_objects/kernels/free_space.py': 'layers/test_free_space.py',
+    'mapping/kernels/queries.py': 'mapping/kernels/test_queries.py',
+    'mapping/kernels/reduction.py': 'mapping/kernels/test_reduction.py',
+    'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',
+    'mapping/kernels/voxels.py': 'mapping/kernels/test_voxels.py',
+    'messages/kernels/attach.py': 'messages/test_scan_normals.py',
+    'messages/kernels/discs.py': 'messages/test_surfel_markers.py',
+    'models/kernels/bisection.py': 'models/kernels/test_bisection.py',
+    'models/kernels/bspline.py': 'models/test_bspline.py',
+    'models/kernels/bspline_incremental.py': 'models/kernels/test_bspline_incremental.py',
+    'models/kernels/charts.py': 'models/kernels/test_charts.py',
+    'models/kernels/frames.py': 'models/test_segmentation.py',
+    'models/kernels/gaussian_mixture.py': 'models/kernels/test_bisection.py',
+    'models/kernels/grid.py': 'models/test_grid.py',
+    'models/kernels/growth.py': 'models/kernels/test_growth.py',
+    'models/kernels/outlines.py': 'models/test_outlines.py',
+    'models/kernels/patches.py': 'models/kernels/test_patches.py',
+    'models/kernels/region_merging.py': 'models/kernels/test_patches.py',
+    'models/kernels/surfel_classes.py': 'models/kernels/test_surfels.py',
+    'models/kernels/surfel_groups.py': 'models/kernels/test_surfels.py',
+    'models/kernels/surfel_links.py': 'models/kernels/test_surfels.py',
+    'models/kernels/voxel_means.py': 'models/kernels/test_voxel_means.py',
+    'models/kernels/voxel_points.py': 'models/kernels/test_growth.py',
+    'sensors/kernels/depth.py': 'sensors/test_depth.py',
+    'sensors/kernels/deskew.py': 'sensors/test_deskew.py',
+    'simulation/kernels/raycast.py': 'simulation/kernels/test_raycast.py',
+    'simulation/kernels/surfaces.py': 'simulation/kernels/test_raycast.py',
+    'tsdf/kernels/block_marks.py': 'tsdf/test_selection.py',
+    'tsdf/kernels/blocks.py': 'tsdf/test_blocks.py',
+    'tsdf/kernels/channels.py': 'tsdf/test_labels.py',
+    'tsdf/kernels/integration.py': 'tsdf/test_twin.py',
+    'tsdf/kernels/lookup.py': 'tsdf/test_range_image.py',
+    'tsdf/kernels/marching_cubes.py': 'tsdf/test_mesh.py',
+    'tsdf/kernels/point_fusion.py': 'tsdf/test_point_integrator.py',
+    'tsdf/kernels/queries.py': 'tsdf/test_queries.py',
+    'tsdf/kernels/range_image.py': 'tsdf/test_range_image.py',
+    'viz/kernels/painting.py': 'viz/kernels/test_painting.py',
+}
+"""Module of kernels, under surfel_mapper/: the test with its twin or reference, under test/."""
+
+
+if __name__ == '__main__':
+    print(*sorted({f'test/{name}' for name in REFERENCES.values()}))
