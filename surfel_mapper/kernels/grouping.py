@@ -13,6 +13,7 @@ Source: Fibonacci hashing, Knuth, The Art of Computer Programming, vol. 3, 6.4.
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.prefetch import prefetch
 
 CHUNK = 1024
@@ -40,7 +41,7 @@ def home(key, shift):
     return np.int64((np.uint64(key) * _MIX) >> shift)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def find_runs(keys, num, starts):
     """
     Find the runs of consecutive points of one voxel; return their number.
@@ -59,7 +60,7 @@ def find_runs(keys, num, starts):
     return num_runs
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def find_run_rows(chunk_keys, starts, num_runs, table, keys, sums, num_rows, run_rows):
     """
     Look up the row of each run's voxel, adding rows of zeros for new voxels; return their number.
@@ -103,7 +104,7 @@ def find_run_rows(chunk_keys, starts, num_runs, table, keys, sums, num_rows, run
     return num_rows
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def enlarged_table(table, keys, num_rows):
     """Return a table (4 B,) int32 that holds the same rows; see ``find_run_rows``."""
     larger = np.full(4 * len(table), -1, np.int32)
@@ -117,7 +118,7 @@ def enlarged_table(table, keys, num_rows):
     return larger
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def build_table(keys, table):
     """
     Build the hash table of unique voxel keys.
@@ -135,7 +136,7 @@ def build_table(keys, table):
         table[place] = row
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def find_key(key, keys, table, shift):
     """Return the row of a voxel key in a table of build_table, -1 if not found."""
     mask = len(table) - 1

@@ -23,6 +23,7 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after Knuth, vol. 3, 6.4
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
@@ -97,7 +98,7 @@ def is_full(hashed, table, depth):
     return held[segment] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def find_row(key, rows, table, depth):
     """
     Return the row of a voxel, or -1 if not found.
@@ -118,7 +119,7 @@ def find_row(key, rows, table, depth):
     return np.int64(-1)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def insert_row(hashed, row, table, depth):
     """Insert the row of a voxel that is not in the table."""
     directory, buckets, held, _ = table
@@ -129,7 +130,7 @@ def insert_row(hashed, row, table, depth):
     buckets[bucket] = (hashed << 32) | (row + 1)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def remove_row(key, row, table, depth):
     """
     Remove the row of a voxel from the table and close the gap.
@@ -153,7 +154,7 @@ def remove_row(key, row, table, depth):
     buckets[gap] = 0
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def split_segment(hashed, table, state):
     """
     Split the segment of a hash by the next bit of the hashes; return whether there was room.

@@ -27,13 +27,15 @@ import math
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
+
 NOISE = 1e-15
 """Eigenvalues below this share of the trace are rounding errors, and become 0."""
 
 SIXTH = 1.0 / 6.0
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def decompose(scatter, num, eigenvalues, normals):
     """
     Decompose the first num matrices.
@@ -54,7 +56,7 @@ def decompose(scatter, num, eigenvalues, normals):
     write_normals(roots, vectors, planes, num, normals)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def normalise(scatter, num, deviators, sizes):
     """
     Subtract the mean eigenvalue and scale the deviator.
@@ -88,7 +90,7 @@ def normalise(scatter, num, deviators, sizes):
         sizes[0, i], sizes[1, i], sizes[2, i] = trace, (0.0 if ball else spread), back
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def isolate(deviators, num, roots):
     """Find the eigenvalue of each deviator farthest from the other two, in [-2, 2]."""
     for i in range(num):
@@ -108,7 +110,7 @@ def isolate(deviators, num, roots):
         roots[i] = t * side
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def cross(deviators, roots, num, vectors):
     """Find the unit eigenvectors (3, num) of the isolated eigenvalues."""
     for i in range(num):
@@ -132,7 +134,7 @@ def cross(deviators, roots, num, vectors):
         vectors[0, i], vectors[1, i], vectors[2, i] = vx * scale, vy * scale, vz * scale
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def deflate(deviators, roots, vectors, num, planes):
     """
     Solve for the other two eigenvalues, in the plane across the isolated eigenvector.
@@ -164,7 +166,7 @@ def deflate(deviators, roots, vectors, num, planes):
         planes[3, i] = first * uz + second * wz
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def write_eigenvalues(sizes, roots, planes, num, eigenvalues):
     """Scale the three eigenvalues back, in ascending order."""
     for i in range(num):
@@ -182,7 +184,7 @@ def write_eigenvalues(sizes, roots, planes, num, eigenvalues):
         eigenvalues[0, i], eigenvalues[1, i], eigenvalues[2, i] = e0 * back, e1 * back, e2 * back
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def write_normals(roots, vectors, planes, num, normals):
     """Write the unit eigenvectors of the lowest eigenvalues, isolated or not."""
     for i in range(num):
@@ -194,7 +196,7 @@ def write_normals(roots, vectors, planes, num, normals):
         normals[2, i] = vectors[2, i] if isolated else pz * scale
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def eigenvectors(matrices, values, smallest, vectors):
     """
     Find all eigenvectors, given those of the smallest eigenvalues.
@@ -256,7 +258,7 @@ def store(vectors, i, k, x, y, z):
     vectors[i, k, 0], vectors[i, k, 1], vectors[i, k, 2] = side * x, side * y, side * z
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def eigen_frame(matrix, values, vectors):
     """
     Decompose one matrix.

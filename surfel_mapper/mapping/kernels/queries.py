@@ -16,6 +16,7 @@ import math
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.grouping import find_key, hash_shift
 from surfel_mapper.kernels.layout import (
     COUNT,
@@ -36,7 +37,7 @@ _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio, odd."""
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def rows_at(points, scale, bits, keys, table, rows):
     """
     Find the row of the voxel that each point lies in.
@@ -59,7 +60,7 @@ def rows_at(points, scale, bits, keys, table, rows):
             rows[i] = -1
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def best_around(points, radius, voxel_size, positions, ranks, keys, table, rows):
     """
     Find the surfels of lowest rank around each point.
@@ -96,7 +97,7 @@ def best_around(points, radius, voxel_size, positions, ranks, keys, table, rows)
                         insert_ranked(rank, row, best, rows, i)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def insert_ranked(rank, row, best, rows, i):
     """Insert a row into the sorted best rows of point i; a rank of nan is ignored."""
     place = len(best)
@@ -113,7 +114,7 @@ def insert_ranked(rank, row, best, rows, i):
     rows[i, place] = row
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def reach(coordinate, radius, voxel_size):
     """Return the first and last valid voxel index that a ball may touch along an axis."""
     slack = radius + 1e-9 * voxel_size  # a mean may be rounded onto the face of its voxel
@@ -125,7 +126,7 @@ def reach(coordinate, radius, voxel_size):
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def keys_in_box(rows, used, low, high):
     """Return the keys of occupied voxels with indices from low to high, (3,) int64 each."""
     kept = np.empty(used, np.int64)
@@ -142,7 +143,7 @@ def keys_in_box(rows, used, low, high):
     return kept[:num].copy()
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def rows_changed_at(rows, changed, version, min_points):
     """Return the rows of at least min_points points that were last changed at a version."""
     kept = np.empty(len(changed), np.int32)
@@ -158,7 +159,7 @@ def rows_changed_at(rows, changed, version, min_points):
     return kept[:num]
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def rows_changed_after(rows, used, version, min_points):
     """Return the rows of at least min_points points that were changed after a version."""
     kept = np.empty(used, np.int32)
@@ -180,14 +181,14 @@ def mix(key):
     return mixed * _GOLDEN
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def mix_keys(keys, mixed):
     """Mix voxel keys, (K,) int64, into (K,) uint64."""
     for i in range(len(keys)):
         mixed[i] = mix(keys[i])
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def rows_held(rows, used, min_points, chosen, mixed):
     """
     List the rows of at least min_points points with their mixed keys; return their number.
@@ -206,7 +207,7 @@ def rows_held(rows, used, min_points, chosen, mixed):
     return num
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def mark_seen(seen, limit, keys, table, marks, mark, left):
     """
     Mark the unmarked surfels whose voxels a scan observed.
@@ -236,7 +237,7 @@ def mark_seen(seen, limit, keys, table, marks, mark, left):
     return num, num_left
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def keys_within(keys, limit, within):
     """
     List the keys whose mixed keys are at most a limit; return their number.

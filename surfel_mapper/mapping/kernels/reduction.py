@@ -15,9 +15,9 @@ Source: exactness by integer arithmetic is our own.
 
 import math
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
@@ -32,7 +32,7 @@ NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     """
     Sum the points of a scan by voxel; return the number of voxels, or -1 if they may not fit.
@@ -56,7 +56,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     starts = np.empty(CHUNK + 1, np.int32)
     run_rows = np.empty(CHUNK, np.int32)
     left_out[:] = 0
-    num_rows = 0
+    num_rows = np.int64(0)  # an int here would compile find_run_rows for a literal 0 too
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
@@ -77,7 +77,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     return num_rows
 
 
-@njit(cache=True, nogil=True)
+@part()
 def add_runs(places, starts, num_runs, run_rows, sums):
     """
     Add count, sums and products of the places of each run to the sums of its voxel.
@@ -114,7 +114,7 @@ def add_runs(places, starts, num_runs, run_rows, sums):
         sums[row, 9] += zz
 
 
-@njit(cache=True, nogil=True)
+@part()
 def reason(x, y, z, range_sq):
     """Return the reason why a point is rejected, a row of ``left_out``."""
     px, py, pz = np.float64(x), np.float64(y), np.float64(z)
@@ -126,7 +126,7 @@ def reason(x, y, z, range_sq):
     return TOO_FAR if distance_sq > range_sq[1] else BEYOND
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def pack_sums(sums, count, total, product):
     """
     Convert the sums of a scan to integers.
@@ -144,7 +144,7 @@ def pack_sums(sums, count, total, product):
             product[row, pair] = np.int64(sums[row, 4 + pair])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def look_back(keys, origin, voxel_size, view):
     """
     Compute the direction from each voxel to the sensor.
@@ -178,7 +178,7 @@ def look_back(keys, origin, voxel_size, view):
             views[i, 0], views[i, 1], views[i, 2] = np.int16(x[i]), np.int16(y[i]), np.int16(z[i])
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     """
     Sum the values of the points of each voxel.

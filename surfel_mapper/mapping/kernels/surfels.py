@@ -11,9 +11,9 @@ decomposed with vector instructions.
 
 import math
 
-from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.layout import (
     COUNT,
     INDEX_BITS,
@@ -46,7 +46,7 @@ V = 10
 MOMENTS = 13
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     """
     Derive the surfels of some rows of the slab.
@@ -85,7 +85,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
                 eigenvalues[out, axis] = values[axis, i]
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@kernel(error_model='numpy')
 def derive_covariances(rows, chosen, voxel_size, bits, covariance):
     """
     Derive the covariances of the points of some rows of the slab.
@@ -110,7 +110,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
                 covariance[start + i, pair] = scatter[pair, i] * scale
 
 
-@njit(cache=True, nogil=True)
+@part()
 def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     """
     Gather the moments of num voxels from start on; return the largest count.
@@ -142,7 +142,7 @@ def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     return most
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def center(moments, num, mean, scatter):
     """
     Compute mean and scatter of the voxels of a chunk, in lattice units.
@@ -170,7 +170,7 @@ def center(moments, num, mean, scatter):
         scatter[5, i] = (moments[P + 5, i] - cz * (sz + dz)) - dz * dz * inverse
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def center_exactly(rows, chosen, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     for i in range(len(chosen)):
@@ -191,7 +191,7 @@ def center_exactly(rows, chosen, scatter):
                 pair += 1
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def place(mean, num, voxel_size, bits, voxel_index, position):
     """Convert the means of a chunk to positions, (num, 3) m."""
     cell = 1.0 / (1 << bits)
@@ -202,7 +202,7 @@ def place(mean, num, voxel_size, bits, voxel_index, position):
             position[i, axis] = (voxel_index[i, axis] + inside) * voxel_size
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@part(error_model='numpy')
 def derive_shape(values, num, moments, unit, planarity, curvature, start):
     """
     Compute planarity and curvature of a chunk; scale eigenvalues of scatter to covariance.
@@ -222,7 +222,7 @@ def derive_shape(values, num, moments, unit, planarity, curvature, start):
         values[2, i] = e2 * scale
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def turn(normals, num, moments):
     """
     Turn the normals (3, CHUNK) of a chunk towards the sensor.

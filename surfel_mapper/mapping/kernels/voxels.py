@@ -21,6 +21,7 @@ One module of 355 lines: all work on the moments of a scan and the rows of the s
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.grouping import hash_shift, home
 from surfel_mapper.kernels.hashing import (
     DEPTH,
@@ -87,7 +88,7 @@ def look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely):
             prefetch(flat, row * ROW + ROW // 2)
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def find_rows(keys, rows, table, state, found):
     """
     Look up the row of every voxel.
@@ -109,7 +110,7 @@ def find_rows(keys, rows, table, state, found):
             found[start + i] = row
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def add_moments(moments, view_weight, rows, table, state, version, start, found):
     """
     Add the moments of a scan from voxel start on; return the number of voxels done.
@@ -152,7 +153,7 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
     return done
 
 
-@njit(cache=True, nogil=True)
+@part()
 def new_row(key, hashed, rows, table, state):
     """Insert a voxel with a row of zeros; return the row, or -1 if there is no room."""
     depth = state[DEPTH]
@@ -175,7 +176,7 @@ def new_row(key, hashed, rows, table, state):
     return row
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def remove_moments(moments, view_weight, rows, table, state, version, found, min_points, fallen):
     """
     Subtract moments, or nothing if a voxel does not hold them; free the rows that become empty.
@@ -249,7 +250,7 @@ def change_row(moments, view_weight, rows, row, place, sign):
         rows[row, PRODUCT + pair] += sign * product[place, pair]
 
 
-@njit(cache=True, nogil=True)
+@part()
 def holds_exactly(moments, view_weight, rows, row, place):
     """Return whether the sums of a row are the moments of a voxel."""
     _, count, total, product, view = moments
@@ -263,7 +264,7 @@ def holds_exactly(moments, view_weight, rows, row, place):
     return equal
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def coarsen(moments, fine_level, level, table, keys, sums, rows):
     """
     Sum moments into voxels 2^level times larger; return the number of coarse voxels.
@@ -321,7 +322,7 @@ def coarsen(moments, fine_level, level, table, keys, sums, rows):
     return num
 
 
-@njit(cache=True, nogil=True)
+@kernel()
 def first_impossible(key, count, total, product, view, view_is_sum, level):
     """
     Return the first row whose moments no points of a voxel can have, or -1.
