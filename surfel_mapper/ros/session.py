@@ -16,6 +16,7 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.memory import lasting_objects
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.ros.inputs import Inputs
@@ -74,8 +75,9 @@ class Session:
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, the first time a quarter of a minute')
         before, later = self.mapper.warm_up_steps()
-        for step in before:
-            step()
+        with lasting_objects():
+            for step in before:
+                step()
         self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *later]
         self._compiler = threading.Thread(target=self._compile, name='compiling', daemon=True)
         self._is_closing = threading.Event()

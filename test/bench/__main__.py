@@ -23,6 +23,7 @@ BENCHES = (
     'real',
     'threads',
     'scaling',
+    'start',
     'live',
     'offline',
     'compare',

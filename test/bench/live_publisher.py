@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The lidar of the live bench, a process of its own: clouds and odometry at a rate.
+The lidar of the live bench, a process of its own: clouds and odometry at a rate, by defaults.
 
 The drive goes forth and back over the scans held in memory, so that poses stay smooth however
 long it lasts. A cloud is stamped right before it is published, from which latency is counted.
@@ -23,30 +23,27 @@ from test.bench.street import Street
 NUM_SCANS = 60
 """Held in memory, 4 MiB each."""
 
-START_UP_S = 20.0
+START_UP_S = 300.0
 
 
 def main(arguments):
-    """Publish a number of clouds at a rate, and print their stamps as JSON."""
+    """Publish a number of clouds at a rate, and write their stamps to a file as JSON."""
     from nav_msgs.msg import Odometry
     import rclpy
-    from rclpy.qos import qos_profile_sensor_data
     from sensor_msgs.msg import PointCloud2
 
     from surfel_mapper.memory import keep_freed_memory
-    from surfel_mapper.ros.context import enlarge_shared_memory
     from surfel_mapper.simulation.recording import BASE, ODOM
 
     settings = json.loads(arguments[0])
     size = {name: settings[name] for name in ('beams', 'columns')}
     street = Street(Options(**size, cache=Path(settings['cache'])))
-    enlarge_shared_memory()
     keep_freed_memory()
     clouds = [ros_cloud(street.message(number)) for number in range(settings['scans'])]
     poses = [odometry(street, number, ODOM, BASE) for number in range(settings['scans'])]
     rclpy.init()
     node = rclpy.create_node('lidar')
-    points = node.create_publisher(PointCloud2, 'points', qos_profile_sensor_data)
+    points = node.create_publisher(PointCloud2, 'points', 10)
     odom = node.create_publisher(Odometry, 'odom', 10)
     end_s = time.monotonic() + START_UP_S
     while not (points.get_subscription_count() and odom.get_subscription_count()):
@@ -55,8 +52,8 @@ def main(arguments):
         time.sleep(0.05)
     time.sleep(0.5)  # the other side needs to know of us too
     stamps = drive(settings, clouds, poses, points, odom)
-    time.sleep(0.5)  # messages in shared memory vanish with their publisher
-    print(json.dumps(stamps))
+    time.sleep(5.0)  # unread messages vanish with their publisher
+    Path(settings['stamps']).write_text(json.dumps(stamps), encoding='utf-8')
     rclpy.shutdown()
 
 

@@ -28,7 +28,6 @@ from surfel_mapper.config import Config
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
-from surfel_mapper.ros.context import enlarge_shared_memory
 from test.bench.live_publisher import ros_cloud
 from test.bench.options import Options
 from test.bench.report import Row
@@ -58,7 +57,6 @@ class Drive:
         self.latest: deque[RawCloud] = deque(maxlen=CONFIG['window.max_scans'])
         settings = {**CONFIG, 'publish.diagnostics_rate_hz': 50.0, 'output.directory': MAPS}
         given = [item for k, v in settings.items() for item in ('-p', f'{k}:={v}')]
-        enlarge_shared_memory()
         self.node = Process(['node', '--ros-args', *given], folder)
         self.peer = Peer()
         self._reports = self.peer.collect(DiagnosticArray, '/diagnostics', QoSProfile(depth=1))

@@ -1,0 +1,54 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels and their parts: who can call them, and with which options they are compiled."""
+
+import math
+
+import numba
+import numpy as np
+import pytest
+
+from surfel_mapper.kernels.compiling import kernel, part
+
+needs_compiler = pytest.mark.skipif(
+    numba.config.DISABLE_JIT, reason='kernels are interpreted in this run'
+)
+
+
+@part(error_model='numpy')
+def reciprocal(value):
+    """Return 1 / value."""
+    return 1.0 / value
+
+
+@kernel(cache=False, error_model='numpy')
+def reciprocals(values, found):
+    """Write 1 / value of each value."""
+    for i in range(len(values)):
+        found[i] = reciprocal(values[i])
+
+
+@needs_compiler
+def test_a_part_is_compiled_into_its_kernel_with_its_options():
+    found = np.empty(3)
+
+    reciprocals(np.array([4.0, 0.0, -0.0]), found)
+
+    assert found.tolist() == [0.25, math.inf, -math.inf]  # Python would raise
+
+
+def test_a_part_called_from_python_is_interpreted():
+    assert reciprocal(8.0) == 0.125
+    with pytest.raises(ZeroDivisionError):
+        reciprocal(0.0)
+
+
+@needs_compiler
+def test_a_kernel_is_no_function_of_c():
+    reciprocals(np.ones(1), np.empty(1))
+    (compiled,) = reciprocals.overloads.values()
+
+    names = [function.name for function in compiled.library.get_defined_functions()]
+
+    assert any(name.startswith('_ZN7cpython') for name in names)
+    assert not any(name.startswith('cfunc.') for name in names)
