@@ -122,8 +122,11 @@ def overrides(values: dict[str, str]) -> dict[str, object]:
     if values['autostart'] == 'false':
         found['autostart'] = False
     for argument, (name, kind) in SETTINGS.items():
-        if values[argument]:
-            found[name] = kind(values[argument])
+        try:
+            if values[argument]:
+                found[name] = kind(values[argument])
+        except ValueError:
+            raise ValueError(f'{argument}:={values[argument]}: expected a number') from None
     return found
 
 

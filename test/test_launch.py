@@ -83,6 +83,11 @@ def test_a_settings_file_that_does_not_exist_ends_the_launch(launch, tmp_path):
         launch.nodes(values(launch, config=str(tmp_path / 'typo.yaml')))
 
 
+def test_a_voxel_size_that_is_no_number_ends_the_launch(launch):
+    with pytest.raises(ValueError, match=r'voxel_size:=0,2: expected a number'):
+        launch.overrides(values(launch, voxel_size='0,2'))
+
+
 def test_arguments_override_existing_settings_with_their_type(launch):
     given = {'pose_source': 'odometry', 'input_kind': 'depth', 'voxel_size': '0.2'}
     (node,) = launch.nodes(values(launch, **given, fixed_frame='map', autostart='false'))

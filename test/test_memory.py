@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Memory kept: large blocks are not taken from the system again and again."""
+"""Memory kept: large blocks are used again, and lasting objects are not visited by collections."""
 
+import gc
 import os
 import platform
 import subprocess
 import sys
 
 import pytest
+
+from surfel_mapper.memory import lasting_objects
 
 FAULTS = """
 import resource, sys
@@ -41,3 +44,30 @@ def test_blocks_are_used_again_once_memory_is_kept():
     }
     assert faults['kept'] < 100
     assert faults['kept'] < 0.1 * faults['given back']
+
+
+def test_objects_of_the_block_are_not_visited_by_later_collections():
+    threshold = gc.get_threshold()
+    try:
+        with lasting_objects():
+            assert gc.get_threshold()[0] > threshold[0]
+            lasting = [[] for _ in range(10)]
+        later = [[]]
+        visited = {id(each) for each in gc.get_objects()}
+
+        assert id(lasting) not in visited
+        assert id(lasting[0]) not in visited
+        assert id(later) in visited
+        assert gc.get_threshold() == threshold
+    finally:
+        gc.unfreeze()
+
+
+def test_an_error_in_the_block_restores_the_collector():
+    threshold = gc.get_threshold()
+    try:
+        with pytest.raises(KeyError), lasting_objects():
+            raise KeyError
+        assert gc.get_threshold() == threshold
+    finally:
+        gc.unfreeze()

@@ -143,10 +143,11 @@ class Session:
         """Compile the kernels that the first scans do not need; run in a thread of its own."""
         start = time.monotonic()
         try:
-            for step in self._later:
-                if self._is_closing.is_set():
-                    return
-                step()
+            with lasting_objects():
+                for step in self._later:
+                    if self._is_closing.is_set():
+                        return
+                    step()
         except Exception as error:
             self._tasks.fail(error)
         else:
