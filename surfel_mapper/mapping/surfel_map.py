@@ -12,7 +12,7 @@ eigenvalue is 2.5 to 6 % off at 1 km after 1e5 cycles.
 Limits: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m), 2^23 points of a
 scan in a voxel, 2^31 points of the map in a voxel.
 
-(One module of 500 lines because it is one class, the main one; most of it is the description of
+(One module of 700 lines because it is one class, the main one; most of it is the description of
 its methods. The work is done in voxel_table, reducer, surfels and moments.)
 """
 
