@@ -58,6 +58,10 @@ LAS = [
     'laspy[lazrs]>=2.5',  # scans in LAS and LAZ files; lazrs unpacks LAZ
 ]
 
+LOOPS = [
+    'map-closures>=2.2',  # recognises places that were seen before; MIT, wheels for 3.10 to 3.14
+]
+
 VIEWER = [
     'rerun-sdk>=0.23',  # replay --view and --rrd
 ]
@@ -73,6 +77,7 @@ TEST = [
     *FORMATS,
     *CLUSTER,
     *LAS,
+    *LOOPS,
     *VIEWER,
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
@@ -135,6 +140,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
+        'loops': LOOPS,
         'viewer': VIEWER,
         'ros': ROS,
         'test': TEST,

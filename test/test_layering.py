@@ -59,6 +59,7 @@ HOMES = {
     'lz4': ('bags/',),
     'lzf': ('files/pcd',),
     'PIL': ('messages/compressed_image',),
+    'map_closures': ('alignment/recognition',),
     'matplotlib': ('viz/',),
     'open3d': ('mapping/surfels',),
     'pandas': ('mapping/surfels',),

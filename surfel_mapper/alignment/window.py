@@ -143,7 +143,7 @@ def align_scans(
     counts = [ends for ends in by_surfels if ends not in result.dropped]
     part = components(len(keys), np.array(counts, np.int64).reshape(-1, 2))
     return WindowAlignment(
-        T_map_sensor=_carried(poses, keys, T_map_key),
+        T_map_sensor=carried(poses, keys, T_map_key),
         settled=settled,
         rounds=rounds,
         residuals={(keys[s], keys[t]): gap for (s, t), gap in by_surfels.items()},
@@ -253,7 +253,7 @@ def _neighbours(T_map_sensor: Floats) -> list[tuple[int, int]]:
     return ends
 
 
-def _carried(before: Floats, keys: list[int], T_map_key: Floats) -> Floats:
+def carried(before: Floats, keys: list[int], T_map_key: Floats) -> Floats:
     """Return the poses of all scans; others move with the key scans around them."""
     after = before.copy()
     after[keys] = T_map_key

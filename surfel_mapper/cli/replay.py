@@ -107,8 +107,9 @@ def add_input_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add(
         '--align',
-        action='store_true',
-        help='align all scans with each other at the end; keeps all points in memory until then',
+        action=argparse.BooleanOptionalAction,
+        help='close loops, and align all scans with each other at the end; the latter keeps all '
+        'points in memory (default: loops only, if poses come from registration)',
     )
 
 

@@ -31,7 +31,7 @@ from surfel_mapper.config.layers import (
     TsdfConfig,
     WEIGHT_MODES,
 )
-from surfel_mapper.config.registration import AlignConfig, RegistrationConfig
+from surfel_mapper.config.registration import AlignConfig, LoopsConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
     Declaration,
     flatten,
@@ -70,6 +70,7 @@ __all__ = [
     'GridConfig',
     'INTERPOLATIONS',
     'InputConfig',
+    'LoopsConfig',
     'MapConfig',
     'ModelsConfig',
     'ModelsLayerConfig',

@@ -19,7 +19,7 @@ from surfel_mapper.config.layers import (
     ModelsLayerConfig,
     TsdfConfig,
 )
-from surfel_mapper.config.registration import AlignConfig, RegistrationConfig
+from surfel_mapper.config.registration import AlignConfig, LoopsConfig, RegistrationConfig
 from surfel_mapper.config.settings import (
     checked,
     Declaration,
@@ -64,6 +64,7 @@ class Config:
     pose: PoseConfig = field(default_factory=PoseConfig)
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     align: AlignConfig = field(default_factory=AlignConfig)
+    loops: LoopsConfig = field(default_factory=LoopsConfig)
     frames: FramesConfig = field(default_factory=FramesConfig)
     input: InputConfig = field(default_factory=InputConfig)
     deskew: DeskewConfig = field(default_factory=DeskewConfig)
@@ -96,6 +97,8 @@ class Config:
                 'deskew.enabled: true, but clouds that already are in the fixed frame '
                 '(pose.source identity) cannot be deskewed'
             )
+        if self.loops.enabled and self.map.mode == 'frozen':
+            raise ConfigError('loops.enabled: true, but map.mode frozen, which moves no scan')
         if self.align.every_scans and not self.window.keep_points:
             raise ConfigError(
                 f'align.every_scans: {self.align.every_scans}, but window.keep_points is false; '

@@ -195,3 +195,66 @@ class AlignConfig(Stage):
         'Frame of the map if alignment moves scans; its transform to frames.fixed is published. '
         'Empty: the map stays in frames.fixed, without such a transform.',
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopsConfig(Stage):
+    """Loops of a drive: places seen twice, at which the drift of the poses is corrected."""
+
+    enabled: bool = setting(
+        False,
+        'Keep the points of all scans in a file, to close loops on request: at the end of a '
+        'replay, or by ~/align.',
+    )
+    key_distance_m: float = setting(
+        5.0, 'Distance travelled between keyframes, m.', low=0.1, high=1e4
+    )
+    recognise_distance_m: float = setting(
+        25.0,
+        'Distance travelled between keyframes that are compared with all earlier ones, m.',
+        low=0.1,
+        high=1e4,
+    )
+    near_distance_m: float = setting(
+        10.0,
+        'Keyframes nearer to each other by their poses are compared too, m.',
+        low=0.0,
+        high=1e4,
+    )
+    local_map_m: float = setting(
+        40.0, 'Length of the path whose scans make up the map of a keyframe, m.', low=1.0, high=1e4
+    )
+    odometry_map_m: float = setting(
+        100.0,
+        'With pose.source registration, scans are registered to those of the last this many '
+        'metres, so that places seen before do not pull at them.',
+        low=1.0,
+        high=1e6,
+    )
+    min_votes: int = setting(
+        5, 'A place is recognised if this many features agree.', low=3, high=10_000
+    )
+    min_overlap_ratio: float = setting(
+        0.7,
+        'A loop is refused unless this share of a local map overlaps the other.',
+        low=0.0,
+        high=1.0,
+    )
+    min_fit_ratio: float = setting(
+        0.8,
+        'A loop is refused unless this share of the overlap fits.',
+        low=0.0,
+        high=1.0,
+    )
+    drift_ratio: float = setting(
+        0.01,
+        'Standard deviation of a step of the poses that come in, as a share of its length.',
+        low=1e-5,
+        high=1.0,
+    )
+    max_rounds: int = setting(
+        5, 'At most this many rounds of comparing keyframes near each other.', low=0, high=1000
+    )
+    directory: str = setting(
+        '', 'Directory of the file with the points; empty: that of temporary files.'
+    )

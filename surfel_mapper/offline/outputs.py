@@ -133,7 +133,9 @@ class ScanTrajectory:
         self.poses.append(update.T_map_sensor)
 
     def follow_alignment(self, mapper: Mapper) -> None:
-        """Replace the poses of scans that are still in the window by their aligned poses."""
+        """Replace the poses of scans that loops or the alignment of the window have moved."""
+        if mapper.loops is not None and mapper.loops.stamps_ns == self.stamps_ns:
+            self.poses = list(mapper.loops.T_map_sensor)
         for place, scan in enumerate(reversed(list(mapper.window)), start=1):
             if place > len(self.stamps_ns) or self.stamps_ns[-place] != scan.stamp_ns:
                 break

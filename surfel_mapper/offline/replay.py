@@ -65,8 +65,9 @@ class ReplayOptions:
     window : bool
         Let scans leave the map by the window of the configuration, as the node does; else all
         scans stay.
-    align : bool
-        Align all scans with each other at the end; keeps all points in memory until then.
+    align : bool, optional
+        Close loops, and align all scans with each other at the end; the latter keeps all points
+        in memory until then. By default loops are closed if poses come from registration.
     formats : tuple of str
         Formats of the map: ply, pcd, parquet, npz, dxf, bag.
     poses_out : Path, optional
@@ -81,7 +82,7 @@ class ReplayOptions:
     """
 
     window: bool = False
-    align: bool = False
+    align: bool | None = None
     formats: tuple[str, ...] = ('ply', 'npz')
     poses_out: Path | None = None
     truth: Path | None = None
@@ -174,7 +175,7 @@ def replay(
     check_outputs(directory, options)
     keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
     with open_recording(request, settings) as recording:
-        mapper = started_mapper(recording.config)
+        mapper = started_mapper(with_loops(recording.config, options, directory))
         history = History()
         with listeners(directory, options, mapper) as listening:
             listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
@@ -183,7 +184,7 @@ def replay(
             replay_s = time.perf_counter() - start_s
             refuse_empty(recording, mapper, was_stopped)
             with write_first(partial(write_maps, directory, options.formats, mapper, trajectory)):
-                aligned = {'alignment': mapper.align().summary()} if options.align else {}
+                aligned = align(mapper, options)
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()
@@ -227,6 +228,27 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     if options.align:
         settings = settings.replace({'window.keep_points': True})
     return settings if options.window else settings.replace(ALL_SCANS)
+
+
+def with_loops(config: Config, options: ReplayOptions, directory: Path) -> Config:
+    """Return the configuration with loops if they are wanted, and points in the directory."""
+    is_wanted = options.align or (options.align is None and config.pose.source == 'registration')
+    can_move = not options.window and config.map.mode != 'frozen' and not config.map.load
+    if not (is_wanted and can_move):
+        return config
+    directory.mkdir(parents=True, exist_ok=True)
+    kept_in = config.loops.directory or str(directory)
+    return config.replace({'loops.enabled': True, 'loops.directory': kept_in})
+
+
+def align(mapper: Mapper, options: ReplayOptions) -> dict[str, Any]:
+    """Close loops and align the scans, as far as asked for; return both for the summary."""
+    done: dict[str, Any] = {}
+    if mapper.loops is not None and len(mapper.loops) > 1:
+        done['loops'] = mapper.close_loops().summary()
+    if options.align:
+        done['alignment'] = mapper.align().summary()
+    return done
 
 
 def started_mapper(config: Config) -> Mapper:

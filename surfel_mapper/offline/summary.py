@@ -25,7 +25,9 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
         for name, done in summary['filters'].items()
     )
-    aligned = f'{summary["alignment"]["text"]}\n' if 'alignment' in summary else ''
+    aligned = ''.join(
+        f'{summary[name]["text"]}\n' for name in ('loops', 'alignment') if name in summary
+    )
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     speed = summary['recorded_s'] / summary['replay_s']
     deskewed = ', deskewed' if summary.get('deskewed') else ''

@@ -4,12 +4,13 @@
 Inserter: the way of one scan through the pipeline, once its pose is there.
 
 Prepare, reduce, insert, layers, derive: ``insert`` is that sequence, and every stage is a module
-beside this one or a part below.
+beside this one or a part below. The module is long because every stage and every keeper of scans
+(window, layers, loops) meets here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 import logging
 
@@ -18,17 +19,19 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
-from surfel_mapper.errors import AlignmentError, MapError
+from surfel_mapper.errors import AlignmentError, FileFormatError, MapError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import InsertedScan, Surroundings
 from surfel_mapper.layers.sensor_models import SensorModels
 from surfel_mapper.mapping.moments import looks_like_millimetres, MILLIMETRES, pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.window import SlidingWindow
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 from surfel_mapper.memory import machine_bytes
 from surfel_mapper.pipeline.drops import described, Drops
 from surfel_mapper.pipeline.layer_stack import LayerStack
+from surfel_mapper.pipeline.local_map import LocalMap
+from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.preparation import Preparation, Prepared
 from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
@@ -61,6 +64,8 @@ class Inserter:
     ----------
     map, window, layers
         See Mapper.
+    loops : LoopCloser or None
+        Keeps the points of all scans, with ``loops.enabled``.
     preparation : Preparation
         The stages before reduction.
     images : ScanImages or None
@@ -83,6 +88,9 @@ class Inserter:
             surfel_map=self.map, window=self.window, sensors=SensorModels(config.tsdf)
         )
         self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
+        self.loops = LoopCloser(config, self.map, self.window) if config.loops.enabled else None
+        has_local_map = config.loops.enabled and not config.map.load
+        self._local_map = LocalMap(config) if has_local_map and poses.registered else None
         self.layers = LayerStack(config, around, drops)
         wanted = self.layers.images
         self.images = ScanImages(wanted) if wanted.topics else None
@@ -94,6 +102,7 @@ class Inserter:
             self.images,
             self.layers.needs_free_rays,
             drops,
+            self._local_map,
         )
         self._reduction = Reduction(self.map, config.map.threads)
         self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
@@ -117,11 +126,35 @@ class Inserter:
         self.window.clear()
         self.aligner.reset()
         self.layers.clear()
+        for kept in (self.loops, self._local_map):
+            if kept is not None:
+                kept.clear()
+
+    def drop_voxels(
+        self, voxel_index: npt.NDArray[np.int32], min_points: int
+    ) -> npt.NDArray[np.int32]:
+        """Empty voxels for good, in all scans; see SlidingWindow.drop_voxels."""
+        fallen = self.window.drop_voxels(voxel_index, min_points)
+        if self.loops is not None:
+            self.loops.drop_voxels(pack_keys(voxel_index))
+        return fallen
+
+    def close_loops(self, config: Config, progress: Callable[[str], object]) -> LoopMove:
+        """Find the loops and move the scans; see Mapper.close_loops."""
+        if self.loops is None:
+            raise AlignmentError('no points are kept to close loops with: set loops.enabled')
+        with self._drops.counters.timed('loops'):
+            move = self.loops.close(config, progress)
+        self.aligner.correct(move.correction)
+        return move
 
     def align(self, config: Config) -> Alignment:
         """Move the scans of the window to poses at which they agree; see Mapper.align."""
         with self._drops.counters.timed('align'):
-            return self.aligner.align(self.window, config)
+            alignment = self.aligner.align(self.window, config)
+        if self.loops is not None:
+            self.loops.follow_window()
+        return alignment
 
     def warm_up_steps(self, config: Config) -> tuple[list[Step], list[Step]]:
         """Return the steps that compile all kernels; see Mapper.warm_up_steps."""
@@ -175,7 +208,7 @@ class Inserter:
             return None
         cleared = self.layers.voxels_to_clear(inserted, laps)
         if len(cleared):
-            cleared = self.window.drop_voxels(cleared, config.map.min_points)
+            cleared = self.drop_voxels(cleared, config.map.min_points)
         alignment = self._align_when_due(config)
         if alignment is not None:
             inserted = inserted.at(alignment.T_map_sensor[-1])
@@ -229,6 +262,7 @@ class Inserter:
         except MapError as error:
             self._drops.scan(scan, 'map_limit', str(error))
             return None
+        self._keep(scan, windowed, config)
         laps.end('insert')
         return InsertedScan(
             scan=scan,
@@ -237,6 +271,20 @@ class Inserter:
             num_points=windowed.moments.num_points,
             evictions=tuple(evictions),
         )
+
+    def _keep(self, scan: Scan, windowed: WindowedScan, config: Config) -> None:
+        """Keep a mapped scan for registration and for loops; warn if the disk is full."""
+        pose = windowed.T_map_sensor
+        if self._local_map is not None:
+            self._local_map.add(scan, windowed, self.aligner.to_fixed(pose), config)
+        if self.loops is None:
+            return
+        try:
+            self.loops.add(scan, pose, config)
+        except FileFormatError as error:
+            self._drops.warn('loops', f'{error}; loops are not closed')
+            self.loops.clear()
+            self.loops = None
 
     def _localised(self, prepared: Prepared, config: Config, laps: Laps) -> Update:
         """Return the pose of a scan in a frozen map, which takes no scan."""
@@ -263,6 +311,8 @@ class Inserter:
             return None
         try:
             alignment = self.aligner.align(self.window, config)
+            if self.loops is not None:
+                self.loops.follow_window()
         except (AlignmentError, MapError, MemoryError) as error:
             self._drops.warn('alignment', f'the window is not aligned: {described(error)}')
             return None

@@ -14,7 +14,7 @@ inserter, and in the modules that these call.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -37,6 +37,7 @@ from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline import regions
 from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
+from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.reduction import Step
 from surfel_mapper.pipeline.regions import Region
@@ -359,6 +360,37 @@ class Mapper:
         _log.info('aligned: %s', alignment)
         return alignment
 
+    def close_loops(self, progress: Callable[[str], object] = lambda text: None) -> LoopMove:
+        """
+        Find places that were seen twice, and move all scans so that they agree there.
+
+        The map then equals, to the bit, one that was built at the corrected poses; layers stay
+        as they are. Scans to come are corrected like the newest one; the poses in
+        ``frames.fixed`` do not change.
+
+        Parameters
+        ----------
+        progress : callable
+            Called with a line of text at each stage.
+
+        Raises
+        ------
+        AlignmentError
+            If points are not kept (``loops.enabled``), the window has evicted scans, or there
+            are fewer than two. Nothing has changed then.
+        MapError
+            If the map refuses a scan at its new pose. Nothing has changed then.
+
+        """
+        move = self._inserter.close_loops(self.config, progress)
+        _log.info('loops: %s', move)
+        return move
+
+    @property
+    def loops(self) -> LoopCloser | None:
+        """The scans and poses that loops are closed with; None without ``loops.enabled``."""
+        return self._inserter.loops
+
     @property
     def T_map_fixed(self) -> Transform:
         """From the fixed frame of the poses to the map: its origin, and alignment's correction."""
@@ -418,7 +450,7 @@ class Mapper:
         voxel_index = self.map.moments().voxel_index
         centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
         inside = voxel_index[region.contains(centers)]
-        return self.window.drop_voxels(inside, self.config.map.min_points)
+        return self._inserter.drop_voxels(inside, self.config.map.min_points)
 
     def restore(self, surfel_map: SurfelMap, scans: Iterable[WindowedScan]) -> None:
         """

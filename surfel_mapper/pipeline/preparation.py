@@ -26,6 +26,7 @@ from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
 from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -79,6 +80,8 @@ class Preparation:
         Whether layers need the directions in which the sensor met nothing.
     drops : Drops
         Counts the scans that are left out.
+    local_map : LocalMap, optional
+        Scans are registered to it instead of the whole map.
 
     """
 
@@ -91,7 +94,9 @@ class Preparation:
         images: ScanImages | None,
         needs_free_rays: bool,
         drops: Drops,
+        local_map: LocalMap | None = None,
     ) -> None:
+        self._local_map = local_map
         self._filters = config.filters
         self._poses = poses
         self._around = around
@@ -184,10 +189,12 @@ class Preparation:
     ) -> Prepared | None:
         """Return a scan at the pose found by registration; None if that fails."""
         scan = prepared.scan
+        if self._local_map is None:
+            target, T_target_fixed = self._around.surfel_map, self._aligner.T_map_fixed
+        else:
+            target, T_target_fixed = self._local_map.surfel_map, np.eye(4)
         try:
-            pose, registration = poses.find(
-                prepared.filtered, times, self._around.surfel_map, self._aligner.T_map_fixed
-            )
+            pose, registration = poses.find(prepared.filtered, times, target, T_target_fixed)
         except (AlignmentError, MapError, PoseError) as error:
             self._drops.scan(scan, 'not_aligned', str(error))
             return None

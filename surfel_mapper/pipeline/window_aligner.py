@@ -130,6 +130,17 @@ class WindowAligner:
             return T_fixed_sensor  # to the bit
         return compose(self.T_map_fixed, T_fixed_sensor)
 
+    def to_fixed(self, T_map_sensor: Transform) -> Transform:
+        """Return the pose in the fixed frame of a sensor whose pose in the map is given."""
+        if np.array_equal(self.T_map_fixed, np.eye(4)):
+            return T_map_sensor  # to the bit
+        return compose(inverse(self.T_map_fixed), T_map_sensor)
+
+    def correct(self, T_after_before: Transform) -> None:
+        """Correct later scans as the newest one was moved in the map."""
+        if not np.array_equal(T_after_before, np.eye(4)):
+            self.T_map_fixed = compose(T_after_before, self.T_map_fixed)
+
     def is_due(self, every_scans: int) -> bool:
         """Count a scan, and return whether it is time to align."""
         self._num_new += 1
@@ -166,8 +177,7 @@ class WindowAligner:
         fallen = window.move(moved, config.map.min_points)
         after = np.array([scan.T_map_sensor for scan in window])
         if len(scans) - 1 in moved:
-            correction = compose(after[-1], inverse(before[-1]))  # in the map
-            self.T_map_fixed = compose(correction, self.T_map_fixed)
+            self.correct(compose(after[-1], inverse(before[-1])))
         return Alignment(
             solution=alignment,
             stamps_ns=np.array([scan.stamp_ns for scan in scans], np.int64),

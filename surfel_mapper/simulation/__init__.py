@@ -11,10 +11,20 @@ A lidar driving through an analytic world: scans, poses and bags with known trut
     load_simulation('street')                   the simulation that a bag was recorded from
 """
 
+from surfel_mapper.simulation.circuit import Route
 from surfel_mapper.simulation.drive import Drive, Simulation
 from surfel_mapper.simulation.lidar import Lidar
 from surfel_mapper.simulation.primitives import Primitive
 from surfel_mapper.simulation.recording import load_simulation, record
 from surfel_mapper.simulation.world import World
 
-__all__ = ['Drive', 'Lidar', 'Primitive', 'Simulation', 'World', 'load_simulation', 'record']
+__all__ = [
+    'Drive',
+    'Lidar',
+    'Primitive',
+    'Route',
+    'Simulation',
+    'World',
+    'load_simulation',
+    'record',
+]

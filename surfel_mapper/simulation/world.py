@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.geometry import pose_matrix
+from surfel_mapper.simulation.circuit import circuit_primitives, Corners
 from surfel_mapper.simulation.kernels import raycast, surfaces
 from surfel_mapper.simulation.primitives import KINDS, Primitive
 from surfel_mapper.simulation.street import street_pose, street_primitives
@@ -156,6 +157,26 @@ class World:
 
         """
         return cls(street_primitives(seed, length_m), street_pose())
+
+    @classmethod
+    def circuit(cls, corners: Corners, *, seed: int = 0) -> World:
+        """
+        Return the streets between corners; see Route for drives through them.
+
+        Parameters
+        ----------
+        corners : sequence of (float, float)
+            Places x y in the frame of the street, m; a street runs between consecutive ones.
+        seed : int
+            Seed of the positions and rotations of objects.
+
+        Raises
+        ------
+        ConfigError
+            If the seed is negative or there are fewer than two corners.
+
+        """
+        return cls(circuit_primitives(seed, corners), street_pose())
 
     def raycast(
         self, origins: npt.ArrayLike, directions: npt.ArrayLike, max_range_m: float = np.inf

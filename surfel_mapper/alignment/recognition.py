@@ -1,0 +1,122 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Recognition of places in the surfels around keyframes, whatever the pose and the heading.
+
+map-closures projects the points of a local map onto the ground, and compares ORB features of the
+density image by a binary search tree; the rotation and translation in the plane follow from the
+matches. The local maps here are the means of surfels of several scans, so that a narrow field of
+view sees as much as a full turn.
+
+Source: Gupta et al. 2024, Effectively Detecting Loop Closures using Point Cloud Density Maps.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import DependencyError
+from surfel_mapper.geometry import inverse, Transform
+
+Floats = npt.NDArray[np.float64]
+
+LEAST_POINTS = 100
+"""Local maps of fewer points are not compared: their density image has no features."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidate:
+    """
+    Two keyframes that may show one place.
+
+    Attributes
+    ----------
+    source, target : int
+        Numbers of the keyframes, the later one first.
+    T_target_source : (4, 4) float64
+        Pose of the source in the frame of the target, about 1 m and 2 deg off if it is right.
+    votes : int
+        Number of features that agree with this pose; 0 if it follows from the poses alone.
+
+    """
+
+    source: int
+    target: int
+    T_target_source: Transform
+    votes: int = 0
+
+
+class Recognition:
+    """
+    The local maps of keyframes, to be compared with later ones.
+
+    Parameters
+    ----------
+    min_votes : int
+        Minimum number of features that agree.
+
+    Raises
+    ------
+    DependencyError
+        If map-closures is not installed.
+
+    """
+
+    def __init__(self, min_votes: int) -> None:
+        self._min_votes = min_votes
+        self._closures = import_map_closures().MapClosures()
+        self._numbers: list[int] = []
+
+    def add(self, number: int, points: Floats, num_candidates: int = 3) -> list[Candidate]:
+        """
+        Add the local map of a keyframe; return earlier keyframes that show the same place.
+
+        Parameters
+        ----------
+        number : int
+            Number of the keyframe.
+        points : (N, 3) float64, m
+            Its local map in its own frame, whose z axis is about vertical.
+        num_candidates : int
+            Maximum number of results, those with most votes.
+
+        """
+        if len(points) < LEAST_POINTS:
+            return []
+        self._numbers.append(number)
+        found = self._closures.get_closures(len(self._numbers) - 1, points)
+        agreeing = [each for each in found if each.number_of_inliers >= self._min_votes]
+        agreeing.sort(key=lambda each: -each.number_of_inliers)
+        return [
+            Candidate(
+                source=number,
+                target=self._numbers[each.source_id],
+                T_target_source=inverse(np.asarray(each.pose, np.float64)),
+                votes=int(each.number_of_inliers),
+            )
+            for each in agreeing[:num_candidates]
+        ]
+
+
+def import_map_closures() -> Any:
+    """
+    Return the module of map-closures.
+
+    Raises
+    ------
+    DependencyError
+        If it is not installed.
+
+    """
+    try:
+        from map_closures import map_closures
+    except ImportError as error:
+        raise DependencyError(
+            'recognising places needs map-closures, which is not installed; '
+            "pip install 'surfel_mapper[loops]'"
+        ) from error
+    return map_closures

@@ -1,0 +1,67 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+LocalMap: the scans of the last metres, in the frame of the poses, for registration.
+
+If loops are to be found, scans must not be registered to a place that was seen before the last
+metres: the drift since then would tear it apart or jump. The map of the last metres is in
+``frames.fixed``, which does not jump either when the map is corrected. It is on its own because
+preparation reads this map and the inserter fills it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from surfel_mapper.config import Config, WindowConfig
+from surfel_mapper.geometry import Transform
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
+from surfel_mapper.pipeline.reduction import reduced
+from surfel_mapper.scan import Scan
+
+MAX_BYTES = 1 << 29
+"""Limit of the kept moments, bytes: some 500 scans, for a sensor that stands still."""
+
+
+class LocalMap:
+    """
+    The last scans, in the fixed frame.
+
+    Parameters
+    ----------
+    config : Config
+        Voxel size, columns, and ``loops.odometry_map_m``.
+
+    Attributes
+    ----------
+    surfel_map : SurfelMap
+        The map of these scans.
+
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
+        limits = WindowConfig(
+            max_scans=0, max_distance_m=config.loops.odometry_map_m, max_bytes=MAX_BYTES
+        )
+        self._window = SlidingWindow(self.surfel_map, limits)
+
+    def add(
+        self,
+        scan: Scan,
+        windowed: WindowedScan,
+        T_fixed_sensor: Transform,
+        config: Config,
+    ) -> None:
+        """Add a scan, given its moments in the map, which are reused if the poses are equal."""
+        if not np.array_equal(windowed.T_map_sensor, T_fixed_sensor):
+            windowed = reduced(scan, T_fixed_sensor, self.surfel_map, config)
+        # a copy: the map of all scans keeps its own hints of rows
+        self._window.insert(replace(windowed, moments=replace(windowed.moments), points=None))
+
+    def clear(self) -> None:
+        """Drop all scans."""
+        self._window.clear()

@@ -1,0 +1,170 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Circuits: streets that meet at corners, and routes that return to where they were.
+
+A street of the simulation is straight. A circuit is one street for every leg between two corners,
+without the objects that would stand in the road of another leg, on one ground. A route follows
+corners on arcs; legs may be driven several times and in both directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cache
+from itertools import pairwise
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw, se3_exp, Transform
+from surfel_mapper.simulation.primitives import Primitive
+from surfel_mapper.simulation.street import (
+    BEYOND_M,
+    PAVEMENT_Y_M,
+    street_pose,
+    street_primitives,
+)
+
+Corners = Sequence[tuple[float, float]]
+"""Places x y in the frame of the street, m."""
+
+TURN_RADIUS_M = 7.0
+"""Radius of the arc at a corner, m."""
+
+END_M = 12.0
+"""Length of a street beyond its corners, m."""
+
+
+class Route:
+    """
+    A way along corners, rounded by arcs; it begins at the first corner towards the second.
+
+    Parameters
+    ----------
+    corners : sequence of (float, float)
+        Two or more places, m; consecutive ones at least twice the radius of the arcs apart.
+
+    Raises
+    ------
+    ConfigError
+        If there are fewer than two corners, or two are too near to each other for the arcs.
+
+    """
+
+    def __init__(self, corners: Corners) -> None:
+        if len(corners) < 2:
+            raise ConfigError(f'corners: {len(corners)}, expected two or more')
+        places = np.array(corners, np.float64)
+        ways = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        if not ways.min() >= 2.0 * TURN_RADIUS_M:
+            raise ConfigError(
+                f'corners: {ways.min():g} m apart, expected {2.0 * TURN_RADIUS_M:g} m or more'
+            )
+        steps = np.diff(places, axis=0) / ways[:, None]
+        pieces = [places[:1]]
+        for number in range(1, len(places) - 1):
+            corner, before, after = places[number], steps[number - 1], steps[number]
+            along = np.linspace(0.0, 1.0, 33)[:, None]
+            a, b = corner - TURN_RADIUS_M * before, corner + TURN_RADIUS_M * after
+            pieces.append((1 - along) ** 2 * a + 2 * along * (1 - along) * corner + along**2 * b)
+        self._places = np.concatenate([*pieces, places[-1:]])
+        lengths = np.linalg.norm(np.diff(self._places, axis=0), axis=1)
+        self._along = np.concatenate([[0.0], np.cumsum(lengths)])
+        slopes = np.diff(self._places, axis=0)
+        self._heading = np.unwrap(np.arctan2(slopes[:, 1], slopes[:, 0]))
+
+    @property
+    def length_m(self) -> float:
+        """Length from the first to the last corner, m."""
+        return float(self._along[-1])
+
+    def T_start_at(self, along_m: float) -> Transform:
+        """Return the pose on the route in the frame of the corners; beyond the ends straight."""
+        piece = int(np.clip(np.searchsorted(self._along, along_m) - 1, 0, len(self._heading) - 1))
+        middle = 0.5 * (self._along[1:] + self._along[:-1])
+        heading = float(np.interp(along_m, middle, self._heading))
+        slope = self._heading[piece]
+        over = along_m - self._along[piece]
+        x, y = self._places[piece] + over * np.array([math.cos(slope), math.sin(slope)])
+        turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading]))
+        return pose_matrix((x, y, 0.0), q_xyzw(turn))
+
+
+@cache
+def route_along(corners: tuple[tuple[float, float], ...]) -> Route:
+    """Return the route along corners, made once."""
+    return Route(corners)
+
+
+def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
+    """
+    Return the primitives of the streets between corners, in the world of ``street_pose``.
+
+    Raises
+    ------
+    ConfigError
+        If the seed is negative or there are fewer than two corners.
+
+    """
+    legs = sorted({tuple(sorted(leg)) for leg in pairwise(corners)})
+    if not legs:
+        raise ConfigError(f'corners: {len(corners)}, expected two or more')
+    pose = street_pose()
+    T_world_street = pose_matrix(pose[:3], pose[3:])
+    kept = [_ground(T_world_street, np.array(corners, np.float64))]
+    for number, (first, last) in enumerate(legs):
+        others = [leg for leg in legs if leg != (first, last)]
+        T_street_leg = _leg_pose(first, last)
+        length_m = math.dist(first, last)
+        move = compose(T_world_street, compose(T_street_leg, inverse(T_world_street)))
+        for primitive in street_primitives(1000 * seed + number, length_m):
+            if primitive.label == 'ground':
+                continue
+            at = compose(inverse(T_world_street), primitive.T_world_primitive)[:2, 3]
+            if not -END_M <= at[0] <= length_m + END_M:
+                continue
+            x, y = T_street_leg[:2, :2] @ at + T_street_leg[:2, 3]
+            reach_m = math.hypot(*primitive.half_m[:2]) + PAVEMENT_Y_M[1]
+            if any(_distance((x, y), leg) < reach_m for leg in others):
+                continue
+            kept.append(_moved(primitive, move))
+    return kept
+
+
+def _leg_pose(first: tuple[float, float], last: tuple[float, float]) -> Transform:
+    heading = math.atan2(last[1] - first[1], last[0] - first[0])
+    turn = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 0.0, heading]))
+    return pose_matrix((*first, 0.0), q_xyzw(turn))
+
+
+def _ground(T_world_street: Transform, corners: npt.NDArray[np.float64]) -> Primitive:
+    """Return the ground below all streets."""
+    low, high = corners.min(axis=0) - 2.0 * BEYOND_M, corners.max(axis=0) + 2.0 * BEYOND_M
+    middle = pose_matrix((*(0.5 * (low + high)), 0.0), (0.0, 0.0, 0.0, 1.0))
+    T = compose(T_world_street, middle)
+    return Primitive(
+        kind='rectangle',
+        size_m=tuple(high - low),
+        xyz=tuple(T[:3, 3]),
+        q_xyzw=tuple(q_xyzw(T)),
+        label='ground',
+        reflectivity=0.25,
+    )
+
+
+def _moved(primitive: Primitive, motion: Transform) -> Primitive:
+    """Return a primitive moved by a motion of the world."""
+    T = compose(motion, primitive.T_world_primitive)
+    values = primitive.to_mapping()
+    return Primitive(**{**values, 'xyz': tuple(T[:3, 3]), 'q_xyzw': tuple(q_xyzw(T))})
+
+
+def _distance(place: tuple[float, float], leg: Sequence[tuple[float, float]]) -> float:
+    """Return the distance of a place from a leg, m."""
+    first, last = np.array(leg)
+    way = last - first
+    along = np.clip(np.dot(np.array(place) - first, way) / np.dot(way, way), 0.0, 1.0)
+    return math.dist(place, first + along * way)

@@ -1,0 +1,94 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Loops of simulated drives: recognised, verified and closed, or refused."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from surfel_mapper.alignment.loop_search import key_numbers, LoopSearch
+from surfel_mapper.alignment.recognition import Candidate, Recognition
+from surfel_mapper.config import Config
+from surfel_mapper.errors import DependencyError
+from test.alignment.circuit import circuit, drifted, gap, SAME_WAY, THERE_AND_BACK
+
+SETTINGS = {'loops.recognise_distance_m': 10.0}
+
+
+def search(scans, poses, **changed):
+    config = Config().replace({**SETTINGS, **changed})
+    voxel_size_m = config.map.voxel_size_m
+    return LoopSearch(scans, poses, config.loops, config.registration, voxel_size_m)
+
+
+@pytest.mark.parametrize('half_deg', [180.0, 60.0], ids=['full turn', '120 deg'])
+def test_a_loop_in_the_same_direction_closes(half_deg):
+    seen = circuit(SAME_WAY)
+    before = drifted(seen.poses)
+
+    closure = search(seen.narrowed(half_deg), before).close()
+
+    first, last = 12, len(seen) - 12
+    assert gap(before, seen.poses, first, last) > 2.0
+    assert gap(closure.T_map_sensor, seen.poses, first, last) < 0.3
+    assert any(loop.votes > 0 for loop in closure.loops)
+    np.testing.assert_array_equal(closure.T_map_sensor[0], before[0])
+
+
+def test_a_loop_with_the_heading_reversed_closes():
+    seen = circuit(THERE_AND_BACK)
+    before = drifted(seen.poses)
+
+    closure = search(seen, before).close()
+
+    first, last = 12, len(seen) - 12
+    assert gap(before, seen.poses, first, last) > 2.0
+    assert gap(closure.T_map_sensor, seen.poses, first, last) < 0.3
+    turned = [loop for loop in closure.loops if loop.T_target_source[0, 0] < -0.9]
+    assert turned
+
+
+def test_a_wrong_candidate_is_refused_by_registration():
+    seen = circuit(SAME_WAY)
+    loops = search(seen, seen.poses)
+    found = loops.register(Candidate(20, 8, np.eye(4)))  # 60 m of another street between them
+
+    assert loops.reason_against(20, found)
+
+
+def test_a_drive_without_loops_keeps_its_poses():
+    seen = circuit(SAME_WAY)
+    before = drifted(seen.poses)[:60]
+
+    closure = search(seen, before).close()
+
+    assert not closure.loops
+    np.testing.assert_array_equal(closure.T_map_sensor, before)
+
+
+def test_recognition_without_its_package_names_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, 'map_closures', None)
+
+    with pytest.raises(DependencyError, match=r"pip install 'surfel_mapper\[loops\]'"):
+        Recognition(5)
+
+
+def test_small_drift_is_corrected_without_recognition(monkeypatch, caplog):
+    monkeypatch.setitem(sys.modules, 'map_closures', None)
+    seen = circuit(SAME_WAY)
+    before = drifted(seen.poses, turn_deg_m=0.005)
+
+    closure = search(seen, before).close()
+
+    assert not closure.recognises
+    assert 'map-closures' in caplog.text
+    first, last = 12, len(seen) - 12
+    assert gap(closure.T_map_sensor, seen.poses, first, last) < 0.3
+    assert closure.loops
+
+
+def test_keyframes_are_first_last_and_those_far_enough():
+    assert key_numbers(np.array([0.0, 1.0, 5.0, 5.5, 10.0, 11.0]), 5.0) == [0, 2, 4, 5]

@@ -1,0 +1,187 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Scans move exactly when loops close, and the poses that come in do not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper.alignment.loop_search import LoopClosure
+from surfel_mapper.config import Config
+from surfel_mapper.errors import AlignmentError, ConfigError
+from surfel_mapper.geometry import compose, inverse, q_xyzw
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.regions import Ball
+from surfel_mapper.scan import Scan
+from test.alignment.circuit import circuit, drifted, gap, SAME_WAY
+
+ALL_SCANS = {'window.max_scans': 0, 'map.max_bytes': 0, 'loops.enabled': True}
+
+
+def fed(mapper, points, poses, first=0):
+    """Feed scans at poses from odometry; return the updates."""
+    updates = []
+    for number, (each, pose) in enumerate(zip(points, poses, strict=True), start=first):
+        stamp_ns = 10**9 + number * 10**8
+        mapper.add_pose('odom', 'lidar', stamp_ns, pose[:3, 3], q_xyzw(pose))
+        mapper.add_scan(Scan(points=each, stamp_ns=stamp_ns, frame_id='lidar'))
+        updates += mapper.insert_ready()
+    return updates
+
+
+def mapper_of(**changed):
+    odometry = {'pose.source': 'odometry', 'frames.base': 'lidar'}
+    return Mapper(Config().replace({**odometry, **ALL_SCANS, **changed}))
+
+
+def digest_at(points, poses):
+    """Return the digest of a map that is made at poses."""
+    surfel_map = SurfelMap(0.5)
+    for each, pose in zip(points, poses, strict=True):
+        surfel_map.insert(surfel_map.reduce(each, pose, origin=pose[:3, 3]))
+    return surfel_map.digest()
+
+
+def shifted(poses):
+    """Return poses moved by a growing motion."""
+    after = np.array(poses)
+    after[:, :3, 3] += np.linspace(0.0, 1.0, len(poses))[:, None] * [0.3, -0.7, 0.1]
+    return after
+
+
+def closure_at(poses):
+    return LoopClosure(
+        T_map_sensor=poses, keys=(0, len(poses) - 1), loops=(), refusals=(), recognises=True
+    )
+
+
+def test_the_map_equals_one_made_at_the_corrected_poses():
+    seen = circuit(SAME_WAY)
+    before = drifted(seen.poses)
+    mapper = mapper_of(**{'loops.recognise_distance_m': 10.0})
+    fed(mapper, seen.scans, before)
+
+    move = mapper.close_loops()
+
+    poses = mapper.loops.T_map_sensor
+    assert move.num_moved > 100
+    assert mapper.map.digest() == digest_at(seen.scans, poses)
+    first, last = 12, len(seen) - 12
+    assert gap(poses, seen.poses, first, last) < 0.3 < 2.0 < gap(before, seen.poses, first, last)
+    summary = move.summary()
+    assert summary['accepted'] == len(move.closure.loops) > 0
+    assert summary['found'] == summary['accepted'] + summary['refused']
+
+
+def test_scans_of_the_window_move_with_it():
+    seen = circuit(SAME_WAY)
+    points = seen.scans[:6]
+    mapper = mapper_of(**{'window.keep_points': True})
+    fed(mapper, points, seen.poses[:6])
+    before = mapper.loops.T_map_sensor
+
+    mapper.loops.move(closure_at(shifted(before)), mapper.config)
+
+    np.testing.assert_array_equal([s.T_map_sensor for s in mapper.window], shifted(before))
+    assert mapper.map.digest() == digest_at(points, shifted(before))
+    mapper.align()  # of the window, which the next move must start from
+    assert mapper.map.digest() == digest_at(points, mapper.loops.T_map_sensor)
+    mapper.loops.move(closure_at(before), mapper.config)
+    assert mapper.map.digest() == digest_at(points, before)
+
+
+def test_later_scans_follow_the_correction_and_move_again():
+    seen = circuit(SAME_WAY)
+    points, before = seen.scans[:9], seen.poses[:9]
+    mapper = mapper_of()
+    fed(mapper, points[:6], before[:6])
+    after = shifted(mapper.loops.T_map_sensor)
+
+    move = mapper.loops.move(closure_at(after), mapper.config)
+    mapper._inserter.aligner.correct(move.correction)
+    updates = fed(mapper, points[6:], before[6:], first=6)
+
+    jump = compose(after[-1], inverse(before[5]))
+    np.testing.assert_allclose(mapper.T_map_fixed, jump, rtol=0, atol=1e-12)
+    for update, pose in zip(updates, before[6:], strict=True):
+        np.testing.assert_allclose(update.T_map_sensor, jump @ pose, rtol=0, atol=1e-9)
+    poses = mapper.loops.T_map_sensor
+    assert mapper.map.digest() == digest_at(points, poses)
+    mapper.loops.move(closure_at(shifted(poses)), mapper.config)
+    assert mapper.map.digest() == digest_at(points, mapper.loops.T_map_sensor)
+
+
+def test_points_of_emptied_voxels_stay_removed_after_two_moves():
+    seen = circuit(SAME_WAY)
+    points, before = seen.scans[:6], seen.poses[:6]
+    mapper = mapper_of()
+    fed(mapper, points[:4], before[:4])
+    mapper.clear_region(Ball(center=tuple(before[2, :3, 3]), radius_m=6.0))
+    num_points = mapper.map.num_points
+    fed(mapper, points[4:5], before[4:5], first=4)
+    one_scan, known = mapper.map.num_points - num_points, mapper.loops.T_map_sensor
+
+    mapper.loops.move(closure_at(shifted(known)), mapper.config)
+    assert mapper.map.num_points == num_points + one_scan
+    mapper.loops.move(closure_at(known), mapper.config)
+
+    expected = mapper_of()
+    fed(expected, points[:4], before[:4])
+    expected.clear_region(Ball(center=tuple(before[2, :3, 3]), radius_m=6.0))
+    fed(expected, points[4:5], before[4:5], first=4)
+    assert mapper.map.digest() == expected.map.digest()
+
+
+def test_a_window_that_evicted_scans_is_refused():
+    seen = circuit(SAME_WAY)
+    mapper = mapper_of(**{'window.max_scans': 3})
+    fed(mapper, seen.scans[:5], seen.poses[:5])
+    digest = mapper.map.digest()
+
+    with pytest.raises(AlignmentError, match='the map holds 3 of 5 scans'):
+        mapper.close_loops()
+
+    assert mapper.map.digest() == digest
+
+
+def test_loops_need_their_points():
+    with pytest.raises(AlignmentError, match=r'set loops\.enabled'):
+        mapper_of(**{'loops.enabled': False}).close_loops()
+
+
+def test_a_cleared_map_starts_again():
+    seen = circuit(SAME_WAY)
+    mapper = mapper_of()
+    fed(mapper, seen.scans[:3], seen.poses[:3])
+    mapper.clear()
+    fed(mapper, seen.scans[3:6], seen.poses[3:6], first=3)
+
+    assert len(mapper.loops) == 3
+    after = shifted(mapper.loops.T_map_sensor)
+    mapper.loops.move(closure_at(after), mapper.config)
+    assert mapper.map.digest() == digest_at(seen.scans[3:6], after)
+
+
+def test_a_frozen_map_moves_no_scan():
+    with pytest.raises(ConfigError, match=r'loops\.enabled: true, but map\.mode frozen'):
+        Config().replace({'loops.enabled': True, 'map.mode': 'frozen', 'map.load': 'hall.npz'})
+
+
+def test_registration_follows_the_last_metres_alone():
+    seen = circuit(SAME_WAY)
+    mapper = Mapper(
+        Config().replace(
+            {'pose.source': 'registration', 'loops.odometry_map_m': 20.0, **ALL_SCANS}
+        )
+    )
+    for number, points in enumerate(seen.scans[:30]):
+        mapper.add_scan(Scan(points=points, stamp_ns=10**9 + number * 10**8, frame_id='lidar'))
+        list(mapper.insert_ready())
+
+    expected = inverse(seen.poses[0]) @ seen.poses[29]
+    found = mapper.loops.T_map_sensor[-1]
+    assert len(mapper.loops) == 30
+    assert mapper._inserter._local_map.surfel_map.num_voxels < mapper.map.num_voxels
+    np.testing.assert_allclose(found[:3, 3], expected[:3, 3], rtol=0, atol=0.2)
