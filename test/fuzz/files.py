@@ -4,11 +4,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 import contextlib
 from functools import cache
 from pathlib import Path
 import tempfile
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -38,11 +39,25 @@ def folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix='surfel_mapper-fuzz-')
 
 
+READS: list[tuple[float, int]] = []
+"""Processor time, s, and bytes of each read of an input, for harnesses that build their files."""
+
+
+@contextlib.contextmanager
+def timed_read(num_bytes: int) -> Iterator[None]:
+    """Time the reading in a block, apart from the building of its file."""
+    start_s = time.process_time()
+    try:
+        yield
+    finally:
+        READS.append((time.process_time() - start_s, num_bytes))
+
+
 def refused(function: Callable[..., object], name: str, data: bytes) -> None:
     """Pass bytes to a function as a file; accept our own errors."""
     path = Path(folder().name, name)
     path.write_bytes(data)
-    with contextlib.suppress(SurfelMapperError):
+    with timed_read(len(data)), contextlib.suppress(SurfelMapperError):
         function(path)
 
 
@@ -116,7 +131,7 @@ def parquet(data: bytes) -> None:
 def read_state(path: Path) -> None:
     """Read a file as every kind of state."""
     for read in (load_map, lambda p: load_tsdf(p, TsdfConfig())):
-        with contextlib.suppress(SurfelMapperError):
+        with timed_read(path.stat().st_size), contextlib.suppress(SurfelMapperError):
             read(path)
 
 

@@ -29,7 +29,7 @@ from surfel_mapper.errors import CloudFormatError, SurfelMapperError
 from surfel_mapper.files.state import content_sha256, FORMAT, VERSION
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.messages.compressed_image import unpacked
-from test.fuzz.files import folder, read_bag, read_state, refused
+from test.fuzz.files import folder, read_bag, read_state, refused, timed_read
 from test.fuzz.source import Source
 
 SIZES = (0, 1, 7, 1000, 65_536, 1 << 24, 1 << 31, 1 << 40, (1 << 63) - 1)
@@ -203,7 +203,7 @@ def png(data: bytes) -> None:
     parts += [chunk(b'IDAT', pixels)] * source.pick((1, 1, 5)) + [chunk(b'IEND', b'')]
     size = (40, 40) if source.chance(2) else None
     message = SimpleNamespace(header=None, format='png', data=b''.join(parts))
-    with contextlib.suppress(CloudFormatError):
+    with timed_read(len(message.data)), contextlib.suppress(CloudFormatError):
         unpacked(message, '/image', exact=True, size=size)
 
 
@@ -280,5 +280,5 @@ def parquet(data: bytes) -> None:
     options = {'compression': source.pick(('zstd', 'snappy', 'none'))}
     groups = source.pick((1, min(len(table), 100)))
     pq.write_table(table, path, row_group_size=-(-len(table) // groups), **options)
-    with contextlib.suppress(SurfelMapperError):
+    with timed_read(path.stat().st_size), contextlib.suppress(SurfelMapperError):
         read_map(path)

@@ -1,0 +1,130 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+No silent loss: a valid file with one change gives the same content, or the loss is told.
+
+A byte is flipped, or the file is cut, at places spread over it. Reading may then fail with our own
+error, warn, or give the same content. Formats without checksums cannot tell a changed number from a
+true one: there, what is not told may differ in values, but not in number, names or types.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+
+import pytest
+
+from surfel_mapper.bags.reader import BagReader
+from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.parquet import read_map
+from test.fuzz import corpus
+
+NUM_CHANGES = 120
+
+
+def changes(content, number=NUM_CHANGES, seed=4):
+    """Yield a file with one byte changed, or cut off."""
+    rng = random.Random(seed)
+    for row in range(number):
+        at = len(content) * row // number + rng.randrange(max(len(content) // number, 1))
+        at = min(at, len(content) - 1)
+        if row % 4:
+            changed = bytearray(content)
+            changed[at] ^= 1 << rng.randrange(8)
+            yield at, bytes(changed)
+        else:
+            yield at, content[:at]
+
+
+def bag_content(path):
+    """Return topic, type, time and bytes of every message."""
+    with BagReader(path) as reader:
+        return [(m.topic, m.type, m.record_ns, bytes(m.raw)) for m in reader.messages()]
+
+
+def checksummed_mcap():
+    """Return an mcap file with checksums of chunks and summary, as the library writes it."""
+    return corpus.mcap()[2]
+
+
+EXACT = {
+    'mcap zstd.mcap': (checksummed_mcap, bag_content),
+    'state.npz': (lambda: corpus.state_bytes()[0], lambda path: load_map(path)[0].digest()),
+    'packed.npz': (lambda: corpus.state_bytes()[1], lambda path: load_map(path)[0].digest()),
+    'map.parquet': (lambda: corpus.parquet()[0], lambda path: read_map(path).digest()),
+}
+
+
+@pytest.mark.parametrize('name', EXACT)
+def test_a_change_in_a_file_with_checksums_is_harmless_or_told(tmp_path, caplog, name):
+    make, read = EXACT[name]
+    if 'parquet' in name:
+        pytest.importorskip('pyarrow')
+    content, path = make(), tmp_path / name
+    path.write_bytes(content)
+    expected = read(path)
+    for at, changed in changes(content):
+        path.write_bytes(changed)
+        assert same_or_told(path, read, caplog, lambda found: found == expected), (name, at)
+
+
+def outline_of_bag(path):
+    """Return how many messages of which topics a bag has, and their sizes."""
+    return sorted((topic, type_, len(raw)) for topic, type_, _, raw in bag_content(path))
+
+
+OUTLINES = {
+    'plain.mcap': (lambda: corpus.rosbag2('mcap')[0], outline_of_bag),
+    'plain.bag': (lambda: corpus.ros1()[0], outline_of_bag),
+    'bz2.bag': (lambda: corpus.ros1()[1], outline_of_bag),
+}
+
+
+@pytest.mark.parametrize('name', OUTLINES)
+def test_a_change_in_a_bag_without_checksums_loses_no_message_in_silence(tmp_path, caplog, name):
+    make, read = OUTLINES[name]
+    content, path = make(), tmp_path / name
+    path.write_bytes(content)
+    expected = read(path)
+    silent = []
+    for at, changed in changes(content):
+        path.write_bytes(changed)
+        if not same_or_told(path, read, caplog, lambda found: len(found) == len(expected)):
+            silent.append(at)
+    assert silent == []
+
+
+@pytest.mark.parametrize(('make', 'module'), [(corpus.points_ply, ply), (corpus.points_pcd, pcd)])
+def test_a_cut_in_a_file_of_points_is_told(tmp_path, make, module):
+    path = tmp_path / 'a'
+    for content in make()[:2]:
+        path.write_bytes(content)
+        number = {len(values) for values in module.read_points(path).values()}
+        for at, changed in changes(content):
+            if len(changed) < len(content):
+                path.write_bytes(changed)
+                with pytest.raises(SurfelMapperError):
+                    module.read_points(path)
+            assert number == {len(v) for v in number_of(path, module, number)}, at
+
+
+def number_of(path, module, number):
+    """Return the columns of a file that may be refused."""
+    try:
+        return module.read_points(path).values()
+    except SurfelMapperError:
+        return [range(*number)]
+
+
+def same_or_told(path, read, caplog, is_same):
+    """Return whether reading fails with our error, warns, or gives the same content."""
+    caplog.clear()
+    try:
+        found = read(path)
+    except SurfelMapperError:
+        return True
+    warned = any(record.levelno >= logging.WARNING for record in caplog.records)
+    return warned or is_same(found)
