@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 KEPT_CHUNKS = 4
 """Number of chunks kept unpacked: neighbouring chunks overlap in time."""
 
-KEPT_BYTES = 64 << 20
+KEPT_BYTES = 32 << 20
 """Limit of their size together; a larger chunk is kept alone."""
 
 MAX_COPIED_BYTES = 1 << 24

@@ -4,8 +4,8 @@
 No silent loss: a valid file with one change gives the same content, or the loss is told.
 
 A byte is flipped, or the file is cut, at places spread over it. Reading may then fail with our own
-error, warn, or give the same content. Formats without checksums cannot tell a changed number from a
-true one: there, what is not told may differ in values, but not in number, names or types.
+error, warn, or give the same content. Formats without checksums cannot tell a changed number from
+a true one: there, content that is not reported as damaged may differ in values, not in number.
 """
 
 from __future__ import annotations
