@@ -102,6 +102,11 @@ class TsdfConfig(Stage):
     max_age_s: float = setting(
         0.0, 'Blocks not updated for longer are dropped, s; 0: no such limit.', low=0.0, high=1e9
     )
+    archive_directory: str = setting(
+        '',
+        'Directory in which blocks that leave by max_radius_m or max_age_s are kept while the '
+        'program runs, so that mesh.ply and saved maps have them; empty: they are dropped.',
+    )
     allocation: str = setting(
         'band',
         'Blocks that a scan updates: band, those its rays cross near a surface; frustum, all in '
@@ -158,6 +163,14 @@ class TsdfConfig(Stage):
         low=1e-6,
         high=1e9,
     )
+    forget_s: float = setting(
+        10.0,
+        'A surface that is gone becomes free within this time of being seen through, and one that '
+        'comes appears, however often the voxels were observed before, s; colours and labels '
+        'follow as fast; 0: only as max_weight says. Needs stamps.',
+        low=0.0,
+        high=1e9,
+    )
     extra_distance_m: float = setting(
         0.0, 'Depth behind the band in which voxels take -truncation_m, m.', low=0.0, high=1e3
     )
@@ -183,6 +196,11 @@ class TsdfConfig(Stage):
         high=10.0,
     )
     tracking: bool = setting(False, 'Keep the first and last stamp of every voxel.')
+    label_map: tuple[float, ...] = setting(
+        (),
+        'Labels to replace before anything else: pairs of the label of the sensor and the one to '
+        'keep, -1 for unknown. Others stay.',
+    )
     semantics: str = setting(
         'none',
         'How labels are fused: majority of counts; weights of the first_k labels; one label by '
@@ -223,6 +241,12 @@ class TsdfConfig(Stage):
         'and 1.25 voxels.',
         low=0.0,
         high=1e3,
+    )
+    mesh_color: str = setting(
+        'auto',
+        'Colour of the mesh: color, that of the voxels; label, one for each label; slope, shaded '
+        'by direction; auto, the first of these that is kept.',
+        choices=('auto', 'color', 'label', 'slope'),
     )
     threads: int = setting(0, 'Threads; 0: one for each core.', low=0, high=1024)
 
@@ -293,6 +317,21 @@ class TsdfConfig(Stage):
                 ),
                 'two or more different angles between -90 and 90, one for each of sensor_rows',
             ),
+            (
+                'label_map',
+                len(self.label_map) % 2 == 0
+                and len(set(self.label_map[::2])) == len(self.label_map) / 2
+                and all(label.is_integer() for label in self.label_map)
+                and all(0 <= label <= MAX_LABEL for label in self.label_map[::2])
+                and all(-1 <= label <= MAX_LABEL for label in self.label_map[1::2]),
+                f'pairs of different labels from 0, and labels from -1, to {MAX_LABEL}',
+            ),
+            ('mesh_color', self.mesh_color != 'color' or self.color, 'another without color'),
+            (
+                'mesh_color',
+                self.mesh_color != 'label' or self.semantics != 'none',
+                'another without semantics',
+            ),
             ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
         )
 
@@ -311,6 +350,14 @@ class TsdfConfig(Stage):
     def dropoff_start_m(self) -> float:
         """Distance behind a surface at which weights start to fall, m."""
         return self.dropoff_m or self.voxel_size_m
+
+    @property
+    def mesh_colors(self) -> str:
+        """Source of the colours of the mesh: color, label or slope."""
+        kept = {'color': self.color, 'label': self.semantics != 'none', 'slope': True}
+        if self.mesh_color != 'auto':
+            return self.mesh_color
+        return next(name for name, is_kept in kept.items() if is_kept)
 
     @property
     def reach_behind_m(self) -> float:

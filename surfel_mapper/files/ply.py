@@ -130,7 +130,7 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
 
 def write_mesh(path: str | Path, mesh: Mesh, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
     """
-    Write a mesh as a binary PLY, with the colours of the vertices if it has any.
+    Write a mesh as a binary PLY, with the colours and labels of the vertices if it has any.
 
     The origin, (3,) m, is added to the vertices.
 
@@ -143,6 +143,8 @@ def write_mesh(path: str | Path, mesh: Mesh, origin_m: npt.ArrayLike = (0.0, 0.0
     columns = dict(zip('xyz', (mesh.vertices + np.asarray(origin_m)).T, strict=True))
     if len(mesh.colors):
         columns.update(zip(('red', 'green', 'blue'), mesh.colors.T, strict=True))
+    if len(mesh.labels):
+        columns['label'] = mesh.labels
     layout = np.dtype([('count', 'u1'), ('corners', '<i4', (3,))])
     faces = np.empty(len(mesh), layout)
     faces['count'], faces['corners'] = 3, mesh.triangles

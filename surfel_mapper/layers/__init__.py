@@ -3,6 +3,7 @@
 """Layers: representations beside the surfels that follow the scans, behind one protocol."""
 
 from surfel_mapper.layers.layer import (
+    Contains,
     Images,
     InsertedScan,
     Layer,
@@ -13,6 +14,7 @@ from surfel_mapper.layers.layer import (
 from surfel_mapper.layers.registry import enabled, names, register, unregister
 
 __all__ = [
+    'Contains',
     'Images',
     'InsertedScan',
     'Layer',

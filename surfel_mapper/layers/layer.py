@@ -25,6 +25,9 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import Eviction, SlidingWindow
 from surfel_mapper.scan import Scan
 
+Contains = Callable[[npt.NDArray[np.float64]], npt.NDArray[np.bool_]]
+"""Returns which of (P, 3) points, map frame, m, are in a region, (P,)."""
+
 NO_VOXELS = np.empty((0, 3), np.int32)
 
 
@@ -132,6 +135,9 @@ class Publication:
     all_messages : callable, optional
         Replaces ``messages`` for a new subscriber, if ``messages`` returns changes since its last
         call.
+    in_background : bool
+        The messages are iterated, and thereby made, in another thread than the one that calls
+        ``messages`` or ``all_messages``, which must copy all that they need.
 
     """
 
@@ -145,6 +151,7 @@ class Publication:
     version: Callable[[], object] | None = None
     prepare: Callable[[], bool] | None = None
     all_messages: Callable[[Moment], Iterable[bytes]] | None = None
+    in_background: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -238,6 +245,9 @@ class Layer:
     def clear(self) -> None:
         """Forget all scans."""
 
+    def clear_region(self, contains: Contains) -> None:
+        """Forget the content of a region; layers that follow the surfels need not."""
+
     def warm_up(self) -> None:
         """Compile the kernels, for points of every type."""
 
@@ -276,6 +286,33 @@ class Layer:
 
         """
         return []
+
+    def save(self, path: Path) -> None:
+        """
+        Write the state of the layer to a file, whole or not at all.
+
+        Called only if a layer overrides it; such a layer overrides ``load`` too.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be written.
+
+        """
+        raise NotImplementedError
+
+    def load(self, path: Path) -> Callable[[], None]:
+        """
+        Read a state that ``save`` wrote; return the function that puts it in place.
+
+        Raises
+        ------
+        FileFormatError
+            If the file cannot be read, is damaged or was written with other settings; the layer
+            is as before then.
+
+        """
+        raise NotImplementedError
 
     def drawings(self) -> Sequence[Drawing]:
         """Return the layer as shapes in the map, for the viewer and the report."""

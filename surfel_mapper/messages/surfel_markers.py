@@ -194,14 +194,16 @@ LIGHT = np.array([0.3, -0.4, 0.87])
 """Direction to the light that shades meshes without colours."""
 
 
-def mesh_marker(mesh: Mesh, *, stamp_ns: int, frame_id: str) -> Marker:
+def mesh_marker(mesh: Mesh, *, number: int, stamp_ns: int, frame_id: str) -> Marker:
     """
-    Return the marker ``mesh``, which replaces the one before, or deletes it if mesh is empty.
+    Return a marker of the namespace ``mesh``; an empty mesh deletes the one before.
 
     Parameters
     ----------
     mesh : Mesh
         If it has no colours, triangles are shaded by their slope: viewers do not light markers.
+    number : int
+        Id of the marker.
     stamp_ns, frame_id : int, str
         Of the mesh.
 
@@ -214,7 +216,7 @@ def mesh_marker(mesh: Mesh, *, stamp_ns: int, frame_id: str) -> Marker:
         colors[..., :3] = shade(corners)[:, None, None]
     return Marker(
         ns='mesh',
-        id=0,
+        id=number,
         type=TRIANGLE_LIST,
         action=ADD if len(mesh) else DELETE,
         frame_id=frame_id,

@@ -231,7 +231,8 @@ def write_files(
 
 def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) -> None:
     """Write the map in one format."""
-    from surfel_mapper.files import map_state, parquet, pcd, ply
+    from surfel_mapper.files import parquet, pcd, ply
+    from surfel_mapper.pipeline.saved_state import save_mapper
 
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     if name == 'ply':
@@ -241,4 +242,4 @@ def write_map(path: Path, name: str, mapper: Mapper, *, window: bool = False) ->
     elif name == 'parquet':
         parquet.write_map(path, mapper.map)
     elif name == 'npz':
-        map_state.save_map(path, mapper.map, mapper.window if window else ())
+        save_mapper(path, mapper, with_window=window)

@@ -16,8 +16,8 @@ import time
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.pipeline.mapper import Mapper
+from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
 
 LATEST = 'latest'
 """Value of map.load: the newest map or checkpoint in output.directory."""
@@ -63,12 +63,16 @@ class Checkpoints:
         self._saved_s, version = time.monotonic(), mapper.map.version
         newest, before = checkpoint_paths(mapper.config.output)
         newest.parent.mkdir(parents=True, exist_ok=True)
-        for path in (newest, before):
+        files = [(newest, before)]
+        for (new, _), (old, _) in zip(*(layer_files(p, mapper) for p in files[0]), strict=True):
+            files.append((new, old))
+        for path in (path for pair in files for path in pair):
             if path.is_symlink():
                 raise FileFormatError(f'{path}: a link, expected a file or none')
-        if newest.exists():
-            os.replace(newest, before)
-        save_map(newest, mapper.map, mapper.window)
+        for new, old in files:
+            if new.exists():
+                os.replace(new, old)
+        save_mapper(newest, mapper)
         self._version = version
         return newest
 
@@ -97,12 +101,10 @@ def load_start(mapper: Mapper) -> None:
 
     """
     config = mapper.config
-    voxel_size_m = config.map.voxel_size_m
     if config.map.load == LATEST:
         _load_latest(mapper)
     elif config.map.load:
-        surfel_map, _ = load_map(config.map.load, voxel_size_m=voxel_size_m)
-        mapper.restore(surfel_map, [])
+        load_mapper(config.map.load, mapper, with_window=False)
 
 
 def _load_latest(mapper: Mapper) -> None:
@@ -111,7 +113,7 @@ def _load_latest(mapper: Mapper) -> None:
     found = [path for path in (saved, *checkpoint_paths(output)) if path.is_file()]
     for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
         try:
-            mapper.restore(*load_map(path, voxel_size_m=mapper.config.map.voxel_size_m))
+            load_mapper(path, mapper)
         except (FileFormatError, MapError) as error:
             _log.warning('map.load latest: %s; an older one is tried', error)
             continue

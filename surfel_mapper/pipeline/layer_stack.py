@@ -20,7 +20,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import CloudFormatError, SurfelMapperError
-from surfel_mapper.layers import enabled, Images, InsertedScan, Layer, Surroundings
+from surfel_mapper.layers import Contains, enabled, Images, InsertedScan, Layer, Surroundings
 from surfel_mapper.pipeline.drops import described, Drops
 
 _log = logging.getLogger(__name__)
@@ -114,6 +114,12 @@ class LayerStack:
         for layer in self:
             with self._drops.guarded(f'clearing layer {layer.name}'):
                 layer.clear()
+
+    def clear_region(self, contains: Contains) -> None:
+        """Empty a region of all layers."""
+        for layer in self:
+            with self._drops.guarded(f'clearing a region of layer {layer.name}'):
+                layer.clear_region(contains)
 
     def finish(self) -> None:
         """Finish all layers, at the end of a recording."""

@@ -450,6 +450,7 @@ class Mapper:
         voxel_index = self.map.moments().voxel_index
         centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
         inside = voxel_index[region.contains(centers)]
+        self._inserter.layers.clear_region(region.contains)
         return self._inserter.drop_voxels(inside, self.config.map.min_points)
 
     def restore(self, surfel_map: SurfelMap, scans: Iterable[WindowedScan]) -> None:

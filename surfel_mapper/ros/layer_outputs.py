@@ -5,19 +5,23 @@ The topics of all layers that are switched on.
 
 A layer describes its topics (layers/layer.py); they are published here, at their rates or when
 the layer has followed a scan. Messages are made in the mapping thread, between two scans, and for
-a new subscriber of a large layer in steps, each between two scans.
+a new subscriber of a large layer in steps, each between two scans. Large ones are made in the
+background: the mapping thread copies what they need, and scans are mapped meanwhile. The next
+ones wait until those before are published, so a slow reader gets fewer, and none twice.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from concurrent.futures import CancelledError
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from functools import partial
 from importlib import import_module
 from typing import Any
 
 from nav_msgs.msg import OccupancyGrid
 from nav_msgs.srv import GetMap
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.duration import Duration
 from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -32,6 +36,9 @@ from surfel_mapper.ros.mapping_thread import MappingThread
 
 GRID = 'nav_msgs/msg/OccupancyGrid'
 """Topics of this type also have a service: ``~/get_grid`` returns the grid of ``~/grid``."""
+
+PATIENCE = Duration(seconds=1.0)
+"""Time for readers to take a message before the next one of the same set."""
 
 
 class LayerOutputs:
@@ -127,7 +134,12 @@ class LayerTopic:
         self._thread = thread
         self._now = now
         self._published: object = None
-        matched = None if self.has_rate else self._on_matched
+        self._background: ThreadPoolExecutor | None = None
+        if publication.in_background:
+            self._background = ThreadPoolExecutor(1, 'publishing')
+        self._pending: Future[None] | None = None
+        is_told = not self.has_rate or publication.all_messages is not None
+        matched = self._on_matched if is_told else None
         self._publisher = node.create_publisher(
             message_class(publication.type_name),
             publication.topic,
@@ -162,7 +174,8 @@ class LayerTopic:
         """Post publishing to the mapping thread if the content changed and is subscribed to."""
         version = self._publication.version
         is_new = version is None or self._published != version()
-        if is_new and (self._publication.is_eager or self._is_read()):
+        is_busy = self._pending is not None and not self._pending.done()
+        if is_new and not is_busy and (self._publication.is_eager or self._is_read()):
             self._thread.post(self._publish)
 
     def publish_if_read(self) -> None:
@@ -204,8 +217,26 @@ class LayerTopic:
         self._send((publication.all_messages or publication.messages)(self._now()))
 
     def _send(self, messages: Iterable[bytes]) -> None:
+        if self._background is not None:
+            self._pending = self._background.submit(self._send_in_background, messages)
+            return
         for message in messages:
             self._publisher.publish(message)
+
+    def _send_in_background(self, messages: Iterable[bytes]) -> None:
+        """Publish messages, each when readers have the one before, or after a second."""
+        try:
+            for number, message in enumerate(messages):
+                if number:
+                    self._publisher.wait_for_all_acked(PATIENCE)
+                self._publisher.publish(message)
+        except Exception as error:
+            self._thread.post(partial(fail, error))  # counted there, as of any other topic
+
+
+def fail(error: Exception) -> None:
+    """Raise an error of another thread."""
+    raise error
 
 
 def qos_of(publication: Publication) -> QoSProfile:

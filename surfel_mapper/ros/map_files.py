@@ -13,10 +13,9 @@ from urllib.parse import unquote, urlsplit
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.files.map_state import load_map as load_state
-from surfel_mapper.files.map_state import save_map as save_state
 from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
 
 
 def save_map(mapper: Mapper) -> str:
@@ -24,7 +23,8 @@ def save_map(mapper: Mapper) -> str:
     Write the map to ``output.directory``; return a sentence that states path, sizes and digest.
 
     ``output.map_name``.ply has the surfels, for other programs; ``output.map_name``.npz the
-    exact map and its window, from which mapping can continue.
+    exact map and its window, from which mapping can continue; layers that keep a state, as the
+    distance field does, have a file each beside it.
 
     Raises
     ------
@@ -38,14 +38,17 @@ def save_map(mapper: Mapper) -> str:
     directory = directory_of(output)
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / f'{output.map_name}.ply'
-    for file in (path, path.with_suffix('.npz')):
+    state = path.with_suffix('.npz')
+    beside = [file for file, _ in layer_files(state, mapper)]
+    for file in (path, state, *beside):
         if not is_inside(directory, file):
             raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     write_surfels(path, surfels)
-    digest = save_state(path.with_suffix('.npz'), mapper.map, mapper.window)
+    digest = save_mapper(state, mapper)
+    layers = ''.join(f', {file.name}' for file in beside)
     return (
-        f'{path} and .npz: {len(surfels)} surfels of {len(mapper.window)} scans '
+        f'{path} and .npz{layers}: {len(surfels)} surfels of {len(mapper.window)} scans '
         f'({mapper.counters.received} received), digest {digest}'
     )
 
@@ -80,12 +83,10 @@ def load_map(mapper: Mapper, url: str) -> str:
     path = path_inside(directory_of(output), url or output.map_name)
     if not path.exists():
         raise FileNotFoundError(f'{path}: no such file; ~/save_map writes one')
-    surfel_map, scans = load_state(path)
-    mapper.restore(surfel_map, scans)
+    num_scans = load_mapper(path, mapper, any_voxel_size=True)
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     return (
-        f'loaded {path}: {len(surfels)} surfels of {len(scans)} scans, '
-        f'digest {mapper.map.digest()}'
+        f'loaded {path}: {len(surfels)} surfels of {num_scans} scans, digest {mapper.map.digest()}'
     )
 
 

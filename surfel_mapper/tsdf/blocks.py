@@ -7,7 +7,7 @@ Block (a, b, c) spans from (a, b, c) * M * voxel_size_m to the next. Voxel (i, j
 number i + M (j + M k), x fastest, N = M^3 in all, and its centre at
 ((a, b, c) * M + (i, j, k) + 0.5) * voxel_size_m. Row r of every array belongs to one block:
 
-    head    (R, 4) int64       key, version, stamp of the last change; see kernels/blocks.py
+    head    (R, 8) int64       key, version, stamp of the last change, ...; see kernels/blocks.py
     field   (R, 2, N) float32  distance in m, positive in front of a surface and negative behind
                                it; weight, 0 for a voxel that was never observed
     color   (R, 4, N) float32  red, green, blue in [0, 255]; weight of the colour
@@ -19,8 +19,9 @@ that grow in place: a view is valid until blocks are added and must not be kept.
 removed block is reused; free rows are zero except for their head.
 
 ``version`` counts the changes of the map. To follow them, keep the last version seen and ask
-``changed_since`` for the rows. Blocks changed after the last ``clear_updated`` are flagged as
-updated and are not evicted.
+``changed_since`` for the rows, or ``moved_since`` for those whose triangles moved by more than
+VISIBLE_VOXELS since, or changed in number. Blocks changed after the last ``clear_updated`` are
+flagged as updated and are not evicted.
 
 One module: the arrays, their content outside of a map (Blocks) and the map over them share the
 layout above.
@@ -28,7 +29,8 @@ layout above.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -39,13 +41,17 @@ from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, KEY
 from surfel_mapper.mapping.storage import HashTable, Slab
 from surfel_mapper.tsdf.kernels.blocks import (
+    DRIFT,
     find_blocks,
     FREE,
+    FREE_VISITS,
     HEAD,
+    INSIDE,
     NEW,
     place_blocks,
     remove_blocks,
     STAMP,
+    SURFACE,
     VERSION,
 )
 
@@ -79,6 +85,12 @@ class Blocks:
     def __len__(self) -> int:
         """Return the number of blocks."""
         return len(self.index)
+
+    def part(self, places: Int64) -> Blocks:
+        """Return some of the blocks, by their places."""
+        arrays = (getattr(self, one.name) for one in fields(self))
+        names = (one.name for one in fields(self))
+        return Blocks(**dict(zip(names, (copied_rows(a, places) for a in arrays), strict=True)))
 
 
 def copied_rows(array: npt.NDArray[Any], rows: Int64) -> Any:
@@ -137,7 +149,7 @@ class BlockArrays:
 
     @property
     def head(self) -> Int64:
-        """Key, version and stamp of each row, (R, 4); valid until the map grows."""
+        """Key, version, stamp and further columns, (R, 8); valid until the map grows."""
         return self._slabs['head'].array[:, :HEAD]
 
     @property
@@ -205,6 +217,15 @@ class BlockArrays:
 MAX_DEPTH = 24
 """Largest depth of the hash table's directory: 2^24 entries, more than 64 million blocks."""
 
+MOST_FORGOTTEN = 16
+"""A measurement forgets at most 1 / 4 of the half-life: a single false one makes no hole."""
+
+PART = 1024
+"""Blocks whose voxel centres are computed at a time: 12 MB."""
+
+VISIBLE_VOXELS = 0.02
+"""Distances may drift by this much, in voxels, before a live mesh follows: 4 mm at 0.2 m."""
+
 UPPER = np.array([(n & 1, n >> 1 & 1, n >> 2) for n in range(8)])
 """Offsets of a block and of the seven that hold the upper corners of its marching cubes."""
 
@@ -256,6 +277,11 @@ class BlockMap(BlockArrays):
     def changed_since(self, version: int) -> Int64:
         """Return the rows of blocks changed after a version of the map, ascending."""
         return np.flatnonzero(self._used_head()[:, VERSION] > version)
+
+    def moved_since(self, version: int) -> Int64:
+        """Return the rows of blocks whose triangles changed visibly after a version, ascending."""
+        head = self._used_head()
+        return np.flatnonzero((head[:, SURFACE] > version) & (head[:, VERSION] != FREE))
 
     def index(self, rows: Int64) -> Int64:
         """Return the block indices of rows, (K, 3) int64."""
@@ -317,10 +343,59 @@ class BlockMap(BlockArrays):
         return rows
 
     def touch(self, rows: Int64, stamp_ns: int) -> None:
-        """Mark blocks as changed at a stamp; increments the version."""
+        """Mark blocks as changed in any way at a stamp; increments the version."""
+        self._mark(rows, stamp_ns)
+        known = self.weight[rows] > 0.0
+        self.head[rows, SURFACE] = self.version
+        self.head[rows, DRIFT] = self.head[rows, FREE_VISITS] = 0
+        self.head[rows, INSIDE] = (known & (self.distance[rows] < 0.0)).sum(axis=1)
+
+    def touch_fused(
+        self, rows: Int64, stamp_ns: int, moved_um: Int64, solid: Int64, inside: Int64
+    ) -> None:
+        """
+        Mark blocks as changed by a measurement; increments the version.
+
+        Parameters
+        ----------
+        rows : (K,) int64
+            The blocks.
+        stamp_ns : int
+            Stamp of the measurement, ns.
+        moved_um : (K,) int64
+            Largest change of a distance, micrometres; see tsdf/kernels/integration.py.
+        solid, inside : (K,) int64
+            Number of observed voxels that are not free, and behind a surface.
+
+        """
+        self._mark(rows, stamp_ns)
+        head = self.head
+        drift = head[rows, DRIFT] + moved_um
+        visible = drift > VISIBLE_VOXELS * self.config.voxel_size_m * 1e6
+        head[rows, DRIFT] = np.where(visible, 0, drift)
+        head[rows[visible], SURFACE] = self.version
+        head[rows, FREE_VISITS] = np.where(solid == 0, head[rows, FREE_VISITS] + 1, 0)
+        head[rows, INSIDE] = inside
+
+    def _mark(self, rows: Int64, stamp_ns: int) -> None:
         self.version += 1
         self.head[rows, VERSION] = self.version
         self.head[rows, STAMP] = stamp_ns
+
+    def forgetting_rates(self, rows: Int64, stamp_ns: int) -> Float32:
+        """
+        Return the least share of measurements that contradict voxels, (K,) in [0, 1).
+
+        After forget_s / 4 of them a distance has moved half of its way to the new one, after
+        forget_s / 2 a voxel deep behind a surface is free. A block that was not
+        seen for long counts as seen forget_s / MOST_FORGOTTEN ago.
+        """
+        forget_s = self.config.forget_s
+        if forget_s == 0.0:
+            return np.zeros(len(rows), np.float32)
+        since_s = (stamp_ns - self.head[rows, STAMP]) / 1e9
+        shares = np.clip(since_s / forget_s, 0.0, 1.0 / MOST_FORGOTTEN)
+        return np.asarray(1.0 - 2.0 ** (-4.0 * shares), np.float32)
 
     def drop_new(self, rows: Int64) -> int:
         """Remove the blocks among rows that were placed but never touched; return their number."""
@@ -394,9 +469,91 @@ class BlockMap(BlockArrays):
             raise MapLimitError(
                 f'{len(blocks)} blocks do not fit into max_blocks = {self.config.max_blocks}'
             )
+        self._write(rows, blocks)
         self.touch(rows, 0)
         self.head[rows, STAMP] = blocks.stamp_ns
-        self._write(rows, blocks)
+
+    def clear_region(self, contains: Callable[[npt.NDArray[np.float64]], Any]) -> None:
+        """
+        Set the voxels whose centres are in a region to unknown; remove blocks that become empty.
+
+        Parameters
+        ----------
+        contains : callable
+            Takes (P, 3) points in the map frame, m; returns which are in the region, (P,) bool.
+
+        """
+        side, size_m = self.config.voxels_per_side, self.config.voxel_size_m
+        local = np.indices((side, side, side)).reshape(3, -1)[::-1].T
+        rows = self.rows()
+        for first in range(0, len(rows), PART):
+            part = rows[first : first + PART]
+            centers = (self.index(part)[:, None] * side + local + 0.5) * size_m
+            inside = np.asarray(contains(centers.reshape(-1, 3))).reshape(len(part), -1)
+            changed, hit = part[inside.any(axis=1)], inside[inside.any(axis=1)]
+            if not len(changed):
+                continue
+            for array in (self.field, self.color, self.votes, self.stamps):
+                if len(array):
+                    array[changed] = np.where(hit[:, None], 0, array[changed])
+            stamps = self.head[changed, STAMP]
+            self.touch(changed, 0)
+            self.head[changed, STAMP] = stamps
+            self.remove(changed[~(self.weight[changed] > 0.0).any(axis=1)])
+
+    def merge(self, blocks: Blocks) -> None:
+        """
+        Fuse blocks into the map, as if their measurements had been made here.
+
+        Distances and colours are weighted means, counts of labels are added; kept labels without
+        counts (first_k, single) stay those of the map. A block may occur several times.
+
+        Raises
+        ------
+        MapLimitError
+            If they exceed max_blocks; the map is unchanged.
+
+        """
+        keys, left = block_keys(blocks.index), np.arange(len(blocks))
+        while len(left):
+            _, first = np.unique(keys[left], return_index=True)
+            self._merge_once(blocks.part(left[first]))
+            left = np.delete(left, first)
+
+    def _merge_once(self, blocks: Blocks) -> None:
+        """Fuse blocks that are all different into the map."""
+        there = self.find(blocks.index)
+        old = there >= 0
+        self.insert(blocks.part(np.flatnonzero(~old)))
+        rows, more, config = there[old], blocks.part(np.flatnonzero(old)), self.config
+        for mean, other in (
+            (self.field[:, :1], more.field[:, :1]),
+            (self.color[:, :3], more.color[:, :3]),
+        ):
+            if not len(other):
+                continue
+            is_color = mean.shape[1] == 3
+            total = self.color[:, 3:] if is_color else self.field[:, 1:]
+            weight = more.color[:, 3:] if is_color else more.field[:, 1:]
+            together = total[rows] + weight
+            share = np.divide(weight, together, out=np.zeros_like(weight), where=weight > 0.0)
+            mean[rows] += (other - mean[rows]) * share
+            total[rows] = np.minimum(together, np.float32(config.max_weight))
+        if len(more.votes):
+            counted = config.semantics in ('majority', 'binary')
+            is_none = ~self.votes[rows].any(axis=1, keepdims=True)
+            added = self.votes[rows] + more.votes
+            kept = np.where(is_none, more.votes, self.votes[rows])
+            self.votes[rows] = added if counted else kept
+        if len(more.stamps):
+            first, last = self.stamps[rows, 0], self.stamps[rows, 1]
+            earlier = np.where(first == 0, more.stamps[:, 0], first)
+            known = more.stamps[:, 0] > 0
+            self.stamps[rows, 0] = np.where(known, np.minimum(earlier, more.stamps[:, 0]), first)
+            self.stamps[rows, 1] = np.maximum(last, more.stamps[:, 1])
+        stamps = np.maximum(self.head[rows, STAMP], more.stamp_ns)
+        self.touch(rows, 0)
+        self.head[rows, STAMP] = stamps
 
     def _used_head(self) -> Int64:
         return self.head[: self._hash.rows_used]

@@ -7,23 +7,33 @@ The cubes of marching cubes have voxel centres as corners, so cubes at the upper
 reach into the blocks above it, and a change of a block affects the seven blocks below as well. A
 vertex is identified by its edge: the voxel at the edge's start, and the axis. Vertices on the same
 edge are welded, within a block and between blocks.
+
+An update has two halves: ``changes`` copies the changed blocks that can have a surface, in the
+thread that owns the map, and ``apply`` makes their triangles, in any thread.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, KeysView
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels.layout import KEY
-from surfel_mapper.tsdf.blocks import BlockMap, UPPER
-from surfel_mapper.tsdf.kernels.marching_cubes import count_triangles, march
+from surfel_mapper.tsdf.blocks import BlockMap, copied_rows, UPPER
+from surfel_mapper.tsdf.kernels.blocks import INSIDE
+from surfel_mapper.tsdf.kernels.marching_cubes import describe, find_cases, march
+from surfel_mapper.tsdf.queries import labels_of
 
+Float32 = npt.NDArray[np.float32]
 Int32 = npt.NDArray[np.int32]
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
 UInt8 = npt.NDArray[np.uint8]
+
+BATCH = 1024
+"""Blocks marched at a time: their working memory fits the cache of a core."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -38,13 +48,16 @@ class Mesh:
     triangles : (F, 3) int32
         Vertex numbers of each, counter-clockwise as seen from free space.
     colors : (V, 3) uint8
-        Red, green, blue; no rows if the map keeps no colour.
+        Red, green, blue, as ``mesh_color`` says; no rows for ``slope``.
+    labels : (V,) int32
+        Label of the nearer voxel that has one, -1 for none; no rows if the map keeps no labels.
 
     """
 
     vertices: Float64
     triangles: Int32
     colors: UInt8
+    labels: Int32 = field(default_factory=lambda: np.empty(0, np.int32))
 
     def __len__(self) -> int:
         """Return the number of triangles."""
@@ -73,6 +86,39 @@ class BlockMesh(Mesh):
     edges: Int32
 
 
+@dataclass(frozen=True, kw_only=True)
+class Changes:
+    """
+    Copy of all that a mesh needs of the blocks that have changed.
+
+    Attributes
+    ----------
+    num_blocks : int
+        Blocks that may have other triangles than before.
+    emptied : list of int
+        Keys of those without a surface, or not in the map any more.
+    keys : (K,) int64
+        Keys of the others.
+    index : (K, 3) int64
+        Their block indices.
+    neighbours : (K, 8) int64
+        Rows, in the arrays below, of each block and of those above it; -1 if missing.
+    field : (R, 2, N) float32
+    color : (R, 4, N) float32, or no rows
+    votes : (R, V, N) float32, or no rows
+
+    """
+
+    num_blocks: int
+    emptied: list[int]
+    keys: Int64
+    index: Int64
+    neighbours: Int64
+    field: Float32
+    color: Float32
+    votes: Float32
+
+
 class Mesher:
     """
     Keeps the mesh of a block map up to date.
@@ -81,13 +127,18 @@ class Mesher:
     ----------
     blocks : BlockMap
         The map.
+    visible_only : bool
+        Update only blocks that have changed visibly, see BlockMap.moved_since: the vertices of
+        others are up to VISIBLE_VOXELS off.
 
     """
 
-    def __init__(self, blocks: BlockMap) -> None:
+    def __init__(self, blocks: BlockMap, *, visible_only: bool = False) -> None:
         """Start without triangles; the first update meshes all blocks."""
         self._blocks = blocks
+        self._changed_since = blocks.moved_since if visible_only else blocks.changed_since
         self._version = -1
+        self._keys: set[int] = set()
         self._meshes: dict[int, BlockMesh] = {}
 
     def update(self) -> int:
@@ -97,27 +148,60 @@ class Mesher:
         Returns
         -------
         int
-            Number of blocks meshed.
+            Number of blocks that could have changed triangles.
 
         """
+        changes = self.changes()
+        self.apply(changes)
+        return changes.num_blocks
+
+    def changes(self) -> Changes:
+        """Return what has changed since the last call; each must be applied, in order."""
         blocks = self._blocks
-        there = set(blocks.head[blocks.rows(), KEY].tolist())
-        for key in self._meshes.keys() - there:
-            del self._meshes[key]
-        changed = blocks.changed_since(self._version)
+        gone = self._keys - set(blocks.head[blocks.rows(), KEY].tolist())
+        changed = self._changed_since(self._version)
         self._version = blocks.version
         below = np.unique(blocks.neighbours(changed, -UPPER))
         rows = below[below >= 0]
-        for key, mesh in zip(blocks.head[rows, KEY].tolist(), self._marched(rows), strict=True):
+        around = blocks.neighbours(rows)
+        has_inside = ((blocks.head[around, INSIDE] > 0) & (around >= 0)).any(axis=1)
+        keys = blocks.head[rows, KEY]
+        self._keys -= gone
+        emptied = gone | (self._keys & set(keys[~has_inside].tolist()))
+        self._keys -= emptied
+        self._keys |= set(keys[has_inside].tolist())
+        needed, place = np.unique(around[has_inside], return_inverse=True)
+        missing = int(len(needed) > 0 and needed[0] < 0)
+        needed = needed[missing:]
+        return Changes(
+            num_blocks=len(rows),
+            emptied=list(emptied),
+            keys=keys[has_inside],
+            index=blocks.index(rows[has_inside]),
+            neighbours=place.reshape(-1, 8) - missing,
+            field=blocks.field[needed],
+            color=copied_rows(blocks.color, needed),
+            votes=copied_rows(blocks.votes, needed),
+        )
+
+    def apply(self, changes: Changes) -> set[int]:
+        """Make the triangles of changed blocks; return the keys of blocks with new triangles."""
+        touched = {key for key in changes.emptied if self._meshes.pop(key, None) is not None}
+        for key, mesh in zip(changes.keys.tolist(), self._marched(changes), strict=True):
             if len(mesh):
                 self._meshes[key] = mesh
-            else:
-                self._meshes.pop(key, None)
-        return len(rows)
+                touched.add(key)
+            elif self._meshes.pop(key, None) is not None:
+                touched.add(key)
+        return touched
 
     def mesh(self) -> Mesh:
         """Return the triangles of all blocks with welded vertices."""
-        meshes = list(self._meshes.values())
+        return self.welded(self._meshes)
+
+    def welded(self, keys: Iterable[int]) -> Mesh:
+        """Return the triangles of some blocks, by their keys, with welded vertices."""
+        meshes = [self._meshes[key] for key in keys if key in self._meshes]
         if not meshes:
             return EMPTY
         firsts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
@@ -133,13 +217,18 @@ class Mesher:
         number = np.empty(len(order), np.int64)
         number[order] = np.cumsum(is_new) - 1
         kept = order[is_new]
+        labels = np.concatenate([mesh.labels for mesh in meshes])
+        colors = np.concatenate([mesh.colors for mesh in meshes])
         return Mesh(
             vertices=np.concatenate([mesh.vertices for mesh in meshes])[kept],
             triangles=number[triangles].astype(np.int32),
-            colors=np.concatenate([mesh.colors for mesh in meshes])[
-                kept if self._blocks.config.color else slice(0)
-            ],
+            colors=colors[kept] if len(colors) else colors,
+            labels=labels[kept] if len(labels) else labels,
         )
+
+    def keys(self) -> KeysView[int]:
+        """Return the keys of the blocks that have triangles."""
+        return self._meshes.keys()
 
     def block_mesh(self, index: npt.ArrayLike) -> Mesh:
         """Return the triangles of one block, by (3,) index."""
@@ -147,55 +236,90 @@ class Mesher:
         found = self._meshes.get(int(self._blocks.head[row, KEY])) if row >= 0 else None
         return EMPTY if found is None else found
 
-    def _marched(self, rows: Int64) -> list[BlockMesh]:
+    def _marched(self, changes: Changes) -> list[BlockMesh]:
         """Run marching cubes over blocks and return their meshes."""
-        blocks, config = self._blocks, self._blocks.config
-        side = config.voxels_per_side
-        limits = config.mesh_min_weight, config.mesh_max_step_m
-        index, neighbours = blocks.index(rows), blocks.neighbours(rows)
-        counts = np.empty(len(rows), np.int64)
-        count_triangles(neighbours, side, blocks.field, limits, counts)
-        ends = np.cumsum(counts)
-        num = int(ends[-1]) if len(ends) else 0
-        edges, places = np.empty((num, 3, 4), np.int64), np.empty((num, 3))
-        march(neighbours, index, side, blocks.field, limits, ends - counts, edges, places)
+        config = self._blocks.config
+        bits = np.empty((len(changes.field), changes.field.shape[2]), np.uint8)
+        describe(changes.field, config.mesh_min_weight, bits)
+        found: list[BlockMesh] = []
+        for first in range(0, len(changes.keys), BATCH):
+            part = slice(first, first + BATCH)
+            found += self._batch(changes, changes.neighbours[part], changes.index[part], bits)
+        return found
 
-        block = np.repeat(np.arange(len(rows)), 3 * counts)
-        flat: npt.NDArray[np.int64] = edges.reshape(-1, 4)
-        inner = flat[:, :3] - index[block] * side
-        number = np.ravel_multi_index(
-            (block, *inner.T, flat[:, 3]), (len(rows), side + 1, side + 1, side + 1, 3)
-        )
-        _, first, corner = np.unique(number, return_index=True, return_inverse=True)
-        flat, place = flat[first], places.ravel()[first]
-        vertices = np.asarray(flat[:, :3] + 0.5, np.float64)
-        vertices[np.arange(len(flat)), flat[:, 3]] += place
+    def _batch(
+        self, changes: Changes, neighbours: Int64, index: Int64, bits: UInt8
+    ) -> list[BlockMesh]:
+        """Return the meshes of some of the changed blocks."""
+        config, num = self._blocks.config, len(index)
+        side = config.voxels_per_side
+        cases, counts = np.empty((num, side**3), np.uint8), np.empty(num, np.int64)
+        content = side, changes.field
+        find_cases(neighbours, *content, bits, config.mesh_max_step_m, cases, counts)
+        starts = np.cumsum([0, *counts.tolist()])
+        triangles = np.empty((starts[-1], 3), np.int32)
+        edges = np.empty((3 * starts[-1], 4), np.int32)
+        places, num_vertices = np.empty(3 * starts[-1]), np.empty(num, np.int64)
+        march(neighbours, index, *content, cases, starts, triangles, edges, places, num_vertices)
+        bounds = np.cumsum([0, *num_vertices.tolist()])
+        edges, places = edges[: bounds[-1]].copy(), places[: bounds[-1]]
+        vertices = edges[:, :3] + 0.5
+        vertices[np.arange(len(edges)), edges[:, 3]] += places
         vertices *= config.voxel_size_m
-        colors = self._colors(flat, place)
-        bounds = np.searchsorted(block[first], np.arange(len(rows) + 1))
-        triangles = corner.reshape(-1, 3)
+        colors, labels = EMPTY.colors, EMPTY.labels
+        if config.color or config.votes_per_voxel:
+            block = np.repeat(np.arange(num), num_vertices)
+            ends = ends_of(edges, neighbours[block], index[block], side)
+            labels = self._labels(changes, ends, places)
+            if config.mesh_colors == 'label':
+                colors = label_colors(labels)
+            elif config.mesh_colors == 'color':
+                colors = self._colors(changes, ends, places)
         return [
             BlockMesh(
                 vertices=vertices[bounds[i] : bounds[i + 1]],
-                triangles=(triangles[end - count : end] - bounds[i]).astype(np.int32),
+                triangles=triangles[starts[i] : starts[i + 1]],
                 colors=colors[bounds[i] : bounds[i + 1]],
-                edges=flat[bounds[i] : bounds[i + 1]].astype(np.int32),
+                labels=labels[bounds[i] : bounds[i + 1]],
+                edges=edges[bounds[i] : bounds[i + 1]],
             )
-            for i, (end, count) in enumerate(zip(ends, counts, strict=True))
+            for i in range(num)
         ]
 
-    def _colors(self, edges: Int64, place: Float64) -> UInt8:
+    def _colors(self, changes: Changes, ends: tuple[Int64, Int64], places: Float64) -> UInt8:
         """Return colours interpolated between the voxels at the ends of edges."""
-        if not self._blocks.config.color:
-            return np.empty((0, 3), np.uint8)
-        ends = np.repeat(edges[:, None, :3], 2, axis=1)
-        ends[np.arange(len(edges)), 1, edges[:, 3]] += 1
-        side = self._blocks.config.voxels_per_side
-        rows = self._blocks.find(ends // side)
-        x, y, z = (ends % side).transpose(2, 0, 1)
-        color = self._blocks.color[rows, :, x + side * (y + side * z)].astype(np.float64)
-        share = np.stack([1.0 - place, place], axis=1) * (color[..., 3] > 0.0)
+        rows, voxels = ends
+        color = changes.color[rows, :, voxels].astype(np.float64)
+        share = np.stack([1.0 - places, places], axis=1) * (color[..., 3] > 0.0)
         total = share.sum(axis=1, keepdims=True)
         share = np.divide(share, total, out=np.zeros_like(share), where=total > 0.0)
         mixed = (share[..., None] * color[..., :3]).sum(axis=1)
         return np.asarray(np.rint(mixed), np.uint8)
+
+    def _labels(self, changes: Changes, ends: tuple[Int64, Int64], places: Float64) -> Int32:
+        """Return the label at the nearer end of each edge that has one."""
+        config = self._blocks.config
+        if not config.votes_per_voxel:
+            return np.empty(0, np.int32)
+        votes = np.moveaxis(changes.votes[ends[0], :, ends[1]], -1, 0)
+        labels, _ = labels_of(config.semantics, votes, min_weight=config.min_label_weight)
+        second = places > 0.5
+        near = np.where(second, labels[:, 1], labels[:, 0])
+        return np.where(near >= 0, near, np.where(second, labels[:, 0], labels[:, 1]))
+
+
+def label_colors(labels: Int32) -> UInt8:
+    """Return a colour for each label (V,), (V, 3): hues a golden angle apart; grey for none."""
+    hue = labels * 0.618034 % 1.0
+    distance = np.abs((hue[:, None] * 6.0 - [0.0, 2.0, 4.0] + 3.0) % 6.0 - 3.0)
+    colors = 70.0 + 180.0 * np.clip(2.0 - distance, 0.0, 1.0)
+    return np.where(labels[:, None] < 0, 128.0, colors).astype(np.uint8)
+
+
+def ends_of(edges: Int32, neighbours: Int64, index: Int64, side: int) -> tuple[Int64, Int64]:
+    """Return rows and voxels of both ends of edges (V, 4) of blocks, (V, 2) each."""
+    ends = np.repeat(edges[:, None, :3].astype(np.int64), 2, axis=1) - side * index[:, None]
+    ends[np.arange(len(edges)), 1, edges[:, 3]] += 1
+    above = ((ends // side) @ [1, 2, 4]).astype(np.int64)
+    voxels = (ends % side) @ [1, side, side * side]
+    return np.take_along_axis(neighbours, above, axis=1), voxels.astype(np.int64)

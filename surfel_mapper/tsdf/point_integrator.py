@@ -23,14 +23,23 @@ import numpy.typing as npt
 from surfel_mapper.config import SEMANTICS
 from surfel_mapper.errors import CloudFormatError, MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
-from surfel_mapper.tsdf.integrator import checked_pose, Integrated, POWERS
-from surfel_mapper.tsdf.kernels import lookup as settings_of
 from surfel_mapper.tsdf.kernels import point_fusion as kernels
 from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
+from surfel_mapper.tsdf.kernels.integration import INSIDE, MOVED, NUM_FOUND, OBSERVED, SOLID
+from surfel_mapper.tsdf.measurements import (
+    checked_pose,
+    Integrated,
+    POWERS,
+    remapped,
+    settings,
+)
 from surfel_mapper.tsdf.selection import MAX_SIDE, NO_COSINE
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
+
+NO_COLORS = np.empty((0, 3), np.uint8)
+NO_LABELS = np.empty(0, np.int32)
 
 
 class PointIntegrator:
@@ -96,18 +105,19 @@ class PointIntegrator:
         for name, values in (('colors', colors), ('labels', labels)):
             if values is not None and len(values) != len(points):
                 raise CloudFormatError(f'{name}: {len(values)}, expected {len(points)} as points')
-        config, blocks = self.blocks.config, self.blocks
+        voxel_m, blocks = self.blocks.config.voxel_size_m, self.blocks
         used = np.isfinite(points).all(axis=1)
         local = points[used].astype(np.float64)
         ranges = np.linalg.norm(local, axis=1)
-        origin = T[:3, 3] / config.voxel_size_m
-        places = (local @ T[:3, :3].T + T[:3, 3]) / config.voxel_size_m
+        places = (local @ T[:3, :3].T + T[:3, 3]) / voxel_m
         solid: npt.NDArray[Any] = np.ones(len(local), bool)
         if labels is not None:
-            labels = np.ascontiguousarray(labels[used], np.int32)
+            labels = remapped(labels[used], self.blocks.config)
             solid = ~np.isin(labels, self._masked)
+            labels = labels[solid]
+        if colors is not None:
+            colors = np.ascontiguousarray(colors[used][solid])
         surfaces = np.ascontiguousarray(places[solid])
-
         index = self._touched(local, ranges, surfaces, T)
         before = blocks.num_blocks
         rows = blocks.place(index)
@@ -115,47 +125,57 @@ class PointIntegrator:
         try:
             slots = np.full(len(blocks.head), -1, np.int64)
             slots[there] = np.arange(len(there))
-            sums = self._sums(surfaces, places, origin, slots, len(there))
-            observed = np.empty(len(there), np.int64)
-            kernels.fuse_sums(
-                there, sums, stamp_ns, config.max_weight, blocks.field, blocks.stamps, observed
+            rates = blocks.forgetting_rates(there, stamp_ns)
+            found = self._fuse(places, surfaces, T[:3, 3] / voxel_m, stamp_ns, there, slots, rates)
+            images = (
+                NO_COLORS if colors is None else colors,
+                NO_LABELS if labels is None else labels,
             )
-            colors = None if colors is None else colors[used][solid]
-            labels = None if labels is None else labels[solid]
-            lost = self._fuse_channels(surfaces, ranges[solid], slots, colors, labels)
-            updated = there[observed > 0]
-            if len(updated):
-                blocks.touch(updated, stamp_ns)
+            lost = self._fuse_channels(surfaces, ranges[solid], rates, slots, images)
+            changed = found[:, OBSERVED] > 0
+            if changed.any():
+                figures = (found[changed, column] for column in (MOVED, SOLID, INSIDE))
+                blocks.touch_fused(there[changed], stamp_ns, *figures)
         finally:
             blocks.drop_new(rows)
         return Integrated(
             num_blocks=len(index),
-            num_updated=len(updated),
+            num_updated=int(changed.sum()),
+            num_skipped=0,
             num_added=blocks.num_blocks - before,
             num_refused=len(rows) - len(there),
-            num_voxels=int(observed.sum()),
+            num_voxels=int(found[:, OBSERVED].sum()),
             num_labels_lost=lost,
         )
 
-    def _sums(
-        self, surfaces: Float64, places: Float64, origin: Float64, slots: Int64, num_blocks: int
-    ) -> Float32:
-        """Return the weighted sums of the rays in each voxel, (num_blocks, N, 3)."""
+    def _fuse(
+        self,
+        places: Float64,
+        surfaces: Float64,
+        origin: Float64,
+        stamp_ns: int,
+        rows: Int64,
+        slots: Int64,
+        rates: Float32,
+    ) -> Int64:
+        """Fuse distances, places and origin in voxels; return figures of each block."""
         config, blocks = self.blocks.config, self.blocks
-        sums = np.zeros((num_blocks, blocks.voxels_per_block, 3), np.float32)
-        common = (
+        sums = np.zeros((len(rows), blocks.voxels_per_block, 3), np.float32)
+        content = (
             config.voxel_size_m,
             self._bits,
-            self._settings(),
+            settings(self.blocks.config),
             POWERS[config.weight_mode],
-            blocks.lookup,
-            slots,
-            sums,
         )
-        kernels.sum_surfaces(surfaces, origin, *common)
+        kernels.sum_surfaces(surfaces, origin, *content, blocks.lookup, slots, sums)
         if config.carve:
-            kernels.sum_free(places, origin, *common)
-        return sums
+            kernels.sum_free(places, origin, *content, blocks.lookup, slots, sums)
+        found = np.empty((len(rows), NUM_FOUND), np.int64)
+        arrays = blocks.field, blocks.stamps
+        kernels.fuse_sums(
+            rows, sums, rates, stamp_ns, settings(self.blocks.config), *arrays, found
+        )
+        return found
 
     def _touched(
         self, local: Float64, ranges: Float64, surfaces: Float64, T_map_sensor: Float64
@@ -200,9 +220,9 @@ class PointIntegrator:
         self,
         points: Float64,
         ranges: Float64,
+        rates: Float32,
         slots: Int64,
-        colors: npt.NDArray[np.uint8] | None,
-        labels: npt.NDArray[np.int32] | None,
+        images: tuple[npt.NDArray[np.uint8], npt.NDArray[np.int32]],
     ) -> int:
         """Fuse colours and labels of points; return the number of lost labels."""
         config, blocks = self.blocks.config, self.blocks
@@ -212,36 +232,9 @@ class PointIntegrator:
             depth ** (-2.0 * POWERS[config.weight_mode]), config.min_measurement_weight
         )
         weights = np.where(valid, weights, 0.0).astype(np.float32)
-        if config.color and colors is not None:
-            kernels.fuse_point_colors(
-                points,
-                np.ascontiguousarray(colors),
-                self._bits,
-                weights,
-                np.float32(config.max_weight),
-                blocks.lookup,
-                slots,
-                blocks.color,
-            )
-        if config.semantics == 'none' or labels is None:
-            return 0
-        semantics = SEMANTICS.index(config.semantics)
+        most = np.float32(config.max_weight)
+        channels = blocks.color, blocks.votes, SEMANTICS.index(config.semantics)
+        where = self._bits, blocks.lookup, slots
         return int(
-            kernels.fuse_point_labels(
-                points, labels, semantics, self._bits, weights, blocks.lookup, slots, blocks.votes
-            )
+            kernels.fuse_point_channels(points, weights, rates, most, *where, images, channels)
         )
-
-    def _settings(self) -> Float32:
-        """Return the settings of an integration, in the order of kernels/lookup.py."""
-        config = self.blocks.config
-        found = np.zeros(settings_of.NUM_SETTINGS, np.float32)
-        found[settings_of.TAU] = config.truncation_m
-        found[settings_of.EXTRA] = config.extra_distance_m
-        found[settings_of.MIN_RANGE] = config.min_range_m
-        found[settings_of.MAX_RANGE] = config.max_range_m
-        found[settings_of.WEIGHT] = 1.0
-        found[settings_of.DROPOFF] = config.dropoff_start_m if config.weight_dropoff else np.inf
-        found[settings_of.MIN_WEIGHT] = config.min_measurement_weight
-        found[settings_of.MAX_WEIGHT] = config.max_weight
-        return found

@@ -4,7 +4,8 @@
 Selection of the blocks that a range image updates: touched by its rays, or in its field of view.
 
 The cost of the first grows with the number of rays, of the second with the volume in view. Blocks
-are fused independently, so a block that both select gets the same values.
+are fused independently, so a block that both select gets the same values. Blocks in which an
+image shows no surface, which need no fusion if they are free already, are found here too.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.tsdf.blocks import UPPER
 from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
+from surfel_mapper.tsdf.kernels.free_space import find_ends, find_free, RUN
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
 
 Int64 = npt.NDArray[np.int64]
@@ -122,3 +125,27 @@ def in_view(config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: 
         far = distance <= image.largest_m + reach_behind_m(config, image) + radius_m
         found.append(index[near & far & sensor.sees(centres, radius_m)])
     return np.concatenate(found)
+
+
+def without_surface(
+    config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, index: Int64
+) -> npt.NDArray[np.bool_]:
+    """Return in which blocks (K, 3) an image shows no surface, (K,); in doubt it does."""
+    shape, sensor = image.range_m.shape, image.sensor
+    runs = np.empty((shape[0], -(-shape[1] // RUN), 2), np.float32)
+    cosine = NO_COSINE if image.cosine is None else image.cosine
+    is_mixed = config.interpolation == 'bilinear'  # across edges, so before is not unknown
+    behind = np.inf if is_mixed else config.reach_behind_m
+    find_ends(image.range_m, cosine, config.truncation_m, behind, runs)
+    lower = index * config.block_size_m - T_map_sensor[:3, 3]
+    corners = (lower[:, None] + config.block_size_m * UPPER).reshape(-1, 3)
+    free = np.empty(len(index), bool)
+    find_free(
+        np.ascontiguousarray((corners @ T_map_sensor[:3, :3]).T, np.float32),
+        config.block_size_m,
+        sensor.projection,
+        (sensor.rows, sensor.columns, sensor.wraps),
+        runs,
+        free,
+    )
+    return free

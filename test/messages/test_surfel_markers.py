@@ -13,7 +13,6 @@ from surfel_mapper.messages.markers import (
     DELETE,
     LINE_LIST,
     marker_array,
-    marker_bytes,
     TRIANGLE_LIST,
 )
 from surfel_mapper.messages.surfel_markers import (
@@ -179,12 +178,12 @@ NO_COLORS = np.empty((0, 3), np.uint8)
 
 def marker_of(colors=NO_COLORS):
     mesh = Mesh(vertices=SQUARE, triangles=TRIANGLES, colors=colors)
-    return mesh_marker(mesh, stamp_ns=5, frame_id='odom')
+    return mesh_marker(mesh, number=7, stamp_ns=5, frame_id='odom')
 
 
 def test_every_triangle_has_its_three_corners_in_order():
     marker = marker_of()
-    assert (marker.type, marker.action, marker.frame_id) == (TRIANGLE_LIST, ADD, 'odom')
+    assert (marker.type, marker.action, marker.id) == (TRIANGLE_LIST, ADD, 7)
     assert np.array_equal(marker.points, SQUARE[TRIANGLES.ravel()])
     assert marker.colors.shape == (12, 4)
     assert (marker.colors[:, 3] == 1.0).all()
@@ -202,16 +201,5 @@ def test_without_colours_faces_upwards_are_brighter_than_faces_downwards():
 
 
 def test_an_empty_mesh_deletes_the_marker():
-    marker = mesh_marker(EMPTY, stamp_ns=5, frame_id='odom')
+    marker = mesh_marker(EMPTY, number=7, stamp_ns=5, frame_id='odom')
     assert (marker.action, len(marker.points)) == (DELETE, 0)
-
-
-def test_a_single_marker_is_serialised_as_in_an_array():
-    marker = marker_of()
-    header, number = b'\x00\x01\x00\x00', b'\x01\x00\x00\x00'
-    alone = marker_bytes(marker)
-    # shifted by four bytes, members aligned to eight move: compared up to the pose
-    assert alone[:4] == header
-    assert marker_array([marker])[:8] == header + number
-    assert alone[4:24] == marker_array([marker])[8:28]
-    assert len(alone) <= len(marker_array([marker]))

@@ -10,6 +10,7 @@ import os
 import pytest
 
 from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import checkpoints
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
@@ -59,7 +60,7 @@ def test_a_checkpoint_is_written_when_due_and_two_are_kept(tmp_path, clock):
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([newest.name, before.name])
 
     for path, digest in ((newest, digests[2]), (before, digests[1])):
-        assert checkpoints.load_map(path)[0].digest() == digest
+        assert load_map(path)[0].digest() == digest
 
 
 def test_latest_continues_with_map_and_window(tmp_path, clock):
@@ -116,14 +117,14 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
     def fail(*args):
         raise FileFormatError('no space')
 
-    monkeypatch.setattr(checkpoints, 'save_map', fail)
+    monkeypatch.setattr(checkpoints, 'save_mapper', fail)
     for _ in range(3):
         drive(mapper, 2.0 + clock.now_s)
         clock.now_s += 10.0
         with pytest.raises(FileFormatError):
             saving.save_if_due()
     assert not newest.exists()
-    assert checkpoints.load_map(before)[0].digest() == digest
+    assert load_map(before)[0].digest() == digest
 
 
 def test_a_checkpoint_is_not_written_through_a_link(tmp_path, clock):

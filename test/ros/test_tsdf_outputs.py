@@ -13,8 +13,9 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from visualization_msgs.msg import Marker
+from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper.sensors.depth import PinholeCamera
 from surfel_mapper.tsdf.sensors import LidarModel
@@ -36,17 +37,32 @@ SETTINGS = {
     'layers.tsdf.sensor_columns': 360,
 }
 
+MESHES = QoSProfile(depth=50, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def shown(arrays):
+    """Return the markers that a viewer shows after some MarkerArrays, by id."""
+    found = {}
+    for marker in (marker for message in arrays for marker in message.markers):
+        if marker.action == Marker.DELETEALL:
+            found.clear()
+        elif marker.action == Marker.DELETE:
+            found.pop(marker.id, None)
+        else:
+            found[marker.id] = marker
+    return found
+
 
 def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     start_node(start, peer, **SETTINGS)
-    meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
 
-    peer.spin_until(lambda: meshes and meshes[-1].points)
-    mesh = meshes[-1]
+    peer.spin_until(lambda: shown(meshes))
+    (mesh,) = shown(meshes).values()  # the tile about the origin
     corners = np.array([(p.x, p.y, p.z) for p in mesh.points])
     middle = (0.1, 0.0, 0.5)  # where the sensor is on the robot
     assert (mesh.type, mesh.action, mesh.header.frame_id) == (Marker.TRIANGLE_LIST, 0, 'odom')
@@ -80,7 +96,7 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
     kinds = {'/depth/image': Image, '/depth/camera_info': CameraInfo, '/rgb/image': Image}
     start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
-    meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/depth/camera_info', camera_info(camera))
@@ -88,8 +104,8 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
     peer.publish('/depth/image', depth_image(START_NS, depth, '16UC1'))
     pixels = np.full((60, 80, 3), (200, 100, 0), np.uint8)
     peer.publish('/rgb/image', depth_image(START_NS, pixels, 'rgb8'))
-    peer.spin_until(lambda: meshes and meshes[-1].points)
-    colors = np.array([(c.r, c.g, c.b) for c in meshes[-1].colors])
+    peer.spin_until(lambda: shown(meshes))
+    colors = np.array([(c.r, c.g, c.b) for m in shown(meshes).values() for c in m.colors])
     np.testing.assert_allclose(colors, np.tile([200, 100, 0], (len(colors), 1)) / 255, atol=0.01)
 
 
@@ -108,7 +124,7 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
     kinds = {depth_topic: CompressedImage, info: CameraInfo, color_topic: CompressedImage}
     start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
-    meshes = peer.collect(Marker, f'{BASE}/mesh', LATCHED)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     depth = packed_depth(np.full((60, 80), 2000, np.uint16))
     color = packed(np.full((60, 80, 3), (200, 100, 0), np.uint8), 'rgb8; jpeg compressed', 'JPEG')
@@ -122,8 +138,8 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
             message.header.frame_id = 'camera'
             stamp(message, stamp_ns)
             peer.publish(topic, message)
-    peer.spin_until(lambda: meshes and meshes[-1].points)
-    colors = np.array([(c.r, c.g, c.b) for c in meshes[-1].colors])
+    peer.spin_until(lambda: shown(meshes))
+    colors = np.array([(c.r, c.g, c.b) for m in shown(meshes).values() for c in m.colors])
     np.testing.assert_allclose(colors, np.tile([200, 100, 0], (len(colors), 1)) / 255, atol=0.02)
     peer.diagnosis(
         {
@@ -158,3 +174,30 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
     distance = np.hypot(corner.x + (x + 0.5) * 0.2 - 0.1, corner.y + (y + 0.5) * 0.2)
     # 2 m above the sensor the sphere of 5 m is a circle of sqrt(21) m; its inside is free.
     assert 21**0.5 - 0.4 < distance.min() < 21**0.5
+
+
+def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
+    start_node(start, peer, **SETTINGS, **{'layers.tsdf.max_range_m': 100.0})
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    half = directions[:, 0] > 0.0
+    ranges = np.where(half, 30.0, RADIUS_M)[:, None]
+    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
+    peer.publish('/points', cloud(START_NS, ranges * directions))
+    peer.spin_until(lambda: len(shown(meshes)) > 5)
+    num_before = len(meshes)
+    late = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    peer.spin_until(lambda: late and shown(late).keys() == shown(meshes).keys())
+    assert {n: m.points for n, m in shown(late).items()} == {
+        n: m.points for n, m in shown(meshes).items()
+    }
+    peer.spin_until(lambda: len(meshes) > num_before)  # the complete set, for all readers
+    num_before = len(meshes)
+
+    # The sphere comes 0.4 m nearer, the half at 30 m stays out of the image.
+    near = np.where(half, np.nan, RADIUS_M - 0.4)[:, None] * directions
+    peer.publish('/odom', odometry(START_NS + PERIOD_NS, (0.0, 0.0, 0.0)))
+    peer.publish('/points', cloud(START_NS + PERIOD_NS, near))
+    peer.spin_until(lambda: len(meshes) > num_before)
+    changed = {marker.id for message in meshes[num_before:] for marker in message.markers}
+    assert changed < shown(meshes).keys()

@@ -21,9 +21,10 @@ WEIGHTS = RNG.uniform(0.5, 2.0, (40, 50)).astype(np.float32)
 def votes_after(semantics, width, seen=SEEN, weights=WEIGHTS):
     """Return the votes of voxels, (V, N), and labels lost, after rows of labels and weights."""
     votes, lost = np.zeros((width, seen.shape[1]), np.float32), 0
-    signed = np.zeros(seen.shape[1], np.float32)
+    signed, caps = np.zeros(seen.shape[1], np.float32), (np.float32(1e5), np.float32(0.0))
     for label, weight in zip(seen.astype(np.int32), weights.astype(np.float32), strict=True):
-        lost += fuse_labels(semantics, np.float32(1.0), False, label, signed, weight, votes)
+        content = label, signed, weight, votes
+        lost += fuse_labels(semantics, np.float32(1.0), False, caps, *content)
     return votes, lost
 
 

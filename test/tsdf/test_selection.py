@@ -9,6 +9,7 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.kernels.integration import OBSERVED
 from surfel_mapper.tsdf.selection import BlockSelection
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 from test.tsdf.scenes import image_of
@@ -49,7 +50,8 @@ def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
         one = Integrator(BlockMap(config))
         index = everywhere(T, 5.4, config.block_size_m)
         rows = one.blocks.place(index)
-        observed, _ = one._fuse(image, T, 0, index, rows)
+        found, _ = one._fuse(image, T, 0, index, rows)
+        observed = found[:, OBSERVED]
         assert (observed > 0).sum() > 100
         assert {*map(tuple, index[observed > 0])} <= chosen
         touched = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T)

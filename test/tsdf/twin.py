@@ -168,5 +168,5 @@ def integrate(config, blocks, image, T_map_sensor, index):
             if image.color is not None and s < config.truncation_m:
                 c = sum(share * image.color[j, i].astype(float) for j, i, share in pixels)
                 C[n] = (C[n] * W_color[n] + c * w) / (W_color[n] + w)
-                W_color[n] += w
+                W_color[n] = min(W_color[n] + w, config.max_weight)
     return blocks

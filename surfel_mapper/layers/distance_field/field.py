@@ -19,7 +19,8 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.integrator import Integrated, Integrator
+from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample, states

@@ -10,8 +10,9 @@ fitted to the first points of its frame; see tsdf/fitting.py.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,14 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.files.ply import write_mesh
+from surfel_mapper.files.tsdf_archive import BlockArchive
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.field import DistanceField
+from surfel_mapper.layers.distance_field.live_mesh import LiveMesh
 from surfel_mapper.layers.distance_field.obstacles import slice_at
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
+    Contains,
     Images,
     InsertedScan,
     Layer,
@@ -36,11 +41,10 @@ from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
-from surfel_mapper.messages.markers import marker_bytes
-from surfel_mapper.messages.surfel_markers import mesh_marker
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
-from surfel_mapper.tsdf.integrator import Integrated, Integrator
+from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.range_image import from_points
@@ -48,6 +52,9 @@ from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 SPARSE_ROWS = 24
 """Lidars of fewer fitted beams are fused point by point: their images have gaps."""
+
+MESHES_KEPT = 8
+"""Messages of ~/mesh that its publisher keeps for slow readers: 32 MiB."""
 
 
 class TsdfLayer(Layer):
@@ -66,6 +73,8 @@ class TsdfLayer(Layer):
 
     def __init__(self, config: Config, around: Surroundings) -> None:
         super().__init__(config, around)
+        directory = config.tsdf.archive_directory
+        self._archive = BlockArchive(directory) if directory else None
         self.clear()
 
     @property
@@ -80,10 +89,17 @@ class TsdfLayer(Layer):
 
     def clear(self) -> None:
         """Forget everything but the sensors."""
-        self.blocks = BlockMap(self.config.tsdf)
+        if self._archive is not None:
+            self._archive.clear()
+        self._begin(BlockMap(self.config.tsdf))
+
+    def _begin(self, blocks: BlockMap) -> None:
+        """Continue with a field."""
+        self.blocks = blocks
         self._integrator = Integrator(self.blocks)
         self._point_integrator = PointIntegrator(self.blocks)
         self._mesher = Mesher(self.blocks)
+        self._live_mesh = LiveMesh(self.blocks)
         self._waiting: dict[int, Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
         self._num_by_points = 0
@@ -135,7 +151,9 @@ class TsdfLayer(Layer):
             points, channels = self._measured(scan, sensor.max_range_m)
             image = from_points(sensor, points, **channels)
             done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
-        self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
+        left = self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
+        if self._archive is not None:
+            self._archive.add(left)
         self._num_scans += 1
         self._num_refused += done.num_refused
         self._num_labels_lost += done.num_labels_lost
@@ -150,6 +168,10 @@ class TsdfLayer(Layer):
         """Return the surface; blocks that have not changed since the last call cost little."""
         self._mesher.update()
         return self._mesher.mesh()
+
+    def clear_region(self, contains: Contains) -> None:
+        """Set the voxels in a region to unknown; those of the archive stay."""
+        self.blocks.clear_region(contains)
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
@@ -175,6 +197,7 @@ class TsdfLayer(Layer):
             'scans': self._num_scans,
             'waiting': len(self._waiting),
             'blocks': self.blocks.num_blocks,
+            'blocks_archived': self._archive.num_blocks if self._archive else 0,
             'blocks_refused': self._num_refused,
             'labels_lost': self._num_labels_lost,
             'bytes': self.blocks.nbytes,
@@ -188,8 +211,12 @@ class TsdfLayer(Layer):
         return (
             Publication(
                 topic='~/mesh',
-                type_name='visualization_msgs/msg/Marker',
-                messages=self._mesh_messages,
+                type_name='visualization_msgs/msg/MarkerArray',
+                messages=lambda now: self._live_mesh.changed(now),
+                all_messages=self._whole_mesh,
+                in_background=True,
+                version=lambda: (id(self.blocks), self.blocks.version),
+                depth=MESHES_KEPT,
                 rate_hz=lambda config: config.tsdf.mesh_rate_hz,
             ),
             Publication(
@@ -201,20 +228,40 @@ class TsdfLayer(Layer):
             ),
         )
 
+    def whole(self) -> BlockMap:
+        """Return the field, with the blocks of the archive if there is one."""
+        if self._archive is None or not self._archive.num_blocks:
+            return self.blocks
+        found = BlockMap(replace(self.config.tsdf, max_blocks=0))
+        for blocks in self._archive:
+            found.merge(blocks)
+        found.merge(self.blocks.copied(self.blocks.rows()))
+        return found
+
+    def save(self, path: Path) -> None:
+        """Write the field, the archive included."""
+        save_tsdf(path, self.whole())
+
+    def load(self, path: Path) -> Callable[[], None]:
+        """Read a field that ``save`` wrote; return the function that puts it in place."""
+        return partial(self._begin, load_tsdf(path, self.config.tsdf))
+
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write mesh.ply."""
+        """Write mesh.ply, of the archive too."""
         path = directory / 'mesh.ply'
-        write_mesh(path, self.mesh(), self.around.surfel_map.origin_m)
+        write_mesh(path, self._whole_surface(), self.around.surfel_map.origin_m)
         return [path]
 
     def drawings(self) -> Sequence[Drawing]:
-        """Return the mesh."""
-        return [MeshDrawing(name='mesh', mesh=self.mesh())]
+        """Return the mesh, of the archive too."""
+        return [MeshDrawing(name='mesh', mesh=self._whole_surface())]
 
-    def _mesh_messages(self, now: Moment) -> list[bytes]:
-        return [
-            marker_bytes(mesh_marker(self.mesh(), stamp_ns=now.stamp_ns, frame_id=now.frame_id))
-        ]
+    def _whole_surface(self) -> Mesh:
+        blocks = self.whole()
+        return self.mesh() if blocks is self.blocks else DistanceField(blocks=blocks).mesh()
+
+    def _whole_mesh(self, now: Moment) -> Iterable[bytes]:
+        return self._live_mesh.complete(now) if self.config.tsdf.mesh_rate_hz else ()
 
     def _slice_messages(self, now: Moment) -> list[bytes]:
         found = slice_at(self.blocks, self.config.tsdf.slice_height_m)

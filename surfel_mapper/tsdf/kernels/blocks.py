@@ -29,7 +29,15 @@ VERSION = 1
 """Version of the map at the last change of the block; NEW or FREE otherwise."""
 STAMP = 2
 """Stamp of the measurement that changed it last, ns."""
-HEAD = 4
+SURFACE = 3
+"""Version of the map at the last change that moved or changed triangles."""
+DRIFT = 4
+"""Sum of the largest changes of a distance since then, micrometres."""
+FREE_VISITS = 5
+"""Measurements in a row after which all observed voxels were free."""
+INSIDE = 6
+"""Number of observed voxels behind a surface."""
+HEAD = 8
 """Columns of a head; the last is unused, because rows of a slab divide a page."""
 
 NEW = -1
@@ -82,7 +90,7 @@ def place_blocks(keys, head, table, state, limit, start, rows):
                 return place
             head[row, KEY] = key
             head[row, VERSION] = NEW
-            head[row, STAMP] = 0
+            head[row, STAMP:] = 0
             insert_row(hashed, row, table, depth)
             state[VOXELS] += 1
         rows[place] = row

@@ -17,6 +17,9 @@ Votes for labels of a voxel, ``votes`` (V, N) float32:
 
 A label is stored as float32, exact up to 2^24. Label -1 means unknown.
 
+Totals obey the cap of the map, ``max_weight``: votes beyond it scale the other votes of the voxel
+down, so that what was observed 50 times after 500 others replaces them at a cap of 10.
+
 MAJORITY equals adding log-likelihoods if every label but the observed one gets the same
 likelihood: differences are those of the counts times log(c / (1 - c)), c the confidence.
 """
@@ -77,13 +80,16 @@ def all_known(alpha, mixed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
+def fuse_color(image, bounds, u, v, mixed, signed, weight, color):
     """
     Fuse the colours of the image into the mean colours of voxels in the band, in place.
 
     image   (rows, columns, 3 or 4) uint8; pixels whose fourth channel is 0 have no colour
+    bounds  (tau, skip_extra, max_weight, rate): the band; largest weight of a colour, and least
+            share of a measurement
     color   (4, N) float32: red, green, blue, and their weight
     """
+    tau, skip_extra, max_weight, rate = bounds
     for n in range(len(signed)):
         w, s = weight[n], signed[n]
         if w == _ZERO or s >= tau or (skip_extra and s <= -tau):
@@ -92,7 +98,7 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
         if image.shape[2] > 3 and not all_known(image[j : j + 2, i : i + 2, 3], mixed[n]):
             continue
         together = color[3, n] + w
-        gain = w / together
+        gain = max(w / together, rate)
         for channel in range(3):
             value = np.float32(image[j, i, channel])
             if mixed[n] != 0:
@@ -102,7 +108,7 @@ def fuse_color(image, tau, skip_extra, u, v, mixed, signed, weight, color):
                 right = np.float32(image[j + 1, i + 1, channel])
                 value = upper + dv * (left + du * (right - left) - upper)
             color[channel, n] += (value - color[channel, n]) * gain
-        color[3, n] = together
+        color[3, n] = min(together, max_weight)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -127,9 +133,6 @@ MAJORITY = 1
 FIRST_K = 2
 SINGLE = 3
 BINARY = 4
-
-_ONE = np.float32(1.0)
-_ZERO = np.float32(0.0)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -184,10 +187,11 @@ def keep_labels(wanted, tau, label, signed):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_labels(semantics, tau, skip_extra, label, signed, weight, votes):
+def fuse_labels(semantics, tau, skip_extra, caps, label, signed, weight, votes):
     """
     Fuse the labels of a measurement into the votes of a block; return how many found no slot.
 
+    caps                   (max_weight, rate): largest vote, and least share of a measurement
     label, signed, weight  (N,)
     votes                  (V, N) float32, see the module docstring
     """
@@ -197,35 +201,61 @@ def fuse_labels(semantics, tau, skip_extra, label, signed, weight, votes):
             continue
         if skip_extra and signed[n] <= -tau:
             continue
-        if semantics == MAJORITY:
-            if label[n] < votes.shape[0]:
-                votes[label[n], n] += _ONE
-        elif semantics == FIRST_K:
-            overflow += vote_slot(np.float32(label[n] + 1), weight[n], votes, n)
-        elif semantics == SINGLE:
-            vote_single(np.float32(label[n] + 1), weight[n], votes, n)
-        elif semantics == BINARY:
-            votes[1 if label[n] > 0 else 0, n] += _ONE
+        overflow += vote(semantics, label[n], weight[n], caps, votes, n)
     return overflow
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def vote_slot(name, weight, votes, n):
-    """Add weight to the slot of a label or to the first empty one; return 1 if all are taken."""
+def vote(semantics, label, weight, caps, votes, n):
+    """
+    Add a label to the votes of a voxel; return 1 if it found no slot.
+
+    label, weight  of the measurement
+    caps           (max_weight, rate), see fuse_labels
+    votes          (V, N) float32; n is the number of the voxel
+    """
+    max_weight, rate = caps
+    if semantics in (MAJORITY, BINARY):
+        place = label if semantics == MAJORITY else (1 if label > 0 else 0)
+        if place < votes.shape[0]:
+            most = max(min(max_weight, _ONE / rate if rate > _ZERO else max_weight), _ONE)
+            add_vote(_ONE, most, 0, 1, place, votes, n)
+        return 0
+    most = min(max_weight, weight / rate if rate > _ZERO else max_weight)
+    name = np.float32(label + 1)
+    if semantics == SINGLE:
+        vote_single(name, weight, most, votes, n)
+        return 0
     for slot in range(votes.shape[0] // 2):
         if votes[2 * slot, n] == name or votes[2 * slot, n] == _ZERO:
             votes[2 * slot, n] = name
-            votes[2 * slot + 1, n] += weight
+            add_vote(weight, most, 1, 2, slot, votes, n)
             return 0
     return 1
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def vote_single(name, weight, votes, n):
+def add_vote(weight, most, first, step, place, votes, n):
+    """
+    Add weight to one vote of a voxel; beyond the largest one, scale the others down instead.
+
+    first, step  rows first, first + step, ... of votes are the votes; place counts among them
+    """
+    together = votes[first + step * place, n] + weight
+    if together > most:
+        share = most / together
+        for row in range(first, votes.shape[0], step):
+            votes[row, n] *= share
+        together = most
+    votes[first + step * place, n] = together
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def vote_single(name, weight, most, votes, n):
     """Add weight to the stored label, or reduce its lead; a larger weight replaces it."""
     if votes[0, n] == name:
-        votes[1, n] += weight
+        votes[1, n] = min(votes[1, n] + weight, most)
     elif weight >= votes[1, n]:
         votes[0, n], votes[1, n] = name, weight - votes[1, n]
     else:
-        votes[1, n] -= weight
+        votes[1, n] = min(votes[1, n], most) - weight

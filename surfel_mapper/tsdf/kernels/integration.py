@@ -11,6 +11,10 @@ cache.
 
 The field of a block is two rows of float32: the distance, positive in front of a surface and
 negative behind it, and the weight, 0 for voxels never observed.
+
+A measurement that contradicts a voxel (it differs by half a voxel or more: a wall is gone, or an
+object has come) counts at least the share ``rate``, however heavy the voxel is; colours and
+labels always count that share. 0 never forgets.
 """
 
 from numba import njit
@@ -28,10 +32,12 @@ from surfel_mapper.tsdf.kernels.channels import (
     vote_labels,
 )
 from surfel_mapper.tsdf.kernels.lookup import (
+    CONTRADICTS,
     drop_far,
     DROPOFF,
     EXTRA,
     gather,
+    LEAST,
     locate,
     MAX_OFFSET,
     MAX_RANGE,
@@ -46,17 +52,33 @@ from surfel_mapper.tsdf.kernels.lookup import (
 
 _ZERO = np.float32(0.0)
 _ONE = np.float32(1.0)
+_MICROMETRES = np.float32(1e6)
+
+# Columns of the figures that the fusion of a block returns.
+OBSERVED = 0
+"""Voxels fused."""
+MOVED = 1
+"""Largest change of a distance, micrometres, or JUMP."""
+SOLID = 2
+"""Observed voxels whose distance is below the truncation; set if any was fused."""
+INSIDE = 3
+"""Observed voxels behind a surface; set if any was fused."""
+NUM_FOUND = 4
+
+JUMP = np.int32(2**31 - 1)
+"""Change of a block whose triangles differ in number."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def integrate_blocks(
-    rows, corners, offsets, field, sensor, images, settings, modes, channels, observed
+    rows, corners, rates, offsets, field, sensor, images, settings, modes, channels, found
 ):
     """
     Fuse a range image into blocks; return the number of labels without a slot.
 
     rows      (K,) int64, row of each block
     corners   (K, 3) float32 m, centre of the first voxel of each block, in the sensor's frame
+    rates     (K,) float32, least share of contradicting measurements, in [0, 1)
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations), see kernels/projection.py
@@ -67,21 +89,21 @@ def integrate_blocks(
     channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
               blocks, no rows for channels not kept; kind of semantics; labels of the extra band,
               empty for all; whether the extra band has distances only; the stamp, ns
-    observed  (K,) int64, out: number of voxels fused in each block
+    found     (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
-    scratch = np.empty((13, num_voxels), np.float32)
+    scratch = np.empty((14, num_voxels), np.float32)
     x, y, z, distance = scratch[0], scratch[1], scratch[2], scratch[3]
     u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
-    pixels, value = scratch[8:12], scratch[12]
+    pixels, value, fused = scratch[8:12], scratch[12], scratch[13]
     place = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
     kind, parameters, elevations = sensor
     image, cosine, color_image, label_image, mask = images
     color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
-    tau, overflow = settings[TAU], 0
+    tau, most, overflow = settings[TAU], settings[MAX_WEIGHT], 0
     for b in range(len(rows)):
-        row = rows[b]
+        row, rate = rows[b], rates[b]
         shift(offsets[0], corners[b, 0], x)
         shift(offsets[1], corners[b, 1], y)
         shift(offsets[2], corners[b, 2], z)
@@ -103,18 +125,27 @@ def integrate_blocks(
             vote_labels(label_image, tau, u, v, mixed, signed, label)
             if len(extra_labels) > 0:
                 count -= keep_labels(extra_labels, tau, label, signed)
-        observed[b] = count
+        found[b, OBSERVED] = count
         if count == 0:
+            found[b, MOVED] = 0
             continue
         weigh(distance if kind > 0 else z, signed, settings, modes[1], weight)
         if label_image.shape[0] > 0 and semantics != NONE:
-            overflow += fuse_labels(semantics, tau, skip_extra, label, signed, weight, votes[row])
+            caps = most, rate
+            overflow += fuse_labels(
+                semantics, tau, skip_extra, caps, label, signed, weight, votes[row]
+            )
         if color.shape[0] > 0 and color_image.shape[0] > 0:
             flag_mixed(value, mixed)
-            fuse_color(color_image, tau, skip_extra, u, v, mixed, signed, weight, color[row])
+            bounds = tau, skip_extra, most, rate
+            fuse_color(color_image, bounds, u, v, mixed, signed, weight, color[row])
         if stamps.shape[0] > 0:
             fuse_stamps(stamp, weight, field[row, 1], stamps[row])
-        fuse(signed, weight, settings[MAX_WEIGHT], field[row, 0], field[row, 1])
+        mean, total = field[row, 0], field[row, 1]
+        fuse(signed, weight, settings[CONTRADICTS], rate, mean, total, fused)
+        found[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
+        replace(fused, weight, most, mean, total)
+        found[b, SOLID], found[b, INSIDE] = count_solid(mean, total, tau)
     return overflow
 
 
@@ -183,17 +214,56 @@ def weigh(depth, signed, settings, power, weight):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse(signed, weight, max_weight, mean, total):
+def fuse(signed, weight, contradicts, rate, mean, total, fused):
     """
-    Fuse weighted measurements into the mean distance and the total weight, in place.
+    Find the mean distances after weighted measurements.
 
     signed, weight, mean, total  (N,) float32
+    contradicts, rate            least share of measurements that differ by so much, m, or more
+    fused                        (N,) float32, out
     """
     for n in range(len(mean)):
         # In this form a first measurement, or one equal to the mean, is exact.
         gain = weight[n] / (total[n] + weight[n])
-        value = mean[n] + (signed[n] - mean[n]) * gain
-        mean[n] = value if weight[n] > _ZERO else mean[n]
+        step = signed[n] - mean[n]
+        gain = rate if (abs(step) >= contradicts) & (gain < rate) else gain
+        value = mean[n] + step * gain
+        fused[n] = value if weight[n] > _ZERO else mean[n]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def largest_step(mean, fused, total, weight, least):
+    """
+    Return the largest change of a distance, micrometres.
+
+    JUMP if a sign changes, or a voxel reaches the least weight of the mesh: the triangles differ.
+    """
+    largest = np.int32(0)
+    for n in range(len(mean)):
+        step = np.int32(abs(fused[n] - mean[n]) * _MICROMETRES)
+        flips = (mean[n] < _ZERO) != (fused[n] < _ZERO)
+        enters = (total[n] < least) & (total[n] + weight[n] >= least)
+        step = JUMP if flips | enters else step
+        largest = max(largest, step)
+    return np.int64(largest)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def replace(fused, weight, max_weight, mean, total):
+    """Write the fused distances and add the weights, in place."""
+    for n in range(len(mean)):
+        mean[n] = fused[n]
     for n in range(len(mean)):
         together = total[n] + weight[n]
         total[n] = together if together < max_weight else max_weight
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def count_solid(mean, total, tau):
+    """Return the number of observed voxels that are not free, and of those behind a surface."""
+    solid, inside = np.int32(0), np.int32(0)
+    for n in range(len(mean)):
+        solid += np.int32((total[n] > _ZERO) & (mean[n] < tau))
+    for n in range(len(mean)):
+        inside += np.int32((total[n] > _ZERO) & (mean[n] < _ZERO))
+    return np.int64(solid), np.int64(inside)

@@ -30,7 +30,11 @@ DROPOFF = 10
 """Distance behind the surface at which weights begin to fall, m; TAU or more: never."""
 MIN_WEIGHT = 11
 MAX_WEIGHT = 12
-NUM_SETTINGS = 13
+LEAST = 13
+"""Least weight of a voxel in the mesh; positive."""
+CONTRADICTS = 14
+"""Difference from which a measurement contradicts a voxel, m."""
+NUM_SETTINGS = 15
 
 NEAREST = 0
 BILINEAR = 1

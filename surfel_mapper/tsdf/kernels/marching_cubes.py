@@ -92,113 +92,150 @@ FLAT = 1e-6
 """For distances that differ by at most this, the vertex is the midpoint of the edge."""
 
 
+INSIDE, KNOWN = 1, 2
+"""Bits of a voxel: behind a surface; of sufficient weight."""
+
+
 @njit(cache=True, nogil=True)
-def pad(neighbours, side, values, missing, padded):
+def pad(neighbours, side, values, padded):
     """
     Copy a channel of a block, with the first layer of the blocks above.
 
-    neighbours  (8,) int64, rows of the block and of those above; -1 if missing
-    values      (R, N) float32, the channel; N = side^3
-    missing     value for missing blocks
-    padded      (side + 1, side + 1, side + 1) float32, out, z first
+    neighbours  (8,) int64, rows of the block and of those above; -1 if missing: 0 is copied
+    values      (R, N), the channel; N = side^3
+    padded      (side + 1, side + 1, side + 1), out, z first
     """
     for k in range(side + 1):
         for j in range(side + 1):
-            for i in range(side + 1):
-                above = i // side + 2 * (j // side) + 4 * (k // side)
-                row = neighbours[above]
-                inner = i % side + side * (j % side + side * (k % side))
-                padded[k, j, i] = values[row, inner] if row >= 0 else missing
+            above = (2 if j == side else 0) + (4 if k == side else 0)
+            first = side * ((j if j < side else 0) + side * (k if k < side else 0))
+            row, beside = neighbours[above], neighbours[above + 1]
+            for i in range(side):
+                padded[k, j, i] = values[row, first + i] if row >= 0 else 0
+            padded[k, j, side] = values[beside, first] if beside >= 0 else 0
 
 
 @njit(cache=True, nogil=True)
-def cube_case(distance, weight, i, j, k, limits):
+def describe(field, min_weight, bits):
     """
-    Return the case of a cube; -1 if the weight of a corner is too small or the cube is torn.
+    Find the bits of every voxel.
 
-    limits  (smallest weight of a corner, largest step along an edge across the surface, m)
+    field  (R, 2, N) float32, distance and weight
+    bits   (R, N) uint8, out
     """
-    min_weight, max_step_m = limits
-    case = 0
-    for corner in range(8):
-        x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-        if weight[z, y, x] <= 0.0 or weight[z, y, x] < min_weight:
-            return -1
-        if distance[z, y, x] < 0.0:
-            case |= 1 << corner
-    if 0 < case < 255 and max_step_m < np.inf:
-        for corner in range(8):
-            x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-            for axis in range(3):
-                other = corner | 1 << axis
-                if other == corner or (case >> corner & 1) == (case >> other & 1):
-                    continue
-                end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
-                if abs(end - distance[z, y, x]) > max_step_m:
-                    return -1
-    return case
+    least = np.float32(max(min_weight, 1e-30))
+    for row in range(len(field)):
+        distance, weight = field[row, 0], field[row, 1]
+        for n in range(distance.shape[0]):
+            known = np.uint8(KNOWN) if weight[n] >= least else np.uint8(0)
+            bits[row, n] = known | (np.uint8(INSIDE) if distance[n] < 0 else np.uint8(0))
 
 
 @njit(cache=True, nogil=True)
-def count_triangles(neighbours, side, field, limits, counts):
+def find_cases(neighbours, side, field, bits, max_step_m, cases, counts):
     """
-    Count the triangles of every block.
+    Find the case of every cube; 0 if a corner is not known or the cube is torn.
 
     neighbours  (K, 8) int64
     field       (R, 2, N) float32, distance and weight
-    limits      of cubes, see cube_case
-    counts      (K,) int64, out
+    bits        (R, N) uint8, see describe
+    max_step_m  largest step along an edge across the surface, m
+    cases       (K, N) uint8, out
+    counts      (K,) int64, out: number of triangles
     """
+    whole = np.empty((side + 1, side + 1, side + 1), np.uint8)
     distance = np.empty((side + 1, side + 1, side + 1), np.float32)
-    weight = np.empty((side + 1, side + 1, side + 1), np.float32)
     for block in range(len(neighbours)):
-        pad(neighbours[block], side, field[:, 0], 0.0, distance)
-        pad(neighbours[block], side, field[:, 1], 0.0, weight)
+        pad(neighbours[block], side, bits, whole)
         counts[block] = 0
+        has_distance = max_step_m == np.inf
         for k in range(side):
             for j in range(side):
-                for i in range(side):
-                    case = cube_case(distance, weight, i, j, k, limits)
+                known = inside = np.uint8(0)
+                for i in range(side + 1):
+                    a, b = whole[k, j, i], whole[k, j + 1, i]
+                    c, d = whole[k + 1, j, i], whole[k + 1, j + 1, i]
+                    before, behind = known, inside
+                    known = a & b & c & d & KNOWN
+                    inside = (a & 1) | (b & 1) << 2 | (c & 1) << 4 | (d & 1) << 6
+                    if i == 0:
+                        continue
+                    case = behind | inside << 1
+                    if known & before == 0 or case == 255:
+                        case = np.uint8(0)
                     if case > 0:
-                        counts[block] += NUM_TRIANGLES[case]
+                        if not has_distance:
+                            pad(neighbours[block], side, field[:, 0], distance)
+                            has_distance = True
+                        if max_step_m < np.inf and is_torn(
+                            distance, i - 1, j, k, case, max_step_m
+                        ):
+                            case = np.uint8(0)
+                    cases[block, i - 1 + side * (j + side * k)] = case
+                    counts[block] += NUM_TRIANGLES[case]
 
 
 @njit(cache=True, nogil=True)
-def march(neighbours, index, side, field, limits, starts, edges, places):
-    """
-    Write the triangles of every block; a corner is an edge and a position along it.
+def is_torn(distance, i, j, k, case, max_step_m):
+    """Return whether a step along an edge of a cube across the surface is too large."""
+    for corner in range(8):
+        for axis in range(3):
+            other = corner | 1 << axis
+            if other == corner or (case >> corner & 1) == (case >> other & 1):
+                continue
+            x, y, z = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
+            end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
+            if abs(end - distance[z, y, x]) > max_step_m:
+                return True
+    return False
 
-    neighbours  (K, 8) int64
-    index       (K, 3) int64, of the blocks
-    starts      (K,) int64, number of the first triangle of each block
-    edges       (T, 3, 4) int64, out: voxel index at the start of the edge (3), and its axis
-    places      (T, 3) float64, out: position along the edge, in [0, 1]
+
+@njit(cache=True, nogil=True)
+def march(neighbours, index, side, field, cases, starts, triangles, edges, places, num_vertices):
+    """
+    Write the triangles of every block, and their vertices, each once a block.
+
+    neighbours    (K, 8) int64
+    index         (K, 3) int64, of the blocks
+    field         (R, 2, N) float32, distance and weight
+    cases         (K, N) uint8, see find_cases
+    starts        (K + 1,) int64, number of the first triangle of each block
+    triangles     (T, 3) int32, out: vertices, counted from the first of the block
+    edges         (V, 4) int32, out: voxel index at the start of the edge (3), and its axis
+    places        (V,) float64, out: position along the edge, in [0, 1]
+    num_vertices  (K,) int64, out: vertices of each block; those of all blocks lie one by one
     """
     distance = np.empty((side + 1, side + 1, side + 1), np.float32)
-    weight = np.empty((side + 1, side + 1, side + 1), np.float32)
+    numbers = np.empty((side + 1, side + 1, side + 1, 3), np.int32)
+    vertex = 0
     for block in range(len(neighbours)):
-        pad(neighbours[block], side, field[:, 0], 0.0, distance)
-        pad(neighbours[block], side, field[:, 1], 0.0, weight)
-        out = starts[block]
-        for k in range(side):
-            for j in range(side):
-                for i in range(side):
-                    case = cube_case(distance, weight, i, j, k, limits)
-                    if case <= 0:
-                        continue
-                    for triangle in range(NUM_TRIANGLES[case]):
-                        for corner in range(3):
-                            edge = np.int64(TRIANGLES[case, triangle, corner])
-                            begin, axis = edge // 3, edge % 3
-                            x, y, z = i + (begin & 1), j + (begin >> 1 & 1), k + (begin >> 2)
-                            edges[out, corner, 0] = index[block, 0] * side + x
-                            edges[out, corner, 1] = index[block, 1] * side + y
-                            edges[out, corner, 2] = index[block, 2] * side + z
-                            edges[out, corner, 3] = axis
-                            d0 = np.float64(distance[z, y, x])
-                            d1 = np.float64(
-                                distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
-                            )
-                            flat = abs(d0 - d1) <= FLAT
-                            places[out, corner] = 0.5 if flat else d0 / (d0 - d1)
-                        out += 1
+        first, out = vertex, starts[block]
+        num_vertices[block] = 0
+        if starts[block + 1] == out:
+            continue
+        pad(neighbours[block], side, field[:, 0], distance)
+        numbers[:] = -1
+        for cube in range(cases.shape[1]):
+            case = cases[block, cube]
+            if case == 0:
+                continue
+            i, j, k = cube % side, cube // side % side, cube // (side * side)
+            for triangle in range(NUM_TRIANGLES[case]):
+                for corner in range(3):
+                    edge = np.int64(TRIANGLES[case, triangle, corner])
+                    begin, axis = edge // 3, edge % 3
+                    x, y, z = i + (begin & 1), j + (begin >> 1 & 1), k + (begin >> 2)
+                    if numbers[z, y, x, axis] < 0:
+                        numbers[z, y, x, axis] = vertex - first
+                        edges[vertex, 0] = index[block, 0] * side + x
+                        edges[vertex, 1] = index[block, 1] * side + y
+                        edges[vertex, 2] = index[block, 2] * side + z
+                        edges[vertex, 3] = axis
+                        d0 = np.float64(distance[z, y, x])
+                        end = distance[z + (axis == 2), y + (axis == 1), x + (axis == 0)]
+                        d1 = np.float64(end)
+                        places[vertex] = 0.5 if abs(d0 - d1) <= FLAT else d0 / (d0 - d1)
+                        vertex += 1
+                    triangles[out, corner] = numbers[z, y, x, axis]
+                out += 1
+        num_vertices[block] = vertex - first

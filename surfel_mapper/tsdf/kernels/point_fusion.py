@@ -23,11 +23,15 @@ import numpy as np
 
 from surfel_mapper.kernels.hashing import DEPTH
 from surfel_mapper.tsdf.kernels.block_marks import walk
-from surfel_mapper.tsdf.kernels.channels import BINARY, FIRST_K, MAJORITY, vote_single, vote_slot
+from surfel_mapper.tsdf.kernels.channels import vote
+from surfel_mapper.tsdf.kernels.integration import INSIDE, JUMP, MOVED, OBSERVED, SOLID
 from surfel_mapper.tsdf.kernels.lookup import (
+    CONTRADICTS,
     DROPOFF,
     EXTRA,
+    LEAST,
     MAX_RANGE,
+    MAX_WEIGHT,
     MIN_RANGE,
     MIN_WEIGHT,
     TAU,
@@ -75,6 +79,38 @@ def mark_corners(points, origin, low, side, bits, limits, marks):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def begin_walk(origin, along, start, end, places, steps, reached, spacing):
+    """
+    Prepare the traversal of voxels from origin + start along to origin + end along.
+
+    origin, along  (3,) float64
+    places         (3,) int64, out: the first voxel
+    steps          (2, 3) int64, out: direction and number of steps along each axis
+    reached        (3,) float64, out: range at which the next voxel along each axis begins
+    spacing        (3,) float64, out: range from voxel to voxel
+
+    Returns the number of voxels.
+    """
+    number = 1
+    for axis in range(3):
+        found = walk(origin[axis], along[axis], start, end, 1)
+        places[axis], reached[axis], spacing[axis], steps[0, axis], steps[1, axis] = found
+        number += steps[1, axis]
+    return number
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def next_voxel(places, steps, reached, spacing):
+    """Go to the next voxel of a traversal, see begin_walk."""
+    axis = 0 if reached[0] <= reached[1] and reached[0] <= reached[2] else 2
+    if axis == 2 and reached[1] <= reached[2]:
+        axis = 1
+    places[axis] += steps[0, axis]
+    steps[1, axis] -= 1
+    reached[axis] = reached[axis] + spacing[axis] if steps[1, axis] > 0 else np.inf
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def weight_at(depth_m, signed_m, settings, power):
     """Return the weight of a measurement at a depth and signed distance, m."""
     weight = np.float64(settings[WEIGHT])
@@ -110,6 +146,8 @@ def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, 
     per_metre = 1.0 / (settings[TAU] - start_m) if start_m < settings[TAU] else 0.0
     start_m = start_m if start_m < settings[TAU] else np.inf
     mask = (1 << bits) - 1
+    places, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
+    along, reached, spacing = np.empty(3), np.empty(3), np.empty(3)
     used = 0
     for p in range(len(points)):
         x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
@@ -119,10 +157,9 @@ def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, 
         used += 1
         x, y, z = x / measured, y / measured, z / measured
         start, end = max(measured - tau, near), measured + behind
-        i, tx, ix, sx, nx = walk(origin[0], x, start, end, 1)
-        j, ty, iy, sy, ny = walk(origin[1], y, start, end, 1)
-        k, tz, iz, sz, nz = walk(origin[2], z, start, end, 1)
-        for _ in range(nx + ny + nz + 1):
+        along[0], along[1], along[2] = x, y, z
+        for _ in range(begin_walk(origin, along, start, end, places, steps, reached, spacing)):
+            i, j, k = places[0], places[1], places[2]
             u, v, w = i + 0.5 - origin[0], j + 0.5 - origin[1], k + 0.5 - origin[2]
             signed = measured - (x * u + y * v + z * w)
             if abs(signed) > CORE:  # nearer voxels follow below
@@ -133,19 +170,8 @@ def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, 
                     sums[slot, voxel, 0] += weight * signed_m
                     sums[slot, voxel, 1] += weight
                     sums[slot, voxel, 2] += 1.0
-            if tx <= ty and tx <= tz:
-                i += sx
-                nx -= 1
-                tx = tx + ix if nx > 0 else np.inf
-            elif ty <= tz:
-                j += sy
-                ny -= 1
-                ty = ty + iy if ny > 0 else np.inf
-            else:
-                k += sz
-                nz -= 1
-                tz = tz + iz if nz > 0 else np.inf
-        last_i, last_j, last_k = i - 9, j, k
+            next_voxel(places, steps, reached, spacing)
+        last_i, last_j, last_k = places[0] - 9, 0, 0
         full = weight_at(measured * voxel_m, 0.0, settings, power)
         for sample in range(-2, 3):
             t = measured + sample * STEP
@@ -192,6 +218,9 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
     recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
     tau = settings[TAU] / voxel_m
     near, far = settings[MIN_RANGE] / voxel_m, settings[MAX_RANGE] / voxel_m
+    places, steps = np.empty(3, np.int64), np.empty((2, 3), np.int64)
+    along, ends = np.empty(3), np.empty(3)
+    reached, spacing = np.empty(3), np.empty(3)
     for p in range(len(points)):
         x, y, z = points[p, 0] - origin[0], points[p, 1] - origin[1], points[p, 2] - origin[2]
         measured = np.sqrt(x * x + y * y + z * z)
@@ -201,12 +230,12 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
         end = min(measured - tau, far)
         if end <= near:
             continue
-        u, v, w = origin[0] + end * x, origin[1] + end * y, origin[2] + end * z
-        i, tx, ix, sx, nx = walk(u, -x, 0.0, end - near, 1)
-        j, ty, iy, sy, ny = walk(v, -y, 0.0, end - near, 1)
-        k, tz, iz, sz, nz = walk(w, -z, 0.0, end - near, 1)
+        along[0], along[1], along[2] = -x, -y, -z
+        for axis in range(3):
+            ends[axis] = origin[axis] - end * along[axis]
         seen = 0
-        for _ in range(nx + ny + nz + 1):
+        for _ in range(begin_walk(ends, along, 0.0, end - near, places, steps, reached, spacing)):
+            i, j, k = places[0], places[1], places[2]
             row, voxel = find_voxel(i, j, k, bits, recent, head, table, depth)
             if row >= 0 and slots[row] >= 0 and sums[slots[row], voxel, 2] <= 0.0:
                 seen = seen + 1 if sums[slots[row], voxel, 2] < 0.0 else 0
@@ -218,96 +247,77 @@ def sum_free(points, origin, voxel_m, bits, settings, power, lookup, slots, sums
                 sums[slots[row], voxel, 0] += weight * settings[TAU]
                 sums[slots[row], voxel, 1] += weight
                 sums[slots[row], voxel, 2] -= 1.0
-            if tx <= ty and tx <= tz:
-                i += sx
-                nx -= 1
-                tx = tx + ix if nx > 0 else np.inf
-            elif ty <= tz:
-                j += sy
-                ny -= 1
-                ty = ty + iy if ny > 0 else np.inf
-            else:
-                k += sz
-                nz -= 1
-                tz = tz + iz if nz > 0 else np.inf
+            next_voxel(places, steps, reached, spacing)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_sums(rows, sums, stamp, max_weight, field, stamps, observed):
+def fuse_sums(rows, sums, rates, stamp, settings, field, stamps, found):
     """
     Fuse the summed measurements of a scan into blocks: each voxel once, with its mean weight.
 
     rows      (K,) int64
     sums      (K, N, 3) float32
+    rates     (K,) float32, least share of contradicting measurements
     stamp     int64 ns
+    settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
     field     (R, 2, N) float32
     stamps    (R, 2, N) int64, or no rows
-    observed  (K,) int64, out: number of voxels fused in each block
+    found     (K, NUM_FOUND) int64, out: as of integrate_blocks
     """
+    tau, least = settings[TAU], settings[LEAST]
     for slot in range(len(rows)):
         row = rows[slot]
-        observed[slot] = 0
+        found[slot] = 0
         for voxel in range(sums.shape[1]):
-            if sums[slot, voxel, 2] == 0.0:
-                continue
-            value = sums[slot, voxel, 0] / sums[slot, voxel, 1]
-            weight = sums[slot, voxel, 1] / abs(sums[slot, voxel, 2])
-            total = field[row, 1, voxel]
-            if stamps.shape[0] > 0:
-                if total == 0.0:
-                    stamps[row, 0, voxel] = stamp
-                stamps[row, 1, voxel] = stamp
-            mean = field[row, 0, voxel]
-            field[row, 0, voxel] = mean + (value - mean) * (weight / (total + weight))
-            field[row, 1, voxel] = min(total + weight, max_weight)
-            observed[slot] += 1
+            mean, total = field[row, 0, voxel], field[row, 1, voxel]
+            if sums[slot, voxel, 2] != 0.0:
+                value = sums[slot, voxel, 0] / sums[slot, voxel, 1]
+                weight = sums[slot, voxel, 1] / abs(sums[slot, voxel, 2])
+                if stamps.shape[0] > 0:
+                    if total == 0.0:
+                        stamps[row, 0, voxel] = stamp
+                    stamps[row, 1, voxel] = stamp
+                gain = weight / (total + weight)
+                if abs(value - mean) >= settings[CONTRADICTS]:
+                    gain = max(gain, rates[slot])
+                fused = mean + (value - mean) * gain
+                flips = (fused < 0.0) != (mean < 0.0) or total < least <= total + weight
+                moved = JUMP if flips else np.int64(abs(fused - mean) * 1e6)
+                found[slot, MOVED] = max(found[slot, MOVED], moved)
+                found[slot, OBSERVED] += 1
+                mean, total = fused, min(total + weight, settings[MAX_WEIGHT])
+                field[row, 0, voxel], field[row, 1, voxel] = mean, total
+            if total > 0.0:
+                found[slot, SOLID] += mean < tau
+                found[slot, INSIDE] += mean < 0.0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def fuse_point_colors(points, colors, bits, weights, max_weight, lookup, slots, color):
+def fuse_point_channels(points, weights, rates, max_weight, bits, lookup, slots, images, channels):
     """
-    Fuse the colour of each point into the eight voxels about it.
+    Fuse colour and label of each point into the eight voxels about it.
 
-    points   (N, 3) float64, map frame; non-finite points are skipped
-    colors   (N, 3 or 4) uint8; points whose fourth channel is 0 have no colour
-    weights  (N,) float32, 0 for points out of range
-    color    (R, 4, N) float32: red, green, blue and their weight
-    """
-    head, table, state = lookup
-    recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
-    for p in range(len(points)):
-        w = weights[p]
-        if w <= 0.0 or (colors.shape[1] > 3 and colors[p, 3] == 0):
-            continue
-        i = np.int64(np.floor(points[p, 0] - 0.5))
-        j = np.int64(np.floor(points[p, 1] - 0.5))
-        k = np.int64(np.floor(points[p, 2] - 0.5))
-        for corner in range(8):
-            a, b, c = i + (corner & 1), j + (corner >> 1 & 1), k + (corner >> 2)
-            row, voxel = find_voxel(a, b, c, bits, recent, head, table, depth)
-            if row < 0 or slots[row] < 0:
-                continue
-            together = color[row, 3, voxel] + w
-            for channel in range(3):
-                change = np.float32(colors[p, channel]) - color[row, channel, voxel]
-                color[row, channel, voxel] += change * (w / together)
-            color[row, 3, voxel] = min(together, max_weight)
+    points      (N, 3) float64, map frame
+    weights     (N,) float32, 0 for points out of range
+    rates       (K,) float32, least share of a measurement in a block
+    max_weight  float32, largest weight of a colour, or of a vote
+    images      (colors, labels): (N, 3 or 4) uint8, those whose fourth value is 0 have no colour;
+                (N,) int32, -1 for unknown; no rows if not given
+    channels    (color, votes, semantics), see kernels/channels.py; no rows if not kept
 
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def fuse_point_labels(points, labels, semantics, bits, weights, lookup, slots, votes):
-    """
-    Fuse the label of each point into the eight voxels about it; return how many found no slot.
-
-    labels   (N,) int32, -1 for unknown
-    votes    (R, V, N) float32, see kernels/channels.py
+    Returns how many labels found no slot.
     """
     head, table, state = lookup
+    colors, labels = images
+    color, votes, semantics = channels
     recent, depth = np.array([1 << 40, 0, 0, -1]), state[DEPTH]
     overflow = 0
     for p in range(len(points)):
-        w, label = weights[p], labels[p]
-        if w <= 0.0 or label < 0:
+        w = weights[p]
+        has_color = color.shape[0] > 0 and colors.shape[0] > 0
+        has_color = has_color and (colors.shape[1] == 3 or colors[p, 3] != 0)
+        has_label = votes.shape[0] > 0 and labels.shape[0] > 0 and labels[p] >= 0
+        if w <= 0.0 or not (has_color or has_label):
             continue
         i = np.int64(np.floor(points[p, 0] - 0.5))
         j = np.int64(np.floor(points[p, 1] - 0.5))
@@ -317,13 +327,15 @@ def fuse_point_labels(points, labels, semantics, bits, weights, lookup, slots, v
             row, voxel = find_voxel(a, b, c, bits, recent, head, table, depth)
             if row < 0 or slots[row] < 0:
                 continue
-            if semantics == MAJORITY:
-                if label < votes.shape[1]:
-                    votes[row, label, voxel] += np.float32(1.0)
-            elif semantics == FIRST_K:
-                overflow += vote_slot(np.float32(label + 1), w, votes[row], voxel)
-            elif semantics == BINARY:
-                votes[row, 1 if label > 0 else 0, voxel] += np.float32(1.0)
-            else:
-                vote_single(np.float32(label + 1), w, votes[row], voxel)
+            rate = rates[slots[row]]
+            if has_color:
+                together = color[row, 3, voxel] + w
+                gain = max(w / together, rate)
+                for channel in range(3):
+                    change = np.float32(colors[p, channel]) - color[row, channel, voxel]
+                    color[row, channel, voxel] += change * gain
+                color[row, 3, voxel] = min(together, max_weight)
+            if has_label:
+                caps = max_weight, rate
+                overflow += vote(semantics, labels[p], w, caps, votes[row], voxel)
     return overflow

@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The mesh of a distance field as markers that are updated tile by tile.
+
+A tile is a cube of TILE blocks a side and one marker, so viewers replace only what has changed.
+The triangles are made while the messages are iterated, in any thread; only the copy of changed
+blocks is taken when the messages are asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.layers.layer import Moment
+from surfel_mapper.messages.markers import DELETE_ALL, Marker, marker_array, TRIANGLE_LIST
+from surfel_mapper.messages.surfel_markers import mesh_marker
+from surfel_mapper.tsdf.blocks import block_index, BlockMap
+from surfel_mapper.tsdf.mesh import Changes, Mesher
+
+TILE = 8
+"""Blocks along the edge of a tile: 12.8 m with voxels of 0.2 m, some 200 tiles about a lidar."""
+
+MAX_BYTES = 4 << 20
+"""A message is sent when its markers exceed this; larger ones are lost by readers more easily."""
+
+CORNER_BYTES = 40
+"""Bytes of a corner of a triangle: three float64, four float32."""
+
+Tile = tuple[int, int, int]
+
+
+class LiveMesh:
+    """
+    Messages that keep a viewer's mesh up to date.
+
+    The results of ``changed`` and ``complete`` must be iterated in the order in which they were
+    made, by one thread at a time.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The field.
+
+    """
+
+    def __init__(self, blocks: BlockMap) -> None:
+        self._mesher = Mesher(blocks, visible_only=True)
+        self._tiles: dict[Tile, dict[int, None]] = {}
+        self._numbers: dict[Tile, int] = {}
+        self._is_known = False
+
+    def changed(self, now: Moment) -> Iterable[bytes]:
+        """Return MarkerArrays of the tiles that have changed; called by the owner of the map."""
+        return self._messages(self._mesher.changes(), now, is_complete=False)
+
+    def complete(self, now: Moment) -> Iterable[bytes]:
+        """Return MarkerArrays of all tiles, which replace any before."""
+        return self._messages(self._mesher.changes(), now, is_complete=True)
+
+    def _messages(self, changes: Changes, now: Moment, *, is_complete: bool) -> Iterator[bytes]:
+        tiles = self._apply(changes)
+        markers, size = [], 0
+        if is_complete or not self._is_known:  # a viewer may show tiles of an earlier map
+            self._is_known = True
+            tiles = [tile for tile, keys in self._tiles.items() if keys]
+            markers.append(clearing(now))
+        for tile in tiles:
+            mesh = self._mesher.welded(self._tiles[tile])
+            number = self._numbers.setdefault(tile, len(self._numbers))
+            stamp_ns, frame_id = now.stamp_ns, now.frame_id
+            markers.append(mesh_marker(mesh, number=number, stamp_ns=stamp_ns, frame_id=frame_id))
+            size += 3 * len(mesh) * CORNER_BYTES
+            if size > MAX_BYTES:
+                yield marker_array(markers)
+                markers, size = [], 0
+        if markers:
+            yield marker_array(markers)
+
+    def _apply(self, changes: Changes) -> list[Tile]:
+        """Update the triangles; return the tiles that have changed."""
+        keys = sorted(self._mesher.apply(changes))
+        there, touched = self._mesher.keys(), dict[Tile, None]()
+        for key, tile in zip(keys, tiles_of(keys), strict=True):
+            touched[tile] = None
+            content = self._tiles.setdefault(tile, {})
+            if key in there:
+                content[key] = None
+            else:
+                content.pop(key, None)
+        return list(touched)
+
+
+def tiles_of(keys: list[int]) -> list[Tile]:
+    """Return the tile of each block; the tile 0, 0, 0 is about the origin."""
+    index = block_index(np.array(keys, np.int64))
+    tiles: npt.NDArray[np.int64] = (index + TILE // 2) // TILE
+    return [(x, y, z) for x, y, z in tiles.tolist()]
+
+
+def clearing(now: Moment) -> Marker:
+    """Return the marker that deletes all others."""
+    return Marker(
+        ns='mesh',
+        id=0,
+        type=TRIANGLE_LIST,
+        action=DELETE_ALL,
+        frame_id=now.frame_id,
+        stamp_ns=now.stamp_ns,
+    )

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Saving and loading of a mapper: its map with the window, and the layers that keep a state.
+
+A layer's file lies beside that of the map and has the layer's name in its own: ``map.npz`` and
+``map.tsdf.npz``. It is written first, so that a map that is there has its layers; it stands alone
+because a map is often wanted without its layers, which are larger.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from surfel_mapper.files.map_state import FILE, load_map, save_map
+from surfel_mapper.layers import Layer
+from surfel_mapper.pipeline.mapper import Mapper
+
+
+def save_mapper(path: Path, mapper: Mapper, *, with_window: bool = True) -> str:
+    """
+    Write map, window and layers of a mapper; return the digest of the map.
+
+    Parameters
+    ----------
+    path : Path
+        The file of the map, with the extension npz.
+    mapper : Mapper
+        The mapper.
+    with_window : bool
+        With the scans that can leave; otherwise all surfels stay for good.
+
+    Raises
+    ------
+    FileFormatError
+        If a file cannot be written.
+
+    """
+    for file, layer in layer_files(path, mapper):
+        layer.save(file)
+    return save_map(path, mapper.map, mapper.window if with_window else ())
+
+
+def load_mapper(
+    path: str | Path, mapper: Mapper, *, with_window: bool = True, any_voxel_size: bool = False
+) -> int:
+    """
+    Replace map, window and layers by saved ones; return the number of scans in the window.
+
+    Layers whose file is missing start empty. After an error nothing has changed.
+
+    Parameters
+    ----------
+    path : str or Path
+        As of load_map.
+    mapper : Mapper
+        Takes them.
+    with_window : bool
+        With the scans that can leave.
+    any_voxel_size : bool
+        Leave it to the mapper to refuse another voxel size.
+
+    Raises
+    ------
+    FileFormatError
+        If a file cannot be read, is damaged or was written with other settings.
+    MapError
+        If the map has other columns than are configured.
+
+    """
+    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    size_m = None if any_voxel_size else mapper.config.map.voxel_size_m
+    surfel_map, scans = load_map(path, voxel_size_m=size_m)
+    scans = scans if with_window else []
+    restores = [layer.load(file) for file, layer in layer_files(path, mapper) if file.exists()]
+    mapper.restore(surfel_map, scans)
+    for restore in restores:
+        restore()
+    return len(scans)
+
+
+def layer_files(path: Path, mapper: Mapper) -> Iterator[tuple[Path, Layer]]:
+    """Yield the layers that keep a state, and the file of each beside that of the map."""
+    for name, layer in mapper.layers.items():
+        if type(layer).save is not Layer.save:
+            yield path.with_suffix(f'.{name}.npz'), layer

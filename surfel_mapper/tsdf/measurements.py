@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Input and result of an integration, whether of an image or of points: pose, labels, settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+import logging
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.errors import PoseError
+from surfel_mapper.tsdf.kernels import lookup as kernels
+
+logger = logging.getLogger(__name__)
+
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+
+EXACT, MAX_SKEW = 1e-6, 2e-3
+"""
+Largest entries of R R^T - I: of rotations taken as they are, and of those taken at all.
+
+Rotations in text files of public datasets have determinants down to 0.9995.
+"""
+
+POWERS = {'constant': 0, 'inverse_square': 1, 'ray_density': 1, 'ray_density_inv_sq': 2}
+"""Exponent p of each weight mode: weights are proportional to depth^(-2 p)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Integrated:
+    """
+    Counts of one integrated range image.
+
+    Attributes
+    ----------
+    num_blocks : int
+        Blocks selected.
+    num_updated : int
+        Blocks in which at least one voxel was observed.
+    num_skipped : int
+        Blocks that were free for long and are free in the image, so nothing would have changed.
+    num_added : int
+        Updated blocks that are new in the map.
+    num_refused : int
+        Blocks not added because of max_blocks.
+    num_voxels : int
+        Voxels observed.
+    num_labels_lost : int
+        Label observations dropped because a voxel had no free slot.
+
+    """
+
+    num_blocks: int
+    num_updated: int
+    num_skipped: int
+    num_added: int
+    num_refused: int
+    num_voxels: int
+    num_labels_lost: int
+
+
+def settings(config: TsdfConfig) -> Float32:
+    """Return the settings that any integration needs, in the order of kernels/lookup.py."""
+    found = np.zeros(kernels.NUM_SETTINGS, np.float32)
+    found[kernels.TAU] = config.truncation_m
+    found[kernels.EXTRA] = config.extra_distance_m
+    found[kernels.MIN_RANGE] = config.min_range_m
+    found[kernels.MAX_RANGE] = config.max_range_m
+    found[kernels.WEIGHT] = 1.0
+    found[kernels.DROPOFF] = config.dropoff_start_m if config.weight_dropoff else np.inf
+    found[kernels.MIN_WEIGHT] = config.min_measurement_weight
+    found[kernels.MAX_WEIGHT] = config.max_weight
+    found[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
+    found[kernels.LEAST] = max(config.mesh_min_weight, 1e-30)
+    return found
+
+
+def remapped(labels: npt.NDArray[Any], config: TsdfConfig) -> npt.NDArray[np.int32]:
+    """Return labels, of any shape, after label_map."""
+    found = np.ascontiguousarray(labels, np.int32)
+    if not config.label_map:
+        return found
+    pairs = np.array(config.label_map, np.int32).reshape(-1, 2)
+    pairs = pairs[np.argsort(pairs[:, 0])]
+    place = np.minimum(np.searchsorted(pairs[:, 0], found), len(pairs) - 1)
+    return np.where(pairs[place, 0] == found, pairs[place, 1], found)
+
+
+@cache
+def warn_of_skew() -> None:
+    """Warn, once, of a rotation that is not orthonormal."""
+    logger.warning(
+        'poses of the sensor: a rotation is not orthonormal (by up to %g, as in files of few '
+        'digits); such rotations are replaced by the nearest orthonormal one',
+        MAX_SKEW,
+    )
+
+
+def checked_pose(T_map_sensor: Float64) -> Float64:
+    """
+    Return a pose as float64, its rotation made orthonormal if it is off by up to MAX_SKEW.
+
+    Raises
+    ------
+    PoseError
+        If it is not finite or not rigid.
+
+    """
+    T = np.asarray(T_map_sensor, np.float64)
+    if T.shape != (4, 4) or not np.isfinite(T).all():
+        raise PoseError(f'pose of the sensor: {T.tolist()}, expected finite (4, 4)')
+    R = T[:3, :3]
+    skew = np.abs(R @ R.T - np.eye(3)).max()
+    if skew > MAX_SKEW or np.linalg.det(R) < 0.0:
+        raise PoseError(f'pose of the sensor: {R.tolist()} is not a rotation')
+    if skew > EXACT:
+        warn_of_skew()
+        left, _, right = np.linalg.svd(R)
+        T = T.copy()
+        T[:3, :3] = left @ right
+    if np.abs(T[3] - (0.0, 0.0, 0.0, 1.0)).max() > 1e-9:
+        raise PoseError(f'pose of the sensor: last row {T[3].tolist()}, expected 0 0 0 1')
+    return T

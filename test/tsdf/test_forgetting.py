@@ -1,0 +1,137 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Surfaces that are gone, objects that come, and the cap that colours and labels obey."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.integrator import Integrator
+from surfel_mapper.tsdf.point_integrator import PointIntegrator
+from surfel_mapper.tsdf.queries import FREE, labels_at, OCCUPIED, sample, states
+from test.tsdf.scenes import image_of, integrator, SMALL
+
+PERIOD_NS = 10**8
+WALL = image_of(SMALL, 2.0 * SMALL.ray_length)
+BEHIND = image_of(SMALL, 4.0 * SMALL.ray_length)
+PLACE = [[0.02, 0.02, 2.02]]
+DEEP = [[0.02, 0.02, z] for z in (2.02, 2.12, 2.22)]
+SIZES = dict(voxel_size_m=0.1, truncation_m=0.3, weight_mode='constant')
+
+
+def seen_through(one, first, num):
+    """Return the number of scans until the place of the wall is free, at most num."""
+    for number in range(num):
+        one.integrate(BEHIND, np.eye(4), (first + number) * PERIOD_NS)
+        if (states(one.blocks, DEEP) == FREE).all():
+            return number + 1
+    return num
+
+
+@pytest.mark.parametrize('forget_s', [2.0, 5.0])
+def test_a_wall_that_is_gone_becomes_free_in_time(forget_s):
+    one = integrator(**SIZES, forget_s=forget_s)
+    for number in range(300):
+        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+    assert states(one.blocks, PLACE)[0] == OCCUPIED
+    scans = seen_through(one, 300, 1000)
+    assert 3 <= scans <= forget_s * 1e9 / PERIOD_NS
+
+
+def test_without_forgetting_a_wall_stays_as_long_as_it_was_seen():
+    one = integrator(**SIZES, forget_s=0.0)
+    for number in range(300):
+        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+    assert seen_through(one, 300, 60) == 60
+
+
+def test_a_wall_that_is_gone_becomes_free_point_by_point():
+    blocks = BlockMap(TsdfConfig(**SIZES, forget_s=2.0))
+    one, rays = PointIntegrator(blocks), SMALL.directions.reshape(-1, 3)
+    for number in range(120):
+        far = 2.0 if number < 100 else 4.0
+        points = rays * (far / rays[:, 2:])
+        one.integrate(points, np.eye(4), number * PERIOD_NS)
+        if number == 99:
+            assert states(blocks, PLACE)[0] == OCCUPIED
+    assert sample(blocks, PLACE).distance[0] > 0.05
+
+
+def test_an_object_in_space_that_was_free_for_long_appears_in_time():
+    one = integrator(**SIZES, forget_s=2.0)
+    for number in range(300):
+        one.integrate(BEHIND, np.eye(4), number * PERIOD_NS)
+    one.integrate(WALL, np.eye(4), 300 * PERIOD_NS)
+    assert states(one.blocks, PLACE)[0] == FREE  # a single false measurement is no object
+    for number in range(301, 320):
+        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+    assert states(one.blocks, PLACE)[0] == OCCUPIED
+
+
+@pytest.mark.parametrize('semantics', ['majority', 'first_k', 'single', 'binary'])
+@pytest.mark.parametrize('by_points', [False, True])
+def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(semantics, by_points):
+    config = TsdfConfig(
+        **SIZES,
+        weight_dropoff=False,
+        max_weight=10.0,
+        forget_s=0.0,
+        color=True,
+        semantics=semantics,
+        num_labels=2,
+    )
+    one = Integrator(BlockMap(config))
+    points = WALL.sensor.directions.reshape(-1, 3)[::7]
+    points = points * (2.0 / points[:, 2:])
+    for number in range(550):
+        label, color = (0, (200, 0, 0)) if number < 500 else (1, (0, 0, 200))
+        if by_points:
+            content = np.full((len(points), 3), color, np.uint8), np.full(len(points), label)
+            PointIntegrator(one.blocks).integrate(
+                points, np.eye(4), colors=content[0], labels=content[1]
+            )
+        else:
+            image = WALL.with_images(
+                color=np.full((60, 80, 3), color, np.uint8), label=np.full((60, 80), label)
+            )
+            one.integrate(image, np.eye(4))
+    assert labels_at(one.blocks, PLACE)[0].tolist() == [1]
+    row = one.blocks.find(np.floor(np.array(PLACE) / 0.8).astype(int))[0]
+    color = one.blocks.color[row]
+    seen = color[3] > 0
+    red, blue, weight = color[0, seen], color[2, seen], color[3, seen]
+    # 200 (10 / 11)^50 red is left; less with several points of a scan at a voxel
+    left = 200.0 * (10.0 / 11.0) ** 50
+    assert red.max() < left + 0.01
+    assert by_points or red.min() > left - 0.01
+    assert blue.min() > 195.0
+    assert weight.max() == 10.0
+
+
+def test_blocks_that_are_free_for_long_are_skipped_and_nothing_is_missed(monkeypatch):
+    fields = []
+    for settled in (4, 10**9):
+        monkeypatch.setattr('surfel_mapper.tsdf.integrator.SETTLED', settled)
+        one, skipped = integrator(voxel_size_m=0.05, truncation_m=0.15, carve=True), 0
+        for number in range(30):
+            board = np.abs(np.arange(80) - 40) < 8
+            depth = np.where(board & (number >= 20), 1.0, 2.5) * np.ones((60, 1))
+            image = image_of(SMALL, depth * SMALL.ray_length)
+            done = one.integrate(image, np.eye(4), number * PERIOD_NS)
+            skipped += done.num_skipped
+        blocks = one.blocks
+        order = np.lexsort(blocks.index(blocks.rows()).T)
+        fields.append((blocks.copied(blocks.rows()[order]), skipped))
+    (found, num_skipped), (expected, none_skipped) = fields
+    assert none_skipped == 0
+    assert num_skipped > 100
+    np.testing.assert_array_equal(found.index, expected.index)
+    known = found.field[:, 1] > 0
+    np.testing.assert_array_equal(known, expected.field[:, 1] > 0)
+    free = expected.field[:, 0] == np.float32(0.15)
+    np.testing.assert_array_equal(found.field[:, 0] == np.float32(0.15), free)
+    # The board stands in space that was free for 20 scans: fewer of them counted, if skipped.
+    assert ((found.field[:, 0] < 0) & known).sum() >= ((expected.field[:, 0] < 0) & known).sum()
+    on_wall = (found.index[:, 2] >= 5) & known.any(axis=1)
+    np.testing.assert_allclose(found.field[on_wall, 0], expected.field[on_wall, 0], atol=1e-6)
