@@ -95,6 +95,8 @@ class RegistrationResult:
     rival : float
         Support of another place that fits about equally well and is about as near to the starts;
         0 if there is none, or if the first start fitted and no search was needed.
+    is_found : bool
+        The place was found by a search and differs from that of the first start.
 
     """
 
@@ -108,6 +110,7 @@ class RegistrationResult:
     degenerate: npt.NDArray[np.float64]
     radius_m: float
     rival: float = 0.0
+    is_found: bool = False
 
     @property
     def support(self) -> float:
@@ -151,6 +154,7 @@ class Registration:
         starts: Sequence[Transform],
         deviation_m: float,
         expected_support: float = 0.0,
+        is_lost: bool = False,
     ) -> RegistrationResult:
         """
         Return the pose of a scan on a map.
@@ -169,23 +173,34 @@ class Registration:
             width of the robust kernel.
         expected_support : float
             Other starts and headings are tried if less of the scan fits.
+        is_lost : bool
+            The starts are guesses: they are all tried, and of places that fit about equally well
+            each is a rival of the best, however far it is.
 
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
         found = self._descend(cells, levels, starts[0], deviation_m)
-        if not (found.converged and found.support >= expected_support and self.fits(found)):
+        is_usual = found.converged and found.support >= expected_support and self.fits(found)
+        if is_lost or not is_usual:
             width_m = levels.voxel_size_m(self.config.coarse_levels)
             others = [
                 self._descend(cells, levels, start, width_m)
                 for start in self._places(cells, levels, starts)
             ]
-            found = self._chosen([found, *others], starts)
+            first = found.T_map_sensor
+            found = self._chosen([found, *others], starts, is_lost)
+            is_found = not is_near(found.T_map_sensor, first, self._voxel_size_m)
+            found = replace(found, is_found=is_found)
         return found
 
     def _chosen(
-        self, places: Sequence[RegistrationResult], starts: Sequence[Transform]
+        self, places: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool
     ) -> RegistrationResult:
-        """Return the nearest of the places that fit about equally well, with its rival."""
+        """
+        Return the nearest of the places that fit about equally well, with its rival.
+
+        If the scan is lost, the best one.
+        """
         best = max(places, key=lambda place: (place.converged, place.support))
         if not (best.converged and best.support > 0.0):
             return best
@@ -195,8 +210,8 @@ class Registration:
             return min(math.hypot(*T[:3, 3], best.radius_m * rotation_angle(T)) for T in off)
 
         equal = [p for p in places if p.converged and p.support >= AMBIGUOUS * best.support]
-        nearest = min(equal, key=motion_m)
-        reach_m = FARTHER * motion_m(nearest)
+        nearest = best if is_lost else min(equal, key=motion_m)
+        reach_m = math.inf if is_lost else FARTHER * motion_m(nearest)
         rivals = [
             place.support
             for place in equal

@@ -6,7 +6,8 @@ Tracking: the pose of scan after scan, each predicted from the previous ones.
 The body that carries the sensor is assumed to continue its motion between the last two scans. The
 recent errors of this prediction determine the search distance and the width of the robust kernel
 of the next alignment; the recent shares of fitting cells determine whether the next result is
-accepted.
+accepted. A place that only a search found, and that fits worse than usual, is not accepted at
+once: pipeline/map_part.py waits for the next scans to agree.
 
 Source: Vizzo et al. 2023 (KISS-ICP) for the adaptive threshold.
 """
@@ -37,6 +38,13 @@ REMEMBERED = 10
 EXPECTED_SUPPORT = 0.85
 """Minimum support of a scan, as a share of the median support of recent scans."""
 
+POOR_SUPPORT = 0.6
+"""Share of the expected support below which a scan is not accepted at once wherever it fits."""
+
+FIRST_SUPPORT = 0.35
+"""Minimum support before there are recent scans: real scans of a hall that a hand turned by 90 deg
+fit the scan before to 0.5."""
+
 FLOOR_NOISES = 3.0
 """Minimum expected deviation, in standard deviations of a range."""
 
@@ -60,12 +68,16 @@ class Tracker:
         The last velocity, m/s and rad/s, in the frame of the body.
     num_ambiguous : int
         Number of scans that fitted the map at two places.
+    doubtful : (4, 4) float64, optional
+        T_map_body of the last scan, if it was refused although it fits there: a search found the
+        place and it fits worse than usual, or it fits much worse than usual.
 
     """
 
     def __init__(self, registration: Registration, start: Transform) -> None:
         self._registration = registration
         self.num_ambiguous = 0
+        self.doubtful: Transform | None = None
         self.restart(start)
 
     def restart(self, T_fixed_body: Transform) -> None:
@@ -78,6 +90,14 @@ class Tracker:
     def begin(self, stamp_ns: int, twist: npt.NDArray[np.float64]) -> None:
         """Set the initial stamp and velocity (6,), m/s and rad/s."""
         self._stamp_ns, self.twist = stamp_ns, twist
+
+    def resume(
+        self, T_fixed_body: Transform, stamp_ns: int, twist: npt.NDArray[np.float64]
+    ) -> None:
+        """Continue from a pose at a stamp with a velocity (6,), m/s and rad/s."""
+        self.pose = T_fixed_body
+        self._clear_history()
+        self.begin(stamp_ns, twist)
 
     def _clear_history(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
@@ -128,46 +148,81 @@ class Tracker:
         Raises
         ------
         AlignmentError
-            If the scan does not fit the map, or fits it at two places about equally well. The
-            predicted velocity is halved then.
+            If the scan does not fit the map, fits it at two places about equally well, needs a
+            motion faster than ``registration.max_speed_m_s``, or fits too poorly to be accepted
+            at once (see ``doubtful``). The predicted velocity is halved then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
         if self._stamp_ns is not None:
             starts.append(compose(T_map_fixed, self.pose))
-        usual = sorted(self._supports)[len(self._supports) // 2] if self._supports else 0.0
-        expected = EXPECTED_SUPPORT * usual
+        expected = self.expected_support
         found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
-        is_steady = found.converged or found.support >= expected > 0.0
+        is_usual = bool(self._supports) and found.support >= expected > 0.0
+        is_steady = found.converged or is_usual
         is_ambiguous = found.rival > 0.0
         self.num_ambiguous += is_ambiguous and is_steady
-        if is_ambiguous or not (is_steady and self._registration.fits(found)):
-            self._clear_history()
-            self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
-            raise AlignmentError(self._refusal(found))
-        self._supports.append(found.support)
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
+        refusal = self._refusal(found, is_steady, self.speed_m_s(pose, stamp_ns))
+        self.doubtful = None
+        is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
+        if not refusal and (is_poor or (found.is_found and found.support < expected)):
+            self.doubtful = found.T_map_sensor
+            refusal = (
+                f'{self._shares(found)}, usually {expected / EXPECTED_SUPPORT:.0%} in all: '
+                'the next scans have to agree'
+            )
+        if refusal:
+            self._deviations.clear()
+            self.twist = 0.5 * self.twist  # after several failures the prediction is at rest
+            raise AlignmentError(refusal)
+        self._supports.append(found.support)
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
         return found
 
-    def _refusal(self, found: RegistrationResult) -> str:
-        """Return the reason why a scan was rejected."""
-        config = self._registration.config
-        said = (
+    @property
+    def expected_support(self) -> float:
+        """Share of the cells of a scan that should fit, from recent scans."""
+        if not self._supports:
+            return FIRST_SUPPORT
+        return EXPECTED_SUPPORT * sorted(self._supports)[len(self._supports) // 2]
+
+    def speed_m_s(self, T_fixed_body: Transform, stamp_ns: int) -> float:
+        """Return the speed that a pose requires since the last scan; 0 without one."""
+        if self._stamp_ns is None or stamp_ns <= self._stamp_ns:
+            return 0.0
+        distance_m = math.dist(T_fixed_body[:3, 3], self.pose[:3, 3])
+        return distance_m / ((stamp_ns - self._stamp_ns) / 1e9)
+
+    def _shares(self, found: RegistrationResult) -> str:
+        """Return in words how well a scan fits."""
+        return (
             f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
             f'{found.fit:.0%} of these fit it'
         )
+
+    def _refusal(self, found: RegistrationResult, is_steady: bool, speed_m_s: float) -> str:
+        """Return the reason why a scan is rejected; empty if it is not."""
+        config = self._registration.config
+        said = self._shares(found)
         if found.rival > 0.0:
             return (
                 f'{said}, but another place fits {found.rival / max(found.support, 1e-9):.0%} as '
                 'well: its pose is ambiguous'
             )
-        if self._registration.fits(found):
+        if not self._registration.fits(found):
+            return (
+                f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%} '
+                '(registration.min_overlap_ratio, min_fit_ratio)'
+            )
+        if not is_steady:
             return f'{said}, but its pose has not settled (registration.max_iterations)'
-        return (
-            f'{said}, expected {config.min_overlap_ratio:.0%} and {config.min_fit_ratio:.0%} '
-            '(registration.min_overlap_ratio, min_fit_ratio)'
-        )
+        if speed_m_s > config.max_speed_m_s:
+            return (
+                f'{said}, but {speed_m_s:.0f} m/s lead there, expected at most '
+                f'{config.max_speed_m_s:g} (registration.max_speed_m_s)'
+            )
+        return ''
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """

@@ -14,8 +14,11 @@ import math
 import re
 from typing import NoReturn
 
-CUT, INTERRUPTED = 3, 130
-"""Exit codes: a recording ends too early and --strict was given; Ctrl-C ended the work."""
+CUT, APART, INTERRUPTED = 3, 4, 130
+"""
+Exit codes: a recording ends too early and --strict was given; scans were mapped apart from the
+map; Ctrl-C ended the work.
+"""
 
 
 class UsageError(Exception):

@@ -6,7 +6,8 @@
 Ctrl-C ends the recording early, and the scans mapped until then are written; pressed again, it
 ends at once. Several bags, --workers and --scheduler make a map in tiles.
 
-Exit code 3: done, but the recording is cut off and --strict was given.
+Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
+could not place some scans on the map, which became maps of their own.
 """
 
 from __future__ import annotations
@@ -15,10 +16,12 @@ import argparse
 import json
 import math
 from pathlib import Path
+import sys
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import (
     add_workers,
+    APART,
     CUT,
     INTERRUPTED,
     positive_float,
@@ -31,7 +34,7 @@ from surfel_mapper.errors import MapError
 from surfel_mapper.offline.outputs import FORMATS, output_directory
 from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.offline.request import Request
-from surfel_mapper.offline.summary import as_text
+from surfel_mapper.offline.summary import apart_text, as_text
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config
@@ -183,6 +186,9 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
         if stopped():  # while files were written
             raise KeyboardInterrupt
+    if apart := apart_text(summary):
+        print(f'surfel-mapper: {apart}', file=sys.stderr)
+        return APART
     return CUT if args.strict and summary['cut'] else 0
 
 

@@ -88,6 +88,13 @@ class RegistrationConfig(Stage):
         high=180.0,
         live=True,
     )
+    max_speed_m_s: float = setting(
+        70.0,
+        'A place of a scan that needs a higher speed since the last one is refused, m/s.',
+        low=0.01,
+        high=1e5,
+        live=True,
+    )
     min_information_ratio: float = setting(
         0.003,
         'A direction of motion with less than this share of the total information is degenerate: '

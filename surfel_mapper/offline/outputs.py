@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from surfel_mapper.pipeline import Mapper, Update
+    from surfel_mapper.pipeline.map_part import ApartMap
     from surfel_mapper.viz.history import History
 
 BAG = 'bag'
@@ -175,11 +176,31 @@ def write_maps(
     *,
     window: bool = False,
 ) -> None:
-    """Write the map in some formats, and the trajectory; npz with the window if that is kept."""
+    """
+    Write the map in some formats, and the trajectory; npz with the window if that is kept.
+
+    Parts that registration could not place on the map become apart_1.npz and apart_1.tum, and so
+    on; those of an earlier replay are removed.
+    """
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper, window=window)
     trajectory.write(output / TRAJECTORY)
+    for old in (*output.glob('apart_*.npz'), *output.glob('apart_*.tum')):
+        old.unlink()
+    for number, part in enumerate(mapper.registered.apart if mapper.registered else (), start=1):
+        write_apart(output / f'apart_{number}', part)
+
+
+def write_apart(path: Path, part: ApartMap) -> None:
+    """Write a part of the map that stayed apart, and the poses on it, to path.npz and .tum."""
+    import numpy as np
+
+    from surfel_mapper.files.map_state import save_map
+    from surfel_mapper.files.trajectory import write_tum
+
+    save_map(path.with_suffix('.npz'), part.map)
+    write_tum(path.with_suffix('.tum'), list(part.stamps_ns), np.array(part.poses))
 
 
 def write_files(

@@ -29,6 +29,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'{summary[name]["text"]}\n' for name in ('loops', 'alignment') if name in summary
     )
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
+    apart = apart_text(summary)
     speed = summary['recorded_s'] / summary['replay_s']
     deskewed = ', deskewed' if summary.get('deskewed') else ''
     poses = (
@@ -42,9 +43,27 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
         f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
-        f'{filters}{aligned}{errors}'
+        f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(str(path) for path in written)}'
+    )
+
+
+def apart_text(summary: Mapping[str, Any]) -> str:
+    """Return which scans have no certain place on the map, and why; empty if there are none."""
+    tracking = summary.get('registration', {})
+    parts = tracking.get('apart', [])
+    if not parts:
+        return ''
+    num_scans = summary['scans']['dropped'].get('apart', 0)
+    spans = ', '.join(
+        f'apart_{number} ({part["scans"]} scans from {part["first_s"]:.3f} to '
+        f'{part["last_s"]:.3f} s: {part["reason"]})'
+        for number, part in enumerate(parts, start=1)
+    )
+    return (
+        f'{num_scans} of {summary["scans"]["received"]} scans have no certain place on the map; '
+        f'{tracking["parts_apart"]} maps of their own: {spans}'
     )
 
 

@@ -10,7 +10,7 @@ beside this one or a part below. The module is long because every stage and ever
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 import logging
 
@@ -33,7 +33,8 @@ from surfel_mapper.pipeline.layer_stack import LayerStack
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame
-from surfel_mapper.pipeline.preparation import Preparation, Prepared
+from surfel_mapper.pipeline.preparation import Preparation
+from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
 from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
 from surfel_mapper.pipeline.scan_images import ScanImages
@@ -181,9 +182,9 @@ class Inserter:
         pose: Transform,
         config: Config,
         following: tuple[Scan, Transform] | None = None,
-    ) -> Update | None:
+    ) -> Iterator[Update]:
         """
-        Map a scan; None if it is left out.
+        Map a scan, and those before it that waited for it; yield the update of each.
 
         Parameters
         ----------
@@ -197,12 +198,24 @@ class Inserter:
             The next scan, which another thread begins to reduce; only if ``reduces_ahead``.
 
         """
-        laps, version = Laps(), self.map.version
-        prepared = self.preparation.prepare(scan, self.aligner.to_map(pose), config, laps)
-        if prepared is None:
-            return None
+        laps = Laps()
+        for prepared in self.preparation.prepare(scan, self.aligner.to_map(pose), config, laps):
+            update = self._insert(prepared, config, following, laps)
+            if update is not None:
+                yield update
+            laps = Laps()
+
+    def _insert(
+        self,
+        prepared: Prepared,
+        config: Config,
+        following: tuple[Scan, Transform] | None,
+        laps: Laps,
+    ) -> Update | None:
+        """Insert a prepared scan; None if the map refuses it."""
         if config.map.mode == 'frozen':
             return self._localised(prepared, config, laps)
+        version = self.map.version
         inserted = self._add_to_map(prepared, following, config, laps)
         if inserted is None:
             return None
@@ -234,6 +247,7 @@ class Inserter:
             layers=results,
             alignment=alignment,
             registration=prepared.registration,
+            T_fixed_body=prepared.T_fixed_body,
         )
 
     def _add_to_map(
@@ -303,6 +317,7 @@ class Inserter:
             evictions=(),
             milliseconds=milliseconds,
             registration=prepared.registration,
+            T_fixed_body=prepared.T_fixed_body,
         )
 
     def _align_when_due(self, config: Config) -> Alignment | None:

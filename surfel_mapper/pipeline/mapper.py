@@ -283,9 +283,7 @@ class Mapper:
         ahead = self._inserter.reduces_ahead(self.config)
         keeps = int(more_follows and ahead)
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
-            update = self._insert(*self._queue.posed.popleft())
-            if update is not None:
-                yield update
+            yield from self._insert(*self._queue.posed.popleft())
         if self._queue.posed:
             self._inserter.begin(*self._queue.posed[0], self.config)
 
@@ -329,14 +327,18 @@ class Mapper:
         self._inserter.layers.finish()
 
     def finish(self) -> None:
-        """End the input: scans that still wait for a pose are dropped and counted."""
+        """End the input: scans that still wait for a certain pose are dropped and counted."""
         self._guard.drop_held()
         self._queue.drop_waiting('no_pose', 'no pose until the end of the input')
+        if self.registered is not None:
+            self.registered.finish()
 
     def clear(self) -> None:
         """Drop all scans, waiting ones too (counted); poses, counts and a frozen map stay."""
         self._guard.drop_held()
         self._queue.drop_all('cleared', 'the map was cleared')
+        if self.registered is not None:
+            self.registered.finish()
         if self.config.map.mode != 'frozen':
             self._inserter.clear()
 
@@ -551,16 +553,22 @@ class Mapper:
         if newest_pose is not None and (newest_pose - scan.stamp_ns) / 1e9 > reset_after_s:
             self.transforms.clear()  # else the scan would be mapped at a pose of that time
 
-    def _insert(self, scan: Scan, pose: Transform) -> Update | None:
-        """Map a scan whose pose is there; None if it is left out."""
+    def _insert(self, scan: Scan, pose: Transform) -> Iterator[Update]:
+        """Map a scan whose pose is there, and those that waited for it; yield their updates."""
         num_mapped = self.counters.mapped + self.counters.localised + self.counters.gated
-        try:
-            following = self._queue.posed[0] if self._queue.posed else None
-            return self._inserter.insert(scan, pose, self.config, following)
-        except Exception as error:  # MemoryError too: the next scan may fit
-            _log.debug('scan at %d ns', scan.stamp_ns, exc_info=True)
-            if self.counters.mapped + self.counters.localised + self.counters.gated == num_mapped:
-                self._drops.scan(scan, INTERNAL, described(error))
-            else:
-                self._drops.message(INTERNAL, f'surfels not derived: {described(error)}')
-            return None
+        following = self._queue.posed[0] if self._queue.posed else None
+        updates = self._inserter.insert(scan, pose, self.config, following)
+        while True:
+            try:
+                update = next(updates, None)
+            except Exception as error:  # MemoryError too: the next scan may fit
+                _log.debug('scan at %d ns', scan.stamp_ns, exc_info=True)
+                counters = self.counters
+                if counters.mapped + counters.localised + counters.gated == num_mapped:
+                    self._drops.scan(scan, INTERNAL, described(error))
+                else:
+                    self._drops.message(INTERNAL, f'surfels not derived: {described(error)}')
+                return
+            if update is None:
+                return
+            yield update

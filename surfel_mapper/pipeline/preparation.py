@@ -8,15 +8,13 @@ A scan that the motion gate, the filters or the registration leave out is counte
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, replace
+from dataclasses import astuple, replace
 
 import numpy as np
 
-from surfel_mapper.alignment.registration import RegistrationResult
 from surfel_mapper.config import Config, WindowConfig
 from surfel_mapper.counters import Laps
 from surfel_mapper.errors import (
-    AlignmentError,
     CloudFormatError,
     FilterError,
     MapError,
@@ -27,6 +25,7 @@ from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.local_map import LocalMap
+from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -34,30 +33,6 @@ from surfel_mapper.pipeline.window_aligner import WindowAligner
 from surfel_mapper.scan import PointTimes, Scan
 from surfel_mapper.sensors.deskew import warm_up as warm_up_deskewing
 from surfel_mapper.sensors.free_rays import free_directions
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """
-    A scan that is ready for the map.
-
-    Attributes
-    ----------
-    scan : Scan
-        Deskewed, before the filters.
-    filtered : Scan
-        After the filters.
-    T_map_sensor : (4, 4) float64
-        Its pose.
-    registration : RegistrationResult, optional
-        If poses come from registration to the map.
-
-    """
-
-    scan: Scan
-    filtered: Scan
-    T_map_sensor: Transform
-    registration: RegistrationResult | None = None
 
 
 class Preparation:
@@ -139,9 +114,12 @@ class Preparation:
         if self._poses.registered is not None:
             self._poses.registered.warm_up()
 
-    def prepare(self, scan: Scan, pose: Transform, config: Config, laps: Laps) -> Prepared | None:
+    def prepare(self, scan: Scan, pose: Transform, config: Config, laps: Laps) -> list[Prepared]:
         """
-        Deskew, filter and register a scan; None if it is left out.
+        Deskew, filter and register a scan; return the scans that can be mapped now.
+
+        None if it is left out, or registration waits for the next scans to confirm its place;
+        with the scan that confirms it, all that have waited.
 
         Parameters
         ----------
@@ -156,7 +134,7 @@ class Preparation:
 
         """
         if self._poses.registered is None and self._is_gated(pose, config.window):
-            return None
+            return []
         times = scan.times
         if times is not None:
             scan = self._poses.deskewed(scan, times)
@@ -172,41 +150,38 @@ class Preparation:
             filtered = self._filter(scan, pose)
             laps.end('filter')
         if filtered is None:
-            return None
+            return []
         prepared = Prepared(scan, filtered, pose)
         if self._poses.registered is None:
-            return prepared
+            return [prepared]
         registered = self._register(self._poses.registered, prepared, times)
         laps.end('register')
-        return (
-            None
-            if registered is None or self._is_gated(registered.T_map_sensor, config.window)
-            else registered
-        )
+        if len(registered) > 1:  # those that have waited: the gate would compare them with one
+            return registered
+        return [p for p in registered if not self._is_gated(p.T_map_sensor, config.window)]
 
     def _register(
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None
-    ) -> Prepared | None:
-        """Return a scan at the pose found by registration; None if that fails."""
-        scan = prepared.scan
+    ) -> list[Prepared]:
+        """Return the scans whose places registration knows now."""
         if self._local_map is None:
             target, T_target_fixed = self._around.surfel_map, self._aligner.T_map_fixed
         else:
             target, T_target_fixed = self._local_map.surfel_map, np.eye(4)
         try:
-            pose, registration = poses.find(prepared.filtered, times, target, T_target_fixed)
-        except (AlignmentError, MapError, PoseError) as error:
-            self._drops.scan(scan, 'not_aligned', str(error))
-            return None
-        if registration is not None and len(registration.degenerate):
-            num = len(registration.degenerate)
-            self._drops.warn(
-                'degenerate',
-                f'scan at {scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
-                'are not determined by its points; the prediction is kept in these',
-            )
-        T_map_sensor = self._aligner.to_map(pose)
-        return replace(prepared, T_map_sensor=T_map_sensor, registration=registration)
+            found = poses.place(prepared, times, target, T_target_fixed)
+        except (MapError, PoseError) as error:
+            self._drops.scan(prepared.scan, 'not_aligned', str(error))
+            return []
+        for each in found:
+            if each.registration is not None and len(each.registration.degenerate):
+                num = len(each.registration.degenerate)
+                self._drops.warn(
+                    'degenerate',
+                    f'scan at {each.scan.stamp_ns / 1e9:.6f} s: {num} of 6 directions of motion '
+                    'are not determined by its points; the prediction is kept in these',
+                )
+        return [replace(p, T_map_sensor=self._aligner.to_map(p.T_map_sensor)) for p in found]
 
     def _with_images(self, scan: Scan, images: ScanImages) -> Scan:
         """Return a scan with columns from images, before points are filtered."""

@@ -5,12 +5,16 @@ Poses by registration: each scan is aligned to the map of the scans before it.
 
 The track is that of the base if the mount of the sensor on it is known, so that several sensors
 share one track; otherwise that of the sensor itself.
+
+A scan without a certain place begins a part of the map of its own (map_part); later scans are
+tracked on that part until their place on the map is confirmed, and are then mapped all together.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,8 +28,41 @@ from surfel_mapper.errors import AlignmentError, PoseError, PoseNotYetError
 from surfel_mapper.geometry import compose, inverse, pose_matrix, Transform
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline.drops import Drops
+from surfel_mapper.pipeline.map_part import ApartMap, LEAST_SCANS, MapPart, MOST_SCANS, Sighting
+from surfel_mapper.pipeline.prepared import Prepared
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
+
+MOST_PARTS = 20
+"""Number of parts whose maps are kept; of more, the oldest are forgotten."""
+
+MAX_STEP_S = 10.0
+"""Longest time between two scans that counts for a state, s; more is a gap of the recording."""
+
+
+class StateTimes:
+    """Scans and seconds in each state of tracking: lost, unconfirmed, ambiguous, degenerate."""
+
+    def __init__(self) -> None:
+        self._last_ns: int | None = None
+        self._scans = dict.fromkeys(('lost', 'unconfirmed', 'ambiguous', 'degenerate'), 0)
+        self._seconds = dict.fromkeys(self._scans, 0.0)
+
+    def add(self, stamp_ns: int, states: list[str]) -> None:
+        """Count a scan, and the time since the one before, under its states."""
+        step_s = 0.0 if self._last_ns is None else (stamp_ns - self._last_ns) / 1e9
+        self._last_ns = stamp_ns
+        for state in states:
+            self._scans[state] += 1
+            self._seconds[state] += min(max(step_s, 0.0), MAX_STEP_S)
+
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Return scans and seconds by state."""
+        return {
+            state: {'scans': number, 'seconds': round(self._seconds[state], 3)}
+            for state, number in self._scans.items()
+        }
 
 
 class RegisteredPoses:
@@ -38,26 +75,31 @@ class RegisteredPoses:
         Its ``registration``, ``input`` and ``frames``.
     transforms : TransformBuffer
         Mounts of the sensors on the robot.
+    drops : Drops
+        Counts the scans whose place is never confirmed.
 
     Attributes
     ----------
     body : str
         The tracked frame; empty before the first scan.
-    T_fixed_body : (4, 4) float64
-        Its pose at the stamp of the last scan.
+    apart : list of ApartMap
+        The latest parts that were not joined, at most MOST_PARTS.
 
     """
 
-    def __init__(self, config: Config, transforms: TransformBuffer) -> None:
+    def __init__(self, config: Config, transforms: TransformBuffer, drops: Drops) -> None:
         self._config = config
         self._transforms = transforms
+        self._drops = drops
+        self._part: MapPart | None = None
+        self.apart: list[ApartMap] = []
+        self._states = StateTimes()
         self._registration = Registration(config.registration, config.map.voxel_size_m)
         start = config.registration.start
         self._start = pose_matrix(start[:3], start[3:]) if start else np.eye(4)
         self._tracker = Tracker(self._registration, self._start)
         self.body = ''
-        self.T_fixed_body = self._start
-        self._num_aligned = self._num_degenerate = 0
+        self._num_aligned = self._num_degenerate = self._num_parts = 0
         self._fits: deque[float] = deque(maxlen=LATEST)
 
     def reconfigure(self, config: Config) -> None:
@@ -68,7 +110,12 @@ class RegisteredPoses:
     @property
     def twist(self) -> npt.NDArray[np.float64]:
         """Velocity of the tracked frame, (6,) m/s and rad/s, in that frame."""
-        return self._tracker.twist
+        return self._active.twist
+
+    @property
+    def _active(self) -> Tracker:
+        """The tracker of the newest scan: that of a part, if there is one."""
+        return self._tracker if self._part is None else self._part.tracker
 
     def warm_up(self) -> None:
         """Compile the kernels, for both types that points may have."""
@@ -81,6 +128,7 @@ class RegisteredPoses:
 
     def restart(self, T_fixed_body: Transform | None = None) -> None:
         """Go on from a pose, by default the one of registration.start."""
+        self.finish()
         self._tracker.restart(self._start if T_fixed_body is None else T_fixed_body)
 
     def learn_motion(self, scan: Scan, following: Scan | None) -> None:
@@ -118,22 +166,22 @@ class RegisteredPoses:
             If the mount of the sensor on the tracked frame is unknown.
 
         """
-        return compose(self._tracker.predict(stamp_ns), self._mount(frame_id, stamp_ns))
+        return compose(self._active.predict(stamp_ns), self._mount(frame_id, stamp_ns))
 
-    def find(
+    def place(
         self,
-        scan: Scan,
+        prepared: Prepared,
         times: PointTimes | None,
         surfel_map: SurfelMap,
         T_map_fixed: Transform,
-    ) -> tuple[Transform, RegistrationResult | None]:
+    ) -> list[Prepared]:
         """
-        Align a scan to the map, and continue the track from its pose.
+        Align a scan to the map; return the scans whose places are certain now.
 
         Parameters
         ----------
-        scan : Scan
-            Deskewed and filtered.
+        prepared : Prepared
+            The scan, deskewed and filtered.
         times : PointTimes, optional
             Times of its points, if it was deskewed.
         surfel_map : SurfelMap
@@ -143,37 +191,54 @@ class RegisteredPoses:
 
         Returns
         -------
-        T_fixed_sensor : (4, 4) float64
-            Pose of the sensor at the stamp.
-        registration : RegistrationResult or None
-            None if the map is empty and the prediction is used.
+        list of Prepared
+            The scan itself; none if its place is not certain; if it confirms the place of a part,
+            all scans of the part. Their poses, ``T_map_sensor``, are in the fixed frame.
+            ``registration`` is None if the map is empty.
 
         Raises
         ------
-        AlignmentError
-            If the scan does not fit the map.
+        MapError
+            If a coarser level of the map would hold too many points in a voxel.
         PoseError
             If the mount of the sensor on the tracked frame is unknown.
 
         """
-        tracker = self._tracker
+        scan = prepared.filtered
         # Deskewed by a velocity that is off, a sweep is right in its middle and off at both
         # ends: followed at its stamp, which is one of them, pose and velocity would swing.
         middle_ns = (times.first_ns + times.last_ns) // 2 if times else scan.stamp_ns
-        T_fixed_middle = tracker.predict(middle_ns)
-        T_middle_body = compose(inverse(T_fixed_middle), tracker.predict(scan.stamp_ns))
-        if surfel_map.num_voxels:
-            cells = transformed(T_middle_body, self._cells(scan))
-            registration = tracker.track(cells, middle_ns, surfel_map, T_map_fixed)
-            self._num_aligned += 1
-            self._num_degenerate += len(registration.degenerate) > 0
-            self._fits.append(registration.fit)
+        T_active_middle = self._active.predict(middle_ns)
+        T_middle_body = compose(inverse(T_active_middle), self._active.predict(scan.stamp_ns))
+        if not surfel_map.num_voxels:
+            self._tracker.advance(T_active_middle, middle_ns)
+            return [self._placed(prepared, T_middle_body, None)]
+        seen = Sighting(
+            prepared=prepared,
+            cells=transformed(T_middle_body, self._cells(scan)),
+            stamp_ns=middle_ns,
+            T_middle_body=T_middle_body,
+            T_body_sensor=self._mount(scan.frame_id, scan.stamp_ns),
+        )
+        if self._part is None:
+            placed = self._track(seen, surfel_map, T_map_fixed)
         else:
-            registration = None
-            tracker.advance(T_fixed_middle, middle_ns)
-        self.T_fixed_body = compose(tracker.pose, T_middle_body)
-        pose = compose(self.T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns))
-        return pose, registration
+            placed = self._recover(seen, self._part, surfel_map, T_map_fixed)
+        self._count_state(scan.stamp_ns, placed)
+        return placed
+
+    def finish(self) -> None:
+        """End the part whose place was not confirmed: it stays apart."""
+        part, self._part = self._part, None
+        if part is None:
+            return
+        is_kept = len(part.scans) >= LEAST_SCANS
+        for waiting in part.scans:
+            cause = 'apart' if is_kept else 'not_aligned'
+            self._drops.scan(waiting.prepared.scan, cause, part.reason)
+        if is_kept:
+            self.apart = [*self.apart, part.apart()][-MOST_PARTS:]
+            self._num_parts += 1
 
     def summary(self) -> dict[str, Any]:
         """Return figures of the fit of the scans, for files and reports."""
@@ -184,7 +249,129 @@ class RegisteredPoses:
             'degenerate': self._num_degenerate,
             'ambiguous': self._tracker.num_ambiguous,
             'fit': {'median': float(np.median(fits)), 'min': float(np.min(fits))},
+            'tracking': self._states.summary(),
+            'parts_apart': self._num_parts,
+            'apart': [part.summary() for part in self.apart],
         }
+
+    def _track(
+        self, seen: Sighting, surfel_map: SurfelMap, T_map_fixed: Transform
+    ) -> list[Prepared]:
+        """Align a scan where it is expected; if it has no certain place, begin a part with it."""
+        T_map_middle = compose(T_map_fixed, self._tracker.predict(seen.stamp_ns))
+        twist = self._tracker.twist
+        try:
+            found = self._tracker.track(seen.cells, seen.stamp_ns, surfel_map, T_map_fixed)
+        except AlignmentError as error:
+            self._begin_part(seen, T_map_middle, twist, str(error))
+            return []
+        return [self._placed(seen.prepared, seen.T_middle_body, found)]
+
+    def _begin_part(
+        self,
+        seen: Sighting,
+        T_map_middle: Transform,
+        twist: npt.NDArray[np.float64],
+        reason: str,
+    ) -> None:
+        """Begin a part with a scan, predicted at a pose with a velocity."""
+        expected = self._tracker.expected_support
+        part = MapPart(self._registration, self._config, T_map_middle, expected, reason)
+        part.tracker.begin(seen.stamp_ns, twist)
+        part.add(seen)
+        if self._tracker.doubtful is not None:
+            part.set_place(self._tracker.doubtful, np.eye(4))
+        self._part = part
+        self._drops.warn(
+            'lost', f'scan at {seen.stamp_ns / 1e9:.6f} s has no certain place: {reason}'
+        )
+
+    def _recover(
+        self, seen: Sighting, part: MapPart, surfel_map: SurfelMap, T_map_fixed: Transform
+    ) -> list[Prepared]:
+        """Track a scan on the part, and join the part once its place on the map is confirmed."""
+        twist = part.tracker.twist
+        try:
+            T_part_middle = part.add(seen)
+        except AlignmentError:
+            return self._leave(seen, part, twist, surfel_map, T_map_fixed)
+        confirmed = part.confirmed(seen.cells, surfel_map, T_part_middle)
+        if confirmed is None:
+            if len(part.scans) >= MOST_SCANS:
+                self.finish()
+            return []
+        T_map_part, found = confirmed
+        T_fixed_part = compose(inverse(T_map_fixed), T_map_part)
+        self._part = None
+        self._tracker.resume(
+            compose(T_fixed_part, T_part_middle), seen.stamp_ns, part.tracker.twist
+        )
+        self._num_aligned += len(part.scans)
+        self._fits.append(found.fit)
+        return [
+            self._at(each.prepared, compose(T_fixed_part, each.T_part_body), found)
+            for each in part.scans
+        ]
+
+    def _leave(
+        self,
+        seen: Sighting,
+        part: MapPart,
+        twist: npt.NDArray[np.float64],
+        surfel_map: SurfelMap,
+        T_map_fixed: Transform,
+    ) -> list[Prepared]:
+        """
+        End a part that a scan does not fit; the scan is tracked on the map or begins the next.
+
+        A single scan that fits nothing is no loss: the next one may continue the track.
+        """
+        self.finish()
+        if len(part.scans) > 1:
+            guess = compose(part.guess, part.tracker.predict(seen.stamp_ns))
+            self._begin_part(seen, guess, twist, part.reason)
+            return []
+        return self._track(seen, surfel_map, T_map_fixed)
+
+    def _placed(
+        self,
+        prepared: Prepared,
+        T_middle_body: Transform,
+        registration: RegistrationResult | None,
+    ) -> Prepared:
+        """Return a scan at the pose of the track, and count its registration."""
+        if registration is not None:
+            self._num_aligned += 1
+            self._num_degenerate += len(registration.degenerate) > 0
+            self._fits.append(registration.fit)
+        T_fixed_body = compose(self._tracker.pose, T_middle_body)
+        return self._at(prepared, T_fixed_body, registration)
+
+    def _at(
+        self,
+        prepared: Prepared,
+        T_fixed_body: Transform,
+        registration: RegistrationResult | None,
+    ) -> Prepared:
+        """Return a scan at a pose of the tracked frame, in the fixed frame."""
+        scan = prepared.filtered
+        T_fixed_sensor = compose(T_fixed_body, self._mount(scan.frame_id, scan.stamp_ns))
+        return replace(
+            prepared,
+            T_map_sensor=T_fixed_sensor,
+            registration=registration,
+            T_fixed_body=T_fixed_body,
+        )
+
+    def _count_state(self, stamp_ns: int, placed: list[Prepared]) -> None:
+        """Count the time since the scan before under the states of this one."""
+        states = []
+        if self._part is not None:
+            states.append('unconfirmed' if self._part.has_place else 'lost')
+            states += ['ambiguous'] if 'ambiguous' in self._part.reason else []
+        elif placed and placed[-1].registration is not None:
+            states += ['degenerate'] if len(placed[-1].registration.degenerate) else []
+        self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:
         """Return the cells of a scan in the tracked frame."""

@@ -60,7 +60,7 @@ class ScanPoses:
         self._set_max_gap(config)
         self.registered: RegisteredPoses | None = None
         if config.pose.source == 'registration':
-            self.registered = RegisteredPoses(config, self.transforms)
+            self.registered = RegisteredPoses(config, self.transforms, drops)
 
     def reconfigure(self, config: Config) -> None:
         """Take new settings; those of frames and sources never change."""

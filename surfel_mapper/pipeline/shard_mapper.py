@@ -10,6 +10,7 @@ equal, both would map or drop every later scan alike, at the same pose.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import hashlib
 from typing import Any
 
@@ -65,9 +66,9 @@ class ShardMapper(Mapper):
         ]
         return hashlib.sha256(repr(state).encode()).hexdigest()
 
-    def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Update | None:
+    def _insert(self, scan: Scan, pose: npt.NDArray[np.float64]) -> Iterator[Update]:
         """Map a scan, unless scans are passed over."""
-        return None if self._passes_over else super()._insert(scan, pose)
+        return iter(()) if self._passes_over else super()._insert(scan, pose)
 
 
 def sweep_s(config: Config) -> float:

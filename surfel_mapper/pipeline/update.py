@@ -50,6 +50,8 @@ class Update:
         Result of the alignment of the window, if one was due after this scan.
     registration : RegistrationResult, optional
         Result of the registration to the map, if ``pose.source`` is ``registration``.
+    T_fixed_body : (4, 4) float64, optional
+        Pose of the frame that registration tracks.
     layers : mapping of str to object
         The results of layers that followed the scan, by name; ``update.models`` is that of
         ``models``, or None.
@@ -71,6 +73,7 @@ class Update:
     milliseconds: dict[str, float]
     alignment: Alignment | None = None
     registration: RegistrationResult | None = None
+    T_fixed_body: npt.NDArray[np.float64] | None = None
     layers: Mapping[str, Any] = field(default_factory=dict)
 
     if not TYPE_CHECKING:  # hidden from mypy: the names depend on the registry

@@ -169,6 +169,7 @@ def figures(session: Session) -> dict[str, Any]:
             for name, found in (('median', latency(session, 50)), ('p99', latency(session, 99)))
         },
         **counters.summary(),
+        **({'registration': mapper.registered.summary()} if mapper.registered else {}),
         'normals': 'not oriented' if mapper.config.pose.source == 'identity' else 'oriented',
         'voxels': mapper.map.num_voxels,
         'map_bytes': mapper.map.nbytes,

@@ -171,10 +171,12 @@ class RegistrationOutputs:
 
     def publish(self, update: Update) -> None:
         """Publish the pose of a scan; called in the mapping thread."""
-        T_fixed_body = self._registered.T_fixed_body
+        T_fixed_body = update.T_fixed_body
+        if T_fixed_body is None:
+            return
         header = Header(stamp=time_message(update.stamp_ns), frame_id=self._fixed)
         if self._odometry.get_subscription_count():
-            self._odometry.publish(self._odometry_message(header, update))
+            self._odometry.publish(self._odometry_message(header, update, T_fixed_body))
         if self._transform is not None:
             self._transform.publish(update.stamp_ns, self._registered.body, T_fixed_body)
         self._poses.append(PoseStamped(header=header, pose=pose_message(T_fixed_body)))
@@ -182,10 +184,12 @@ class RegistrationOutputs:
             self._track_ns = update.stamp_ns
             self._track.publish(Path(header=header, poses=list(self._poses)))
 
-    def _odometry_message(self, header: Header, update: Update) -> Odometry:
+    def _odometry_message(
+        self, header: Header, update: Update, T_fixed_body: Transform
+    ) -> Odometry:
         """Return pose and velocity of the body as Odometry."""
         message = Odometry(header=header, child_frame_id=self._registered.body)
-        message.pose.pose = pose_message(self._registered.T_fixed_body)
+        message.pose.pose = pose_message(T_fixed_body)
         if update.registration is not None:
             message.pose.covariance = covariance(update.registration.information).ravel()
         fill(message.twist.twist.linear, self._registered.twist[:3])

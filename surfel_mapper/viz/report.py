@@ -90,6 +90,7 @@ def write_report(
         *sections,
         plots(valid, summary, history),
         pose_errors_table(summary.get('pose_errors')),
+        tracking_table(summary.get('registration', {})),
         f'<h2>Milliseconds a scan</h2>{times_table(summary)}',
         settings_table(summary.get('settings', {})),
     ]
@@ -163,6 +164,23 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
         shown['speed'] = f'{speed:.3g} \u00d7 real time'
     cells = ''.join(f'<div><dt>{k}</dt><dd>{escape(v)}</dd></div>' for k, v in shown.items())
     return f'<dl class="figures">{cells}</dl>'
+
+
+def tracking_table(registration: Mapping[str, Any]) -> str:
+    """Return the states of tracking and the parts that stayed apart, as HTML."""
+    if 'tracking' not in registration:
+        return ''
+    states = ''.join(
+        f'<tr><td>{escape(state)}</td><td>{found["scans"]}</td><td>{found["seconds"]:.1f}</td></tr>'
+        for state, found in registration['tracking'].items()
+    )
+    parts = ''.join(
+        f'<p>apart_{number}: {part["scans"]} scans from {part["first_s"]:.3f} to '
+        f'{part["last_s"]:.3f} s have no certain place on the map: {escape(part["reason"])}</p>'
+        for number, part in enumerate(registration['apart'], start=1)
+    )
+    head = '<tr><th>state</th><th>scans</th><th>s</th></tr>'
+    return f'<h2>Tracking</h2><table>{head}{states}</table>{parts}'
 
 
 def plots(surfels: Surfels, summary: Mapping[str, Any], history: History) -> str:

@@ -9,13 +9,13 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.evaluation.trajectory_errors import compare
-from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.geometry import compose, inverse, pose_matrix, q_xyzw
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from test.alignment.test_registration import map_of, ROOM, TRUE
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
-from test.pipeline.test_registered_poses import pose_at, scan_at
+from test.pipeline.test_registered_poses import in_hall, pose_at, scan_at
 
 NUM_SCANS = 5
 REGISTRATION = 'pose: {source: registration}\nregistration: {noise_m: 0.005}\n'
@@ -126,3 +126,29 @@ def test_real_scans_of_a_hand_that_turns_fast_are_followed(recorded, tmp_path, e
     assert errors['relative']['translation_m']['max'] < 0.03
     assert errors['relative']['rotation_deg']['max'] < 0.5
     assert errors['absolute']['translation_m']['max'] < 0.1
+
+
+def test_scans_without_a_certain_place_become_a_map_of_their_own(tmp_path, capsys):
+    entries = Entries()
+    scans = [scan_at(number) for number in range(4)]
+    scans += [in_hall(4 + n, pose_matrix((0.1 * n, 0, 0), (0, 0, 0, 1))) for n in range(4)]
+    for number, scan in enumerate(scans):
+        entries.cloud('/points', START_NS + number * PERIOD_NS, scan.points)
+    bag, output = write_rosbag2(tmp_path / 'two', entries), tmp_path / 'out'
+    arguments = ['--config', settings_file(tmp_path, REGISTRATION), '--output', str(output)]
+
+    assert main(['replay', str(bag), *arguments]) == 4
+
+    said = capsys.readouterr()
+    assert '4 of 8 scans have no certain place on the map' in said.err
+    assert '4 of 8 scans have no certain place on the map' in said.out
+    assert 'apart_1: 4 scans' in (output / 'report.html').read_text()
+    summary = json.loads((output / 'summary.json').read_text())
+    assert summary['scans']['dropped'] == {'apart': 4}
+    states = summary['registration']['tracking']
+    assert states['lost']['scans'] + states['unconfirmed']['scans'] == 4
+    found = load_map(output / 'apart_1.npz')[0]
+    assert found.num_points == sum(len(scan.points) for scan in scans[4:])
+    stamps, poses = poses_in(output / 'apart_1.tum')
+    assert len(stamps) == 4
+    np.testing.assert_allclose(poses[3][:3, 3], [0.3, 0.0, 0.0], atol=0.01)

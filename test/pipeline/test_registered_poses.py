@@ -136,11 +136,86 @@ def test_a_scan_that_does_not_fit_is_dropped_and_the_next_one_mapped():
     noise = replace(scan_at(4), points=rng.uniform(-9.0, 9.0, (3000, 3)))
 
     assert feed(mapper, [noise]) == []
-    assert mapper.counters.dropped == {'not_aligned': 1}
     assert mapper.map.digest() == digest
 
     (update,) = feed(mapper, [scan_at(5)])
+    assert mapper.counters.dropped == {'not_aligned': 1}
     np.testing.assert_allclose(update.T_map_sensor, compose(inverse(TRUE), pose_at(5)), atol=5e-3)
+
+
+def in_hall(number, pose):
+    """Return a scan of another place: eight large surfaces that lean in all directions."""
+    layout, rng = np.random.default_rng(5), np.random.default_rng(100 + number)
+    parts = []
+    for _ in range(8):
+        normal = layout.normal(size=3)
+        normal /= np.linalg.norm(normal)
+        aside = np.linalg.svd(normal[None])[2][1:]
+        spread = rng.uniform(-4.0, 4.0, (4000, 2)) @ aside
+        distance = layout.uniform(5.0, 9.0) + rng.normal(0.0, NOISE_M, (4000, 1))
+        parts.append(spread + distance * normal)
+    T_sensor_hall = inverse(pose)
+    points = np.concatenate(parts) @ T_sensor_hall[:3, :3].T + T_sensor_hall[:3, 3]
+    return Scan(points=points, stamp_ns=number * STEP_NS, frame_id='lidar')
+
+
+def test_scans_of_another_place_stay_apart_and_are_named():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(4)])
+    digest = mapper.map.digest()
+    steps = [se3_exp(np.array([0.1 * n, 0.02 * n, 0.0, 0.0, 0.0, 0.01 * n])) for n in range(6)]
+
+    assert feed(mapper, [in_hall(4 + n, step) for n, step in enumerate(steps)]) == []
+    mapper.finish()
+
+    assert mapper.map.digest() == digest
+    assert mapper.counters.dropped == {'apart': 6}
+    (part,) = mapper.registered.apart
+    for n, pose in enumerate(part.poses):
+        np.testing.assert_allclose(pose, compose(inverse(steps[0]), steps[n]), atol=0.01)
+    found = mapper.summary()['registration']
+    assert found['parts_apart'] == 1
+    assert (found['apart'][0]['scans'], found['apart'][0]['first_s']) == (6, 0.4)
+    states = found['tracking']
+    assert states['lost']['scans'] + states['unconfirmed']['scans'] == 6
+    assert states['lost']['seconds'] + states['unconfirmed']['seconds'] == pytest.approx(0.6)
+
+
+def test_after_a_loss_scans_are_joined_once_the_next_ones_agree():
+    mapper = mapper_with()
+    feed(mapper, [scan_at(number) for number in range(4)])
+    lost = [in_hall(4 + n, np.eye(4)) for n in range(2)]  # two scans that fit each other
+    assert feed(mapper, lost) == []
+    digest = mapper.map.digest()
+
+    held = [feed(mapper, [scan_at(number)]) for number in (6, 7)]
+    assert held == [[], []]
+    assert mapper.map.digest() == digest
+    assert mapper.summary()['registration']['tracking']['unconfirmed']['scans'] >= 1
+    updates = feed(mapper, [scan_at(8), scan_at(9), scan_at(10)])
+
+    assert [update.stamp_ns // STEP_NS for update in updates] == [6, 7, 8, 9, 10]
+    for update in updates:
+        truth = compose(inverse(TRUE), pose_at(update.stamp_ns // STEP_NS))
+        np.testing.assert_allclose(update.T_map_sensor, truth, atol=5e-3)
+    assert mapper.counters.dropped == {'not_aligned': 2}
+    assert mapper.counters.mapped == 4 + 5
+
+
+def test_a_joined_map_is_that_of_the_scans_at_their_poses():
+    mapper = mapper_with()
+    scans = [scan_at(number) for number in (0, 1, 2, 3, 6, 7, 8, 9)]
+    updates = feed(mapper, scans[:4])
+    feed(mapper, [in_hall(4 + n, np.eye(4)) for n in range(2)])
+
+    updates += feed(mapper, scans[4:])
+
+    expected = Mapper(Config.from_mapping({'pose.source': 'identity'})).map
+    assert len(updates) == len(scans)
+    for scan, update in zip(scans, updates, strict=True):
+        pose = update.T_map_sensor
+        expected.insert(expected.reduce(scan.points, pose, origin=pose[:3, 3], min_range_m=0.1))
+    assert mapper.map.digest() == expected.digest()
 
 
 def test_degenerate_registrations_are_warned_about(caplog):
@@ -267,6 +342,7 @@ def test_live_settings_of_the_registration_hold_from_the_next_scan_on():
     mapper.reconfigure(mapper.config.replace({'registration.min_fit_ratio': 1.0}))
 
     assert feed(mapper, [scan_at(1)]) == []
+    mapper.finish()
     assert mapper.counters.dropped == {'not_aligned': 1}
 
 

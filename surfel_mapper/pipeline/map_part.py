@@ -1,0 +1,242 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+MapPart: a map of its own for scans whose place on the map is not certain.
+
+After a loss scans are tracked on this part, and each is compared with the map as well. Once a
+place on the map beats all others and CONFIRMING more scans agree with it, the part is joined: its
+scans are reduced again at their poses on the map, so the map equals, bit for bit, one that was
+made at these poses. A part that is never confirmed stays apart; one wrong place in a map would
+spoil all that is mapped later.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.alignment.registration import is_near, Registration, RegistrationResult
+from surfel_mapper.alignment.tracking import FIRST_SUPPORT, Tracker
+from surfel_mapper.config import Config
+from surfel_mapper.errors import AlignmentError
+from surfel_mapper.geometry import compose, inverse, Transform
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.pipeline.prepared import Prepared
+
+CONFIRMING = 2
+"""Number of scans that have to agree with the place of an earlier one."""
+
+MOST_SCANS = 200
+"""Number of scans that a part keeps for joining it, some 300 MB of 131,072 points each."""
+
+LEAST_SCANS = 3
+"""Parts of fewer scans are not kept: their scans count as dropped."""
+
+LEAST_SUPPORT = 0.1
+"""Minimum support of a scan on its part: a scan that hardly fits says nothing about the motion."""
+
+SHARE_OF_USUAL = 0.5
+"""Minimum support at a place on the map, as a share of the usual support before the loss."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Sighting:
+    """
+    A scan to be placed.
+
+    Attributes
+    ----------
+    prepared : Prepared
+        The scan.
+    cells : (K, 3) float64, m
+        Its cells, in the frame of the body.
+    stamp_ns : int
+        The time in the middle of its sweep.
+    T_middle_body, T_body_sensor : (4, 4) float64
+        Motion from the middle of the sweep to its stamp; mount of the sensor.
+
+    """
+
+    prepared: Prepared
+    cells: npt.NDArray[np.float64]
+    stamp_ns: int
+    T_middle_body: Transform
+    T_body_sensor: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WaitingScan:
+    """A scan of a part: T_part_body at its stamp, and T_part_sensor."""
+
+    prepared: Prepared
+    T_part_body: Transform
+    T_part_sensor: Transform
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ApartMap:
+    """
+    A part that was not joined.
+
+    Attributes
+    ----------
+    map : SurfelMap
+        Its map; the first scan is at the origin.
+    stamps_ns : tuple of int
+    poses : list of (4, 4) float64
+        T_part_sensor of every scan.
+    reason : str
+        Why its first scan was not mapped.
+
+    """
+
+    map: SurfelMap
+    stamps_ns: tuple[int, ...]
+    poses: list[Transform]
+    reason: str
+
+    def summary(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            'scans': len(self.stamps_ns),
+            'first_s': self.stamps_ns[0] / 1e9,
+            'last_s': self.stamps_ns[-1] / 1e9,
+            'voxels': self.map.num_voxels,
+            'reason': self.reason,
+        }
+
+
+class MapPart:
+    """
+    Scans apart from the map, until their place on it is confirmed.
+
+    Parameters
+    ----------
+    registration : Registration
+    config : Config
+        All settings.
+    T_map_part : (4, 4) float64
+        Guess of the place of the part on the map: the prediction for its first scan.
+    expected_support : float
+        Minimum support of a place on the map.
+    reason : str
+        Why its first scan was not mapped.
+
+    Attributes
+    ----------
+    scans : list of WaitingScan
+    tracker : Tracker
+        Tracks the scans on the part.
+    guess : (4, 4) float64
+        The guess of its place.
+    reason : str
+        Why its first scan was not mapped.
+
+    """
+
+    def __init__(
+        self,
+        registration: Registration,
+        config: Config,
+        T_map_part: Transform,
+        expected_support: float,
+        reason: str,
+    ) -> None:
+        self._registration = registration
+        self.guess = T_map_part
+        self._expected_support = SHARE_OF_USUAL * expected_support
+        self.reason = reason
+        self._config = config
+        self._map = SurfelMap(config.map.voxel_size_m)
+        self._place: Transform | None = None
+        self._num_agreeing = 0
+        self.scans: list[WaitingScan] = []
+        self.tracker = Tracker(registration, np.eye(4))
+
+    @property
+    def has_place(self) -> bool:
+        """Whether a place on the map is known that later scans have to confirm."""
+        return self._place is not None
+
+    def add(self, seen: Sighting) -> Transform:
+        """
+        Track a scan on the part and add it; return T_part_middle.
+
+        Raises
+        ------
+        AlignmentError
+            If it does not fit the part.
+
+        """
+        if self._map.num_voxels:
+            found = self.tracker.track(seen.cells, seen.stamp_ns, self._map, np.eye(4))
+            least = FIRST_SUPPORT if found.is_found else LEAST_SUPPORT
+            if found.support < least:
+                raise AlignmentError(
+                    f'{found.support:.0%} of its cells fit, expected {least:.0%} of a new part'
+                )
+        T_part_body = compose(self.tracker.pose, seen.T_middle_body)
+        T_part_sensor = compose(T_part_body, seen.T_body_sensor)
+        limits = self._config.input
+        moments = self._map.reduce(
+            seen.prepared.filtered.points,
+            T_part_sensor,
+            origin=T_part_sensor[:3, 3],
+            min_range_m=limits.min_range_m,
+            max_range_m=limits.max_range_m or math.inf,
+        )
+        self._map.insert(moments)
+        self.scans.append(WaitingScan(seen.prepared, T_part_body, T_part_sensor))
+        return self.tracker.pose
+
+    def set_place(self, T_map_middle: Transform, T_part_middle: Transform) -> None:
+        """Set a place on the map that the next scans have to confirm."""
+        self._place, self._num_agreeing = compose(T_map_middle, inverse(T_part_middle)), 0
+
+    def confirmed(
+        self, cells: npt.NDArray[np.float64], surfel_map: SurfelMap, T_part_middle: Transform
+    ) -> tuple[Transform, RegistrationResult] | None:
+        """
+        Compare the newest scan with the map; return T_map_part once enough scans agree.
+
+        Parameters
+        ----------
+        cells : (K, 3) float64, m
+            Cells of the newest scan, in the frame of the body.
+        surfel_map : SurfelMap
+            The map.
+        T_part_middle : (4, 4) float64
+            Pose of the scan on the part.
+
+        """
+        settings = self._registration.config
+        start = compose(self.guess if self._place is None else self._place, T_part_middle)
+        found = self._registration.align(
+            cells, surfel_map, [start], settings.max_deviation_m, is_lost=self._place is None
+        )
+        fits = found.converged and self._registration.fits(found)
+        if not fits or found.rival > 0.0 or found.support < self._expected_support:
+            self._place = None
+            return None
+        if self._place is None:
+            self.set_place(found.T_map_sensor, T_part_middle)
+            return None
+        if not is_near(found.T_map_sensor, start, surfel_map.voxel_size_m):
+            self._place = None
+            return None
+        self._place = compose(found.T_map_sensor, inverse(T_part_middle))
+        self._num_agreeing += 1
+        return (self._place, found) if self._num_agreeing >= CONFIRMING else None
+
+    def apart(self) -> ApartMap:
+        """Return the part as a map that stays apart."""
+        return ApartMap(
+            map=self._map,
+            stamps_ns=tuple(each.prepared.scan.stamp_ns for each in self.scans),
+            poses=[each.T_part_sensor for each in self.scans],
+            reason=self.reason,
+        )
