@@ -32,6 +32,7 @@ BENCHES = (
     'align',
     'accuracy',
     'registration',
+    'tracking',
     'outputs',
     'tsdf',
     'models',
