@@ -47,6 +47,13 @@ TOLERANCE_M = 1e-4
 COARSE_TOLERANCE = 0.01
 """The same in coarser voxels, as a share of the voxel size."""
 
+COARSE_CELLS = 4000
+"""Maximum number of cells that are aligned to coarser voxels."""
+
+SAME_VOXELS = 0.03
+"""Displacement of the points, as a share of the voxel size, up to which cells keep their surfels
+between two steps: 3 % of the cells at most would meet another one."""
+
 SEARCH_STEP_DEG = 7.5
 """Step of the heading search, deg."""
 
@@ -243,13 +250,14 @@ class Registration:
             size_m = levels.voxel_size_m(level)
             width_m = min(deviation_m, 0.5 * size_m)
             tolerance_m = COARSE_TOLERANCE * size_m if level else TOLERANCE_M
-            finer = self._converge(cells, levels.planes(level), pose, width_m, tolerance_m)
+            some = thinned(cells, COARSE_CELLS) if level else cells
+            finer = self._converge(some, levels.planes(level), pose, width_m, tolerance_m)
             iterations += finer.iterations
             # the first scans of few beams may only fill the larger voxels
             if found is None or finer.overlap >= self.config.min_overlap_ratio:
                 found = finer
         assert found is not None, 'there is always level 0'
-        return replace(found, iterations=iterations)
+        return replace(found, num_cells=len(cells), iterations=iterations)
 
     def _converge(
         self,
@@ -262,13 +270,17 @@ class Registration:
         """Iterate Gauss-Newton steps until they are below the tolerance."""
         pose, iteration, moved_m = start, 0, math.inf
         least = self.config.min_information_ratio
+        place, placed_m = planes.place(cells, pose), 0.0
         while True:
-            hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m)
+            if placed_m > SAME_VOXELS * planes.voxel_size_m:
+                place, placed_m = planes.place(cells, pose), 0.0
+            hessian, gradient, overlap, fit = planes.equations(cells, pose, width_m, place)
             if moved_m < tolerance_m or iteration == self.config.max_iterations:
                 break
             step, degenerate, radius_m = solve(hessian, gradient, least)
             pose = moved(pose, step)
             moved_m = math.hypot(*step[:3], *(radius_m * step[3:]))
+            placed_m += moved_m
             iteration += 1
         return RegistrationResult(
             T_map_sensor=pose,
@@ -294,7 +306,7 @@ class Registration:
         """
         num = int(self.config.search_deg / SEARCH_STEP_DEG)
         level = self.config.coarse_levels
-        some = np.ascontiguousarray(cells[:: max(len(cells) // SEARCH_CELLS, 1)])
+        some = thinned(cells, SEARCH_CELLS)
         size_m = levels.voxel_size_m(level)
         found = [
             self._converge(some, levels.planes(level), start, size_m, COARSE_TOLERANCE * size_m)
@@ -308,6 +320,11 @@ class Registration:
             if len(places) == SEARCH_STARTS:
                 break
         return places
+
+
+def thinned(cells: npt.NDArray[np.float64], num: int) -> npt.NDArray[np.float64]:
+    """Return an even selection of cells (K, 3), less than twice a number of them."""
+    return np.ascontiguousarray(cells[:: max(len(cells) // num, 1)])
 
 
 def turned(starts: Sequence[Transform], num: int) -> list[Transform]:

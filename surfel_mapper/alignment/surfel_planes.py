@@ -28,20 +28,16 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.kernels.planes import continuation_keys, fill_planes
 from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
-    MEAN,
-    NORMAL,
     number_rows,
     PLANE,
-    SPREAD,
     sum_equations,
-    VARIANCE,
 )
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import Transform
 from surfel_mapper.kernels.layout import BITS
-from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 
@@ -81,8 +77,17 @@ class SurfelPlanes:
         self._number: npt.NDArray[np.int32] = np.empty(0, np.int32)
         self._planes: npt.NDArray[np.float64] = np.empty((0, PLANE))
 
+    @property
+    def voxel_size_m(self) -> float:
+        """Edge of a voxel, m."""
+        return self._map.voxel_size_m
+
     def equations(
-        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform, width_m: float
+        self,
+        cells: npt.NDArray[np.float64],
+        T_map_sensor: Transform,
+        width_m: float,
+        place: npt.NDArray[np.int32] | None = None,
     ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], float, float]:
         """
         Return the normal equations of a Gauss-Newton step at a pose.
@@ -95,6 +100,8 @@ class SurfelPlanes:
             The pose.
         width_m : float
             Width of the robust kernel.
+        place : (K,) int32, optional
+            Result of ``place`` at a pose nearby; by default that at the pose.
 
         Returns
         -------
@@ -108,17 +115,19 @@ class SurfelPlanes:
 
         """
         pose = np.ascontiguousarray(T_map_sensor[:3])
-        place = self._place(cells, pose)
+        if place is None:
+            place = self.place(cells, T_map_sensor)
         hessian, gradient = np.empty((6, 6)), np.empty(6)
         met, fit = sum_equations(
             cells, pose, place, self._planes, width_m * width_m, hessian, gradient
         )
         return hessian, gradient, met / max(len(cells), 1), fit / max(met, 1)
 
-    def _place(
-        self, cells: npt.NDArray[np.float64], pose: npt.NDArray[np.float64]
+    def place(
+        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform
     ) -> npt.NDArray[np.int32]:
         """Return the row of the plane that each cell hits at a pose, -1 if none."""
+        pose = np.ascontiguousarray(T_map_sensor[:3])
         keys = np.empty(len(cells), np.int64)
         cell_keys(cells, pose, self._scale, BITS + self._map.level, keys)
         found = self._map.find(keys)
@@ -134,46 +143,34 @@ class SurfelPlanes:
         return found
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
-        """Return surfels as rows of planes; unusable surfels get an infinite variance."""
-        surfels = self._merged_across_faces(surfels)
-        planes = np.empty((len(surfels), PLANE))
-        planes[:, MEAN : MEAN + 3] = surfels.position
-        planes[:, NORMAL : NORMAL + 3] = surfels.normal
-        count = surfels.num_points
-        low, middle = surfels.eigenvalues[:, 0] + self._noise_sq, surfels.eigenvalues[:, 1]
-        by_noise = min(NOISE_IN_PLANE * self._noise_sq, self._map.voxel_size_m**2 / 48.0)
-        gap = np.maximum(middle - surfels.eigenvalues[:, 0] - by_noise, 1e-9 * low)
-        planes[:, VARIANCE] = low * (1.0 + 1.0 / count)
-        planes[:, SPREAD] = low * middle / (count * gap * gap)
-        unusable = (
-            (count < self._min_points)
-            | np.isnan(surfels.planarity)
-            | (planes[:, SPREAD] > MAX_TILT_SQ)
-        )
-        planes[unusable, VARIANCE] = math.inf
-        return planes
+        """
+        Return surfels as rows of planes; unusable surfels get an infinite variance.
 
-    def _merged_across_faces(self, surfels: Surfels) -> Surfels:
-        """Merge surfels near a face of their voxel with their continuation behind it."""
+        Surfels near a face of their voxel are merged with their continuation behind it.
+        """
         size_m = self._map.voxel_size_m
-        every = np.arange(len(surfels))
-        axis = np.argmax(np.abs(np.nan_to_num(surfels.normal)), axis=1)
-        slope = surfels.normal[every, axis]
-        inside_m = surfels.position[every, axis] - surfels.voxel_index[every, axis] * size_m
-        reach_m = SIGMAS * np.sqrt(surfels.eigenvalues[:, 0] + self._noise_sq)
-        side = np.where(inside_m < 0.5 * size_m, -1, 1)
-        to_face_m = np.minimum(inside_m, size_m - inside_m) * np.abs(slope)
-        near = np.flatnonzero(to_face_m < reach_m)
-        behind = surfels.voxel_index[near]
-        behind[np.arange(len(near)), axis[near]] += side[near]
-        found = self._map.find(pack_keys(behind))
-        near, found = near[found >= 0], found[found >= 0]
-        other = self._map.surfels_of(found)
-        across_m = ((other.position - surfels.position[near]) * surfels.normal[near]).sum(axis=1)
-        alike = np.abs((other.normal * surfels.normal[near]).sum(axis=1)) > ALIKE
-        one = alike & (np.abs(across_m) < 2.0 * reach_m[near])
-        merge(surfels, near[one], other.select(one), across_m[one])
-        return surfels
+        keys = np.empty(len(surfels), np.int64)
+        continuation_keys(
+            surfels.position,
+            surfels.normal,
+            surfels.eigenvalues[:, 0],
+            surfels.voxel_index,
+            (size_m, self._noise_sq, SIGMAS),
+            keys,
+        )
+        found = self._map.find(keys)
+        others = self._map.surfels_of(found[found >= 0])
+        behind = np.where(found >= 0, np.cumsum(found >= 0) - 1, -1)
+        ring_sq = min(NOISE_IN_PLANE * self._noise_sq, size_m**2 / 48.0)
+        planes = np.empty((len(surfels), PLANE))
+        fill_planes(
+            (surfels.position, surfels.normal, surfels.eigenvalues, surfels.num_points),
+            (others.position, others.normal, others.eigenvalues, others.num_points),
+            behind,
+            (self._noise_sq, SIGMAS, ALIKE, self._min_points, MAX_TILT_SQ, ring_sq),
+            planes,
+        )
+        return planes
 
 
 class PlaneLevels:
@@ -201,6 +198,7 @@ class PlaneLevels:
     ) -> None:
         self._config = config
         self._map = surfel_map
+        self._maps = {0: surfel_map}
         self._cells = cells
         self._starts = list(starts)
         self._planes: dict[int, SurfelPlanes] = {}
@@ -220,11 +218,17 @@ class PlaneLevels:
 
         """
         if level not in self._planes:
-            target = self._map.coarsen(level, self._box()) if level else self._map
             self._planes[level] = SurfelPlanes(
-                target, self._config.min_points, self._config.noise_m
+                self._level(level), self._config.min_points, self._config.noise_m
             )
         return self._planes[level]
+
+    def _level(self, level: int) -> SurfelMap:
+        """Return the map of a level, made of the level below it, which is needed next."""
+        if level not in self._maps:
+            within = self._box() if level == 1 else None
+            self._maps[level] = self._level(level - 1).coarsen(1, within)
+        return self._maps[level]
 
     def _box(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Return the box of voxels within reach of the scan at any heading."""
@@ -234,35 +238,3 @@ class PlaneLevels:
         low = np.floor((at.min(axis=0) - reach_m) / self._map.voxel_size_m)
         high = np.floor((at.max(axis=0) + reach_m) / self._map.voxel_size_m)
         return low.astype(np.int64), high.astype(np.int64)
-
-
-def merge(
-    surfels: Surfels,
-    rows: npt.NDArray[np.int64],
-    other: Surfels,
-    across_m: npt.NDArray[np.float64],
-) -> None:
-    """
-    Merge surfels pairwise into others of similar normals, in place.
-
-    Parameters
-    ----------
-    surfels : Surfels
-        Surfels to change.
-    rows : (K,) int64
-        Rows to merge into.
-    other : Surfels
-        K surfels to merge, one for each row.
-    across_m : (K,) float64
-        Distance of these from the first along the normals of the first.
-
-    """
-    first, second = surfels.num_points[rows], other.num_points
-    share = (second / (first + second))[:, None]
-    turned = np.sign((other.normal * surfels.normal[rows]).sum(axis=1))[:, None] * other.normal
-    normal = (1.0 - share) * surfels.normal[rows] + share * turned
-    surfels.normal[rows] = normal / np.sqrt((normal**2).sum(axis=1))[:, None]
-    surfels.position[rows] += share * (other.position - surfels.position[rows])
-    surfels.eigenvalues[rows] += share * (other.eigenvalues - surfels.eigenvalues[rows])
-    surfels.eigenvalues[rows, 0] += ((1.0 - share) * share)[:, 0] * across_m**2
-    surfels.num_points[rows] = first + second

@@ -492,7 +492,7 @@ class SurfelMap:
             origin_m=self.origin_m,
         )
         if within:
-            fine = self.moments(unpack_keys(self._table.keys_in_box(*within)))
+            fine = self._moments_of(self._table.find(self._table.keys_in_box(*within)))
         else:
             fine = self._moments_of(self._table.changed_after(-1, 1))
         coarse.insert(coarse_moments(fine, level))
