@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 STAGES = (
+    'read',
     'decode',
     'deskew',
     'images',
@@ -31,9 +32,10 @@ STAGES = (
     'tsdf',
     'models',
     'normals',
+    'record',
     'total',
 )
-"""Timed stages in the order of a scan; ``total`` is all but decoding."""
+"""Timed stages in the order of a scan; ``total`` is all but reading, decoding and recording."""
 
 LATEST = 1000
 """Number of scans whose times are kept for the percentiles."""
@@ -84,6 +86,8 @@ class Counters:
         Layers that were switched off because they failed, with the last error.
     milliseconds : dict of str to deque of float
         Times of every stage for the latest scans.
+    stage_s : dict of str to float
+        Sum of the times of every stage, s.
     filters : dict of str to FilterCounts
         Counts of every filter, in the order of the chain.
 
@@ -103,6 +107,7 @@ class Counters:
     messages_ignored: Counter[str] = field(default_factory=Counter)
     layers_off: dict[str, str] = field(default_factory=dict)
     milliseconds: dict[str, deque[float]] = field(default_factory=dict)
+    stage_s: dict[str, float] = field(default_factory=dict)
     filters: dict[str, FilterCounts] = field(default_factory=dict)
 
     @contextmanager
@@ -126,6 +131,7 @@ class Counters:
         """Add the times of a scan by stage."""
         for stage, time_ms in milliseconds.items():
             self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(time_ms)
+            self.stage_s[stage] = self.stage_s.get(stage, 0.0) + 1e-3 * time_ms
 
     def add_filter(
         self,
@@ -170,6 +176,7 @@ class Counters:
             'messages_ignored': dict(self.messages_ignored),
             **({'layers_off': dict(self.layers_off)} if self.layers_off else {}),
             'milliseconds': {k: percentiles(v) for k, v in self.milliseconds.items()},
+            'stage_s': {stage: round(total, 6) for stage, total in self.stage_s.items()},
             'filters': filters,
         }
 

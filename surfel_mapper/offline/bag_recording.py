@@ -212,8 +212,11 @@ def feed(
     infos = images.info_topics if images else {}
     scenes = scene_feed(mapper)
     scene_topics = scenes.topics if scenes else set()
-    for message in messages(reader, {*clouds, *infos, *scene_topics}, poses, span):
-        if stopped():
+    found = messages(reader, {*clouds, *infos, *scene_topics}, poses, span)
+    while not stopped():
+        with mapper.counters.timed('read'):
+            message = next(found, None)
+        if message is None:
             break
         if scenes and message.topic in scene_topics:
             scenes.add(reader, message)

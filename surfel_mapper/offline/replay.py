@@ -378,10 +378,11 @@ def mapped(
 
     trajectory, total = ScanTrajectory(mapper), recording.num_scans
     for update in recording.replay(mapper, stopped):
-        trajectory.add(update)
-        for each in listen:
-            each(update)
-        progress(mapper.counters.received, total)
+        with mapper.counters.timed('record'):
+            trajectory.add(update)
+            for each in listen:
+                each(update)
+            progress(mapper.counters.received, total)
     return trajectory, stopped()
 
 

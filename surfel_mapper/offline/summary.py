@@ -10,15 +10,23 @@ from typing import Any
 
 
 def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
-    """Return the summary in a few lines for people."""
+    """
+    Return the summary in a few lines for people.
+
+    The times of the stages are those of the whole replay by scan received; they add up to the
+    total, but for loading and for stages in two threads at a time.
+    """
     from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
 
     scans, times = summary['scans'], summary['milliseconds']
     out = f' ({sum(scans["dropped"].values())} dropped: {causes_text(scans["dropped"])})'
     gated = f' ({scans["gated"]} left out by the motion gate)'
     localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
+    slowest = times['total']['p99'] if 'total' in times else 0.0
+    share = 1e3 / max(scans['received'], 1)
+    means = {**summary['stage_s'], 'total': summary['replay_s']}
     stages = '   '.join(
-        f'{stage} {times[stage]["median"]:.1f} ms' for stage in STAGES if stage in times
+        f'{stage} {share * means[stage]:.1f} ms' for stage in STAGES if stage in means
     )
     filters = ''.join(
         f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
@@ -42,7 +50,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'scans {scans["received"]}{out if scans["dropped"] else ""}'
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
-        f'{stages} a scan (p99 {times["total"]["p99"]:.1f})   {speed:.1f} times real time\n'
+        f'{stages} a scan (p99 {slowest:.1f})   {speed:.1f} times real time\n'
         f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(str(path) for path in written)}'

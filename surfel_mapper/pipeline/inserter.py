@@ -199,7 +199,10 @@ class Inserter:
 
         """
         laps = Laps()
-        for prepared in self.preparation.prepare(scan, self.aligner.to_map(pose), config, laps):
+        found = self.preparation.prepare(scan, self.aligner.to_map(pose), config, laps)
+        if not found and len(laps.milliseconds) > 1:
+            self._drops.counters.add_times(laps.milliseconds)
+        for prepared in found:
             update = self._insert(prepared, config, following, laps)
             if update is not None:
                 yield update

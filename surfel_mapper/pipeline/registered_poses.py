@@ -263,7 +263,9 @@ class RegisteredPoses:
         try:
             found = self._tracker.track(seen.cells, seen.stamp_ns, surfel_map, T_map_fixed)
         except AlignmentError as error:
-            self._begin_part(seen, T_map_middle, twist, str(error))
+            part = self._begin_part(seen, T_map_middle, twist, str(error))
+            if self._tracker.doubtful is not None:
+                part.set_place(self._tracker.doubtful, np.eye(4))
             return []
         return [self._placed(seen.prepared, seen.T_middle_body, found)]
 
@@ -273,18 +275,17 @@ class RegisteredPoses:
         T_map_middle: Transform,
         twist: npt.NDArray[np.float64],
         reason: str,
-    ) -> None:
+    ) -> MapPart:
         """Begin a part with a scan, predicted at a pose with a velocity."""
         expected = self._tracker.expected_support
         part = MapPart(self._registration, self._config, T_map_middle, expected, reason)
         part.tracker.begin(seen.stamp_ns, twist)
         part.add(seen)
-        if self._tracker.doubtful is not None:
-            part.set_place(self._tracker.doubtful, np.eye(4))
         self._part = part
         self._drops.warn(
             'lost', f'scan at {seen.stamp_ns / 1e9:.6f} s has no certain place: {reason}'
         )
+        return part
 
     def _recover(
         self, seen: Sighting, part: MapPart, surfel_map: SurfelMap, T_map_fixed: Transform
