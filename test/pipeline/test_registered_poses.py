@@ -225,7 +225,7 @@ def test_degenerate_registrations_are_warned_about(caplog):
 
     assert len(updates[2].registration.degenerate) == 1
     assert mapper.summary()['registration']['degenerate'] == 2
-    assert '1 of 6 directions of motion cannot be told' in caplog.text
+    assert '1 of 6 directions of motion are not determined' in caplog.text
 
 
 def test_the_motion_gate_looks_at_the_pose_found():
