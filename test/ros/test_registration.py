@@ -64,10 +64,8 @@ def test_odometry_and_track_are_those_that_a_mapper_finds(start, peer):
     mapper = Mapper(Config.from_mapping(SETTINGS))
     for message, odometry in zip(messages, found, strict=True):
         mapper.add_scan(to_scan(message))
-        list(mapper.insert_ready())
-        np.testing.assert_allclose(
-            pose_of(odometry), mapper.registered.T_fixed_body, rtol=0.0, atol=1e-12
-        )
+        (update,) = mapper.insert_ready()
+        np.testing.assert_allclose(pose_of(odometry), update.T_fixed_body, rtol=0.0, atol=1e-12)
         linear = odometry.twist.twist.linear
         np.testing.assert_allclose(
             [linear.x, linear.y, linear.z], mapper.registered.twist[:3], atol=1e-12
