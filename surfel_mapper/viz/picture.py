@@ -1,13 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-map.png: a map from above and from the side, its surfels coloured by planarity.
+map.png: a map from above and from the side, its surfels shaded by normal and light.
 
 A compiled kernel paints the surfels and matplotlib adds the axes: drawn by matplotlib, each 70,000
 surfels took 2 s. A surfel is drawn as a disc seen at an angle, an ellipse, so walls become lines
 from above. Surfels that face away from the viewer are left out, because they would hide
 the others: from above the ceiling of a hall, from the side its near wall. The rest is painted from
 far to near.
+
+Normals vary little along a surface, so that floors, walls and cars are plain areas. Planarity, the
+other choice, depends on how the voxels of the lattice cut a wall, and gives stripes.
 
 A few distant surfels would make all others tiny, so the picture leaves out half a percent of the
 surfels at either end of each axis.
@@ -23,6 +26,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.kernels.painting import paint_discs
@@ -125,10 +129,20 @@ class Frame:
         image[rows.clip(0, self.height - 1)] = GRID
         return image
 
-    def discs(self, surfels: Surfels, half_m: Array) -> Discs:
-        """Return the surfels that face the viewer as discs of half sizes half_m, far to near."""
-        from matplotlib import colormaps
+    def discs(self, surfels: Surfels, half_m: Array, colours: Array) -> Discs:
+        """
+        Return the surfels that face the viewer as discs, far to near.
 
+        Parameters
+        ----------
+        surfels : Surfels
+            K surfels.
+        half_m : (K,) float64, m
+            Half sizes of their discs.
+        colours : (K, 3) float64
+            Red, green and blue, 0 to 1.
+
+        """
         normal_right, normal_up, facing = self.view.seen(surfels.normal)
         order = np.argsort(self.view.seen(surfels.position)[2], kind='stable')
         order = order[facing[order] > FACING_AWAY]
@@ -138,8 +152,7 @@ class Frame:
         angle = np.arctan2(normal_right, normal_up)[order]
         sizes = np.maximum(np.column_stack([half, thin]), THINNEST_PX)
         discs = np.column_stack([self.placed(surfels.position[order]), sizes, angle])
-        colours = 255.0 * colormaps['viridis'](surfels.planarity[order])[:, :3]
-        return discs, colours.astype(np.float32)
+        return discs, (255.0 * colours[order]).astype(np.float32)
 
     def line(self, positions: Array) -> Discs:
         """Return a line through (S, 3) positions as discs, one for each pixel of its length."""
@@ -151,6 +164,37 @@ class Frame:
         discs[:, 0], discs[:, 1] = (np.interp(at, way, axis) for axis in places.T)
         discs[:, 2:4] = 0.5 * LINE_PX
         return discs, np.tile(np.array(LINE, np.float32), (len(at), 1))
+
+
+COLOURINGS = ('normal', 'planarity')
+"""Colours of surfels: shaded by normal and light, or planarity by a colour map."""
+
+LIGHT = np.array([-0.40, -0.55, 0.73])
+"""Direction to the light, about of unit length: from above, the south and the west."""
+
+AMBIENT, TINT = 0.30, 0.45
+"""Share of the light that comes from all sides, and of the colour that depends on the normal."""
+
+
+def colours_of(surfels: Surfels, colouring: str) -> Array:
+    """
+    Return the colours (K, 3) of surfels, 0 to 1.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such colouring.
+
+    """
+    if colouring == 'planarity':
+        from matplotlib import colormaps
+
+        return np.asarray(colormaps['viridis'](surfels.planarity)[:, :3], np.float64)
+    if colouring != 'normal':
+        raise ConfigError(f'colouring {colouring!r}, expected one of {", ".join(COLOURINGS)}')
+    base = (1.0 - TINT) * 0.88 + TINT * (0.5 + 0.5 * surfels.normal)
+    lit = 0.5 + 0.5 * surfels.normal @ LIGHT  # also what faces away is not black
+    return np.asarray(np.clip(base * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None], 0.0, 1.0))
 
 
 X, Y, Z = 0, 1, 2
@@ -189,6 +233,7 @@ def draw_map(
     title: str = '',
     *,
     trajectory: Array | None = None,
+    colouring: str = 'normal',
 ) -> None:
     """
     Draw a map as a PNG file, written whole or not at all.
@@ -203,9 +248,13 @@ def draw_map(
         Title above the picture.
     trajectory : (S, 3) float64, m, optional
         Positions of the sensor; drawn as a line.
+    colouring : str
+        ``normal``: shaded by normal and light; ``planarity``: by a colour map.
 
     Raises
     ------
+    ConfigError
+        If there is no such colouring.
     FileFormatError
         If the file cannot be written.
 
@@ -213,6 +262,7 @@ def draw_map(
     from matplotlib.image import imsave
 
     drawn = surfels.select(np.isfinite(surfels.planarity))
+    colours = colours_of(drawn, colouring)
     box = low, high = limits(drawn)
     both = views(high - low)
     extent = high - low
@@ -220,10 +270,10 @@ def draw_map(
         WIDTH_PX / extent[both[0].right], HEIGHT_PX / sum(extent[view.up] for view in both)
     )
     frames = [Frame.of(view, box, px_per_m) for view in both]
-    pixels, corners = framed(frames, title)
+    pixels, corners = framed(frames, title, colouring)
     for frame, (row, column) in zip(frames, corners, strict=True):
         image = frame.gridded()
-        paint_discs(*frame.discs(drawn, 0.5 * SPREAD * sides_m(drawn)), image)
+        paint_discs(*frame.discs(drawn, 0.5 * SPREAD * sides_m(drawn), colours), image)
         if trajectory is not None and len(trajectory):
             paint_discs(*frame.line(trajectory), image)
         height, width = image.shape[:2]
@@ -259,10 +309,10 @@ def views(extent: Array) -> tuple[View, View]:
 
 
 def framed(
-    frames: Sequence[Frame], title: str
+    frames: Sequence[Frame], title: str, colouring: str
 ) -> tuple[npt.NDArray[np.uint8], list[tuple[int, int]]]:
     """
-    Return a picture with empty axes, one below the other, and a colour bar.
+    Return a picture with empty axes, one below the other; of planarity with a colour bar.
 
     The second value holds row and column of the upper left corner of each pair of axes.
     """
@@ -271,7 +321,7 @@ def framed(
     from matplotlib.figure import Figure
 
     across = frames[0].width
-    width = max(LEFT + across + RIGHT, SMALLEST_PX)
+    width = max(LEFT + across + (RIGHT if colouring == 'planarity' else RIGHT // 3), SMALLEST_PX)
     height = ABOVE + sum(frame.height + BELOW for frame in frames)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
@@ -285,8 +335,9 @@ def framed(
         label(axes_at(row, LEFT, frame.height, across), frame)
         corners.append((row, LEFT))
         row += frame.height + BELOW
-    bar = axes_at(ABOVE, LEFT + across + 30, height - ABOVE - BELOW, 25)
-    figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label('planarity')
+    if colouring == 'planarity':
+        bar = axes_at(ABOVE, LEFT + across + 30, height - ABOVE - BELOW, 25)
+        figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label(colouring)
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(title), 1))
     figure.axes[0].set_title(title, fontsize=min(TITLE_PT, points), x=0.0, ha='left')
     canvas.draw()

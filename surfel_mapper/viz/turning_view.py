@@ -63,7 +63,7 @@ def turning_view(
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
         fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
-    colours = ''.join(f'<option>{n}</option>' for n in ('planarity', 'height', 'slope', 'normal'))
+    colours = ''.join(f'<option>{n}</option>' for n in ('normal', 'planarity', 'height', 'slope'))
     return (
         '<h2>The map</h2><div class="view"><canvas id="surfels"></canvas>'
         f'<div id="picture" hidden>{fallback}</div>'

@@ -1,12 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The picture of a map shows the surfels that face the viewer, coloured by planarity, to scale."""
+"""The picture of a map shows what faces the viewer, to scale, shaded or by planarity."""
+
+import dataclasses
 
 import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
 
@@ -38,7 +40,7 @@ def joined(*parts):
 
 
 def drawn(tmp_path, surfels, **options):
-    draw_map(surfels, tmp_path / 'map.png', **options)
+    draw_map(surfels, tmp_path / 'map.png', **{'colouring': 'planarity', **options})
     return np.asarray(Image.open(tmp_path / 'map.png').convert('RGB')) / 255.0
 
 
@@ -50,6 +52,25 @@ def test_a_ceiling_does_not_hide_the_floor(tmp_path):
     image = drawn(tmp_path, joined(sheet(0.0, 1.0, 1.0), sheet(5.0, -1.0, 0.0)))
 
     assert num_pixels(image, YELLOW) > 10 * num_pixels(image, PURPLE)
+
+
+def test_planes_are_of_one_colour_whatever_their_planarity(tmp_path):
+    sheets = sheet(0.0, 1.0, 1.0)
+    stripes = np.arange(len(sheets)) % 2.0
+    striped = dataclasses.replace(sheets, planarity=stripes)
+
+    image = drawn(tmp_path, striped, colouring='normal')
+    assert np.array_equal(image, drawn(tmp_path, sheets, colouring='normal'))
+    # white by 0.88, 45 % of the colour of the normal (0.5, 0.5, 1); light at 0.73 from above
+    expected = (0.55 * 0.88 + 0.45 * np.array([0.5, 0.5, 1.0])) * (0.3 + 0.7 * (0.5 + 0.5 * 0.73))
+    assert num_pixels(image, expected) > 100_000
+    assert num_pixels(drawn(tmp_path, striped), expected) == 0
+
+
+def test_an_unknown_colouring_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="colouring 'height', expected one of normal, planarity"):
+        draw_map(sheet(0.0, 1.0, 1.0), tmp_path / 'map.png', colouring='height')
+    assert not (tmp_path / 'map.png').exists()
 
 
 def test_a_roof_hides_the_ground(tmp_path):

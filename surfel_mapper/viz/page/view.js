@@ -35,9 +35,10 @@
       vec3 at = centre + look.x * largest * (cos(turn) * u + sin(turn) * cross(n, u));
       float facing = dot(n, normalize(eye - centre));
       gl_Position = facing < -0.2 * hide - (1.0 - hide) ? vec4(2, 2, 2, 1) : camera * vec4(at, 1);
-      float value = colouring == 0 ? look.y : colouring == 1 ? place.z : abs(n.z);
-      vec3 base = colouring == 3 ? 0.5 + 0.5 * n : texture(ramp, vec2(value, 0.5)).rgb;
-      colour = base * (0.62 + 0.38 * abs(facing));
+      float value = colouring == 1 ? look.y : colouring == 2 ? place.z : abs(n.z);
+      float lit = 0.65 + 0.35 * dot(n, vec3(-0.40, -0.55, 0.73)); // as in viz/picture.py
+      colour = colouring == 0 ? (0.484 + 0.45 * (0.5 + 0.5 * n)) * lit
+        : texture(ramp, vec2(value, 0.5)).rgb * (0.62 + 0.38 * abs(facing));
     }`;
   const FRAGMENT = `#version 300 es
     precision mediump float;
@@ -366,8 +367,8 @@
   );
   document.querySelector('.scale .ramp').style.background =
     `linear-gradient(to right, ${stops.join()})`;
-  const ends = [['0', '1'], data.heights, ['90\u00b0', '0\u00b0'], null];
-  document.getElementById('colouring').addEventListener('change', () => {
+  const ends = [null, ['0', '1'], data.heights, ['90\u00b0', '0\u00b0']];
+  function recolour() {
     const chosen = ends[document.getElementById('colouring').selectedIndex];
     document.querySelector('.scale').hidden = !chosen;
     if (chosen) {
@@ -375,11 +376,13 @@
         document.getElementById('most').textContent] = chosen;
     }
     redraw();
-  });
+  }
+  document.getElementById('colouring').addEventListener('change', recolour);
   document.getElementById('hide').addEventListener('change', redraw);
   document.getElementById('reset').addEventListener('click', reset);
   new ResizeObserver(redraw).observe(canvas);
   matchMedia('(prefers-color-scheme: dark)').addEventListener('change', redraw);
   reset();
+  recolour();
 
 })();
