@@ -11,6 +11,7 @@ far to near.
 
 Normals vary little along a surface, so that floors, walls and cars are plain areas. Planarity, the
 other choice, depends on how the voxels of the lattice cut a wall, and gives stripes.
+Frames, colours and axes are one module because each is of no use without the others.
 
 A few distant surfels would make all others tiny, so the picture leaves out half a percent of the
 surfels at either end of each axis.
