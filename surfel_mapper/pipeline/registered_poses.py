@@ -8,6 +8,7 @@ share one track; otherwise that of the sensor itself.
 
 A scan without a certain place begins a part of the map of its own (map_part); later scans are
 tracked on that part until their place on the map is confirmed, and are then mapped all together.
+Tracking, waiting and joining share the state of one track, so they are one module.
 """
 
 from __future__ import annotations

@@ -488,8 +488,9 @@ class BlockMap(BlockArrays):
         rows = self.rows()
         for first in range(0, len(rows), PART):
             part = rows[first : first + PART]
-            centers = (self.index(part)[:, None] * side + local + 0.5) * size_m
-            inside = np.asarray(contains(centers.reshape(-1, 3))).reshape(len(part), -1)
+            centers = (self.index(part)[:, None] * side + local + 0.5).astype(np.float64) * size_m
+            points: npt.NDArray[np.float64] = centers.reshape(-1, 3)
+            inside = np.asarray(contains(points)).reshape(len(part), -1)
             changed, hit = part[inside.any(axis=1)], inside[inside.any(axis=1)]
             if not len(changed):
                 continue

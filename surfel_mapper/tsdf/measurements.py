@@ -83,7 +83,7 @@ def settings(config: TsdfConfig) -> Float32:
 
 def remapped(labels: npt.NDArray[Any], config: TsdfConfig) -> npt.NDArray[np.int32]:
     """Return labels, of any shape, after label_map."""
-    found = np.ascontiguousarray(labels, np.int32)
+    found: npt.NDArray[np.int32] = np.ascontiguousarray(labels, np.int32)
     if not config.label_map:
         return found
     pairs = np.array(config.label_map, np.int32).reshape(-1, 2)
