@@ -83,13 +83,14 @@ def settings(config: TsdfConfig) -> Float32:
 
 def remapped(labels: npt.NDArray[Any], config: TsdfConfig) -> npt.NDArray[np.int32]:
     """Return labels, of any shape, after label_map."""
-    found: npt.NDArray[np.int32] = np.ascontiguousarray(labels, np.int32)
+    found: npt.NDArray[np.int32] = np.asarray(labels, np.int32)
     if not config.label_map:
         return found
-    pairs = np.array(config.label_map, np.int32).reshape(-1, 2)
+    pairs: npt.NDArray[np.int32] = np.array(config.label_map, np.int32).reshape(-1, 2)
     pairs = pairs[np.argsort(pairs[:, 0])]
     place = np.minimum(np.searchsorted(pairs[:, 0], found), len(pairs) - 1)
-    return np.where(pairs[place, 0] == found, pairs[place, 1], found)
+    chosen: npt.NDArray[np.int32] = np.where(pairs[place, 0] == found, pairs[place, 1], found)
+    return chosen
 
 
 @cache
