@@ -220,7 +220,7 @@ class TsdfConfig(Stage):
     )
     mesh_rate_hz: float = setting(
         1.0,
-        'Rate of ~/mesh, Hz, while it has subscribers; 0: never.',
+        'Rate of ~/mesh and ~/mesh_tiles, Hz, while each has subscribers; 0: never.',
         low=0.0,
         high=100.0,
         live=True,

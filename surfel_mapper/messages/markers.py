@@ -102,6 +102,13 @@ def marker_array(markers: Sequence[Marker]) -> bytes:
     return writer.join()
 
 
+def marker_bytes(marker: Marker) -> bytes:
+    """Return the serialised visualization_msgs/Marker; raises as marker_array does."""
+    writer = MessageWriter()
+    write_marker(writer, marker)
+    return writer.join()
+
+
 def polygon_instance(
     ring: npt.NDArray[np.float64], number: int, *, stamp_ns: int, frame_id: str
 ) -> bytes:

@@ -55,7 +55,7 @@ def shown(arrays):
 
 def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     start_node(start, peer, **SETTINGS)
-    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     slices = peer.collect(OccupancyGrid, f'{BASE}/tsdf_slice', LATCHED)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
@@ -69,6 +69,12 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     assert len(corners) == len(mesh.colors) > 3000
     assert len(corners) % 3 == 0
     assert np.abs(np.linalg.norm(corners - middle, axis=1) - RADIUS_M).max() <= 0.1
+
+    whole = peer.collect(Marker, f'{BASE}/mesh', LATCHED)  # the same triangles in one marker
+    peer.spin_until(lambda: whole and len(whole[-1].points) == len(corners))
+    assert (whole[-1].type, whole[-1].action, whole[-1].header.frame_id) == (11, 0, 'odom')
+    one = np.array([(p.x, p.y, p.z) for p in whole[-1].points])
+    assert np.array_equal(np.sort(one, axis=0), np.sort(corners, axis=0))
 
     peer.spin_until(lambda: slices and slices[-1].data)
     grid = slices[-1]
@@ -96,7 +102,7 @@ def test_colours_come_from_the_image_beside_a_depth_image(start, peer):
     kinds = {'/depth/image': Image, '/depth/camera_info': CameraInfo, '/rgb/image': Image}
     start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
-    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/depth/camera_info', camera_info(camera))
@@ -124,7 +130,7 @@ def test_packed_images_are_taken_and_damaged_ones_counted(start, peer):
     kinds = {depth_topic: CompressedImage, info: CameraInfo, color_topic: CompressedImage}
     start('node', *arguments(**settings))
     peer.advertise('/odom', *kinds, kinds=kinds)
-    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
     depth = packed_depth(np.full((60, 80), 2000, np.uint16))
     color = packed(np.full((60, 80, 3), (200, 100, 0), np.uint8), 'rgb8; jpeg compressed', 'JPEG')
@@ -178,7 +184,7 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
 
 def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     start_node(start, peer, **SETTINGS, **{'layers.tsdf.max_range_m': 100.0})
-    meshes = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     half = directions[:, 0] > 0.0
     ranges = np.where(half, 30.0, RADIUS_M)[:, None]
@@ -186,7 +192,7 @@ def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     peer.publish('/points', cloud(START_NS, ranges * directions))
     peer.spin_until(lambda: len(shown(meshes)) > 5)
     num_before = len(meshes)
-    late = peer.collect(MarkerArray, f'{BASE}/mesh', MESHES)
+    late = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     peer.spin_until(lambda: late and shown(late).keys() == shown(meshes).keys())
     assert {n: m.points for n, m in shown(late).items()} == {
         n: m.points for n, m in shown(meshes).items()

@@ -25,7 +25,7 @@ from surfel_mapper.files.ply import write_mesh
 from surfel_mapper.files.tsdf_archive import BlockArchive
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.field import DistanceField
-from surfel_mapper.layers.distance_field.live_mesh import LiveMesh
+from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import slice_at
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
@@ -100,6 +100,7 @@ class TsdfLayer(Layer):
         self._point_integrator = PointIntegrator(self.blocks)
         self._mesher = Mesher(self.blocks)
         self._live_mesh = LiveMesh(self.blocks)
+        self._whole_mesh = WholeMesh(self.blocks)
         self._waiting: dict[int, Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
         self._num_by_points = 0
@@ -211,9 +212,17 @@ class TsdfLayer(Layer):
         return (
             Publication(
                 topic='~/mesh',
+                type_name='visualization_msgs/msg/Marker',
+                messages=lambda now: self._whole_mesh.messages(now),
+                in_background=True,
+                version=lambda: (id(self.blocks), self.blocks.version),
+                rate_hz=lambda config: config.tsdf.mesh_rate_hz,
+            ),
+            Publication(
+                topic='~/mesh_tiles',
                 type_name='visualization_msgs/msg/MarkerArray',
                 messages=lambda now: self._live_mesh.changed(now),
-                all_messages=self._whole_mesh,
+                all_messages=self._all_tiles,
                 in_background=True,
                 version=lambda: (id(self.blocks), self.blocks.version),
                 depth=MESHES_KEPT,
@@ -260,7 +269,7 @@ class TsdfLayer(Layer):
         blocks = self.whole()
         return self.mesh() if blocks is self.blocks else DistanceField(blocks=blocks).mesh()
 
-    def _whole_mesh(self, now: Moment) -> Iterable[bytes]:
+    def _all_tiles(self, now: Moment) -> Iterable[bytes]:
         return self._live_mesh.complete(now) if self.config.tsdf.mesh_rate_hz else ()
 
     def _slice_messages(self, now: Moment) -> list[bytes]:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The mesh of a distance field as markers that are updated tile by tile.
+The mesh of a distance field as one marker, or as markers that are updated tile by tile.
 
 A tile is a cube of TILE blocks a side and one marker, so viewers replace only what has changed.
 The triangles are made while the messages are iterated, in any thread; only the copy of changed
@@ -16,7 +16,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.layers.layer import Moment
-from surfel_mapper.messages.markers import DELETE_ALL, Marker, marker_array, TRIANGLE_LIST
+from surfel_mapper.messages.markers import (
+    DELETE_ALL,
+    Marker,
+    marker_array,
+    marker_bytes,
+    TRIANGLE_LIST,
+)
 from surfel_mapper.messages.surfel_markers import mesh_marker
 from surfel_mapper.tsdf.blocks import block_index, BlockMap
 from surfel_mapper.tsdf.mesh import Changes, Mesher
@@ -92,6 +98,34 @@ class LiveMesh:
             else:
                 content.pop(key, None)
         return list(touched)
+
+
+class WholeMesh:
+    """
+    The mesh as one marker; its blocks are marched only if they have changed.
+
+    The results of ``messages`` must be iterated as those of LiveMesh.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The field.
+
+    """
+
+    def __init__(self, blocks: BlockMap) -> None:
+        self._mesher = Mesher(blocks, visible_only=True)
+
+    def messages(self, now: Moment) -> Iterable[bytes]:
+        """Return one Marker; called by the owner of the map."""
+        return self._marker(self._mesher.changes(), now)
+
+    def _marker(self, changes: Changes, now: Moment) -> Iterator[bytes]:
+        self._mesher.apply(changes)
+        mesh = self._mesher.mesh()
+        yield marker_bytes(
+            mesh_marker(mesh, number=0, stamp_ns=now.stamp_ns, frame_id=now.frame_id)
+        )
 
 
 def tiles_of(keys: list[int]) -> list[Tile]:
