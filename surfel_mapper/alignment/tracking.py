@@ -41,6 +41,9 @@ EXPECTED_SUPPORT = 0.85
 POOR_SUPPORT = 0.6
 """Share of the expected support below which a scan is not accepted at once wherever it fits."""
 
+CLEAR_FIT = 0.8
+"""A scan of small overlap that fits so well sees a new place: .97 there, .78 at wrong places."""
+
 FIRST_SUPPORT = 0.35
 """Minimum support before there are recent scans: real scans of a hall that a hand turned by 90 deg
 fit the scan before to 0.5."""
@@ -166,6 +169,7 @@ class Tracker:
         refusal = self._refusal(found, is_steady, self.speed_m_s(pose, stamp_ns))
         self.doubtful = None
         is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
+        is_poor = is_poor and found.fit < CLEAR_FIT  # a new place has a small overlap, but fits
         if not refusal and (is_poor or (found.is_found and found.support < expected)):
             self.doubtful = found.T_map_sensor
             refusal = (

@@ -53,7 +53,7 @@ def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     printed = capsys.readouterr()
     lines = printed.out.splitlines()
     assert lines[0] == f'scans {NUM_SCANS}   points 27 k   surfels {summary["surfels"]}'
-    assert lines[1].startswith('decode ')
+    assert lines[1].startswith('read ')
     assert lines[2] == f'digest {summary["digest"]}'
     assert printed.err == ''  # no progress without a terminal
 
