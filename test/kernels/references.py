@@ -9,6 +9,7 @@ compares the table with the modules that there are.
 
 REFERENCES = {
     'alignment/kernels/edges.py': 'alignment/kernels/test_edges.py',
+    'alignment/kernels/planes.py': 'alignment/kernels/test_planes.py',
     'alignment/kernels/registration.py': 'alignment/kernels/test_registration.py',
     'filters/kernels/boxes.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/limits.py': 'filters/kernels/test_kernels.py',
@@ -56,6 +57,7 @@ REFERENCES = {
     'tsdf/kernels/block_marks.py': 'tsdf/test_selection.py',
     'tsdf/kernels/blocks.py': 'tsdf/test_blocks.py',
     'tsdf/kernels/channels.py': 'tsdf/test_labels.py',
+    'tsdf/kernels/free_space.py': 'tsdf/test_selection.py',
     'tsdf/kernels/integration.py': 'tsdf/test_twin.py',
     'tsdf/kernels/lookup.py': 'tsdf/test_range_image.py',
     'tsdf/kernels/marching_cubes.py': 'tsdf/test_mesh.py',

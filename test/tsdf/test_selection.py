@@ -10,9 +10,9 @@ from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.kernels.integration import OBSERVED
-from surfel_mapper.tsdf.selection import BlockSelection
+from surfel_mapper.tsdf.selection import BlockSelection, without_surface
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
-from test.tsdf.scenes import image_of
+from test.tsdf.scenes import image_of, SMALL
 
 SENSORS = {
     'camera': CameraModel(
@@ -141,3 +141,24 @@ def test_without_a_measurement_there_is_no_block():
         image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
         config = TsdfConfig(**SIZES, allocation=allocation)
         assert BlockSelection(config).blocks(image, np.eye(4)).shape == (0, 3)
+
+
+def test_blocks_without_a_surface_are_before_the_band_of_a_wall_or_behind_it():
+    config = TsdfConfig(voxel_size_m=0.05, truncation_m=0.15, voxels_per_side=4)
+    image = image_of(SMALL, 2.5 * SMALL.ray_length)
+    steps = np.arange(-10, 11)
+    index = np.stack(np.meshgrid(steps, steps, steps + 10, indexing='ij'), -1).reshape(-1, 3)
+    free = without_surface(config, image, np.eye(4), index)
+
+    size_m, inner = config.block_size_m, np.linspace(0.0, 1.0, 6)
+    within = np.stack(np.meshgrid(inner, inner, inner, indexing='ij'), -1).reshape(-1, 3)
+    points = (index[:, None] + within) * size_m  # in the frame of the camera, z forward
+    distance = np.linalg.norm(points, axis=2)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        wall = 2.5 * distance / points[..., 2]  # range of the wall in the direction of each point
+    in_band = (distance > wall - config.truncation_m) & (distance < wall + config.reach_behind_m)
+    assert not in_band[free].any()
+    ahead = (points[..., 2] > 1.0).all(axis=1) & (points[..., 2] < 2.0).all(axis=1)
+    central = ahead & (np.abs(points[..., :2]) < 0.4).all(axis=(1, 2))
+    assert central.sum() >= 8
+    assert free[central].all()
