@@ -129,6 +129,15 @@ def topics_in(view):
 def test_the_view_has_every_output_and_the_initial_pose(launch):
     text = (FOLDER / 'mapper.rviz').read_text(encoding='utf-8')
     topics = topics_in(yaml.safe_load(text))
-    for name in ('markers', 'planes', 'mesh', 'tsdf_slice', 'track', 'path', 'grid', 'normals'):
+    for name in (
+        'markers',
+        'planes',
+        'mesh_tiles',
+        'tsdf_slice',
+        'track',
+        'path',
+        'grid',
+        'normals',
+    ):
         assert f'/surfel_mapper/{name}' in topics
     assert '/initialpose' in topics

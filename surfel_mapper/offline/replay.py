@@ -14,7 +14,7 @@ One module of 400 lines: a replay reads from top to bottom as check, start, map,
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, ExitStack
+from contextlib import contextmanager, ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 import logging
@@ -174,7 +174,7 @@ def replay(
     directory = output_directory(request.path, None if output is None else Path(output))
     check_outputs(directory, options)
     keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
-    with open_recording(request, settings) as recording:
+    with no_empty_directory(directory), open_recording(request, settings) as recording:
         mapper = started_mapper(with_loops(recording.config, options, directory))
         history = History()
         with listeners(directory, options, mapper) as listening:
@@ -228,6 +228,19 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     if options.align:
         settings = settings.replace({'window.keep_points': True})
     return settings if options.window else settings.replace(ALL_SCANS)
+
+
+@contextmanager
+def no_empty_directory(directory: Path) -> Iterator[None]:
+    """Remove a directory that was made in the block if an error leaves it empty."""
+    was_there = directory.exists()
+    try:
+        yield
+    except BaseException:
+        if not was_there:
+            with suppress(OSError):  # it has files, or was not made
+                directory.rmdir()
+        raise
 
 
 def with_loops(config: Config, options: ReplayOptions, directory: Path) -> Config:
