@@ -42,8 +42,8 @@ def keep_freed_memory() -> None:
 
 
 RARELY = 50_000
-"""New objects between two collections while kernels compile; at 700, Python's default, they take
-9 % of the time, and without any the compiler's garbage takes 60 MB."""
+"""New objects between two collections while kernels compile; Python's default is 700. Without any
+collection the garbage of the compiler takes 60 MB."""
 
 
 @contextmanager

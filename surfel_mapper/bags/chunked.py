@@ -181,7 +181,7 @@ class ChunkedFile(BagFile):
         """
         Raise ValueError if the chunks describe connections otherwise than the index does.
 
-        Each connection is described in the first chunk with a message of it, so few are unpacked.
+        The first chunk with a message of a connection describes it, so few chunks are unpacked.
         """
         left = {key for key, count in self._counts.items() if count}
         if not left <= self._by_id.keys():

@@ -3,7 +3,7 @@
 """
 Decorators for kernels that a start waits for: numba compiles no wrappers that nothing calls.
 
-A function of eight arrays takes 0.3 s to compile, of which 0.15 s are the wrapper for calls from
+A function of eight arrays takes 0.3 s to compile, of which 0.1 s is the wrapper for calls from
 Python and 0.04 s the one for calls from C. A ``kernel`` has the former only. A ``part`` has none:
 only kernels call it compiled; from Python it runs interpreted.
 

@@ -305,6 +305,8 @@ class Layer:
         """
         Read a state that ``save`` wrote; return the function that puts it in place.
 
+        Called only if a layer overrides it, as for ``save``.
+
         Raises
         ------
         FileFormatError

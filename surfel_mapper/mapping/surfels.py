@@ -177,7 +177,7 @@ class Surfels:
         Raises
         ------
         IndexError
-            If a row is negative, as ``SurfelIndex.at`` returns where there is no surfel.
+            If a row is negative: ``SurfelIndex.at`` returns -1 for a voxel without a surfel.
 
         """
         if not isinstance(rows, slice):
@@ -223,7 +223,7 @@ def concatenated(parts: Sequence[Surfels]) -> Surfels:
 
 def no_row(row: int, num_surfels: int) -> str:
     """Return the sentence that refuses a row."""
-    why = ' (index.at returns -1 where there is no surfel: leave these out)' if row == -1 else ''
+    why = ' (index.at returns -1 for a voxel without surfel: leave it out)' if row == -1 else ''
     return f'row {row} of {num_surfels} surfels{why}; expected 0 to {num_surfels - 1}'
 
 

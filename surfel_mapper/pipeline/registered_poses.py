@@ -258,7 +258,7 @@ class RegisteredPoses:
     def _track(
         self, seen: Sighting, surfel_map: SurfelMap, T_map_fixed: Transform
     ) -> list[Prepared]:
-        """Align a scan where it is expected; if it has no certain place, begin a part with it."""
+        """Align a scan at its expected pose; if its place is uncertain, begin a part with it."""
         T_map_middle = compose(T_map_fixed, self._tracker.predict(seen.stamp_ns))
         twist = self._tracker.twist
         try:

@@ -6,7 +6,7 @@ The topics of all layers that are switched on.
 A layer describes its topics (layers/layer.py); they are published here, at their rates or when
 the layer has followed a scan. Messages are made in the mapping thread, between two scans, and for
 a new subscriber of a large layer in steps, each between two scans. Large ones are made in the
-background: the mapping thread copies what they need, and scans are mapped meanwhile. The next
+background: the mapping thread copies their input, and scans are mapped meanwhile. The next
 ones wait until those before are published, so a slow reader gets fewer, and none twice.
 """
 

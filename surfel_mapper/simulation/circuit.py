@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Circuits: streets that meet at corners, and routes that return to where they were.
+Circuits: streets that meet at corners, and routes that return to their start.
 
 A street of the simulation is straight. A circuit is one street for every leg between two corners,
 without the objects that would stand in the road of another leg, on one ground. A route follows

@@ -52,7 +52,9 @@ def main(arguments):
         time.sleep(0.05)
     time.sleep(0.5)  # the other side needs to know of us too
     stamps = drive(settings, clouds, poses, points, odom)
-    time.sleep(5.0)  # unread messages vanish with their publisher
+    # Unread messages vanish with their publisher, and none learns what its reader has read; a wait
+    # that is too short shows as lost clouds.
+    time.sleep(5.0)
     Path(settings['stamps']).write_text(json.dumps(stamps), encoding='utf-8')
     rclpy.shutdown()
 

@@ -104,7 +104,7 @@ def test_rows_beyond_the_surfels_are_refused(surfel_map):
     surfels, index = surfel_map.surfels(), surfel_map.index()
     nowhere = index.at([[100.0, 0.0, 0.0]])
     for rows in (nowhere, int(nowhere[0]), [0, -1]):
-        with pytest.raises(IndexError, match='at returns -1 where there is no surfel'):
+        with pytest.raises(IndexError, match='at returns -1 for a voxel without surfel'):
             surfels[rows]
     with pytest.raises(IndexError):
         surfels[64]

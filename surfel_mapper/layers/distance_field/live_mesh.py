@@ -3,7 +3,7 @@
 """
 The mesh of a distance field as one marker, or as markers that are updated tile by tile.
 
-A tile is a cube of TILE blocks a side and one marker, so viewers replace only what has changed.
+A tile is a cube of TILE blocks a side and one marker, so viewers replace only changed tiles.
 The triangles are made while the messages are iterated, in any thread; only the copy of changed
 blocks is taken when the messages are asked for.
 """

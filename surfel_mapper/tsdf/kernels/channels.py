@@ -18,7 +18,7 @@ Votes for labels of a voxel, ``votes`` (V, N) float32:
 A label is stored as float32, exact up to 2^24. Label -1 means unknown.
 
 Totals obey the cap of the map, ``max_weight``: votes beyond it scale the other votes of the voxel
-down, so that what was observed 50 times after 500 others replaces them at a cap of 10.
+down, so at a cap of 10 a new label observed 50 times replaces one observed 500 times.
 
 MAJORITY equals adding log-likelihoods if every label but the observed one gets the same
 likelihood: differences are those of the counts times log(c / (1 - c)), c the confidence.
