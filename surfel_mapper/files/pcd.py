@@ -46,6 +46,9 @@ MAX_COUNT = 4096
 MAX_RATIO = 100
 """Limit of the compression ratio; LZF reaches at most 88."""
 
+PADDING = 4096
+"""Most zero bytes that may follow the points; the Point Cloud Library adds up to a page."""
+
 Columns = dict[str, npt.NDArray[Any]]
 
 
@@ -204,12 +207,14 @@ def binary_table(
             f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
             'points; truncated?'
         )
-    if left - size >= header.layout.itemsize:
+    content = file.read(size)
+    is_padded = left - size <= PADDING and not any(file.read(PADDING))
+    if left - size >= header.layout.itemsize and not is_padded:
         raise FileFormatError(
             f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
             'points; is its header damaged?'
         )
-    return np.frombuffer(file.read(size), header.layout)
+    return np.frombuffer(content, header.layout)
 
 
 def compressed_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:

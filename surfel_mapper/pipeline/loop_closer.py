@@ -90,9 +90,11 @@ class LoopMove:
 
     def __str__(self) -> str:
         closure = self.closure
+        if not closure.loops and not closure.refusals:
+            return 'no loops found'
         recognised = sum(loop.votes > 0 for loop in closure.loops)
         return (
-            f'{len(closure.loops)} loops accepted ({recognised} of recognised places), '
+            f'{len(closure.loops)} loops accepted ({recognised} found by place recognition), '
             f'{len(closure.refusals)} refused; {self.num_moved} of {len(self.stamps_ns)} scans '
             f'moved, by at most {self.largest_m:.3f} m and {self.largest_deg:.3f} deg'
         )

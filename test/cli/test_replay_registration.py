@@ -128,6 +128,17 @@ def test_real_scans_of_a_hand_that_turns_fast_are_followed(recorded, tmp_path, e
     assert errors['absolute']['translation_m']['max'] < 0.1
 
 
+def test_a_folder_of_real_scans_as_others_write_it_is_registered(data_folder, tmp_path):
+    folder = data_folder / 'data' / 'folders' / 'kitti_city'  # PCD of PCL, without stamps
+    assert main(['replay', str(folder), '--output', str(tmp_path)]) == 0
+    positions = poses_in(tmp_path / 'trajectory.tum')[1][:, :3, 3]
+    steps_m = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    assert len(positions) == 22
+    assert steps_m.min() > 0.7  # a car at 7 to 8 m/s, 10 scans a second
+    assert steps_m.max() < 0.9
+    assert np.abs(np.diff(steps_m)).max() < 0.05
+
+
 def test_scans_without_a_certain_place_become_a_map_of_their_own(tmp_path, capsys):
     entries = Entries()
     scans = [scan_at(number) for number in range(4)]

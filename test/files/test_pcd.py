@@ -101,6 +101,13 @@ def test_fields_of_several_numbers_and_padding_read(tmp_path):
     np.testing.assert_array_equal(found['fpfh'], np.arange(99).reshape(3, 33))
 
 
+@pytest.mark.parametrize('num_zeros', [1, 12, 3906, 4096])
+def test_zeros_up_to_a_page_may_follow_the_points(tmp_path, num_zeros):
+    content = HEADER.encode() + b'DATA binary\n' + np.array([1, 2], '<f4').tobytes()
+    (tmp_path / 'a.pcd').write_bytes(content + bytes(num_zeros))
+    np.testing.assert_array_equal(read_points(tmp_path / 'a.pcd')['x'], [1, 2])
+
+
 HEADER = 'VERSION 0.7\nFIELDS x\nSIZE 4\nTYPE F\nCOUNT 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\n'
 UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
 
@@ -113,6 +120,8 @@ UNSIZED = HEADER.replace('WIDTH 2', 'WIDTH 0')
         ('x' * 10**6, 'not a PCD file'),
         ('DATA binary\n', 'inconsistent PCD header'),
         (HEADER + 'DATA binary\n1234567', '7 bytes after the header, expected 8'),
+        (HEADER + 'DATA binary\n' + '\0' * 8 + '1234', 'is its header damaged'),
+        (HEADER + 'DATA binary\n' + '\0' * 4105, 'is its header damaged'),
         (HEADER + 'DATA ascii\n1\n', '1 numbers, expected 2'),
         (HEADER + 'DATA ascii\n1 a\n', 'could not convert'),
         (HEADER + 'DATA packed\n', 'DATA packed, expected'),
