@@ -134,7 +134,12 @@ def load_map(
         )
         surfel_map.insert(_moments(arrays, 'map', surfel_map))
         scans = [_scan(arrays, number, surfel_map) for number in range(_num_scans(arrays))]
-        held = SurfelMap(found_m, columns=surfel_map.columns, level=surfel_map.level)
+        held = SurfelMap(
+            found_m,
+            columns=surfel_map.columns,
+            level=surfel_map.level,
+            origin_m=surfel_map.origin_m,
+        )
         for scan in scans:
             held.insert(scan.moments)
         surfel_map.copy().subtract(held)  # checks that every scan can be evicted

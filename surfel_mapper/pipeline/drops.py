@@ -36,7 +36,8 @@ REMEDIES = {
     'filtered_out': 'are the limits of the filters too narrow?',
     INTERNAL: 'the map is unchanged by it and mapping goes on; please report it, unless memory is '
     'short (window.max_bytes, layers.tsdf.max_blocks)',
-    'map_limit': 'use a frame nearer to the robot, or larger voxels (map.voxel_size_m)',
+    'map_limit': 'poses in UTM or ECEF need map.origin: auto; otherwise use a frame nearer to the '
+    'robot, or larger voxels (map.voxel_size_m)',
     'missing_column': 'switch map.intensity or map.color off',
     'no_pose': 'compare frames.fixed, the frame of the clouds and their stamps with the data of '
     'pose.source; a sensor without a transform needs frames.base_to_sensor; '

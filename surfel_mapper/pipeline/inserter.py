@@ -270,7 +270,8 @@ class Inserter:
             left_out = windowed.moments.left_out
             self._drops.counters.points_left_out.update(left_out)
             if not len(windowed.moments):
-                self._drops.scan(scan, 'no_valid_points', f'left out: {left_out}')
+                cause = 'map_limit' if 'beyond_map' in left_out else 'no_valid_points'
+                self._drops.scan(scan, cause, f'left out: {left_out}')
                 return None
             if not self._warned_of_units and looks_like_millimetres(windowed.moments):
                 self._warned_of_units = True

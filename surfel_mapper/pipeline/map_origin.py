@@ -53,6 +53,8 @@ class MapOrigin:
 
     Attributes
     ----------
+    has_own_frame : bool
+        Whether the frame of the map has another origin than the fixed frame.
     is_known : bool
         False until ``auto`` has found it.
 
@@ -65,11 +67,11 @@ class MapOrigin:
 
     def __init__(self, config: Config, surfel_map: SurfelMap) -> None:
         self._map = surfel_map
-        self._has_own_frame = has_own_frame(config)
+        self.has_own_frame = has_own_frame(config)
         self._is_registered = config.pose.source == REGISTRATION
-        self.is_known = not self._has_own_frame or config.map.origin != AUTO
+        self.is_known = not self.has_own_frame or config.map.origin != AUTO
         if config.map.origin_m:
-            if not self._has_own_frame:
+            if not self.has_own_frame:
                 raise ConfigError(
                     f'map.origin: {config.map.origin!r}, expected auto or nothing with '
                     'pose.source registration, whose poses begin at the origin of the map'
@@ -80,7 +82,7 @@ class MapOrigin:
     def T_local_fixed(self) -> Transform:
         """From the fixed frame to the frame whose origin is that of the map."""
         T: Transform = np.eye(4)
-        if self._has_own_frame:
+        if self.has_own_frame:
             T[:3, 3] -= self._map.origin_m
         return T
 
@@ -107,7 +109,7 @@ class MapOrigin:
             If it is known, and differs.
 
         """
-        if self._has_own_frame and self.is_known:
+        if self.has_own_frame and self.is_known:
             if not np.array_equal(loaded.origin_m, self._map.origin_m):
                 wanted = ' '.join(f'{value:.17g}' for value in loaded.origin_m)
                 raise MapError(
@@ -115,7 +117,7 @@ class MapOrigin:
                     f"{self._map.origin_m.tolist()}; start with map.origin: '{wanted}'"
                 )
             return
-        if not self._has_own_frame and self._needs_own_frame(loaded):
+        if not self.has_own_frame and self._needs_own_frame(loaded):
             raise MapError(
                 f'map with origin {loaded.origin_m.tolist()}, expected none; start with '
                 'map.origin: auto and this map as map.load'
@@ -129,7 +131,7 @@ class MapOrigin:
 
     def shifted(self, transform: Transform, *, is_child: bool) -> Transform:
         """Return the pose of a frame in the fixed frame, or of the fixed frame, shifted."""
-        if not (self._has_own_frame and self._map.origin_m.any()):
+        if not (self.has_own_frame and self._map.origin_m.any()):
             return transform
         if is_child:
             place = np.eye(4)

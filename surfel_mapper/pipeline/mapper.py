@@ -398,6 +398,16 @@ class Mapper:
         """From the fixed frame of the poses to the map: its origin, and alignment's correction."""
         return compose(self._inserter.aligner.T_map_fixed, self._origin.T_local_fixed)
 
+    @property
+    def origin_m(self) -> npt.NDArray[np.float64] | None:
+        """
+        Place of the map's origin in the fixed frame by ``map.origin``, (3,) m.
+
+        None without that setting, and with ``auto`` until the first pose is known.
+        """
+        origin = self._origin
+        return self.map.origin_m if origin.has_own_frame and origin.is_known else None
+
     def T_map_of(self, frame_id: str, stamp_ns: int) -> Transform:
         """
         Return the pose of a frame in the map at a time; 0: at the newest stamp.

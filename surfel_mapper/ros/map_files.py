@@ -22,9 +22,9 @@ def save_map(mapper: Mapper) -> str:
     """
     Write the map to ``output.directory``; return a sentence that states path, sizes and digest.
 
-    ``output.map_name``.ply has the surfels, for other programs; ``output.map_name``.npz the
-    exact map and its window, from which mapping can continue; layers that keep a state, as the
-    distance field does, have a file each beside it.
+    ``output.map_name``.ply has the surfels in ``frames.fixed``, for other programs;
+    ``output.map_name``.npz the exact map and its window, from which mapping can continue; layers
+    that keep a state, as the distance field does, have a file each beside it.
 
     Raises
     ------
@@ -44,7 +44,7 @@ def save_map(mapper: Mapper) -> str:
         if not is_inside(directory, file):
             raise ConfigError(f'{file}: a link that leads out of output.directory, {directory}')
     surfels = mapper.map.surfels(mapper.config.map.min_points)
-    write_surfels(path, surfels)
+    write_surfels(path, surfels, mapper.map.origin_m)
     digest = save_mapper(state, mapper)
     layers = ''.join(f', {file.name}' for file in beside)
     return (

@@ -43,7 +43,7 @@ from surfel_mapper.ros.changes import ChangeTracker, MapChange
 from surfel_mapper.ros.layer_outputs import LayerOutputs
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.messages import cloud_message
-from surfel_mapper.ros.pose_outputs import AlignmentOutputs
+from surfel_mapper.ros.pose_outputs import AlignmentOutputs, OriginOutput
 from surfel_mapper.scan import Scan
 
 CHANGES = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -75,6 +75,7 @@ class Outputs:
         self._thread = thread
         self._changes = ChangeTracker(mapper)
         self._ages = Ages()
+        self._origin = OriginOutput(node, mapper)
         self._alignment = AlignmentOutputs(node, mapper)
         self._layers = LayerOutputs(node, mapper, thread)
         self._normals = node.create_publisher(PointCloud2, '~/normals', LATCHED)
@@ -99,6 +100,7 @@ class Outputs:
     def publish_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""
         self._stamp_ns = update.stamp_ns
+        self._origin.publish(update.stamp_ns)
         self._alignment.publish(update)
         self._layers.publish_update(update)
         if self._has_clients():
@@ -122,6 +124,7 @@ class Outputs:
         Needed whenever the map or its settings have changed otherwise than by a scan.
         """
         self._published.clear()
+        self._origin.publish(self._stamp_ns)
         self._layers.expire()
         if self._has_clients():
             self._publish_change(self._changes.collect())

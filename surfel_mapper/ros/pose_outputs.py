@@ -1,12 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The poses that the node publishes: the aligned path, and the odometry found by registration.
+The poses that the node publishes: origin of the map, aligned path, odometry by registration.
 
 An alignment of the window corrects poses in the map: ``~/path`` has the poses of the window's
 scans after it, and the transform from the map to the odometry frame goes out with every scan.
 That transform is published only if ``align.map_frame`` gives the map a frame of its own, since a
 frame has one parent, and the parent of odom may be another node's to publish.
+
+With ``map.origin`` the map has a frame whose origin is somewhere else in the fixed frame. The same
+transform states it, and ``~/origin`` too, which needs no tf2_msgs.
 
 With ``pose.source: registration`` the node finds the poses itself. Odometry and its transform go
 out with every scan, ``~/track`` once a second. They are in the fixed frame, which never jumps.
@@ -18,7 +21,12 @@ from collections import deque
 from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
+from geometry_msgs.msg import (
+    PointStamped,
+    PoseStamped,
+    PoseWithCovarianceStamped,
+    TransformStamped,
+)
 from nav_msgs.msg import Odometry, Path
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +36,7 @@ from std_msgs.msg import Header
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.geometry import q_xyzw, Transform
 from surfel_mapper.pipeline import Alignment, Mapper, Update
+from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.ros.base_node import LATCHED
 from surfel_mapper.ros.inputs import transform_message
@@ -80,6 +89,39 @@ class TransformPublisher:
         fill(message.transform.translation, T_parent_child[:3, 3])
         fill(message.transform.rotation, q_xyzw(T_parent_child))
         self._publisher.publish(self._message(transforms=[message]))
+
+
+class OriginOutput:
+    """
+    Publishes the place of the map's origin in the fixed frame, once it is known and if it changes.
+
+    Parameters
+    ----------
+    node : Node
+        The node that publishes.
+    mapper : Mapper
+        The mapper whose ``map.origin`` is published, if it has one.
+
+    """
+
+    def __init__(self, node: Node, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._published: list[float] = []
+        self._publisher: Any = None
+        if has_own_frame(mapper.config):
+            self._publisher = node.create_publisher(PointStamped, '~/origin', LATCHED)
+            self.publish(0)
+
+    def publish(self, stamp_ns: int) -> None:
+        """Publish the origin, unless it is unknown or published already."""
+        origin_m = self._mapper.origin_m
+        if origin_m is None or origin_m.tolist() == self._published:
+            return
+        fixed = self._mapper.config.frames.fixed
+        message = PointStamped(header=Header(stamp=time_message(stamp_ns), frame_id=fixed))
+        fill(message.point, origin_m)
+        self._publisher.publish(message)
+        self._published = origin_m.tolist()
 
 
 class AlignmentOutputs:

@@ -5,8 +5,12 @@ LUM on one core, beside PCL's; then how it grows with the edges.
 
 ``compute`` is one call of all iterations from clouds and pairs just given, sums over the pairs
 included; an iteration is the time of each further one. PCL is compiled from peers/pcl_lum.cpp,
-where a compiler and Debian's libpcl-dev are there, and gets the same graph; else its figures are
-those stated for that package on another machine, and marked so.
+where a compiler and Debian's libpcl-dev are there (or where CPATH, LIBRARY_PATH and
+LD_LIBRARY_PATH lead to them), and gets the same graph; else its figures are those stated for that
+package on another machine, and marked so.
+
+All are medians of processor times, on which other load of the machine has less effect than on
+clock times. PCL's are taken between two halves of ours.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from dataclasses import dataclass
 import os
 from pathlib import Path
 import subprocess
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 
@@ -29,6 +33,7 @@ from test.bench.report import Row
 PCL_LIBRARIES = ('registration', 'search', 'kdtree', 'octree', 'common')
 
 REPEATS = 5
+"""Number of timed calls in each half of ours, and of PCL."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +79,9 @@ def run(options: Options) -> list[Row]:
     with one_core():
         for case in CASES:
             clouds = points(case)
-            compute_ms, iteration_ms = ours(case, clouds)
+            times = ours(case, clouds)
+            others = pcl(case, clouds, program)
+            compute_ms, iteration_ms = np.median(times + ours(case, clouds), axis=0).tolist()
             rows.append(
                 {
                     'graph': case.name,
@@ -85,7 +92,8 @@ def run(options: Options) -> list[Row]:
                     'budget_ms': case.budget_ms,
                     'iteration_ms': iteration_ms,
                     'us_edge': 1e3 * iteration_ms / len(case.ends),
-                    **pcl(case, clouds, program),
+                    **others,
+                    'x_pcl': others['pcl_ms'] / compute_ms if 'pcl_ms' in others else None,
                 }
             )
     return rows
@@ -100,37 +108,39 @@ def points(case: Case) -> np.ndarray:
     return (scene + shift + noise).astype(np.float32)
 
 
-def ours(case: Case, clouds: np.ndarray) -> tuple[float, float]:
-    """Return milliseconds of compute, and of an iteration more; the least of some repeats."""
+def ours(case: Case, clouds: np.ndarray) -> list[tuple[float, float]]:
+    """Return milliseconds of compute, and of an iteration more, of each repeat."""
     pairs = np.repeat(np.arange(case.pairs)[:, None], 2, axis=1)
-    compute, more = [], []
+    found = []
     for _ in range(REPEATS):
         lum = LUM(max_iterations=case.iterations)
         for cloud in clouds:
             lum.add_point_cloud(cloud)
         for source, target in case.ends:
             lum.set_correspondences(source, target, pairs)
-        start = perf_counter()
-        lum.compute()
-        compute.append((perf_counter() - start) * 1e3)
+        compute_ms = milliseconds(lum)
         times = []
-        for iterations in (1, 3):
-            lum.max_iterations = iterations
-            start = perf_counter()
-            lum.compute()
-            times.append((perf_counter() - start) * 1e3)
-        more.append((times[1] - times[0]) / 2.0)
-    return min(compute), min(more)
+        for lum.max_iterations in (1, 6):
+            times.append(milliseconds(lum))
+        found.append((compute_ms, (times[1] - times[0]) / 5.0))
+    return found
+
+
+def milliseconds(lum: LUM) -> float:
+    """Return the processor time of a call of compute."""
+    start = process_time()
+    lum.compute()
+    return (process_time() - start) * 1e3
 
 
 def pcl(case: Case, clouds: np.ndarray, program: Path | None) -> Row:
-    """Return milliseconds of PCL, measured or stated, and how many times ours they are."""
+    """Return the median milliseconds of PCL, measured or stated."""
     if program is None:
         if case.pcl_stated_ms is None:
             return {}
         return {'pcl_ms': case.pcl_stated_ms, 'pcl': 'as stated, not measured'}
     if case.vertices > 200:
-        return {'pcl': 'left out: minutes'}
+        return {'pcl': 'left out: grows with the cube'}
     repeats = REPEATS if case.vertices < 100 else 2
     numbers = [case.vertices, len(case.ends), case.pairs, case.iterations, repeats]
     text = '\n'.join(
@@ -140,4 +150,5 @@ def pcl(case: Case, clouds: np.ndarray, program: Path | None) -> Row:
     done = subprocess.run(
         [program], input=text, capture_output=True, text=True, check=True, env=os.environ
     )
-    return {'pcl_ms': min(float(line) for line in done.stdout.split()), 'pcl': 'measured'}
+    times = [float(line) for line in done.stdout.split()]
+    return {'pcl_ms': float(np.median(times)), 'pcl': 'measured'}

@@ -23,8 +23,8 @@ def test_a_case_is_timed_and_aligned():
     case = Case('small', 5, chain(5, (1, 2), 7), 30, 4)
     clouds = points(case)
 
-    compute_ms, _ = ours(case, clouds)  # in such a small case the time of an iteration is noise
-    assert compute_ms > 0.0
+    times = ours(case, clouds)  # in such a small case the time of an iteration is noise
+    assert all(compute_ms > 0.0 for compute_ms, _ in times)
 
     lum = LUM(max_iterations=case.iterations)
     for cloud in clouds:

@@ -35,7 +35,12 @@ def test_scans_without_a_frame_or_points_are_dropped():
         scan_at(5.0),
     )
     assert len(updates) == 1
-    assert dropped(mapper) == {'empty_frame_id': 1, 'no_points': 1, 'no_valid_points': 2}
+    assert dropped(mapper) == {
+        'empty_frame_id': 1,
+        'no_points': 1,
+        'no_valid_points': 1,
+        'map_limit': 1,
+    }
     assert dict(mapper.counters.points_left_out) == {'not_finite': 9, 'beyond_map': 9}
     assert_counts_add_up(mapper)
 

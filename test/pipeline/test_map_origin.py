@@ -14,6 +14,7 @@ from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
+from surfel_mapper.pipeline.saved_state import load_mapper, save_mapper
 from surfel_mapper.scan import Scan
 from test.alignment.street import drifted, street_scans
 
@@ -177,6 +178,26 @@ def test_bad_origins_are_refused_by_name(text):
 def test_an_origin_with_poses_by_registration_is_refused():
     with pytest.raises(ConfigError, match=r'map\.origin: .* with pose\.source registration'):
         Mapper(Config.from_mapping({'map.origin': '1 2 3', 'pose.source': 'registration'}))
+
+
+def test_a_saved_window_is_loaded_and_evicted(tmp_path):
+    window = {'window.max_scans': 4}
+    mapper = mapped(text_of(UTM), UTM, **window)
+    save_mapper(tmp_path / 'map.npz', mapper)
+    again = Mapper(Config.from_mapping({**SETTINGS, 'map.origin': 'auto', **window}))
+
+    load_mapper(tmp_path / 'map.npz', again)
+
+    for each in (mapper, again):
+        drive(each, UTM, 6, 10 * PERIOD_NS)
+    assert len(again.window) == 4
+    assert again.map == mapper.map
+
+
+def test_a_scan_beyond_the_map_is_dropped_with_the_setting_that_helps(caplog):
+    with pytest.raises(AssertionError):
+        mapped('', UTM, 1)
+    assert 'map.origin: auto' in caplog.text
 
 
 def test_a_loaded_map_gives_its_origin_and_goes_on(tmp_path):

@@ -21,6 +21,7 @@ POLICY = Path(__file__).parents[2] / 'launch_configs' / 'sros2_policy.xml'
 EVERYTHING = [
     *('-p', 'window.keep_points:=true', '-p', 'align.every_scans:=5'),
     *('-p', 'layers.tsdf.enabled:=true', '-p', 'layers.models.enabled:=true'),
+    *('-p', 'map.origin:=auto'),
 ]
 
 SOURCES = {'pose', 'depth', 'camera_info', 'tf', 'tf_static', 'clock', 'initialpose'}
