@@ -62,6 +62,11 @@ LOOPS = [
     'map-closures>=2.2',  # recognises places that were seen before; MIT, wheels for 3.10 to 3.14
 ]
 
+ALIGN = [
+    # finds the motion between two maps for `evaluate --align`; MIT, wheels for 3.10 to 3.12
+    'kiss-matcher>=1.0.2; python_version < "3.13"',
+]
+
 VIEWER = [
     'rerun-sdk>=0.23',  # replay --view and --rrd
 ]
@@ -78,6 +83,7 @@ TEST = [
     *CLUSTER,
     *LAS,
     *LOOPS,
+    *ALIGN,
     *VIEWER,
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
@@ -140,6 +146,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
+        'align': ALIGN,
         'loops': LOOPS,
         'viewer': VIEWER,
         'ros': ROS,

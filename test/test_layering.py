@@ -54,6 +54,7 @@ HOMES = {
     'ezdxf': ('files/model_files',),
     'geometry_msgs': ('ros/',),
     'lifecycle_msgs': ('ros/',),
+    'kiss_matcher': ('evaluation/frames',),
     'laspy': ('files/las',),
     'llvmlite': ('kernels/',),
     'lz4': ('bags/',),

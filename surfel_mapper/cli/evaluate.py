@@ -3,13 +3,14 @@
 """
 ``surfel-mapper evaluate``: a map against a world, a cloud or another map; or a trajectory.
 
-Maps have to be in one frame; trajectories are aligned first.
+Trajectories are aligned first, maps if --align asks for it; a warning says if it looks needed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import logging
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -28,6 +29,8 @@ TRAJECTORIES = ('.tum', '.txt', '.csv', '.kitti')
 
 DEFAULT_M = 0.5
 """Default of --max-distance and --radius for maps without a voxel size, m."""
+
+_log = logging.getLogger(__name__)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +76,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help='points that a voxel needs to count as a surfel (%(default)s)',
     )
+    add(
+        '--align',
+        action='store_true',
+        help='move the map onto the truth first, if their frames differ (trajectories always are)',
+    )
     add('--json', action='store_true', help='print as JSON')
 
 
@@ -90,6 +98,12 @@ def run(args: argparse.Namespace) -> int:
 def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
     """Return the errors of a map, and lines that state them."""
     from surfel_mapper.evaluation.comparison import CloudTruth, evaluate, Truth
+    from surfel_mapper.evaluation.frames import (
+        find_motion,
+        known_starts,
+        looks_needed,
+        moved_discs,
+    )
     from surfel_mapper.evaluation.map_files import load_discs
     from surfel_mapper.evaluation.truth import is_world, load_truth
 
@@ -103,13 +117,19 @@ def maps(args: argparse.Namespace) -> tuple[dict[str, Any], list[str]]:
         truth = CloudTruth(other)
         digests = compared_digests(surfels, other)
     size_m = surfels.voxel_size_m or DEFAULT_M
-    result = evaluate(
-        surfels,
-        truth,
-        max_distance_m=args.max_distance or size_m,
-        radius_m=args.radius or size_m,
-    )
-    return {**result, **digests}, map_lines({**result, **digests})
+    max_distance_m = args.max_distance or size_m
+    motion = None
+    if args.align:
+        motion = find_motion(surfels, truth, known_starts(args.map, args.truth), max_distance_m)
+        surfels = moved_discs(surfels, motion.T_truth_map)
+    elif reason := looks_needed(surfels, truth, max_distance_m):
+        _log.warning('%s, %s: one frame? %s; --align moves the map', args.map, args.truth, reason)
+    result = {
+        **evaluate(surfels, truth, max_distance_m=max_distance_m, radius_m=args.radius or size_m),
+        **digests,
+        **({} if motion is None else {'aligned': motion.summary()}),
+    }
+    return result, map_lines(result)
 
 
 def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
@@ -122,6 +142,13 @@ def compared_digests(surfels: Discs, other: Discs) -> dict[str, Any]:
 def map_lines(result: dict[str, Any]) -> list[str]:
     """Return the errors of a map as lines of text."""
     lines = [f'surfels {result["surfels"]}   compared {result["compared"]}']
+    if 'aligned' in result:
+        motion = result['aligned']
+        lines.append(
+            f'aligned   by {motion["moved_m"]:.3f} m, {motion["turned_deg"]:.3f} deg, from '
+            f'{motion["start"]}; {motion["share_near"]:.0%} near the truth, '
+            f'{motion["share_near_before"]:.0%} before'
+        )
     for name, unit, factor in (('position_m', 'mm', 1e3), ('normal_deg', 'deg', 1.0)):
         if name in result:
             lines.append(f'{name.partition("_")[0]:9} {in_words(result[name], unit, factor)}')

@@ -29,7 +29,7 @@ import numpy as np
 from surfel_mapper.cluster.executors import Executor
 from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.errors import FileFormatError, MapError
-from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.map_state import FILE, load_map, window_stamps_ns
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
     kind_of,
@@ -43,7 +43,7 @@ from surfel_mapper.files.parquet_tiles import (
     write_shard,
     write_tile,
 )
-from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.files.trajectory import read_trajectory, trajectory_beside
 from surfel_mapper.mapping.surfels import concatenated, Surfels
 
 DATASET = 'map'
@@ -51,9 +51,6 @@ DATASET = 'map'
 
 FILES = ('map.parquet', 'map.npz')
 """Files of an exact map inside the output directory of a replay by one process."""
-
-TRAJECTORY = 'trajectory.tum'
-"""File of the poses of its scans there."""
 
 SAMPLE = 100_000
 """About this many surfels are returned for pictures."""
@@ -348,10 +345,7 @@ def warn_of_repeated_scans(sources: Sequence[str | Path]) -> None:
     """Log a warning if two maps contain scans of equal stamps, by the trajectories beside them."""
     seen: dict[int, str | Path] = {}
     for source in sources:
-        folder = Path(source) if Path(source).is_dir() else Path(source).parent
-        path = folder / TRAJECTORY
-        stamps = read_trajectory(path).stamp_ns if path.is_file() else None
-        stamps_ns = set() if stamps is None else set(stamps.tolist())
+        stamps_ns = stamps_of_map(Path(source))
         repeated = seen.keys() & stamps_ns
         if repeated:
             _log.warning(
@@ -363,6 +357,16 @@ def warn_of_repeated_scans(sources: Sequence[str | Path]) -> None:
                 seen[min(repeated)],
             )
         seen |= dict.fromkeys(stamps_ns - seen.keys(), source)
+
+
+def stamps_of_map(source: Path) -> set[int]:
+    """Return the stamps of a map's scans, ns: of the trajectory beside it, or of its window."""
+    path = trajectory_beside(source)
+    if path is not None:
+        stamps_ns = read_trajectory(path).stamp_ns
+        return set() if stamps_ns is None else set(stamps_ns.tolist())
+    file = source / FILE if source.is_dir() else source
+    return set(window_stamps_ns(file)) if file.suffix == '.npz' and file.is_file() else set()
 
 
 def take_name(fresh: Path, wanted: Path) -> None:

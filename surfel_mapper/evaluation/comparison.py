@@ -38,12 +38,15 @@ class Nearest:
         Distance of the positions from the surface there.
     normal : (K, 3) float64, or None
         Normal of the surface; None if unknown.
+    place : (K, 3) float64, m
+        The places; nan if there is none, or if it is on an edge of a known surface.
 
     """
 
     distance_m: Floats
     off_m: Floats
     normal: Floats | None
+    place: Floats
 
 
 class Truth(Protocol):
@@ -74,11 +77,15 @@ class CloudTruth:
     def nearest(self, position: Floats) -> Nearest:
         """Return the places of the truth nearest to positions (K, 3), m."""
         distance_m, row = self._tree.query(position)
-        if self._discs.normal is None or not len(self._discs):
-            return Nearest(distance_m, distance_m, None)
+        if not len(self._discs):
+            return Nearest(distance_m, distance_m, None, np.full((len(position), 3), np.nan))
+        place = self._discs.position[row]
+        if self._discs.normal is None:
+            return Nearest(distance_m, distance_m, None, place)
         normal = self._discs.normal[row]
-        off = np.einsum('ij,ij->i', position - self._discs.position[row], normal)
-        return Nearest(distance_m, np.where(np.isfinite(off), np.abs(off), distance_m), normal)
+        off = np.einsum('ij,ij->i', position - place, normal)
+        off_m = np.where(np.isfinite(off), np.abs(off), distance_m)
+        return Nearest(distance_m, off_m, normal, place)
 
     def samples(self) -> Floats:
         """Return all points."""

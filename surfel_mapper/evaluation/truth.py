@@ -28,6 +28,9 @@ Floats = npt.NDArray[np.float64]
 SCANS = 20
 """Scans of a drive that are cast again, evenly spread: most places are seen by several."""
 
+ON_SURFACE_M = 1e-6
+"""A place is on a surface if it is nearer than this, m."""
+
 
 class WorldTruth:
     """
@@ -48,7 +51,11 @@ class WorldTruth:
     def nearest(self, position: Floats) -> Nearest:
         """Return the places of the surfaces nearest to positions (K, 3), m."""
         _, distance_m, normal = self._world.surface_at(position)
-        return Nearest(distance_m, distance_m, normal)
+        outside, inside = (position - side * distance_m[:, None] * normal for side in (1.0, -1.0))
+        nearer = self._world.surface_at(outside)[1] <= self._world.surface_at(inside)[1]
+        place = np.where(nearer[:, None], outside, inside)
+        place[self._world.surface_at(place)[1] > ON_SURFACE_M] = np.nan  # nearest to an edge
+        return Nearest(distance_m, distance_m, normal, place)
 
     def samples(self) -> Floats | None:
         """Return the points (N, 3), m, that the drive sees without noise; None without a drive."""

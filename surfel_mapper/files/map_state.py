@@ -153,6 +153,22 @@ def load_map(
     return surfel_map, scans
 
 
+def window_stamps_ns(path: str | Path) -> list[int]:
+    """
+    Return the stamps of the scans of the window in a file that save_map wrote.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, or of another kind.
+
+    """
+    arrays, attributes = load_state(path)
+    if attributes.get('kind') != KIND or 'scans.stamp_ns' not in arrays:
+        raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
+    return [int(stamp_ns) for stamp_ns in arrays['scans.stamp_ns']]
+
+
 def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
     return len(arrays['scans.stamp_ns'])
 

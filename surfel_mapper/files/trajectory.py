@@ -28,6 +28,9 @@ from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
 
 FORMATS = ('tum', 'kitti', 'csv')
 
+TRAJECTORY = 'trajectory.tum'
+"""File of a replay with the poses of its scans, beside the map and in its frame."""
+
 TUM_HEADER = '# stamp_s x y z qx qy qz qw\n'
 
 KITTI_TIMES = 'times.txt'
@@ -206,6 +209,12 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         raise FileFormatError(f'{path}: no poses in it, only a header')
     table = np.array(numbers)
     return Trajectory(np.array(stamps, np.int64), table[:, :3], table[:, 3:])
+
+
+def trajectory_beside(path: Path) -> Path | None:
+    """Return the trajectory in the directory of a map, or beside its file; None without one."""
+    found = (path if path.is_dir() else path.parent) / TRAJECTORY
+    return found if found.is_file() else None
 
 
 def numbered_lines(path: str | Path) -> list[tuple[str, str]]:

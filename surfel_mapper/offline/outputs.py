@@ -40,9 +40,6 @@ FORMATS = {
 }
 """File of each format in the output directory; npz and parquet are exact, to be loaded again."""
 
-TRAJECTORY = 'trajectory.tum'
-"""File of the poses of the scans in the output directory."""
-
 
 def output_directory(recording: Path, wanted: Path | None) -> Path:
     """
@@ -103,6 +100,8 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
         from surfel_mapper.files.model_files import import_ezdxf
 
         import_ezdxf()
+    from surfel_mapper.files.trajectory import TRAJECTORY
+
     names = [FORMATS[name] for name in formats if name != BAG]
     for name in [*names, TRAJECTORY, 'map.png', 'report.html', 'summary.json']:
         if (output / name).exists():
@@ -182,6 +181,8 @@ def write_maps(
     Parts that registration could not place on the map become apart_1.npz and apart_1.tum, and so
     on; those of an earlier replay are removed.
     """
+    from surfel_mapper.files.trajectory import TRAJECTORY
+
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
         write_map(output / FORMATS[name], name, mapper, window=window)
@@ -221,6 +222,7 @@ def write_files(
 
     """
     from surfel_mapper.files.atomic import write_json
+    from surfel_mapper.files.trajectory import TRAJECTORY
     from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report

@@ -80,6 +80,31 @@ def test_points_without_normals_are_a_truth_too(street, capsys, tmp_path):
     assert result['position_m']['mean'] > 0.0
 
 
+def test_a_map_in_another_frame_is_moved_onto_its_truth_if_asked(street, capsys, tmp_path, caplog):
+    bag, _ = street
+    registered = str(tmp_path / 'registered')
+    arguments = ['--poses-from', 'registration', '--no-align', '--output', registered]
+    assert main(['replay', str(bag), *arguments]) == 0
+
+    apart = evaluated(capsys, registered, '--truth', bag)
+    assert 'one frame?' in caplog.text
+    assert '--align' in caplog.text
+    result = evaluated(capsys, registered, '--truth', bag, '--align')
+
+    assert apart['compared'] < 0.5 * apart['surfels']
+    assert result['aligned']['start'] == 'trajectories'
+    assert result['aligned']['moved_m'] > 5.0
+    assert result['compared'] > 0.95 * result['surfels']
+    assert result['position_m']['median'] < 0.01
+
+
+def test_maps_in_one_frame_raise_no_doubt(street, capsys, caplog):
+    bag, output = street
+    evaluated(capsys, output, '--truth', bag)
+    evaluated(capsys, output, '--truth', output)
+    assert 'one frame?' not in caplog.text
+
+
 def test_the_poses_of_a_replay_are_those_of_the_simulation(street, capsys):
     bag, output = street
     result = evaluated(capsys, output.parent / 'poses.tum', '--truth', bag)

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 
+from surfel_mapper.cli._arguments import positive_int
 from test.fuzz.harnesses import HARNESSES
 
 
@@ -25,7 +26,9 @@ def parser() -> argparse.ArgumentParser:
     """Return the command line."""
     result = argparse.ArgumentParser(prog='python -m test.fuzz', description='Search for crashes.')
     result.add_argument('names', nargs='*', metavar='NAME', help=f'of {", ".join(HARNESSES)}')
-    result.add_argument('--seconds', type=int, default=60, help='of each; default: %(default)s')
+    result.add_argument(
+        '--seconds', type=positive_int, default=60, help='of each; default: %(default)s'
+    )
     result.add_argument('--input', type=Path, metavar='FILE', help='try one input')
     return result
 
