@@ -52,12 +52,21 @@ def test_every_public_name_is_there_listed_and_the_same_each_time():
         assert name in dir(surfel_mapper)
 
 
+def own_members(of_class):
+    """Return the members of a class and of those that it inherits from in this package."""
+    found = {}
+    for each in reversed(of_class.__mro__):
+        if each.__module__.startswith('surfel_mapper'):
+            found |= vars(each)
+    return found.items()
+
+
 def members():
     """Yield every public name, and those of public classes, with what carries its docstring."""
     for name in sorted(set(surfel_mapper.__all__) - {'__version__'}):
         value = getattr(surfel_mapper, name)
         yield name, value
-        for of_class, member in vars(value).items() if inspect.isclass(value) else ():
+        for of_class, member in own_members(value) if inspect.isclass(value) else ():
             member = member.fget if isinstance(member, property) else member
             member = getattr(member, '__func__', member)
             if inspect.isfunction(member) and not of_class.startswith('_'):

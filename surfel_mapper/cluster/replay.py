@@ -130,21 +130,29 @@ def replay_bags(
         **mapped.counts(),
         **mapped.map.summary(),
         'workers': num_workers,
-        'shards': len(mapped.results),
-        'shards_repeated': mapped.repeated,
-        'peak_memory_mb': {
-            'mapping': max(result.peak_bytes for result in mapped.results) // 10**6,
-            'merging': mapped.map.peak_bytes // 10**6,
-        },
-        'core_s': {
-            'mapping': round(sum(result.core_s for result in mapped.results), 1),
-            'merging': round(mapped.map.core_s, 1),
-        },
+        **shares_of_work(mapped),
         'settings': config.to_mapping(),
     }
     return ShelfResult(
         mapped=mapped, summary=summary, written=write_overview(output, summary, mapped)
     )
+
+
+def shares_of_work(mapped: MapReduceResult) -> dict[str, Any]:
+    """Return the number of shards, and memory and processor time of mapping and merging."""
+    results, merged = mapped.results, mapped.map
+    return {
+        'shards': len(results),
+        'shards_repeated': mapped.repeated,
+        'peak_memory_mb': {
+            'mapping': max(result.peak_bytes for result in results) // 10**6,
+            'merging': merged.peak_bytes // 10**6,
+        },
+        'core_s': {
+            'mapping': round(sum(result.core_s for result in results), 1),
+            'merging': round(merged.core_s, 1),
+        },
+    }
 
 
 def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], list[str]]:

@@ -3,7 +3,7 @@
 """
 Surfel: statistics of a set of points as an object: mean, covariance, normal, planarity.
 
-For single use and for tests; the map stores exact integers instead (surfel_map.py). Removing
+For single use and for tests; the map stores exact integers instead (moment_map.py). Removing
 undoes adding up to the rounding of float64. A bound of that rounding is kept (point_sums.py), and
 smaller eigenvalues count as 0, so a line or a repeated point is recognised even after other points
 were removed.
