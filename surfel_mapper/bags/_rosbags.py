@@ -191,6 +191,12 @@ def is_cdr(connection: Connection) -> bool:
     return getattr(connection.ext, 'serialization_format', 'cdr') == 'cdr'
 
 
+def has_legal_names(connection: Connection) -> bool:
+    """Return whether topic and type have names without control characters; else it is damage."""
+    names = (connection.topic, connection.msgtype)
+    return all(name.isprintable() for name in names)
+
+
 def is_latched(connection: Connection) -> bool:
     """Return whether the publisher offered its last messages to late subscribers."""
     from rosbags.interfaces import ConnectionExtRosbag1

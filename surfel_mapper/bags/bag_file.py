@@ -58,7 +58,7 @@ class BagFile(ABC):
     cut_at : int, optional
         Offset of the first record that is not whole; None if the file is complete.
     skipped_at : list of int
-        Offsets of the damaged chunks that were skipped.
+        Offsets of the damaged chunks, which are skipped from the damage on.
     connections : list of Connection
         With the number of messages found.
     start_time, end_time : int

@@ -101,7 +101,7 @@ class ChunkedFile(BagFile):
     Attributes
     ----------
     skip_reason : str
-        Why the first of the skipped chunks cannot be read.
+        Why the first of the damaged chunks cannot be read.
 
     """
 
@@ -149,7 +149,7 @@ class ChunkedFile(BagFile):
 
     @abstractmethod
     def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
-        """Yield the messages in unpacked records, up to a cut; keep or check connections."""
+        """Yield the messages in unpacked records; keep or check connections; raise at a cut."""
 
     def _survey_chunk(self, chunk: Chunk) -> None:
         """Search a chunk that no index describes; keep its span and counts."""
@@ -216,7 +216,7 @@ class ChunkedFile(BagFile):
             return index[np.argsort(index[:, 0], kind='stable')]
 
     def _search(self, number: int) -> Index:
-        """Return the messages of a chunk in its order; none, and it is skipped, if damaged."""
+        """Return the messages of a chunk in its order, up to the damage if it has some."""
         numbers, chunk = array('q'), self._chunks[number]
         try:
             records = self._unpacked(number)
@@ -227,24 +227,20 @@ class ChunkedFile(BagFile):
                     self._budget.take(CHECK_EVERY * MESSAGE_BYTES, f'index of {count} messages')
                 numbers.extend((found.record_ns, found.connection, *found.place))
         except DAMAGE as error:
-            self._give_back_rounding(len(numbers) // INDEX_COLUMNS, 0)
             if chunk.is_whole:
-                self._skip(chunk.start, str(error))
-            return as_index(array('q'))
+                reason = f'no field {error}' if isinstance(error, KeyError) else str(error)
+                self._note_damage(chunk.start, reason, len(numbers) // INDEX_COLUMNS)
         index = as_index(numbers)
-        self._give_back_rounding(len(index), len(index))
+        rounding = -len(index) % CHECK_EVERY  # memory is charged in steps
+        self._budget.give_back(MESSAGE_BYTES * rounding)
         return index
 
-    def _give_back_rounding(self, found: int, kept: int) -> None:
-        """Return the memory charged for messages beyond those kept; it is charged in steps."""
-        charged = -(-found // CHECK_EVERY) * CHECK_EVERY
-        self._budget.give_back(MESSAGE_BYTES * (charged - kept))
-
-    def _skip(self, start: int, reason: str) -> None:
-        """Note a chunk that cannot be read."""
+    def _note_damage(self, start: int, reason: str, num_found: int) -> None:
+        """Note a damaged chunk, and the number of messages before the damage."""
         if start not in self.skipped_at:
             self.skipped_at.append(start)
-            self.skip_reason = self.skip_reason or reason
+            kept = f' (the {num_found} messages before it are read)' if num_found else ''
+            self.skip_reason = self.skip_reason or reason + kept
 
     def _message(self, number: int, at: int, size: int) -> bytes | memoryview:
         """Return the bytes of a message: a copy, or a view into its chunk if it is large."""

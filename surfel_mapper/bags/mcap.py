@@ -211,15 +211,15 @@ class McapFile(ChunkedFile):
 
 
 def records_in(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:
-    """Yield opcode, offset and length of the content of each whole record."""
+    """Yield opcode, offset and length of the content of each record; raise if one is cut."""
     at = 0
-    while at + RECORD.size <= len(content):
+    while at < len(content):
         kind, length = RECORD.unpack_from(content, at)
-        at += RECORD.size
-        if at + length > len(content):
-            return  # cut off in this record
-        yield kind, at, length
-        at += length
+        end = at + RECORD.size + length
+        if end > len(content):
+            raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
+        yield kind, at + RECORD.size, length
+        at = end
 
 
 def channel_counts(statistics: bytes) -> Counter[int]:

@@ -22,6 +22,7 @@ import tempfile
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 from surfel_mapper.bags._rosbags import (
+    has_legal_names,
     is_cdr,
     is_latched,
     jazzy_types,
@@ -40,6 +41,9 @@ from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection, Typestore
+
+MAX_NAMES = 12
+"""Number of topics named in a message."""
 
 log = logging.getLogger(__name__)
 
@@ -190,6 +194,7 @@ class BagReader:
             self._storages.append((path, storage))
             if isinstance(storage, BagFile):
                 self._note_losses(path, storage)
+            self._note_damaged_names(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
                 self.cuts.append(
@@ -207,9 +212,9 @@ class BagReader:
         return target
 
     def _connections(self) -> Iterator[Connection]:
-        """Yield the connections of all files."""
+        """Yield the connections of all files; without those whose names are damaged."""
         for _, storage in self._storages:
-            yield from storage.connections
+            yield from filter(has_legal_names, storage.connections)
 
     def _indexed_topics(self) -> list[Topic]:
         """Return the topics in all files with the counts of the indexes or metadata.yaml."""
@@ -234,7 +239,7 @@ class BagReader:
         stop_ns: int | None,
     ) -> Iterator[BagMessage]:
         """Yield the messages of one file; packed ones unpacked."""
-        wanted = [c for c in storage.connections if is_cdr(c)]
+        wanted = [c for c in storage.connections if is_cdr(c) and has_legal_names(c)]
         if names is not None:
             wanted = [c for c in wanted if c.topic in names]
         if not wanted:  # rosbags takes an empty list for all connections
@@ -265,6 +270,16 @@ class BagReader:
             )
         self._note_skipped(path, storage, log_now=False)
 
+    def _note_damaged_names(self, path: Path, storage: Storage) -> None:
+        """Add the messages that are skipped because their topic has no legal name to ``cuts``."""
+        damaged = [c for c in storage.connections if not has_legal_names(c)]
+        if damaged:
+            names = ', '.join(repr(c.topic) for c in damaged[:MAX_NAMES])
+            self.cuts.append(
+                f'{path}: {sum(c.msgcount for c in damaged)} messages are skipped, as their topic '
+                f'or type has no legal name: {names}'
+            )
+
     def _note_skipped(self, path: Path, storage: Storage, *, log_now: bool = True) -> None:
         """Add the chunks skipped since the last call to ``cuts``."""
         if not isinstance(storage, ChunkedFile):
@@ -273,8 +288,8 @@ class BagReader:
         if number > self._skipped.get(path, 0):
             self._skipped[path] = number
             self.cuts.append(
-                f'{path}: {number} damaged chunks are skipped, the first at byte '
-                f'{storage.skipped_at[0]}: {storage.skip_reason}'
+                f'{path}: {number} damaged chunks are skipped from the damage on, the first at '
+                f'byte {storage.skipped_at[0]}: {storage.skip_reason}'
             )
             if log_now:
                 log.warning(self.cuts[-1])
@@ -288,6 +303,7 @@ class BagReader:
         if any(not read[topic.name] for topic in short):
             raise BagError(f'{message}; try a single file of the bag, or `ros2 bag reindex`')
         if short:
+            self.cuts.append(message)
             log.warning(message)
 
     def _decoder(self, type_: str) -> tuple[Typestore, str]:

@@ -135,16 +135,14 @@ class Ros1File(ChunkedFile):
     def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
         """Yield the messages in the records of a chunk; keep or check connections."""
         at = 0
-        while at + 4 <= len(records):
+        while at < len(records):
             (length,) = struct.unpack_from('<I', records, at)
             data = at + 8 + length
             if length > MOST_HEADER_BYTES:
                 raise ValueError(f'header of {length} bytes')
-            if data > len(records):
-                return  # cut off in the header of this record
             (size,) = struct.unpack_from('<I', records, data - 4)
             if data + size > len(records):
-                return
+                raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
             fields = header_fields(bytes(records[at + 4 : data - 4]))
             kind = fields['op'][0]
             if kind == CONNECTION:

@@ -108,7 +108,7 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
         f'{content["seconds"]:.1f} s, {messages} messages',
         *table(content['topics']),
     ]
-    lines += [f'cut off: {cut}' for cut in content['cut']]
+    lines += [f'damaged: {cut}' for cut in content['cut']]
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
     for clouds in dict.fromkeys(offer.clouds for offer in made):

@@ -257,10 +257,12 @@ def test_fewer_messages_than_the_index_states_give_a_warning(tmp_path, caplog):
     metadata = path / 'metadata.yaml'
     metadata.write_text(metadata.read_text().replace(f'count: {NUM_SCANS}\n', 'count: 50\n'))
 
-    with caplog.at_level(logging.WARNING):
-        read(path)
+    with caplog.at_level(logging.WARNING), BagReader(path) as reader:
+        assert len([*reader.messages()]) == 4 * NUM_SCANS + 1
 
-    assert f'fewer messages than its index states: /odom {NUM_SCANS} of 50, ' in caplog.text
+    says = f'fewer messages than its index states: /odom {NUM_SCANS} of 50, '
+    assert says in caplog.text
+    assert says in reader.cuts[0]
 
 
 def test_a_message_that_is_not_of_its_type_is_a_bag_error(tmp_path):

@@ -95,7 +95,7 @@ def test_a_bag_that_is_cut_off_is_shown_as_far_as_it_goes(tmp_path, capsys):
     cut(path / 'a.mcap', 0.5)
 
     assert main(['info', str(path)]) == 0
-    assert 'cut off: ' in capsys.readouterr().out
+    assert 'damaged: ' in capsys.readouterr().out
     assert main(['info', str(path), '--strict', '--json']) == 3
     content = json.loads(capsys.readouterr().out)
     assert 'a.mcap: the file is cut off or damaged at byte ' in content['cut'][0]

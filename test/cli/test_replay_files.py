@@ -4,6 +4,7 @@
 
 import json
 import shutil
+import sqlite3
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from test.bags.recorded import (
     MOUNT_M,
     NUM_SCANS,
     PERIOD_NS,
+    ROS1,
     START_NS,
     write_ros1,
     write_rosbag2,
@@ -191,6 +193,49 @@ def test_bad_input_is_refused_in_a_line_and_leaves_nothing(
     assert list((tmp_path / 'here').iterdir()) == []
 
 
+@pytest.mark.parametrize(('kind', 'start', 'scans'), [('mcap', 5000, 0), ('ros1', 20_000, 1)])
+def test_a_bag_with_a_damaged_part_is_read_up_to_there_and_the_damage_told(
+    tmp_path, capsys, caplog, kind, start, scans
+):
+    if kind == 'ros1':
+        path = file = write_ros1(tmp_path / 'drive.bag', drive(ROS1))
+    else:
+        path = write_rosbag2(tmp_path / 'drive', drive())
+        (file,) = names(path)
+    content = bytearray(file.read_bytes())
+    content[start:200_000:7] = bytes(len(range(start, 200_000, 7)))
+    file.write_bytes(content)
+
+    assert main(['info', str(path), '--json', '--strict']) == 3
+    found = json.loads(capsys.readouterr().out)
+    assert main(['replay', str(path), '--output', str(tmp_path / 'out')]) == (0 if scans else 1)
+    printed = capsys.readouterr()
+
+    assert all(row['topic'].isprintable() for row in found['topics'])
+    assert sum(row['messages'] for row in found['topics']) >= 4
+    assert '1 damaged chunks are skipped from the damage on' in found['cut'][0]
+    assert ' messages before it are read)' in found['cut'][0]
+    assert found['cut'][0] in caplog.text
+    assert (tmp_path / 'out').exists() == bool(scans)
+    if scans:
+        assert printed.out.startswith(f'scans {scans} ')
+    else:
+        assert 'no topic of type sensor_msgs/msg/PointCloud2' in printed.err
+
+
+def test_messages_of_a_topic_with_control_characters_are_skipped_and_counted(tmp_path, capsys):
+    path = write_rosbag2(tmp_path / 'drive', drive(), 'sqlite3')
+    with sqlite3.connect(path / 'drive.db3') as database:
+        database.execute("UPDATE topics SET name = '/o' || char(7) || 'om' WHERE name = '/odom'")
+
+    assert main(['info', str(path / 'drive.db3')]) == 0
+
+    printed = capsys.readouterr().out
+    assert f'damaged: {path}/drive.db3: {NUM_SCANS} messages are skipped, as ' in printed
+    assert "no legal name: '/o\\x07om'" in printed
+    assert '/odom' not in printed
+
+
 def names(bag):
     return [path for path in bag.iterdir() if path.name != 'metadata.yaml']
 
@@ -198,8 +243,6 @@ def names(bag):
 @pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'ros1'])
 def test_a_cut_bag_is_mapped_as_far_as_it_goes_and_strict_says_so(tmp_path, capsys, caplog, kind):
     if kind == 'ros1':
-        from test.bags.recorded import ROS1
-
         path = file = write_ros1(tmp_path / 'drive.bag', drive(ROS1))
     else:
         path = write_rosbag2(tmp_path / 'drive', drive(), kind)

@@ -3,9 +3,10 @@
 """
 No silent loss: a valid file with one change gives the same content, or the loss is told.
 
-A byte is flipped, or the file is cut, at places spread over it. Reading may then fail with our own
-error, warn, or give the same content. Formats without checksums cannot tell a changed number from
-a true one: there, content that is not reported as damaged may differ in values, not in number.
+A bit is flipped, every seventh byte of a stretch is zeroed, or the file is cut, at places spread
+over it. Reading may then fail with our own error, warn, or give the same content. Formats without
+checksums cannot tell a changed number from a true one: there, content that is not reported as
+damaged may differ in values, not in number.
 """
 
 from __future__ import annotations
@@ -26,12 +27,17 @@ NUM_CHANGES = 120
 
 
 def changes(content, number=NUM_CHANGES, seed=4):
-    """Yield a file with one byte changed, or cut off."""
+    """Yield a file with one bit changed, with zeros in a stretch of it, or cut off."""
     rng = random.Random(seed)
     for row in range(number):
         at = len(content) * row // number + rng.randrange(max(len(content) // number, 1))
         at = min(at, len(content) - 1)
-        if row % 4:
+        if row % 8 == 1:
+            changed = bytearray(content)
+            places = range(at, min(at + 1000, len(content)), 7)
+            changed[at : places.stop : 7] = bytes(len(places))
+            yield at, bytes(changed)
+        elif row % 4:
             changed = bytearray(content)
             changed[at] ^= 1 << rng.randrange(8)
             yield at, bytes(changed)
