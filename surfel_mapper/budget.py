@@ -85,6 +85,15 @@ class Budget:
         self._error = error
         self._start_s: float | None = None
 
+    @classmethod
+    def of_file(cls, path: str | Path, error: Callable[[str], Exception]) -> Budget:
+        """Return the budget of a file by its size, which is 0 for pipes and missing files."""
+        try:
+            size = os.stat(path).st_size
+        except OSError:
+            size = 0
+        return cls(path, size, error)
+
     def take(self, num_bytes: int, purpose: str) -> None:
         """
         Ask for memory before allocating it.

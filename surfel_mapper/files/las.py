@@ -9,17 +9,33 @@ projection, so they are returned as float64.
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+import struct
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE
 from surfel_mapper.errors import DependencyError, FileFormatError
 
 SUFFIXES = ('.las', '.laz')
 
 RGB = ('red', 'green', 'blue')
+
+
+HEADER_BYTES = 375
+"""Size of the header of version 1.4; that of 1.2 has 227."""
+
+RECORD_BYTES, EXTENDED_RECORD_BYTES = 54, 60
+"""Sizes of the heads of variable length records, before and behind the points."""
+
+PACKED_RATIO = 60
+"""Memory per byte of a LAZ file, which packs a point into 3 to 10 bytes."""
+
+COLUMN_BYTES = 40
+"""Memory of a point in the columns returned."""
 
 
 def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
@@ -48,7 +64,10 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
             "`pip install 'surfel_mapper[las]'`"
         ) from error
     try:
+        check_header(path)
         las = laspy.read(str(path))
+    except FileFormatError:
+        raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except Exception as error:  # laspy passes on errors of its decoders, of many types
@@ -65,3 +84,33 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
         shift = 8 if max((int(v.max()) for v in values if v.size), default=0) > 255 else 0
         columns |= {n: (v >> shift).astype(np.uint8) for n, v in zip(RGB, values, strict=True)}
     return columns
+
+
+def check_header(path: str | Path) -> None:
+    """
+    Raise FileFormatError if the counts in the header do not fit the size of the file.
+
+    laspy loops over as many records as the header states, and reads the points that are there.
+    Source: the specification of LAS 1.4 of the ASPRS, table 3.
+    """
+    with open(path, 'rb') as file:
+        size = os.fstat(file.fileno()).st_size
+        header = file.read(HEADER_BYTES).ljust(HEADER_BYTES, b'\0')
+    start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)
+    num_extended = 0
+    if header[24:26] >= b'\x01\x04':
+        num_extended, count = struct.unpack_from('<IQ', header, 243)
+    if num_records * RECORD_BYTES + num_extended * EXTENDED_RECORD_BYTES > size:
+        raise FileFormatError(
+            f'{path}: {num_records} and {num_extended} records of variable length in a file of '
+            f'{size} bytes; damaged?'
+        )
+    is_packed = point_format & 0xC0
+    if start + count * point_size > size and not is_packed:
+        raise FileFormatError(
+            f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
+            f'{point_size} bytes; truncated?'
+        )
+    ratio = PACKED_RATIO if is_packed else BYTES_PER_BYTE
+    needed = count * (2 * point_size + COLUMN_BYTES)
+    Budget(path, size, FileFormatError, ratio=ratio).take(needed, f'{count} points')

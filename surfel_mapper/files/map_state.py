@@ -34,6 +34,9 @@ FILE = 'map.npz'
 NO_ORIGIN = (0.0, 0.0, 0.0)
 """Origin of maps in files of before there were origins."""
 
+COPIES = 5
+"""Memory of loading, by that of the arrays: the map, its window, and the map without it."""
+
 NAMES = ('key', 'count', 'total', 'product', 'view', 'channels')
 
 
@@ -83,7 +86,7 @@ def save_map(
         'origin_m': surfel_map.origin_m.tolist(),
         'digest': digest,
     }
-    save_state(path, arrays, attributes, compress=compress)
+    save_state(path, arrays, attributes, compress=compress, copies=COPIES)
     return digest
 
 
@@ -117,7 +120,7 @@ def load_map(
     """
     if Path(path).is_dir():
         path = Path(path) / FILE
-    arrays, attributes = load_state(path)
+    arrays, attributes = load_state(path, copies=COPIES)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     found_m: Any = attributes.get('voxel_size_m')

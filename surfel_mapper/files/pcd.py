@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+import math
 import os
 from pathlib import Path
 import struct
@@ -26,8 +27,10 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.text_table import read_table
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 
 if TYPE_CHECKING:
@@ -43,8 +46,8 @@ MAX_HEADER_BYTES = 65536
 MAX_COUNT = 4096
 """Limit of the count of a field; feature histograms have some hundreds."""
 
-MAX_RATIO = 100
-"""Limit of the compression ratio; LZF reaches at most 88."""
+MAX_POINT_BYTES = 65536
+"""Limit of the size of a point."""
 
 PADDING = 4096
 """Most zero bytes that may follow the points; the Point Cloud Library adds up to a page."""
@@ -141,16 +144,21 @@ def read_points(path: str | Path) -> Columns:
     try:
         with open(path, 'rb') as file:
             size = os.fstat(file.fileno()).st_size
-            header = read_header(path, file)
-            if header.encoding == 'binary':
-                table = binary_table(path, header, file, size - file.tell())
-            elif header.encoding == 'binary_compressed':
-                table = compressed_table(path, header, file)
-            else:
-                table = ascii_table(path, header, file)
+            budget = Budget(path, size, FileFormatError)
+            with budget.clock():
+                header = read_header(path, file)
+                left = size - file.tell()
+                if header.encoding == 'binary_compressed':
+                    return compressed_columns(path, header, file, budget)
+                if header.encoding == 'binary':
+                    table = binary_table(path, header, file, left, budget)
+                else:
+                    table = read_table(path, file, header.layout, header.num_points, budget)
+                budget.take(table.nbytes, 'columns')
+                names = header.layout.names or ()
+                return {name: np.ascontiguousarray(table[name]) for name in names}
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    return {name: np.ascontiguousarray(table[name]) for name in header.layout.names or ()}
 
 
 def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
@@ -176,8 +184,8 @@ def read_header(path: str | Path, file: BinaryIO) -> PcdHeader:
             for place, stated in enumerate(zip(names, kinds, sizes, counts, strict=True))
         ]
         layout = np.dtype(fields)
-        if not fields:
-            raise ValueError('no fields')
+        if not fields or layout.itemsize > MAX_POINT_BYTES:
+            raise ValueError('no fields' if not fields else f'points of {layout.itemsize} bytes')
     except (LookupError, ValueError) as error:
         raise FileFormatError(f'{path}: inconsistent PCD header: {error}') from error
     if num_points < 0 or encoding not in ('ascii', 'binary', 'binary_compressed'):
@@ -198,7 +206,7 @@ def field_of(name: str, kind: str, size: int, count: int, place: int) -> tuple[A
 
 
 def binary_table(
-    path: str | Path, header: PcdHeader, file: BinaryIO, left: int
+    path: str | Path, header: PcdHeader, file: BinaryIO, left: int, budget: Budget
 ) -> npt.NDArray[Any]:
     """Return the points of an uncompressed file."""
     size = header.num_points * header.layout.itemsize
@@ -207,6 +215,7 @@ def binary_table(
             f'{path}: {left} bytes after the header, expected {size} for {header.num_points} '
             'points; truncated?'
         )
+    budget.take(size, f'{header.num_points} points')
     content = file.read(size)
     is_padded = left - size <= PADDING and not any(file.read(PADDING))
     if left - size >= header.layout.itemsize and not is_padded:
@@ -217,8 +226,10 @@ def binary_table(
     return np.frombuffer(content, header.layout)
 
 
-def compressed_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:
-    """Return the points of a compressed file, which is stored field by field."""
+def compressed_columns(
+    path: str | Path, header: PcdHeader, file: BinaryIO, budget: Budget
+) -> Columns:
+    """Return the fields of the points of a compressed file, which is stored field by field."""
     try:
         import lzf
     except ImportError as error:
@@ -230,54 +241,23 @@ def compressed_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt
     packed_size, size = struct.unpack('<II', sizes.ljust(8, b'\0'))
     packed = file.read(packed_size)
     expected = header.num_points * header.layout.itemsize
-    is_whole = len(packed) == packed_size and len(sizes) == 8
-    if not is_whole or size != expected or size > MAX_RATIO * packed_size:
+    if len(packed) < packed_size or len(sizes) < 8 or size != expected:
         raise FileFormatError(
             f'{path}: {len(packed)} of {packed_size} packed bytes, for {size} bytes of points, '
             f'expected {expected}; truncated?'
         )
+    budget.take(packed_size + 2 * size, f'{header.num_points} points')
     try:
         content = lzf.decompress(packed, size) if size else b''
     except ValueError as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
     if content is None or len(content) != size:
         raise FileFormatError(f'{path}: damaged: its points cannot be unpacked')
-    table = np.empty(header.num_points, header.layout)
-    at = 0
+    columns, at = {}, 0
     for name in header.layout.names or ():
-        column = table[name]
-        column[...] = np.frombuffer(content, column.dtype, column.size, at).reshape(column.shape)
+        field = header.layout[name]
+        shape = (header.num_points, *field.shape)
+        column = np.frombuffer(content, field.base, math.prod(shape), at).reshape(shape).copy()
+        columns[name] = column
         at += column.nbytes
-    return table
-
-
-def ascii_table(path: str | Path, header: PcdHeader, file: BinaryIO) -> npt.NDArray[Any]:
-    """Return the points of a text file."""
-    numbers = header.layout.itemsize and sum(
-        int(np.prod(header.layout[name].shape)) for name in header.layout.names or ()
-    )
-    text = file.read()
-    if text and not text[-1:].isspace():
-        raise FileFormatError(
-            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
-            'it is complete, append an end of line'
-        )
-    words = text.split()
-    if len(words) != header.num_points * numbers:
-        raise FileFormatError(
-            f'{path}: {len(words)} numbers, expected {header.num_points * numbers} for '
-            f'{header.num_points} points; truncated?'
-        )
-    table = np.empty(header.num_points, header.layout)
-    rows = np.array(words, object).reshape(header.num_points, numbers)
-    at = 0
-    try:
-        for name in header.layout.names or ():
-            column = table[name]
-            width = int(np.prod(header.layout[name].shape))
-            values = rows[:, at : at + width].reshape(column.shape)
-            column[...] = values.astype(np.float64 if column.dtype.kind == 'f' else np.int64)
-            at += width
-    except (ValueError, OverflowError) as error:
-        raise FileFormatError(f'{path}: {error}') from error
-    return table
+    return columns

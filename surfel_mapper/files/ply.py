@@ -24,8 +24,10 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.text_table import read_table
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -191,55 +193,41 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     """
     try:
         with open(path, 'rb') as file:
-            count, layout, is_text, is_last = read_header(path, file)
-            if is_text:
-                return text_columns(path, count, layout, file, is_last=is_last)
-            size, left = count * layout.itemsize, os.fstat(file.fileno()).st_size - file.tell()
-            if size > left:
-                raise FileFormatError(
-                    f'{path}: {left} bytes after the header, expected {size} for {count} '
-                    'vertices; truncated?'
-                )
-            if is_last and left - size >= layout.itemsize:
-                raise FileFormatError(
-                    f'{path}: {left} bytes after the header, expected {size} for {count} '
-                    'vertices; is its header damaged?'
-                )
-            table = np.frombuffer(file.read(size), layout)
+            file_size = os.fstat(file.fileno()).st_size
+            budget = Budget(path, file_size, FileFormatError)
+            with budget.clock():
+                count, layout, is_text, is_last = read_header(path, file)
+                if is_text:
+                    table = read_table(path, file, layout, count, budget, is_last=is_last)
+                else:
+                    left = file_size - file.tell()
+                    check_size(path, count, layout, left, is_last=is_last)
+                    budget.take(count * layout.itemsize, f'{count} vertices')
+                    table = np.frombuffer(file.read(count * layout.itemsize), layout)
+                budget.take(table.nbytes, 'columns')
+                return {
+                    name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
+                    for name in layout.names or ()
+                }
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    return {
-        name: np.ascontiguousarray(table[name], layout[name].newbyteorder('='))
-        for name in layout.names or ()
-    }
 
 
-def text_columns(
-    path: str | Path, count: int, layout: np.dtype[Any], file: BinaryIO, *, is_last: bool
-) -> dict[str, npt.NDArray[Any]]:
-    """Return the properties of the vertices of an ascii file."""
-    names = layout.names or ()
-    text = file.read()
-    words = text.split(None, count * len(names))
-    rest = words[count * len(names) :]
-    if len(words) < count * len(names) or (is_last and rest and rest[0].strip()):
+def check_size(
+    path: str | Path, count: int, layout: np.dtype[Any], left: int, *, is_last: bool
+) -> None:
+    """Raise FileFormatError if the vertices of a binary file do not fill the bytes left."""
+    size = count * layout.itemsize
+    if size > left:
         raise FileFormatError(
-            f'{path}: {len(words)} numbers, expected {count * len(names)} for {count} vertices; '
+            f'{path}: {left} bytes after the header, expected {size} for {count} vertices; '
             'truncated?'
         )
-    if words and not rest and not text[-1:].isspace():
+    if is_last and left - size >= layout.itemsize:
         raise FileFormatError(
-            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
-            'it is complete, append an end of line'
+            f'{path}: {left} bytes after the header, expected {size} for {count} vertices; is its '
+            'header damaged?'
         )
-    del words[count * len(names) :]
-    try:
-        # one by one: as an array of texts every number takes the room of the longest
-        table = np.array([float(word) for word in words]).reshape(count, len(names))
-    except ValueError as error:
-        raise FileFormatError(f'{path}: {error}') from error
-    with np.errstate(invalid='ignore'):  # numbers out of the range of an integer type
-        return {name: table[:, at].astype(layout[name]) for at, name in enumerate(names)}
 
 
 def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], bool, bool]:

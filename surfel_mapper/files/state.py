@@ -7,9 +7,9 @@ The file is an npz archive, so numpy reads the arrays without this package. Its 
 ``manifest.json`` has name and version of the format, attributes, type and shape of every array,
 and the SHA-256 of all of that and of the arrays' bytes. Nothing is pickled.
 
-Sizes in a file are not trusted: all members together may claim at most MAX_RATIO times the size of
-the file (zlib reaches 1000), and no array is larger than its member. So memory is bounded by the
-file; content that would compress better is written uncompressed.
+Sizes in a file are not trusted: the headers of all arrays are compared with the manifest and with
+the budget of the file before an array is unpacked (zlib reaches a ratio of 1000). Content that
+would compress better than the budget allows is written uncompressed.
 """
 
 from __future__ import annotations
@@ -29,18 +29,23 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
 FORMAT = 'surfel_mapper state'
 VERSION = 1
 MANIFEST = 'manifest.json'
-MAX_RATIO = 100
 CHUNK_BYTES = 1 << 20
 
 MAX_MANIFEST_BYTES = 16 << 20
-"""Limit of the manifest, which takes ten times as much as objects; 10,000 scans need 6 MB."""
+"""Limit of the manifest; 10,000 scans need 6 MB."""
+
+OBJECT_BYTES = 10
+"""Memory per byte of the manifest, as text and as objects."""
+
+MEMBER_BYTES = 1000
+"""Memory of the entry of a member in the directory of the archive."""
 
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
@@ -55,7 +60,12 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def save_state(
-    path: str | Path, arrays: Arrays, attributes: Mapping[str, Any], *, compress: bool = False
+    path: str | Path,
+    arrays: Arrays,
+    attributes: Mapping[str, Any],
+    *,
+    compress: bool = False,
+    copies: int = 1,
 ) -> None:
     """
     Write arrays and attributes to a file, atomically.
@@ -70,6 +80,8 @@ def save_state(
         JSON values; tuples come back as lists.
     compress : bool
         Compress with zlib: a map gets 1.7 times smaller and takes 4 times as long.
+    copies : int
+        How many times the memory of the arrays a reader needs, as it tells ``load_state``.
 
     Raises
     ------
@@ -98,7 +110,7 @@ def save_state(
     manifest['sha256'] = content_sha256(manifest, contiguous.values())
     with replace_file(path) as file:
         size = write_archive(file, manifest, contiguous, zipfile.ZIP_DEFLATED * compress)
-        if size > MAX_RATIO * file.tell():
+        if size * copies > max(FLOOR_BYTES, BYTES_PER_BYTE * file.tell()):
             file.seek(0)
             file.truncate()
             write_archive(file, manifest, contiguous, zipfile.ZIP_STORED)
@@ -128,11 +140,18 @@ def content_sha256(manifest: Mapping[str, Any], arrays: Iterable[npt.NDArray[Any
     return content.hexdigest()
 
 
-def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
+def load_state(
+    path: str | Path, *, copies: int = 1
+) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """
     Return the arrays and the attributes of a file that save_state wrote.
 
-    Memory is at most MAX_RATIO times the size of the file.
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    copies : int
+        How many times the memory of the arrays the caller needs in all.
 
     Raises
     ------
@@ -142,7 +161,9 @@ def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
     """
     try:
         with open(path, 'rb') as file, zipfile.ZipFile(file) as archive:
-            return read_archive(path, archive, os.fstat(file.fileno()).st_size)
+            budget = Budget(path, os.fstat(file.fileno()).st_size, FileFormatError)
+            with budget.clock():
+                return read_archive(path, archive, budget, copies)
     except FileFormatError:
         raise
     except OSError as error:
@@ -156,24 +177,19 @@ def load_state(path: str | Path) -> tuple[dict[str, npt.NDArray[Any]], dict[str,
 
 
 def read_archive(
-    path: str | Path, archive: zipfile.ZipFile, file_size: int
+    path: str | Path, archive: zipfile.ZipFile, budget: Budget, copies: int
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return arrays and attributes; raise any exception if the content is inconsistent."""
     members = {info.filename: info for info in archive.infolist()}
     if MANIFEST not in members:
         raise FileFormatError(f'{path}: no {MANIFEST} inside, expected a state of surfel_mapper')
-    size = sum(info.file_size for info in archive.infolist())
-    if size > MAX_RATIO * file_size:
+    budget.take(MEMBER_BYTES * len(members), f'{len(members)} members')
+    manifest_size = members[MANIFEST].file_size
+    if manifest_size > MAX_MANIFEST_BYTES:
         raise FileFormatError(
-            f'{path}: {size} bytes packed into {file_size}, expected at most {MAX_RATIO} times '
-            'the size of the file'
+            f'{path}: {MANIFEST} of {manifest_size} bytes, expected at most {MAX_MANIFEST_BYTES}'
         )
-    Budget(path, file_size, FileFormatError, ratio=MAX_RATIO).take(size, 'arrays')
-    if MANIFEST in members and members[MANIFEST].file_size > MAX_MANIFEST_BYTES:
-        raise FileFormatError(
-            f'{path}: {MANIFEST} of {members[MANIFEST].file_size} bytes, expected at most '
-            f'{MAX_MANIFEST_BYTES}'
-        )
+    budget.take(OBJECT_BYTES * manifest_size, MANIFEST)
     for info in members.values():
         check_packing(info)
     manifest = json.loads(read_bytes(archive, members.pop(MANIFEST)))
@@ -185,6 +201,8 @@ def read_archive(
     infos = [members.pop(f'{entry["name"]}.npy') for entry in manifest['arrays']]
     for info, entry in zip(infos, manifest['arrays'], strict=True):
         check_header(archive, info, entry)
+        budget.take(info.file_size * copies, f'array {entry["name"]}')
+        budget.check_time()
     arrays = {
         entry['name']: read_array(archive, info)
         for info, entry in zip(infos, manifest['arrays'], strict=True)

@@ -13,15 +13,17 @@ The formats are in one module because they share the class, the check of poses a
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from array import array
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
@@ -53,6 +55,15 @@ UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 MOST_SECONDS = 10**11
 """Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
+
+MAX_LINE_BYTES = 1 << 16
+"""Limit of the length of a line; poses have some hundred characters."""
+
+POSE_BYTES = 300
+"""Memory of a pose while its file is read: twelve numbers, a stamp, and a copy of each."""
+
+CHECK_EVERY = 1024
+"""Number of poses after which the time is checked."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -189,26 +200,35 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         not increase.
 
     """
-    lines = numbered_lines(path)
-    if not lines:
-        raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-    format_ = format_ or guessed(path, lines[0][1])
-    if format_ not in FORMATS:
-        raise FileFormatError(f'{path}: format {format_!r}, expected one of {", ".join(FORMATS)}')
-    if format_ == 'kitti':
-        return kitti_poses(path, lines)
-    rows = csv_rows(path, lines) if format_ == 'csv' else tum_rows(path, lines)
-    stamps, numbers = list[int](), list[list[float]]()
+    budget = Budget.of_file(path, FileFormatError)
+    with budget.clock():
+        lines = numbered_lines(path, budget)
+        first = next(lines, None)
+        if first is None:
+            raise FileFormatError(f'{path}: no poses in it, expected a line for each')
+        format_ = format_ or guessed(path, first[1])
+        lines = chain([first], lines)
+        if format_ == 'kitti':
+            return kitti_poses(path, lines)
+        if format_ not in FORMATS:
+            expected = ', '.join(FORMATS)
+            raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
+        return stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
+
+
+def stamped_poses(path: str | Path, rows: Iterable[tuple[str, int, list[float]]]) -> Trajectory:
+    """Return the poses in rows of file:line, stamp and seven numbers."""
+    stamps, numbers = array('q'), array('d')
     for where, stamp_ns, values in rows:
         if stamps and stamp_ns <= stamps[-1]:
             raise FileFormatError(f'{where}: stamp is not after that of the pose before')
         check_pose(where, values)
         stamps.append(stamp_ns)
-        numbers.append(values)
+        numbers.extend(values)
     if not stamps:
         raise FileFormatError(f'{path}: no poses in it, only a header')
-    table = np.array(numbers)
-    return Trajectory(np.array(stamps, np.int64), table[:, :3], table[:, 3:])
+    table = np.array(numbers).reshape(-1, 7)
+    return Trajectory(np.array(stamps), table[:, :3], table[:, 3:])
 
 
 def trajectory_beside(path: Path) -> Path | None:
@@ -217,16 +237,27 @@ def trajectory_beside(path: Path) -> Path | None:
     return found if found.is_file() else None
 
 
-def numbered_lines(path: str | Path) -> list[tuple[str, str]]:
-    """Return file:line and text of all lines but comments; a commented CSV header is kept."""
+def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]]:
+    """Yield file:line and text of all lines but comments; a commented CSV header is kept."""
     try:
-        text = Path(path).read_text(encoding='utf-8-sig')
+        with open(path, encoding='utf-8-sig') as file:
+            number = 0
+            while line := file.readline(MAX_LINE_BYTES):
+                number += 1
+                if len(line) == MAX_LINE_BYTES:
+                    raise FileFormatError(
+                        f'{path}:{number}: a line of over {MAX_LINE_BYTES} characters'
+                    )
+                if number % CHECK_EVERY == 0:
+                    budget.check_time()
+                line = line.strip()
+                if line and not is_comment(line):
+                    budget.take(POSE_BYTES, f'line {number}')
+                    yield f'{path}:{number}', line
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
         raise FileFormatError(f'{path}: no text, expected a file of poses') from error
-    lines = ((f'{path}:{n}', line.strip()) for n, line in enumerate(text.splitlines(), 1))
-    return [(where, line) for where, line in lines if line and not is_comment(line)]
 
 
 def is_comment(line: str) -> bool:
@@ -248,9 +279,7 @@ def guessed(path: str | Path, line: str) -> str:
     return formats[count]
 
 
-def tum_rows(
-    path: str | Path, lines: list[tuple[str, str]]
-) -> Iterator[tuple[str, int, list[float]]]:
+def tum_rows(lines: Iterable[tuple[str, str]]) -> Iterator[tuple[str, int, list[float]]]:
     """Yield file:line, stamp and numbers of every pose of a TUM file."""
     for where, line in lines:
         columns = line.split()
@@ -259,21 +288,21 @@ def tum_rows(
         yield where, nanoseconds(columns[0], where), floats(columns[1:], where)
 
 
-def csv_rows(
-    path: str | Path, lines: list[tuple[str, str]]
-) -> Iterator[tuple[str, int, list[float]]]:
+def csv_rows(lines: Iterable[tuple[str, str]]) -> Iterator[tuple[str, int, list[float]]]:
     """Yield file:line, stamp and numbers of every pose of a CSV file with a header."""
-    header = [column_name(text) for text in lines[0][1].lstrip('# ').split(',')]
+    lines = iter(lines)
+    first, text = next(lines)
+    header = [column_name(column) for column in text.lstrip('# ').split(',')]
     names = [name for name, _ in header]
     stamps = [place for place, name in enumerate(names) if name in STAMP_COLUMNS]
     places = [[names.index(alias) for alias in known if alias in names] for known in POSE_COLUMNS]
     if not stamps or not all(places):
         raise FileFormatError(
-            f'{lines[0][0]}: columns {", ".join(names)}; expected a header with stamp_s or '
+            f'{first}: columns {", ".join(names)}; expected a header with stamp_s or '
             'stamp_ns, x, y, z, qx, qy, qz, qw'
         )
     wanted = [found[0] for found in places]
-    for where, line in lines[1:]:
+    for where, line in lines:
         row = line.split(',')
         if len(row) != len(names):
             raise FileFormatError(f'{where}: {len(row)} columns, expected {len(names)}')
@@ -291,21 +320,24 @@ def column_name(text: str) -> tuple[str, str]:
     return name, unit
 
 
-def kitti_poses(path: str | Path, lines: list[tuple[str, str]]) -> Trajectory:
+def kitti_poses(path: str | Path, lines: Iterable[tuple[str, str]]) -> Trajectory:
     """Return the poses of a KITTI file, each the upper three rows of a matrix."""
-    matrices = []
+    numbers = array('d')
     for where, line in lines:
         columns = line.split()
         if len(columns) != 12:
             raise FileFormatError(f'{where}: {len(columns)} columns, expected 12: 3 rows of 4')
-        matrix = np.eye(4)
-        matrix[:3] = np.array(floats(columns, where)).reshape(3, 4)
-        if not is_rotation(matrix[:3, :3]):
+        values = floats(columns, where)
+        if not is_rotation(np.array(values).reshape(3, 4)[:, :3]):
             raise FileFormatError(f'{where}: its first three columns are no rotation')
-        matrices.append(matrix)
-    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(matrices))
-    poses = np.array(matrices)
-    return Trajectory(stamps, poses[:, :3, 3].copy(), np.array([q_xyzw(m) for m in matrices]))
+        numbers.extend(values)
+    rows = np.array(numbers).reshape(-1, 3, 4)
+    turns = np.empty((len(rows), 4))
+    pose = np.eye(4)
+    for number, pose[:3] in enumerate(rows):
+        turns[number] = q_xyzw(pose)
+    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(rows))
+    return Trajectory(stamps, rows[:, :, 3].copy(), turns)
 
 
 def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
@@ -320,12 +352,13 @@ def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
     """Return the stamps in a times.txt, which must have one line per pose."""
     if not path.is_file():
         return None
-    stamps = [nanoseconds(line, where) for where, line in numbered_lines(path)]
-    if len(stamps) != number or any(b <= a for a, b in pairwise(stamps)):
+    lines = numbered_lines(path, Budget.of_file(path, FileFormatError))
+    stamps = np.array(array('q', (nanoseconds(line, where) for where, line in lines)))
+    if len(stamps) != number or (np.diff(stamps) <= 0).any():
         raise FileFormatError(
             f'{path}: {len(stamps)} stamps for {number} poses, expected one for each, ascending'
         )
-    return np.array(stamps, np.int64)
+    return stamps
 
 
 def check_pose(where: str, values: list[float]) -> None:

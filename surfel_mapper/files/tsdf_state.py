@@ -32,6 +32,9 @@ SHAPE = (
 )
 """Settings that must be equal in a configuration and a file."""
 
+COPIES = 4
+"""Memory of loading, by that of the arrays: storage grows by doubling."""
+
 ARRAYS = {
     'index': np.int64,
     'stamp_ns': np.int64,
@@ -66,7 +69,7 @@ def save_tsdf(path: str | Path, blocks: BlockMap, *, compress: bool = False) -> 
     content = blocks.copied(rows)
     arrays = {name: getattr(content, name) for name in ARRAYS}
     attributes: dict[str, Any] = {name: getattr(blocks.config, name) for name in SHAPE}
-    save_state(path, arrays, {'kind': KIND, **attributes}, compress=compress)
+    save_state(path, arrays, {'kind': KIND, **attributes}, compress=compress, copies=COPIES)
 
 
 def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
@@ -89,7 +92,7 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
         If the map does not fit into max_blocks.
 
     """
-    arrays, attributes = load_state(path)
+    arrays, attributes = load_state(path, copies=COPIES)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
     for name in SHAPE:

@@ -13,7 +13,7 @@ three numbers long, they take 1.0 ms.
 
 ``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
 
-One module of 480 lines: reading and writing share the fields and their types.
+One module of 490 lines: reading and writing share the fields and their types.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.cdr import (
     checked_stamp_ns,
@@ -47,6 +48,9 @@ DTYPES = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', UINT32: 'u4', FLOAT32: 'f
 
 MAX_FIELDS = 1024
 """Limit of the number of fields; drivers have some ten, clouds with descriptors some hundred."""
+
+FIELD_BYTES = 400
+"""Memory of a field: its object, its name and its place in a dictionary."""
 
 DATATYPES = {np.dtype(name): datatype for datatype, name in DTYPES.items()}
 
@@ -106,16 +110,17 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
     data = checked_data(msg, topic)
     if int(msg.height) * int(msg.width) == 0:
         return Scan(points=np.empty((0, 3), np.float32), stamp_ns=stamp_ns, frame_id=frame_id)
-    fields = checked_fields(msg, topic)
+    budget = Budget(topic, len(data), CloudFormatError)
+    fields = checked_fields(msg, topic, budget)
     xyz = [checked_coordinate(fields, name, topic) for name in 'xyz']
     check_overlap(fields, topic)
     points = Points.of(msg, data)
     others = {name: field for name, field in fields.items() if name not in ('x', 'y', 'z')}
     return Scan(
-        points=coordinates(points, xyz),
+        points=coordinates(points, xyz, budget),
         stamp_ns=stamp_ns,
         frame_id=frame_id,
-        columns=MessageColumns(points, others),
+        columns=MessageColumns(points, others, budget),
         msg=msg,
     )
 
@@ -150,7 +155,7 @@ def checked_data(msg: Any, topic: str) -> npt.NDArray[np.uint8]:
     return data
 
 
-def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
+def checked_fields(msg: Any, topic: str, budget: Budget) -> dict[str, Field]:
     """
     Return the fields of a message by name; raise CloudFormatError if they do not fit a point.
 
@@ -158,6 +163,7 @@ def checked_fields(msg: Any, topic: str) -> dict[str, Field]:
     """
     if len(msg.fields) > MAX_FIELDS:
         raise CloudFormatError(f'{topic}: {len(msg.fields)} fields, expected at most {MAX_FIELDS}')
+    budget.take(len(msg.fields) * FIELD_BYTES, f'{len(msg.fields)} fields')
     fields: dict[str, Field] = {}
     for found in msg.fields:
         field = Field(found.name, int(found.offset), int(found.datatype), int(found.count) or 1)
@@ -246,17 +252,18 @@ class MessageColumns(Mapping[str, npt.NDArray[Any]]):
     Most are views; those of other byte orders or padded rows are copies, made only if used.
     """
 
-    __slots__ = ('_decoded', '_fields', '_points', 'num_rows')
+    __slots__ = ('_budget', '_decoded', '_fields', '_points', 'num_rows')
 
-    def __init__(self, points: Points, fields: Mapping[str, Field]) -> None:
+    def __init__(self, points: Points, fields: Mapping[str, Field], budget: Budget) -> None:
         self._points = points
+        self._budget = budget
         self._fields = fields
         self._decoded: dict[str, npt.NDArray[Any]] = {}
         self.num_rows = math.prod(points.shape)
 
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         if name not in self._decoded:
-            self._decoded[name] = column(self._points, self._fields[name])
+            self._decoded[name] = column(self._points, self._fields[name], self._budget)
         return self._decoded[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -269,20 +276,24 @@ class MessageColumns(Mapping[str, npt.NDArray[Any]]):
         return name in self._fields
 
 
-def column(points: Points, field: Field) -> npt.NDArray[Any]:
+def column(points: Points, field: Field, budget: Budget) -> npt.NDArray[Any]:
     """Return one field of all points, (N,) or (N, count), read-only and in native byte order."""
     values = points.view(field.offset, points.order + DTYPES[field.datatype], field.count)
+    if not values.dtype.isnative or len(points.shape) > 1:
+        budget.take(values.nbytes, f'field {field.name!r}')
     values = values.astype(values.dtype.newbyteorder('='), copy=False)
     values = values.reshape(-1, field.count) if field.count > 1 else values.reshape(-1)
     values.flags.writeable = False
     return values
 
 
-def coordinates(points: Points, xyz: list[Field]) -> npt.NDArray[Any]:
+def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray[Any]:
     """Return three fields as a new (N, 3) array in Fortran order and native byte order."""
     views = [points.view(f.offset, points.order + DTYPES[f.datatype]) for f in xyz]
     dtype = np.result_type(*views).newbyteorder('=')
-    packed: npt.NDArray[Any] = np.empty((math.prod(points.shape), 3), dtype, order='F')
+    num_points = math.prod(points.shape)
+    budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
+    packed: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
     for axis, values in enumerate(views):
         packed[:, axis].reshape(points.shape)[...] = values
     return packed
@@ -397,14 +408,16 @@ def parse_cloud(raw: bytes | memoryview, *, ros1: bool = False, topic: str = 'po
 
     """
     try:
-        return _read_cloud(MessageReader(raw, ros1=ros1))
+        return _read_cloud(
+            MessageReader(raw, ros1=ros1), Budget(topic, len(raw), CloudFormatError)
+        )
     except (struct.error, UnicodeDecodeError, ValueError) as error:
         raise CloudFormatError(
             f'{topic}: {len(raw)} bytes that are not a whole PointCloud2: {error}'
         ) from error
 
 
-def _read_cloud(reader: MessageReader) -> RawCloud:
+def _read_cloud(reader: MessageReader, budget: Budget) -> RawCloud:
     """Return the next PointCloud2."""
     header = read_header(reader)
     height, width, num_fields = reader.numbers('III')
@@ -412,6 +425,7 @@ def _read_cloud(reader: MessageReader) -> RawCloud:
         raise ValueError(f'{num_fields} fields announced, {reader.remaining} bytes left')
     if num_fields > MAX_FIELDS:
         raise ValueError(f'{num_fields} fields, expected at most {MAX_FIELDS}')
+    budget.take(num_fields * FIELD_BYTES, f'{num_fields} fields')
     fields = [Field(reader.string(), *reader.numbers('IBI')) for _ in range(num_fields)]
     is_bigendian, point_step, row_step = reader.numbers('BII')
     return RawCloud(

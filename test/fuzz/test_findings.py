@@ -38,7 +38,9 @@ from surfel_mapper.errors import (
 )
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.state import load_state, save_state
+from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -146,7 +148,7 @@ def peak_of(function):
     """Return the exception of a function and its peak of traced memory."""
     tracemalloc.start()
     try:
-        with pytest.raises((BagError, ValueError)) as raised:
+        with pytest.raises((BagError, FileFormatError, ValueError)) as raised:
             function()
         return raised.value, tracemalloc.get_traced_memory()[1]
     finally:
@@ -686,3 +688,79 @@ def test_text_with_an_end_of_line_is_read(tmp_path):
     (tmp_path / 'a.pcd').write_text(TEXT_PCD + 'ascii\n1.25\n2.5\n')
     for reader, name in ((ply, 'a.ply'), (pcd, 'a.pcd')):
         assert reader.read_points(tmp_path / name)['x'].tolist() == [1.25, 2.5]
+
+
+@pytest.mark.parametrize(('name', 'head'), [('a.ply', TEXT_PLY), ('a.pcd', TEXT_PCD + 'ascii\n')])
+def test_text_is_split_in_pieces(tmp_path, name, head):
+    """Split as a whole, each digit is an object of 34 bytes, with 16 bytes of lists."""
+    path, number = tmp_path / name, 300_000
+    head = head.replace('vertex 2', f'vertex {number}').replace('POINTS 2', f'POINTS {number}')
+    path.write_text(head.replace('WIDTH 2', f'WIDTH {number}') + '1 ' * (number - 1) + '7\n')
+    tracemalloc.start()
+    try:
+        values = (ply if name == 'a.ply' else pcd).read_points(path)['x']
+        assert tracemalloc.get_traced_memory()[1] < 12_000_000  # was 24 MB
+    finally:
+        tracemalloc.stop()
+    assert values.sum() == number + 6
+
+
+@pytest.mark.parametrize(('name', 'type_'), [('a.ply', 'uchar'), ('a.pcd', 'U')])
+@pytest.mark.parametrize('number', ['300', '-1', '1.5', 'nan', '1e300'])
+def test_numbers_that_a_type_cannot_hold_are_refused(tmp_path, name, type_, number):
+    path = tmp_path / name
+    text = TEXT_PLY.replace('float', type_) if name == 'a.ply' else TEXT_PCD + 'ascii\n'
+    text = text.replace('SIZE 4\nTYPE F', f'SIZE 1\nTYPE {type_}')
+    path.write_text(f'{text}9\n{number}\n')
+    with pytest.raises(FileFormatError, match=r'x: .*, which uint8 cannot hold'):
+        (ply if name == 'a.ply' else pcd).read_points(path)
+
+
+def test_poses_take_little_more_than_their_numbers(tmp_path):
+    path = tmp_path / 'poses.txt'
+    path.write_text(''.join(f'{i} 0 0 0 0 0 0 1\n' for i in range(5000)))
+    tracemalloc.start()
+    try:
+        assert len(read_trajectory(path)) == 5000
+        assert tracemalloc.get_traced_memory()[1] < 1_000_000  # was 3.5 MB
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_line_of_poses_without_an_end_is_refused(tmp_path):
+    path = tmp_path / 'poses.txt'
+    path.write_bytes(b'1 ' * 10_000_000)
+    error, peak = peak_of(lambda: read_trajectory(path))
+    assert 'poses.txt:1: a line of over 65536 characters' in str(error)
+    assert peak < 1_000_000
+    error, peak = peak_of(lambda: read_trajectory('/dev/zero'))
+    assert '/dev/zero:1: a line of over 65536 characters' in str(error)
+    assert peak < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ('at', 'code', 'number', 'problem'),
+    [
+        (247, '<Q', 10**9, 'bytes, expected 34000000375 for 1000000000 points'),
+        (100, '<I', 10**9, '1000000000 and 0 records of variable length'),
+        (243, '<I', 10**9, '0 and 1000000000 records of variable length'),
+    ],
+    ids=['points', 'records', 'extended'],
+)
+def test_counts_in_the_header_of_las_are_compared_with_the_file(
+    tmp_path, at, code, number, problem
+):
+    """Laspy loops over the records stated, and takes the points found for all."""
+    laspy = pytest.importorskip('laspy')
+    path = tmp_path / 'a.las'
+    data = laspy.LasData(laspy.LasHeader(point_format=3, version='1.4'))
+    data.x = data.y = data.z = np.arange(5.0)
+    data.write(str(path))
+    assert read_scan(path)[0].shape == (5, 3)
+    content = bytearray(path.read_bytes())
+    struct.pack_into(code, content, at, number)
+    path.write_bytes(content)
+    start_s = time.thread_time()
+    with pytest.raises(FileFormatError, match=problem):
+        read_scan(path)
+    assert time.thread_time() - start_s < 0.5

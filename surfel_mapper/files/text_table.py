@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tables of numbers in text, as ASCII PLY and PCD have them, read in pieces within a budget.
+
+Every word of a text is an object of 34 bytes or more. Split as a whole, a file of one-digit
+numbers takes 40 times its size; split by pieces, its table of numbers and little more.
+
+On its own because both formats read their points with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import math
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.budget import Budget
+from surfel_mapper.errors import FileFormatError
+
+PIECE_BYTES = 1 << 18
+"""Bytes split at a time: 8 MB of words at most."""
+
+MAX_WORD_BYTES = 1 << 16
+"""Limit of a number, which may have that many digits."""
+
+
+def read_table(
+    path: str | Path,
+    file: BinaryIO,
+    layout: np.dtype[Any],
+    count: int,
+    budget: Budget,
+    *,
+    is_last: bool = True,
+) -> npt.NDArray[Any]:
+    """
+    Return the rows of a text, one word for every number.
+
+    Parameters
+    ----------
+    path : str or Path
+        Named in errors.
+    file : binary file
+        At the first number.
+    layout : dtype
+        Structured: the columns, each a number or an array of numbers.
+    count : int
+        Number of rows.
+    budget : Budget
+        Of the file.
+    is_last : bool
+        Whether the file ends after the table; else the rest is not read.
+
+    Raises
+    ------
+    FileFormatError
+        If the text has fewer or more numbers, does not end with an end of line, has other words
+        than numbers, or a number that its type cannot hold.
+
+    """
+    budget.take(count * layout.itemsize, f'{count} rows of {layout.itemsize} bytes')
+    table, width, filled = np.empty(count, layout), num_numbers(layout), 0
+    words: list[bytes] = []
+    extra = 0
+    for piece in pieces_of(path, file, budget):
+        words += piece.split()
+        rows = min(len(words) // width, count - filled)
+        try:
+            fill(table[filled : filled + rows], words[: rows * width])
+        except (ValueError, OverflowError) as error:
+            raise FileFormatError(f'{path}: {error}') from error
+        filled += rows
+        del words[: rows * width]
+        if filled == count:
+            extra += len(words)
+            words = []
+            if not is_last:
+                return table
+    if filled < count or extra:
+        found = filled * width + len(words) + extra
+        raise FileFormatError(
+            f'{path}: {found} numbers, expected {count * width} for {count} points; truncated?'
+        )
+    return table
+
+
+def num_numbers(layout: np.dtype[Any]) -> int:
+    """Return the number of numbers in a row."""
+    return sum(math.prod(layout[name].shape) for name in layout.names or ())
+
+
+def pieces_of(path: str | Path, file: BinaryIO, budget: Budget) -> Iterator[bytes]:
+    """Yield a text in pieces of whole words; raise FileFormatError if the last may be cut off."""
+    rest = b''
+    while piece := file.read(PIECE_BYTES):
+        budget.check_time()
+        piece = rest + piece
+        end = 1 + max(piece.rfind(space) for space in (b' ', b'\n', b'\r', b'\t'))
+        piece, rest = piece[:end], piece[end:]
+        if len(rest) > MAX_WORD_BYTES:
+            raise FileFormatError(f'{path}: a number of over {MAX_WORD_BYTES} digits')
+        yield piece
+    if rest:
+        raise FileFormatError(
+            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
+            'it is complete, append an end of line'
+        )
+
+
+def fill(table: npt.NDArray[Any], words: list[bytes]) -> None:
+    """Write the numbers of whole rows into a table; raise ValueError if one does not fit."""
+    rows = np.array(words, object).reshape(len(table), -1)
+    at = 0
+    for name in table.dtype.names or ():
+        column = table[name]
+        width = math.prod(column.shape[1:])
+        # by way of float64, which holds integers of 32 bits and reads 9.0
+        is_long = column.dtype.kind in 'iu' and column.dtype.itemsize == 8
+        values = rows[:, at : at + width].reshape(column.shape)
+        numbers = values.astype(np.int64 if is_long else np.float64)
+        with np.errstate(invalid='ignore', over='ignore'):
+            column[...] = numbers
+        if column.dtype.kind in 'iu' and (column != numbers).any():
+            wrong = numbers[column != numbers].flat[0]
+            raise ValueError(f'{name}: {wrong}, which {column.dtype} cannot hold')
+        at += width
