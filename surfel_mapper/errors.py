@@ -7,7 +7,8 @@ Exceptions of this package.
       ConfigError          a setting is unknown, of the wrong type or out of bounds  (ValueError)
       CloudFormatError     a PointCloud2 that cannot be decoded                       (ValueError)
       PoseError            no pose for a scan, and waiting will not provide one
-        PoseNotYetError    the newest transform is older than the stamp: wait
+        PoseNotYetError    no transform around the stamp: one may still arrive
+          PosesLateError   all transforms are older than the stamp: newer ones will arrive
       MapError             an operation that a surfel map cannot carry out
         MapLimitError      a voxel index or a count beyond the range of the integers  (ValueError)
         NotInMapError      removing moments that the map does not contain             (ValueError)
@@ -62,7 +63,11 @@ class PoseError(SurfelMapperError):
 
 
 class PoseNotYetError(PoseError):
-    """The newest transform is older than the requested stamp: a newer one may arrive."""
+    """There is no transform around the requested stamp: one may arrive."""
+
+
+class PosesLateError(PoseNotYetError):
+    """All transforms of a frame are older than the requested stamp: newer ones will arrive."""
 
 
 class MapError(SurfelMapperError):

@@ -176,6 +176,14 @@ class PoseConfig(Stage):
         high=3600.0,
         live=True,
     )
+    max_delay_s: float = setting(
+        4.0,
+        'A scan that is newer than all poses waits until data newer by this arrives, s, if this '
+        'is longer than max_wait_s: Fast DDS repeats a lost pose after up to 3 s.',
+        low=0.0,
+        high=3600.0,
+        live=True,
+    )
     max_gap_s: float = setting(
         0.5,
         'Poses are interpolated between two at most this far apart, s; a scan in a longer gap '
@@ -185,7 +193,7 @@ class PoseConfig(Stage):
         live=True,
     )
     max_waiting_scans: int = setting(
-        20,
+        100,
         'At most this many scans wait for their pose; the oldest is dropped.',
         low=1,
         high=10**6,

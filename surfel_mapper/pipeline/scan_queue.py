@@ -6,7 +6,8 @@ ScanQueue: scans that wait for their poses and images, in the order of their sta
 Time is the stamps of the data alone, never the clock, so a bag replayed at any speed waits and
 drops alike. Every sensor has its own order: the stamps of one lidar say nothing about another's.
 A scan whose pose cannot come any more, or did not within ``pose.max_wait_s`` of the newest data,
-is dropped and counted.
+is dropped and counted. The wait is longer, ``pose.max_delay_s``, while the scan is newer than all
+poses: these are on the way.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 from collections import deque
 
 from surfel_mapper.config import PoseConfig
-from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.scan_images import ScanImages
@@ -122,13 +123,13 @@ class ScanQueue:
             stamps = (self.newest_ns, self._poses.transforms.newest_ns)
             newest_ns = max(stamp for stamp in stamps if stamp is not None)
             waited_s = (newest_ns - scan.end_ns) / 1e9
-            may_wait = waited_s <= config.max_wait_s
-            if may_wait and self._images is not None and self._images.is_waiting(scan):
+            images = self._images if waited_s <= config.max_wait_s else None
+            if images is not None and images.is_waiting(scan):
                 return None
             try:
                 pose = self._poses.of(scan, self._scans[1] if len(self._scans) > 1 else None)
             except PoseNotYetError as error:
-                if may_wait:
+                if waited_s <= longest_wait_s(error, config):
                     return None
                 reason = f'no pose within {waited_s:.3f} s: {error}'
             except PoseError as error:
@@ -137,3 +138,9 @@ class ScanQueue:
                 return self._scans.popleft(), pose
             self._drops.scan(self._scans.popleft(), 'no_pose', reason)
         return None
+
+
+def longest_wait_s(error: PoseNotYetError, config: PoseConfig) -> float:
+    """Return how far data may be ahead of a scan whose pose is missing for this cause, s."""
+    is_late = isinstance(error, PosesLateError)
+    return max(config.max_wait_s, config.max_delay_s) if is_late else config.max_wait_s

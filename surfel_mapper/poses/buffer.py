@@ -26,7 +26,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.errors import PoseError, PoseNotYetError
+from surfel_mapper.errors import PoseError, PoseNotYetError, PosesLateError
 from surfel_mapper.geometry import compose, inverse, Transform
 from surfel_mapper.poses.pose_track import NS_PER_S, PoseTrack, rigid, seconds
 
@@ -166,9 +166,10 @@ class TransformBuffer:
         Raises
         ------
         PoseNotYetError
-            If a frame was never seen, no edges lead from one to the other, or the newest
-            transform of an edge between them is older than the stamp, or the stamp is in a gap
-            longer than ``max_gap_s``: the missing transforms may still come.
+            If a frame was never seen, no edges lead from one to the other, or the stamp is in a
+            gap longer than ``max_gap_s``: the missing transforms may still come.
+        PosesLateError
+            If the newest transform of an edge between them is older than the stamp.
         PoseError
             If the stamp is before the oldest transform held of an edge between them.
 
@@ -314,7 +315,7 @@ def _check_held(edges: list[PoseTrack], stamp_ns: int, max_gap_s: float) -> None
             raise PoseError(f'older than all of {edge}')
     for edge in dynamic:
         if stamp_ns > edge.stamps[-1]:
-            raise PoseNotYetError(f'newer than all of {edge}')
+            raise PosesLateError(f'newer than all of {edge}')
     for edge in dynamic:
         gap_s = edge.gap_ns(stamp_ns) / NS_PER_S
         if gap_s > max_gap_s:

@@ -3,18 +3,20 @@
 """
 The node over DDS: latency from publish to ``~/changed``, drops, the highest rate, and idle.
 
-Three processes: a lidar (live_publisher.py), the node, and this one, which subscribes to
-``~/changed`` and to ``~/normals`` at 2 Hz. The lidar is an ordinary publisher: reliable, with
-the defaults of the middleware. A rate is sustained if every cloud published comes back as a
-change; the latency of ``~/normals`` counts from the stamp of its latest scan. Idle is a node that
-has mapped, with nothing coming in.
+Four processes: a lidar and an odometry (live_publisher.py), the node, and this one, which
+subscribes to ``~/changed`` and to ``~/normals`` at 2 Hz. The lidar is an ordinary publisher:
+reliable, with the defaults of the middleware, or, in rows ``with profile``, with the profile for
+shared memory. A rate is sustained if every cloud published comes back as a change; the latency of
+``~/normals`` counts from the stamp of its latest scan. Idle is a node that has mapped, with
+nothing coming in. Rows ``transport`` are a subscriber of rclpy that only takes the clouds, in
+place of the node: no subscriber is faster.
 
-Only the 20 Hz row grows with ``--scans``: at 4000 it lasts ten minutes.
+Only the rows of the node at 20 Hz grow with ``--scans``: at 4000 each lasts ten minutes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 import json
 import os
@@ -28,6 +30,7 @@ from typing import Any
 
 import numpy as np
 
+from surfel_mapper.ros.context import PROFILE
 from test.bench.live_publisher import NUM_SCANS
 from test.bench.options import Options
 from test.bench.report import Row
@@ -47,6 +50,9 @@ LATENCY_BUDGET_MS = {'p50_ms': 40.0, 'p99_ms': 50.0, 'normals_max_ms': 150.0}
 BURST, BURST_HZ = 10, 1e6
 """Clouds published at once, without a pause."""
 
+Listen = Callable[[Callable[[], bool]], None]
+"""Takes messages until a condition holds."""
+
 CPU_TICKS = os.sysconf('SC_CLK_TCK')
 
 
@@ -61,7 +67,7 @@ def run(options: Options) -> list[Row]:
     street.prepare(NUM_SCANS)
     isolate()
     scale = options.scans / 100  # --quick takes a quarter of the time
-    rows: list[Row] = []
+    rows: list[Row] = list(transport(options, min(scale, 1.0)))
     for size_m in options.voxel_sizes_m:
         rows += rates(options, street, size_m, scale)
     return rows
@@ -78,10 +84,12 @@ def rates(options: Options, street: Street, size_m: float, scale: float) -> Iter
     mount = list(street.simulation.drive.base_to_sensor)
     with Node(size_m, mount, options.window, {}) as node, listening() as listener:
         node.wait_for('ready:')
-        publish(options, listener, RATE_HZ, 20)  # fills caches
-        row = {**measure(options, node, listener, RATE_HZ, SECONDS * scale), 'voxel_m': size_m}
+        publish(options, listener.listen_until, RATE_HZ, 20)  # fills caches
         budgets = LATENCY_BUDGET_MS if size_m == BUDGET_VOXEL_M else {}
-        yield {**row, **{f'budget_{name}': value for name, value in budgets.items()}}
+        for what, profile in (('live', False), ('with profile', True)):
+            row = measure(options, node, listener, RATE_HZ, SECONDS * scale, profile=profile)
+            row = {**row, 'what': what, 'voxel_m': size_m}
+            yield {**row, **{f'budget_{name}': value for name, value in budgets.items()}}
         burst = measure(options, node, listener, BURST_HZ, BURST / BURST_HZ)
         yield {**burst, 'what': 'burst', 'voxel_m': size_m}
         scale = min(scale, 1.0)
@@ -96,23 +104,25 @@ def rates(options: Options, street: Street, size_m: float, scale: float) -> Iter
 
 
 def measure(
-    options: Options, node: Node, listener: Any, rate_hz: float, seconds: float
+    options: Options,
+    node: Node,
+    listener: Any,
+    rate_hz: float,
+    seconds: float,
+    *,
+    profile: bool = False,
 ) -> dict[str, Any]:
     """Return the row of a rate."""
     before_s, rss_mb = node.cpu_s(), node.resident_mb()
     listener.normals_ms.clear()
-    stamps = publish(options, listener, rate_hz, round(rate_hz * seconds))
+    stamps = publish(
+        options, listener.listen_until, rate_hz, round(rate_hz * seconds), profile=profile
+    )
     cpu_s = node.cpu_s() - before_s
-    came = [(listener.arrivals[s] - s) / 1e6 for s in stamps if s in listener.arrivals]
-    achieved = (len(stamps) - 1) / (stamps[-1] - stamps[0]) * 1e9
     return {
         'what': 'live',
         'rate_hz': rate_hz,
-        'published_hz': achieved,
-        'clouds': len(stamps),
-        'dropped': len(stamps) - len(came),
-        'p50_ms': float(np.percentile(came, 50)) if came else None,
-        'p99_ms': float(np.percentile(came, 99)) if came else None,
+        **latencies(stamps, listener.arrivals),
         'normals': len(listener.normals_ms),
         'normals_max_ms': max(listener.normals_ms, default=None),
         'rss_MB': node.resident_mb(),
@@ -121,20 +131,54 @@ def measure(
     }
 
 
-def publish(options: Options, listener: Any, rate_hz: float, num: int) -> list[int]:
+def latencies(stamps: Sequence[int], arrivals: Mapping[int, int]) -> dict[str, Any]:
+    """Return how many clouds came, and how late."""
+    came = [(arrivals[s] - s) / 1e6 for s in stamps if s in arrivals]
+    return {
+        'clouds': len(stamps),
+        'dropped': len(stamps) - len(came),
+        'p50_ms': float(np.percentile(came, 50)) if came else None,
+        'p99_ms': float(np.percentile(came, 99)) if came else None,
+    }
+
+
+def transport(options: Options, scale: float) -> Iterator[Row]:
+    """Yield the latencies of a subscriber that only takes the clouds, without a node."""
+    from nav_msgs.msg import Odometry
+    from sensor_msgs.msg import PointCloud2
+
+    for what, profile in (('transport', False), ('transport with profile', True)):
+        arrivals: dict[int, int] = {}
+
+        def on_cloud(raw: bytes, arrivals: dict[int, int] = arrivals) -> None:
+            sec, nanosec = np.frombuffer(raw, '<u4', 2, 4).tolist()  # after the 4 bytes of CDR
+            arrivals[sec * 10**9 + nanosec] = time.time_ns()
+
+        with spinning() as (node, listen_until):
+            node.create_subscription(PointCloud2, 'points', on_cloud, 20, raw=True)
+            node.create_subscription(Odometry, 'odom', lambda _: None, 1000, raw=True)
+            num = round(RATE_HZ * SECONDS * scale)
+            stamps = publish(options, listen_until, RATE_HZ, num, profile=profile)
+        yield {'what': what, 'rate_hz': RATE_HZ, **latencies(stamps, arrivals)}
+
+
+def publish(
+    options: Options, listen_until: Listen, rate_hz: float, num: int, *, profile: bool = False
+) -> list[int]:
     """Let the lidar publish, and listen until it ends; return the stamps."""
     with tempfile.NamedTemporaryFile('w+', encoding='utf-8') as file:
-        with start_lidar(options, rate_hz, num, file.name) as lidar:
-            listener.listen_until(lambda: lidar.poll() is not None)
+        with start_lidar(options, rate_hz, num, file.name, profile=profile) as lidar:
+            listen_until(lambda: lidar.poll() is not None)
         stamps: list[int] = json.load(file)
     return stamps
 
 
 def start_lidar(
-    options: Options, rate_hz: float, num: int, stamps: str
+    options: Options, rate_hz: float, num: int, stamps: str, *, profile: bool = False
 ) -> subprocess.Popen[bytes]:
     """Start the lidar, which publishes once the node subscribes, and then writes its stamps."""
     settings = {
+        'role': 'lidar',
         'rate_hz': rate_hz,
         'num': num,
         'scans': NUM_SCANS,
@@ -144,7 +188,8 @@ def start_lidar(
         'stamps': stamps,
     }
     command = [sys.executable, '-m', 'test.bench.live_publisher', json.dumps(settings)]
-    return subprocess.Popen(command, cwd=ROOT)
+    environment = {'FASTRTPS_DEFAULT_PROFILES_FILE': str(PROFILE)} if profile else {}
+    return subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment})
 
 
 class Node:
@@ -206,17 +251,16 @@ class Node:
 @contextmanager
 def listening() -> Iterator[Any]:
     """Subscribe to the topics of the node, in a with-block."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from sensor_msgs.msg import PointCloud2
 
     class Listener:
         """Notes when a change came, by its stamp, and how old each full map is."""
 
-        def __init__(self) -> None:
+        def __init__(self, listen_until: Listen) -> None:
             self.arrivals: dict[int, int] = {}
             self.normals_ms: list[float] = []
+            self.listen_until = listen_until
 
         def on_changed(self, msg: PointCloud2) -> None:
             self.arrivals[stamp_ns(msg)] = time.time_ns()
@@ -225,24 +269,37 @@ def listening() -> Iterator[Any]:
             if msg.width:  # none before the first scan
                 self.normals_ms.append((time.time_ns() - stamp_ns(msg)) / 1e6)
 
-        def listen_until(self, condition: Any) -> None:
-            while not condition():
-                executor.spin_once(0.05)
-
     def stamp_ns(msg: PointCloud2) -> int:
         return int(msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec)
+
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    with spinning() as (node, listen_until):
+        listener = Listener(listen_until)
+        node.create_subscription(PointCloud2, '/surfel_mapper/changed', listener.on_changed, 50)
+        node.create_subscription(
+            PointCloud2, '/surfel_mapper/normals', listener.on_normals, latched
+        )
+        yield listener
+
+
+@contextmanager
+def spinning() -> Iterator[tuple[Any, Listen]]:
+    """Create a node; yield it and a function that takes messages until a condition holds."""
+    import rclpy
+    from rclpy.executors import SingleThreadedExecutor
 
     context = rclpy.Context()
     rclpy.init(context=context)
     node = rclpy.create_node('listener', context=context)
     executor = SingleThreadedExecutor(context=context)
     executor.add_node(node)
-    listener = Listener()
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    node.create_subscription(PointCloud2, '/surfel_mapper/changed', listener.on_changed, 50)
-    node.create_subscription(PointCloud2, '/surfel_mapper/normals', listener.on_normals, latched)
+
+    def listen_until(condition: Callable[[], bool]) -> None:
+        while not condition():
+            executor.spin_once(0.05)
+
     try:
-        yield listener
+        yield node, listen_until
     finally:
         executor.shutdown()
         node.destroy_node()

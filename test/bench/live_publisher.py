@@ -1,17 +1,20 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The lidar of the live bench, a process of its own: clouds and odometry at a rate, by defaults.
+The lidar and the odometry of the live bench, a process each, by the defaults of the middleware.
 
-The drive goes forth and back over the scans held in memory, so that poses stay smooth however
-long it lasts. A cloud is stamped right before it is published, from which latency is counted.
+The lidar starts the odometry, and tells it when the drive begins. The drive goes forth and back
+over the scans held in memory, so that poses stay smooth however long it lasts. Clouds are stamped
+with the time at which they are due; latency counts from there.
 """
 
 from __future__ import annotations
 
 from array import array
 import json
+import os
 from pathlib import Path
+import subprocess
 import sys
 import time
 
@@ -23,57 +26,112 @@ from test.bench.street import Street
 NUM_SCANS = 60
 """Held in memory, 4 MiB each."""
 
+ODOMETRY_HZ = 100.0
+FASTEST_HZ = 100.0
+"""Clouds that come faster show the same place."""
+
 START_UP_S = 300.0
+LEAD_S = 0.5
+"""Odometry runs this long before the first cloud and after the last."""
+
+AFTER_S = 5.0
+"""Unread messages vanish with their publisher, and none learns what its reader has read."""
 
 
 def main(arguments):
-    """Publish a number of clouds at a rate, and write their stamps to a file as JSON."""
-    from nav_msgs.msg import Odometry
+    """Publish clouds at a rate, and write their stamps to a file as JSON; or the odometry."""
     import rclpy
-    from sensor_msgs.msg import PointCloud2
-
-    from surfel_mapper.memory import keep_freed_memory
-    from surfel_mapper.simulation.recording import BASE, ODOM
 
     settings = json.loads(arguments[0])
     size = {name: settings[name] for name in ('beams', 'columns')}
     street = Street(Options(**size, cache=Path(settings['cache'])))
+    rclpy.init()
+    if settings['role'] == 'lidar':
+        stamps = publish_clouds(rclpy.create_node('lidar'), street, settings)
+        Path(settings['stamps']).write_text(json.dumps(stamps), encoding='utf-8')
+    else:
+        publish_odometry(rclpy.create_node('odometry'), street, settings)
+    rclpy.shutdown()
+
+
+def publish_clouds(node, street, settings):
+    """Publish the clouds of a drive; return their stamps."""
+    from sensor_msgs.msg import PointCloud2
+
+    from surfel_mapper.memory import keep_freed_memory
+
     keep_freed_memory()
     clouds = [ros_cloud(street.message(number)) for number in range(settings['scans'])]
-    poses = [odometry(street, number, ODOM, BASE) for number in range(settings['scans'])]
-    rclpy.init()
-    node = rclpy.create_node('lidar')
-    points = node.create_publisher(PointCloud2, 'points', 10)
-    odom = node.create_publisher(Odometry, 'odom', 10)
+    publisher = node.create_publisher(PointCloud2, 'points', 10)
+    with odometry_process(settings) as odometry:
+        wait_for_reader(publisher)
+        assert odometry.stdout.readline() == 'ready\n'
+        start_ns = time.time_ns() + round(2.0 * LEAD_S * 1e9)
+        print(start_ns, file=odometry.stdin, flush=True)
+        stamps = []
+        for number in range(settings['num']):
+            stamp_ns = start_ns + round(number / settings['rate_hz'] * 1e9)
+            cloud = clouds[round(place(stamp_ns - start_ns, settings))]
+            cloud.header.stamp.sec, cloud.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+            sleep_until(stamp_ns)
+            publisher.publish(cloud)
+            stamps.append(stamp_ns)
+        time.sleep(AFTER_S)
+    return stamps
+
+
+def publish_odometry(node, street, settings):
+    """Publish the poses of the drive, whose start comes on standard input."""
+    from nav_msgs.msg import Odometry
+
+    publisher = node.create_publisher(Odometry, 'odom', 10)
+    wait_for_reader(publisher)
+    print('ready', flush=True)
+    start_ns = int(sys.stdin.readline())
+    lead_ns = round(LEAD_S * 1e9)
+    end_ns = start_ns + round(settings['num'] / settings['rate_hz'] * 1e9) + lead_ns
+    for stamp_ns in range(start_ns - lead_ns, end_ns, round(1e9 / ODOMETRY_HZ)):
+        message = odometry(street, place(stamp_ns - start_ns, settings))
+        message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
+        sleep_until(stamp_ns)
+        publisher.publish(message)
+    time.sleep(AFTER_S)
+
+
+def odometry_process(settings):
+    """Start the odometry, by the defaults of the middleware whatever the lidar has."""
+    environment = {name: value for name, value in os.environ.items() if 'PROFILES' not in name}
+    return subprocess.Popen(
+        [sys.executable, '-m', __spec__.name, json.dumps({**settings, 'role': 'odometry'})],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
+def wait_for_reader(publisher):
+    """Wait until the node subscribes."""
     end_s = time.monotonic() + START_UP_S
-    while not (points.get_subscription_count() and odom.get_subscription_count()):
+    while not publisher.get_subscription_count():
         if time.monotonic() > end_s:
             raise SystemExit('no subscriber appeared')
         time.sleep(0.05)
     time.sleep(0.5)  # the other side needs to know of us too
-    stamps = drive(settings, clouds, poses, points, odom)
-    # Unread messages vanish with their publisher, and none learns what its reader has read; a wait
-    # that is too short shows as lost clouds.
-    time.sleep(5.0)
-    Path(settings['stamps']).write_text(json.dumps(stamps), encoding='utf-8')
-    rclpy.shutdown()
 
 
-def drive(settings, clouds, poses, points, odom):
-    """Publish; return the stamps."""
-    there_and_back = [*range(len(clouds)), *range(len(clouds) - 2, 0, -1)]
-    stamps, start = [], time.perf_counter()
-    for number in range(settings['num']):
-        which = there_and_back[number % len(there_and_back)]
-        wait_s = start + number / settings['rate_hz'] - time.perf_counter()
-        if wait_s > 0.0:
-            time.sleep(wait_s)
-        stamp_ns = time.time_ns()
-        for message, publisher in ((poses[which], odom), (clouds[which], points)):
-            message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, 10**9)
-            publisher.publish(message)
-        stamps.append(stamp_ns)
-    return stamps
+def place(since_start_ns, settings):
+    """Return the number of the scan taken where the vehicle is, with fractions between scans."""
+    last = settings['scans'] - 1
+    scans = since_start_ns * 1e-9 * min(settings['rate_hz'], FASTEST_HZ)
+    return last - abs(last - scans % (2 * last))
+
+
+def sleep_until(stamp_ns):
+    """Sleep until a time of the clock."""
+    wait_s = (stamp_ns - time.time_ns()) * 1e-9
+    if wait_s > 0.0:
+        time.sleep(wait_s)
 
 
 def ros_cloud(raw):
@@ -96,13 +154,17 @@ def ros_cloud(raw):
     return message
 
 
-def odometry(street, number, parent, child):
-    """Return the pose of the vehicle at a scan as a message."""
+def odometry(street, number):
+    """Return the pose of the vehicle at a scan, or between two, as a message."""
     from nav_msgs.msg import Odometry
 
-    xyz, q_xyzw = street.simulation.drive.pose(street.simulation.stamp_ns(number))
-    message = Odometry(child_frame_id=child)
-    message.header.frame_id = parent
+    from surfel_mapper.simulation.recording import BASE, ODOM
+
+    period_ns = street.simulation.stamp_ns(1) - street.simulation.stamp_ns(0)
+    stamp_ns = street.simulation.stamp_ns(0) + round(number * period_ns)
+    xyz, q_xyzw = street.simulation.drive.pose(stamp_ns)
+    message = Odometry(child_frame_id=BASE)
+    message.header.frame_id = ODOM
     pose = message.pose.pose
     pose.position.x, pose.position.y, pose.position.z = np.asarray(xyz, float).tolist()
     turned = pose.orientation

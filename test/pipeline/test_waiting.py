@@ -52,6 +52,19 @@ def test_no_pose_is_extrapolated():
     assert_counts_add_up(mapper, waiting=1)
 
 
+def test_a_scan_newer_than_all_poses_waits_longer():
+    mapper = mapper_with(pose__max_wait_s=0.5, pose__max_delay_s=4.0)
+    add_pose(mapper, 1.0)
+    assert insert(mapper, *[scan_at(1.5 + tenths / 10) for tenths in range(41)]) == []
+    assert_counts_add_up(mapper, waiting=41)
+    assert insert(mapper, scan_at(5.6)) == []  # 4.1 s ahead of the first
+    assert dropped(mapper) == {'no_pose': 1}
+    add_pose(mapper, 1.8)
+    assert [update.stamp_ns * 10 // S for update in mapper.insert_ready()] == [16, 17, 18]
+    assert_counts_add_up(mapper, waiting=38)
+    assert dropped(mapper) == {'no_pose': 1}
+
+
 @pytest.mark.parametrize('newer', ['scan', 'pose of another frame'])
 def test_a_scan_is_dropped_once_newer_data_is_too_far_ahead(newer):
     mapper = mapper_with(pose__max_wait_s=0.5)

@@ -205,7 +205,8 @@ def test_limits_and_rates_change_while_running_and_bad_values_are_refused(start,
 
 
 def test_a_missing_pose_is_counted_by_frame_and_logged_with_a_remedy(start, peer):
-    node = start('node', *ARGUMENTS, '-p', 'pose.max_wait_s:=0.05')
+    waits = ('-p', 'pose.max_wait_s:=0.05', '-p', 'pose.max_delay_s:=0.05')
+    node = start('node', *ARGUMENTS, *waits)
     peer.advertise('/odom', '/points')
     (first, pose), (second, _) = drive(2)
     send(peer, [(first, pose)])
