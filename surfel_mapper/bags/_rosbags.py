@@ -3,18 +3,17 @@
 """
 The only module that imports rosbags, and the only one that uses its internals.
 
-rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public reader of
-sqlite3, writer and type store we rely on internals that setup.py therefore bounds to one minor
-version: the named tuples `Connection` and `Qos`, which the other readers fill as rosbags does.
+rosbags is imported when the first bag is opened, since it takes 0.2 s. Beside its public writer
+and type store we rely on internals that setup.py therefore bounds to one minor
+version: the named tuples `Connection` and `Qos`, which our readers fill as rosbags does.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
 from functools import cache
 from pathlib import Path
 import re
-from typing import Any, Literal, Protocol, TYPE_CHECKING
+from typing import Any, Literal, TYPE_CHECKING
 
 from surfel_mapper.bags.topics import SAME_AS
 from surfel_mapper.errors import DependencyError
@@ -32,65 +31,14 @@ BAG_VERSION: Literal[9] = 9
 """Version of metadata.yaml that rosbag2 of Jazzy writes."""
 
 
-class Storage(Protocol):
-    """Interface that rosbags' reader and our own share."""
-
-    @property
-    def connections(self) -> list[Connection]:
-        """The connections with the numbers of their messages."""
-
-    @property
-    def start_time(self) -> int:
-        """Record time of the first message."""
-
-    @property
-    def end_time(self) -> int:
-        """One more than the record time of the last message."""
-
-    @property
-    def message_count(self) -> int:
-        """Number of messages."""
-
-    def messages(
-        self,
-        connections: Collection[Connection],
-        start: int | None = None,
-        stop: int | None = None,
-    ) -> Iterator[tuple[Connection, int, bytes | memoryview]]:
-        """Yield connection, record time and bytes."""
-
-    def close(self) -> None:
-        """Close the file."""
-
-
-def open_rosbag2(path: Path) -> Storage:
-    """
-    Return rosbags' reader of a sqlite3 file, opened.
-
-    Raises
-    ------
-    DependencyError
-        If rosbags is not installed.
-    Exception
-        Of nearly any type, if the file is damaged: rosbags lets KeyError, AssertionError and
-        others through.
-
-    """
-    rosbag2: Any = import_rosbags().rosbag2
-    reader = rosbag2.Reader(path)
-    reader.open()
-    opened: Storage = reader
-    return opened
-
-
 def import_rosbags() -> Any:
-    """Return rosbags, with its readers of ROS 2."""
+    """Return rosbags."""
     try:
         import rosbags.rosbag2
     except ImportError as error:
         raise DependencyError(
-            f'rosbags cannot be loaded ({error}). It reads the bags; install it with '
-            '`pip install rosbags`'
+            f'rosbags cannot be loaded ({error}). It knows the types of the messages in bags; '
+            'install it with `pip install rosbags`'
         ) from error
     return rosbags
 

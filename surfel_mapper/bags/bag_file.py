@@ -3,11 +3,11 @@
 """
 Reading one file of a bag without rosbags, within a budget.
 
-rosbags reads indexes and unpacks chunks without limits, and refuses files without an index, which
-is missing if the recorder was killed, the disk was full or a copy was interrupted. So mcap and
-ROS 1 are read here (chunked.py and the module of each format), and of sqlite3 the files that are
-truncated (sqlite.py). Damage is told: ``cut_at`` is the byte at which a file ends too early,
-``skipped_at`` the damaged chunks.
+rosbags reads indexes and unpacks chunks without limits of memory or time, and refuses files
+without an index, which is missing if the recorder was killed, the disk was full or a copy was
+interrupted. So bags are read here: mcap and ROS 1 in chunked.py and the module of each format,
+sqlite3 through SQLite in sqlite.py, or page by page in sqlite_pages.py if it is truncated. Damage
+is told: ``cut_at`` is the byte at which a file ends too early, ``skipped_at`` the damaged chunks.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class FoundMessage(NamedTuple):
 
 class BagFile(ABC):
     """
-    A file of a bag, with the interface of rosbags' readers (see Storage).
+    A file of a bag, with the interface of rosbags' readers.
 
     Parameters
     ----------
@@ -59,6 +59,8 @@ class BagFile(ABC):
         Offset of the first record that is not whole; None if the file is complete.
     skipped_at : list of int
         Offsets of the damaged chunks, which are skipped from the damage on.
+    losses : list of str
+        What else is missing.
     connections : list of Connection
         With the number of messages found.
     start_time, end_time : int
@@ -81,6 +83,7 @@ class BagFile(ABC):
         self.size = path.stat().st_size
         self.cut_at: int | None = None
         self.skipped_at: list[int] = []
+        self.losses: list[str] = []
         self._budget = Budget(path, self.size, BagError)
         self._by_id: dict[int, Connection] = {}
         self._counts: Counter[int] = Counter()

@@ -27,7 +27,6 @@ from surfel_mapper.bags._rosbags import (
     is_latched,
     jazzy_types,
     ros1_types,
-    Storage,
     type_name,
 )
 from surfel_mapper.bags.bag_file import BagFile
@@ -88,7 +87,7 @@ class BagReader:
         self.cuts: list[str] = []
         self._skipped: dict[Path, int] = {}
         self._decoders: dict[str, tuple[Typestore, str]] = {}
-        self._storages: list[tuple[Path, Storage]] = []
+        self._storages: list[tuple[Path, BagFile]] = []
         with ExitStack() as files:
             self._open(files_of(self.path), files)
             self.topics = Topics(self.path, self._indexed_topics())
@@ -192,8 +191,7 @@ class BagReader:
                 continue
             files.callback(storage.close)
             self._storages.append((path, storage))
-            if isinstance(storage, BagFile):
-                self._note_losses(path, storage)
+            self._note_losses(path, storage)
             self._note_damaged_names(path, storage)
             journal = path.with_name(f'{path.name}-wal')
             if journal.is_file() and journal.stat().st_size:
@@ -233,7 +231,7 @@ class BagReader:
     def _stream(
         self,
         path: Path,
-        storage: Storage,
+        storage: BagFile,
         names: Collection[str] | None,
         start_ns: int | None,
         stop_ns: int | None,
@@ -242,7 +240,7 @@ class BagReader:
         wanted = [c for c in storage.connections if is_cdr(c) and has_legal_names(c)]
         if names is not None:
             wanted = [c for c in wanted if c.topic in names]
-        if not wanted:  # rosbags takes an empty list for all connections
+        if not wanted:
             return
         messages, done = iter(storage.messages(wanted, start_ns, stop_ns)), 0
         while True:
@@ -268,9 +266,10 @@ class BagReader:
                 f'{path}: the file is cut off or damaged at byte {storage.cut_at} of '
                 f'{storage.size}; the {storage.message_count} messages found are read'
             )
+        self.cuts += [f'{path}: {loss}' for loss in storage.losses]
         self._note_skipped(path, storage, log_now=False)
 
-    def _note_damaged_names(self, path: Path, storage: Storage) -> None:
+    def _note_damaged_names(self, path: Path, storage: BagFile) -> None:
         """Add the messages that are skipped because their topic has no legal name to ``cuts``."""
         damaged = [c for c in storage.connections if not has_legal_names(c)]
         if damaged:
@@ -280,7 +279,7 @@ class BagReader:
                 f'or type has no legal name: {names}'
             )
 
-    def _note_skipped(self, path: Path, storage: Storage, *, log_now: bool = True) -> None:
+    def _note_skipped(self, path: Path, storage: BagFile, *, log_now: bool = True) -> None:
         """Add the chunks skipped since the last call to ``cuts``."""
         if not isinstance(storage, ChunkedFile):
             return

@@ -1,87 +1,90 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Checks of sqlite3 bags, and salvage of truncated ones page by page.
+Reading of sqlite3 bags, through SQLite.
 
 A database may define views, virtual tables and computed columns, which SQLite evaluates when they
 are read: one row of text can make endless rows of gigabytes. A bag has plain tables, so files with
-anything else are refused before a row is read.
+anything else are refused before a row is read. Pages that several others lead to also make rows
+without end, so SQLite is interrupted when the time of the file is over, and a table of more rows
+than fit into the file is refused.
 
-SQLite refuses a file that is shorter than its header states, and its trees lead through pages
-that may be lost while the leaves below them are intact. So the leaf pages of tables are read in
-the order of the file: rows of four columns (null, integer, integer, blob) are messages, rows of
-texts are topics. A message larger than a page continues in a chain of overflow pages, and is whole
-only if all of them are in the file.
-
-Source: sqlite.org/fileformat2.html.
+Messages are sorted by their row numbers, not with their bytes: without an index SQLite would sort
+all bytes of the bag in a temporary file.
 """
 
 from __future__ import annotations
 
-from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import closing
-from pathlib import Path
 import re
 import sqlite3
-import struct
-from typing import NamedTuple, TYPE_CHECKING
-
-import numpy as np
+from typing import Any, TYPE_CHECKING, TypeVar
 
 from surfel_mapper.bags._rosbags import ros2_connection
-from surfel_mapper.bags.bag_file import (
-    BagFile,
-    FoundMessage,
-    Index,
-    INDEX_COLUMNS,
-    MESSAGE_BYTES,
-)
+from surfel_mapper.bags.bag_file import BagFile
 from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection
 
-HEADER_BYTES = 100
-"""Size of the file header, at the start of the first page."""
+T = TypeVar('T')
 
-TABLE_LEAF = 13
-"""First byte of a leaf page of a table."""
+STEPS = 20_000
+"""Instructions of SQLite after which the time is checked: about a millisecond."""
 
-NULL, BLOB = 0, 12
+LEAST_ROW_BYTES = 9
+"""Bytes of the smallest message in a table: two numbers, a header of five bytes and its place."""
 
-INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8, 8: 0, 9: 0}
-"""Bytes of an integer column by its serial type; 8 and 9 are the values 0 and 1."""
+READ_BYTES, ROW_BYTES = 1 << 16, 1 << 9
+"""Size of messages read together, and of one beside its bytes; asking for the time takes 3 us."""
+
+TOPIC_BYTES = 2000
+"""Memory of a topic, beside its texts."""
+
+PLAIN = re.compile(r'\s*CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\b', re.IGNORECASE)
+"""Beginning of the definition of a table or an index, not of a view, trigger or virtual table."""
+
+ALL = 'SELECT topic_id, timestamp FROM messages NOT INDEXED'
+
+INDEXED = 'SELECT sum(1) FROM messages INDEXED BY "{}"'
+"""Counts row by row; count(*) is a single instruction, which cannot be interrupted."""
+
+CHOSEN = """
+SELECT found.timestamp, message.timestamp, message.topic_id, message.data
+FROM (
+    SELECT rowid AS number, timestamp FROM messages {} WHERE topic_id IN ({})
+    AND timestamp BETWEEN ? AND ? ORDER BY timestamp, rowid LIMIT -1
+) AS found CROSS JOIN messages AS message ON message.rowid = found.number
+"""
+"""Row numbers in the order of time, and the message of each; SQLite keeps the order of a subquery
+that has a limit, and of the tables of a cross join."""
 
 
-class Row(NamedTuple):
-    """A row: the serial types of its columns, and the place of its bytes."""
-
-    types: list[int]
-    data_at: int
-    payload: int
-    size: int
-    local: int
-
-
-class SalvagedSqlite(BagFile):
-    """The messages of a sqlite3 bag, found without its trees."""
+class SqliteFile(BagFile):
+    """The messages of a complete sqlite3 bag."""
 
     MAGIC = b'SQLite format 3\0'
 
     def _survey(self) -> None:
-        """Index the messages in all pages whose topic was found, on whichever page it was."""
-        numbers = array('q')
-        for count, found in enumerate(self._scan(), 1):
-            self._budget.take(MESSAGE_BYTES, f'index of {count} messages')
-            numbers.extend((found.record_ns, found.connection, *found.place))
-        index: Index = np.array(numbers, np.int64).reshape(-1, INDEX_COLUMNS)
-        index = index[np.isin(index[:, 1], list(self._by_id))]
-        self._index = index[np.argsort(index[:, 0], kind='stable')]
-        self._counts = Counter(self._index[:, 1].tolist())
-        if len(self._index):
-            self._note_span(int(self._index[0, 0]), int(self._index[-1, 0]))
+        """Check the tables, keep the topics and count the messages."""
+        uri = f'{self.path.absolute().as_uri()}?mode=ro&immutable=1'
+        self._database = sqlite3.connect(uri, uri=True, check_same_thread=False)
+        try:
+            self._database.set_progress_handler(self._is_late, STEPS)
+            self._check_tables()
+            self._read_topics()
+            self._count_messages()
+            self._check_indexes()
+        except BaseException:
+            self._database.close()
+            raise
+
+    def close(self) -> None:
+        """Close the file."""
+        self._database.close()
+        super().close()
 
     def messages(
         self,
@@ -91,187 +94,106 @@ class SalvagedSqlite(BagFile):
     ) -> Iterator[tuple[Connection, int, bytes]]:
         """Yield connection, record time and bytes of messages, in order of record time."""
         wanted = {connection.id: connection for connection in connections}
-        first = 0 if start is None else int(np.searchsorted(self._index[:, 0], start))
-        for row in range(first, len(self._index)):
-            record_ns, connection, *place = self._index[row].tolist()
-            if stop is not None and record_ns >= stop:
-                return
-            if connection in wanted:
-                yield wanted[connection], record_ns, self._read(tuple(place))
+        query = CHOSEN.format(self._order_by, ','.join('?' * len(wanted)))
+        span = (-(2**63) if start is None else start, 2**63 - 1 if stop is None else stop - 1)
+        with closing(self._database.cursor()) as cursor:
+            self._ask(lambda: cursor.execute(query, (*wanted, *span)))
+            while rows := self._ask(lambda: some_rows(cursor)):
+                for indexed_ns, record_ns, topic, data in rows:
+                    if topic not in wanted or record_ns != indexed_ns or type(data) is not bytes:
+                        raise ValueError(f'a message at {record_ns} ns, or its index, is damaged')
+                    yield wanted[topic], record_ns, data
 
-    def _scan(self) -> Iterator[FoundMessage]:
-        """Yield the messages in all pages of the file."""
-        header = self._at(0, HEADER_BYTES)
-        self._page_size, num_pages = pages(header)
-        self._usable = self._page_size - header[20]
-        self._num_pages = self.size // self._page_size
-        if num_pages > self._num_pages or self.size % self._page_size:
-            self.cut_at = self._num_pages * self._page_size
-        for page in range(self._num_pages):
-            self._budget.check_time()
-            yield from self._in_page(page)
-
-    def _in_page(self, page: int) -> Iterator[FoundMessage]:
-        """Yield the messages in a page, if it is a leaf; keep its topics."""
-        content = self._at(page * self._page_size, self._page_size)
-        start = HEADER_BYTES if page == 0 else 0
-        if content[start] != TABLE_LEAF:
-            return
-        (cells,) = struct.unpack_from('>H', content, start + 3)
-        if start + 8 + 2 * cells > self._page_size:
-            return
-        for at in struct.unpack_from(f'>{cells}H', content, start + 8):
+    def _ask(self, call: Callable[[], T]) -> T:
+        """Return the result of a call of SQLite, timed."""
+        with self._budget.clock():
             try:
-                yield from self._row(content, page, at)
-            except (struct.error, ValueError, IndexError):
-                self.cut_at = min(self.cut_at or self.size, page * self._page_size + at)
+                return call()
+            except sqlite3.OperationalError:
+                self._budget.check_time()
+                raise
 
-    def _row(self, content: bytes, page: int, at: int) -> Iterator[FoundMessage]:
-        """Yield the message in a cell, or keep the topic in it."""
-        row, rowid = self._parsed(content, at)
-        if is_message(row.types):
-            topic_size = INTEGERS[row.types[1]]
-            topic = integer(row.types[1], content, row.data_at)
-            record_ns = integer(row.types[2], content, row.data_at + topic_size)
-            skipped = row.data_at + topic_size + INTEGERS[row.types[2]] - row.payload
-            place = (page * self._page_size + row.payload, row.local, row.size, skipped)
-            self._check_chain(place)
-            yield FoundMessage(record_ns, topic, place)
-        elif is_topic(row.types) and row.local == row.size:
-            self._note_topic(rowid, row, content)
+    def _is_late(self) -> bool:
+        """Return whether SQLite is to be interrupted."""
+        try:
+            self._budget.check_time()
+        except BagError:
+            return True
+        return False
 
-    def _parsed(self, content: bytes, at: int) -> tuple[Row, int]:
-        """Return the row in a cell and its number."""
-        size, at = varint(content, at)
-        rowid, at = varint(content, at)
-        local = self._local_bytes(size)
-        header_size, types_at = varint(content, at)
-        if at + local > len(content) or header_size > local:
-            raise ValueError('row longer than its page')
-        if size > self.size:
-            raise ValueError('row longer than the file')
-        types = []
-        while types_at < at + header_size:
-            kind, types_at = varint(content, types_at)
-            types.append(kind)
-        return Row(types, at + header_size, at, size, local), rowid
+    def _rows(self, query: str, *values: object) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query."""
+        with closing(self._database.cursor()) as cursor:
+            try:
+                yield from cursor.execute(query, values)
+            except sqlite3.OperationalError:
+                self._budget.check_time()
+                raise
 
-    def _local_bytes(self, size: int) -> int:
-        """Return the bytes of a row that lie in its page; the rest is in overflow pages."""
-        if size <= self._usable - 35:
-            return size
-        least = (self._usable - 12) * 32 // 255 - 23
-        local = least + (size - least) % (self._usable - 4)
-        return local if local <= self._usable - 35 else least
-
-    def _note_topic(self, rowid: int, row: Row, content: bytes) -> None:
-        """Keep the topic in a row; rows of other tables have no topic name and are skipped."""
-        at, texts = row.data_at, []
-        for kind in row.types[1:]:
-            length = (kind - 13) // 2
-            texts.append(content[at : at + length].decode())
-            at += length
-        topic, type_, encoding, *further = texts
-        if topic.startswith('/') and '/' in type_:
-            qos = ' '.join(further[:1])
-            self._by_id[rowid] = ros2_connection(
-                rowid, topic, type_, None, encoding=encoding, qos=qos
-            )
-
-    def _check_chain(self, place: tuple[int, ...]) -> None:
-        """Raise ValueError if an overflow page of a message is not in the file."""
-        for _ in self._chain(place):
-            pass
-
-    def _chain(self, place: tuple[int, ...]) -> Iterator[int]:
-        """Yield the offsets of the overflow pages of a row."""
-        start, local, size, _ = place
-        link = start + local
-        for _ in range(-(-(size - local) // (self._usable - 4))):
-            (page,) = struct.unpack('>I', self._at(link, 4))
-            if not 0 < page <= self._num_pages:
-                raise ValueError(f'page {page} of {self._num_pages}')
-            link = (page - 1) * self._page_size
-            yield link
-
-    def _read(self, place: tuple[int, ...]) -> bytes:
-        """Return the blob of a message."""
-        start, local, size, skipped = place
-        parts = [self._at(start, local)]
-        parts += [self._at(page + 4, self._usable - 4) for page in self._chain(place)]
-        return b''.join(parts)[skipped:size]
-
-
-def pages(header: bytes) -> tuple[int, int]:
-    """Return the size and the number of pages that the file header states."""
-    stated, num_pages = struct.unpack_from('>H10xI', header, 16)
-    size = 65536 if stated == 1 else stated
-    if size < 512 or size & (size - 1):
-        raise ValueError(f'pages of {size} bytes')
-    return size, num_pages
-
-
-PLAIN = re.compile(r'\s*CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\b', re.IGNORECASE)
-"""Beginning of the definition of a table or an index, not of a view, trigger or virtual table."""
-
-
-def check_tables(path: Path) -> None:
-    """
-    Raise BagError if a database has other things than tables of stored columns and indexes.
-
-    Raises
-    ------
-    sqlite3.Error
-        If it cannot be read.
-
-    """
-    uri = f'{path.absolute().as_uri()}?mode=ro&immutable=1'
-    with closing(sqlite3.connect(uri, uri=True)) as database:
-        rows = database.execute('SELECT type, name, sql FROM sqlite_master').fetchall()
-        for kind, name, sql in rows:
+    def _check_tables(self) -> None:
+        """Raise BagError if there are other things than tables of stored columns and indexes."""
+        for kind, name, sql in self._rows('SELECT type, name, sql FROM sqlite_master'):
+            self._budget.take(len(str(sql)), 'definitions of tables')
             if kind not in ('table', 'index') or not (sql is None or PLAIN.match(str(sql))):
                 raise BagError(
-                    f'{path}: {kind} {name!r}, expected tables and indexes only; is this a bag?'
+                    f'{self.path}: {kind} {name!r}, expected tables and indexes only; is this a '
+                    'bag?'
                 )
             if kind == 'table':
                 hidden = 'SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden'
-                if database.execute(hidden, (name,)).fetchone() != (0,):
-                    raise BagError(f'{path}: table {name!r} has computed columns; is this a bag?')
+                if [*self._rows(hidden, name)] != [(0,)]:
+                    raise BagError(
+                        f'{self.path}: table {name!r} has computed columns; is this a bag?'
+                    )
+
+    def _read_topics(self) -> None:
+        """Keep the topics; raise ValueError if one is not described by texts."""
+        columns = {name for _, name, *_ in self._rows('PRAGMA table_info(topics)')}
+        qos = 'offered_qos_profiles' if 'offered_qos_profiles' in columns else "''"
+        query = f'SELECT id, name, type, serialization_format, {qos} FROM topics'
+        for key, *texts in self._rows(query):
+            if not isinstance(key, int) or not all(isinstance(text, str) for text in texts):
+                raise ValueError(f'topic {key!r} is not described by texts')
+            self._budget.take(TOPIC_BYTES + 4 * sum(map(len, texts)), 'topics')
+            topic, type_, encoding, profiles = texts
+            self._by_id[key] = ros2_connection(
+                key, topic, type_, None, encoding=encoding, qos=profiles
+            )
+
+    def _count_messages(self) -> None:
+        """Count the messages of each topic; raise ValueError if one has no topic or time."""
+        counts: Counter[int] = Counter()
+        most, first_ns, last_ns = self.size // LEAST_ROW_BYTES, 2**63 - 1, -(2**63)
+        for number, (topic, record_ns) in enumerate(self._rows(ALL)):
+            if number > most:
+                raise BagError(f'{self.path}: more messages than a file of {self.size} bytes has')
+            if type(topic) is not int or type(record_ns) is not int:
+                raise ValueError(f'message of topic {topic!r} at {record_ns!r}, expected integers')
+            counts[topic] += 1
+            first_ns, last_ns = min(first_ns, record_ns), max(last_ns, record_ns)
+        unknown = sum(count for topic, count in counts.items() if topic not in self._by_id)
+        if unknown:
+            self.losses.append(f'{unknown} messages are skipped, as their topic is not described')
+        self._counts = counts
+        if counts:
+            self._note_span(first_ns, last_ns)
+
+    def _check_indexes(self) -> None:
+        """Note a loss, and sort without an index, if one has another number of messages."""
+        number, self._order_by = sum(self._counts.values()), ''
+        for _, name, _, _, is_partial in self._rows('PRAGMA index_list(messages)'):
+            if is_partial:
+                continue
+            ((indexed,),) = self._rows(INDEXED.format(str(name).replace('"', '""')))
+            if (indexed or 0) != number:
+                self._order_by = 'NOT INDEXED'
+                self.losses.append(f'{number} messages, but {indexed or 0} in the index {name!r}')
 
 
-def is_short(path: Path) -> bool:
-    """Return whether a database is shorter than its header states; SQLite opens some of these."""
-    with open(path, 'rb') as file:
-        size, num_pages = pages(file.read(HEADER_BYTES))
-    return path.stat().st_size < size * num_pages
-
-
-def is_message(types: list[int]) -> bool:
-    """Return whether the columns are number, topic, time and content of a message."""
-    if len(types) != 4 or types[0] != NULL:
-        return False
-    is_blob = types[3] >= BLOB and types[3] % 2 == 0
-    return types[1] in INTEGERS and types[2] in INTEGERS and is_blob
-
-
-def is_topic(types: list[int]) -> bool:
-    """Return whether the columns are number, name, type, encoding, and perhaps more texts."""
-    return len(types) >= 4 and types[0] == NULL and all(t > BLOB and t % 2 for t in types[1:])
-
-
-def integer(kind: int, content: bytes, at: int) -> int:
-    """Return an integer column of a type."""
-    if kind in (8, 9):
-        return kind - 8
-    return int.from_bytes(content[at : at + INTEGERS[kind]], 'big', signed=True)
-
-
-def varint(content: bytes, at: int) -> tuple[int, int]:
-    """Return a number of variable length, and the offset behind it."""
-    value = 0
-    for place in range(8):
-        byte = content[at + place]
-        value = value << 7 | byte & 127
-        if byte < 128:
-            return value, at + place + 1
-    return value << 8 | content[at + 8], at + 9
+def some_rows(cursor: sqlite3.Cursor) -> list[tuple[Any, ...]]:
+    """Return the next rows, at least one unless there are none, of some size together."""
+    rows, size = [], 0
+    while size < READ_BYTES and (row := cursor.fetchone()) is not None:
+        rows.append(row)
+        size += ROW_BYTES + len(row[-1] or b'')
+    return rows

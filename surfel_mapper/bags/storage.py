@@ -3,9 +3,8 @@
 """
 Opening one file of a bag, by its kind.
 
-mcap and ROS 1 are read by our own classes. sqlite3 is read by rosbags, after a check of its
-tables, or by our own class if it is truncated. rosbags raises nearly any exception on damaged
-files (AssertionError, KeyError, ...); each becomes a BagError here.
+A database that SQLite cannot read, or that is truncated, is read page by page. Each exception that
+damaged files lead to becomes a BagError here.
 """
 
 from __future__ import annotations
@@ -13,23 +12,24 @@ from __future__ import annotations
 from pathlib import Path
 import struct
 
-from surfel_mapper.bags._rosbags import import_rosbags, open_rosbag2, Storage
+from surfel_mapper.bags._rosbags import import_rosbags
 from surfel_mapper.bags.bag_file import BagFile
 from surfel_mapper.bags.chunked import ChunkedFile
 from surfel_mapper.bags.mcap import McapFile
 from surfel_mapper.bags.paths import is_ros1, unpacked_name
 from surfel_mapper.bags.ros1 import Ros1File
-from surfel_mapper.bags.sqlite import check_tables, is_short, SalvagedSqlite
+from surfel_mapper.bags.sqlite import SqliteFile
+from surfel_mapper.bags.sqlite_pages import is_short, SalvagedSqlite
 from surfel_mapper.errors import BagError, DependencyError
 
 OURS: dict[str, type[BagFile]] = {'.mcap': McapFile, '.db3': SalvagedSqlite, '.bag': Ros1File}
-"""Our reader for each kind of file."""
+"""The reader for each kind of file, if it may be damaged."""
 
 REPAIR = {'.mcap': 'mcap recover', '.db3': 'sqlite3 FILE .recover', '.bag': 'rosbag reindex'}
 """The tool that may repair a damaged file."""
 
 
-def open_storage(path: Path, named: Path | None = None) -> Storage:
+def open_storage(path: Path, named: Path | None = None) -> BagFile:
     """
     Open one file of a bag.
 
@@ -49,12 +49,8 @@ def open_storage(path: Path, named: Path | None = None) -> Storage:
     named = named or path
     import_rosbags()
     try:
-        if suffix(path) == '.db3':
-            check_tables(path)
-            storage = open_rosbag2(path)
-            if not is_short(path):
-                return storage
-            storage.close()
+        if suffix(path) == '.db3' and not is_short(path):
+            return SqliteFile(path)
         return open_ours(path, named)
     except (DependencyError, BagError):
         raise
@@ -67,7 +63,7 @@ def open_storage(path: Path, named: Path | None = None) -> Storage:
         raise damaged(named, 'cannot be read', error) from error
 
 
-def open_ours(path: Path, named: Path) -> Storage:
+def open_ours(path: Path, named: Path) -> BagFile:
     """Return a file opened by our own reader; raise ValueError or BagError if it has nothing."""
     kind = OURS[suffix(path)]
     with open(path, 'rb') as file:

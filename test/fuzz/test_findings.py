@@ -544,6 +544,94 @@ def test_a_database_that_computes_its_rows_is_refused(tmp_path, statements, prob
     assert seconds < 1.0
 
 
+def endless(content, root):
+    """Return a database whose page, a leaf, becomes a tree in which every path leads to it."""
+    (page_size,) = struct.unpack_from('>H', content, 16)
+    number, depth = len(content) // page_size, 8
+    leaf = content[(root - 1) * page_size : root * page_size]
+    is_table = leaf[0] == 13
+    key = b'\x01' if is_table else b'\x03\x03\x01\x09\x05'  # an entry of timestamp 5, row 1
+    children = [*range(number + 2, number + 1 + depth), number + 1]
+    pages = []
+    for child in children:
+        cell = struct.pack('>I', child) + key
+        count = 50
+        start = page_size - len(cell)
+        head = struct.pack('>BHHHBI', 5 if is_table else 2, 0, count, start, 0, child)
+        page = bytearray(head + struct.pack('>H', start) * count)
+        page += bytes(page_size - len(page))
+        page[start:] = cell
+        pages.append(bytes(page))
+    made = bytearray(content + leaf + b''.join(pages[1:]))
+    made[(root - 1) * page_size : root * page_size] = pages[0]
+    struct.pack_into('>I', made, 28, len(made) // page_size)
+    return bytes(made)
+
+
+@pytest.fixture
+def small_database(tmp_path):
+    """Return a sqlite3 bag of one page a table, with the pages of table and index."""
+    path = tmp_path / 'a.db3'
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.executescript(
+            'CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, '
+            'serialization_format TEXT); CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id '
+            'INTEGER, timestamp INTEGER, data BLOB); CREATE INDEX by_time ON messages(timestamp);'
+            "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/String', 'cdr')"
+        )
+        rows = [(1, stamp, b'abc') for stamp in range(20, 0, -1)]
+        database.executemany('INSERT INTO messages VALUES (NULL, ?, ?, ?)', rows)
+        database.commit()
+        roots = dict(database.execute('SELECT name, rootpage FROM sqlite_master'))
+    return path, roots
+
+
+def test_a_small_database_is_read_in_order_of_time(small_database):
+    path, _ = small_database
+    with BagReader(path) as reader:
+        assert [message.record_ns for message in reader.messages()] == [*range(1, 21)]
+        assert not reader.cuts
+
+
+@pytest.mark.parametrize(
+    ('name', 'problem'),
+    [('messages', 'more messages than a file of'), ('by_time', 'reading took over 0.5 s')],
+)
+def test_a_database_of_rows_without_end_is_refused(small_database, monkeypatch, name, problem):
+    """Rosbags counts 50^8 rows."""
+    monkeypatch.setattr(budget, 'FLOOR_S', 0.5)
+    path, roots = small_database
+    path.write_bytes(endless(path.read_bytes(), roots[name]))
+    found, used, seconds = cost_of_reading(path)
+    assert problem in str(found)
+    assert used < 20 << 20
+    assert seconds < 3.0
+
+
+def test_an_index_that_lacks_messages_is_not_used_and_told(small_database):
+    path, roots = small_database
+    content = bytearray(path.read_bytes())
+    (page_size,) = struct.unpack_from('>H', content, 16)
+    at = (roots['by_time'] - 1) * page_size + 3
+    assert struct.unpack_from('>H', content, at) == (20,)
+    struct.pack_into('>H', content, at, 15)
+    path.write_bytes(content)
+    with BagReader(path) as reader:
+        assert [message.record_ns for message in reader.messages()] == [*range(1, 21)]
+        (cut,) = reader.cuts
+    assert "20 messages, but 15 in the index 'by_time'" in cut
+
+
+def test_messages_of_unknown_topics_are_told(small_database):
+    path, _ = small_database
+    with contextlib.closing(sqlite3.connect(path)) as database:
+        database.execute('UPDATE messages SET topic_id = 2 WHERE id = 3')
+        database.commit()
+    with BagReader(path) as reader:
+        assert sum(1 for _ in reader.messages()) == 19
+        assert '1 messages are skipped, as their topic is not described' in reader.cuts[0]
+
+
 def test_large_chunks_are_unpacked_one_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(chunked, 'KEPT_BYTES', 1 << 20)
     path = tmp_path / 'a.mcap'

@@ -85,6 +85,7 @@ def outline_of_bag(path):
 OUTLINES = {
     'plain.mcap': (lambda: corpus.rosbag2('mcap')[0], outline_of_bag),
     'plain.bag': (lambda: corpus.ros1()[0], outline_of_bag),
+    'plain.db3': (lambda: corpus.sqlite()[0], outline_of_bag),
     'bz2.bag': (lambda: corpus.ros1()[1], outline_of_bag),
 }
 
