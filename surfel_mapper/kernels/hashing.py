@@ -23,7 +23,7 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after Knuth, vol. 3, 6.4
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
@@ -85,7 +85,7 @@ def likely_row(hashed, directory, buckets, depth):
 
 
 @njit(cache=True, nogil=True, inline='always')
-def is_full(hashed, table, depth):
+def is_full(hashed, directory, held, depth):
     """
     Return whether the segment of a hash has to split before the next insertion.
 
@@ -93,7 +93,6 @@ def is_full(hashed, table, depth):
     ratio. With an equal share all segments would split at the same time, since hashes are uniform,
     and look-ups would take twice as long before that moment as after it.
     """
-    directory, _, held, _ = table
     segment = np.int64(directory[hashed >> (32 - depth)])
     return held[segment] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
@@ -123,6 +122,16 @@ def find_row(key, rows, table, depth):
 def insert_row(hashed, row, table, depth):
     """Insert the row of a voxel that is not in the table."""
     directory, buckets, held, _ = table
+    insert_entry(hashed, row, directory, buckets, held, depth)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def insert_entry(hashed, row, directory, buckets, held, depth):
+    """
+    Insert a row as ``insert_row`` does, for loops that unpacked the table before.
+
+    Unpacking it for each voxel counts references to four arrays, a quarter of an insertion.
+    """
     bucket = first_bucket(hashed, directory, depth)
     held[bucket // SEGMENT] += 1
     while buckets[bucket] != 0:
@@ -138,6 +147,12 @@ def remove_row(key, row, table, depth):
     A later bucket moves into the gap unless its search starts after the gap.
     """
     directory, buckets, held, _ = table
+    remove_entry(key, row, directory, buckets, held, depth)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def remove_entry(key, row, directory, buckets, held, depth):
+    """Remove a row as ``remove_row`` does, for loops that unpacked the table before."""
     bucket = first_bucket(hash_key(key), directory, depth)
     held[bucket // SEGMENT] -= 1
     while (buckets[bucket] & _LOW) - 1 != row:
@@ -185,4 +200,15 @@ def split_segment(hashed, table, state):
     for entry in entries:
         if entry != 0:
             insert_row((entry >> 32) & _LOW, (entry & _LOW) - 1, table, depth)
+    return True
+
+
+@part()
+def makes_room(hashed, table, state):
+    """Split the segment of a hash until it has room for a row; return False if it cannot split."""
+    directory, _, held, _ = table
+    depth = state[DEPTH]
+    while is_full(hashed, directory, held, depth):
+        if not split_segment(hashed, table, state):
+            return False
     return True

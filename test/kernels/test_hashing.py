@@ -50,7 +50,7 @@ class Owner:
 
     def insert(self, key, row):
         hashed = self.call(hash_key, np.int64(key))
-        while self.call(is_full, hashed, self.table, self.state[DEPTH]):
+        while self.call(is_full, hashed, self.directory, self.held, self.state[DEPTH]):
             if not self.call(split_segment, hashed, self.table, self.state):
                 assert self.state[SEGMENTS] < len(self.held), 'the test has too few segments'
                 self.directory = np.repeat(self.directory, 2)

@@ -29,13 +29,13 @@ from surfel_mapper.kernels.hashing import (
     first_bucket,
     FREE_ROW,
     hash_key,
-    insert_row,
+    insert_entry,
     is_full,
     likely_row,
+    makes_room,
     POINTS,
-    remove_row,
+    remove_entry,
     ROWS_USED,
-    split_segment,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import (
@@ -61,6 +61,9 @@ AHEAD = 16
 BLOCK = 32
 """Voxels looked up together: prefetch all buckets, then all rows, then use the rows."""
 
+
+LATER = SUM
+"""Column of a free row: the row that is taken AHEAD new voxels later, to be prefetched, or -1."""
 
 SLACK = 1.0 + 1e-9
 """For the rounding of products of sums in float64."""
@@ -124,7 +127,7 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
     and continue from there.
     """
     keys, count, _, _, _ = moments
-    directory, buckets, _, _ = table
+    directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
     hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
@@ -140,10 +143,19 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
             if row >= 0 and rows[row, KEY] != key:
                 row = find_row(key, rows, table, depth)
             if row < 0:
-                row = new_row(key, hashes[i], rows, table, state)
+                full = is_full(hashes[i], directory, held, depth)
+                if full and not makes_room(hashes[i], table, state):
+                    state[POINTS] += num_points
+                    return place
+                row = take_row(rows, flat, state)
                 if row < 0:
                     state[POINTS] += num_points
                     return place
+                for column in range(ROW):
+                    rows[row, column] = 0
+                rows[row, KEY] = key
+                insert_entry(hashes[i], row, directory, buckets, held, depth)
+                state[VOXELS] += 1
             num_points += np.int64(count[place])
             change_row(moments, view_weight, rows, row, place, 1)
             rows[row, VERSION] = version
@@ -153,26 +165,19 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
     return done
 
 
-@part()
-def new_row(key, hashed, rows, table, state):
-    """Insert a voxel with a row of zeros; return the row, or -1 if there is no room."""
-    depth = state[DEPTH]
-    while is_full(hashed, table, depth):
-        if not split_segment(hashed, table, state):
-            return np.int64(-1)
+@njit(cache=True, nogil=True, inline='always')
+def take_row(rows, flat, state):
+    """Return a free row and prefetch a later one; -1 if there is none."""
     row = state[FREE_ROW]
     if row >= 0:
         state[FREE_ROW] = rows[row, KEY]
-        prefetch(rows.ravel(), state[FREE_ROW] * ROW)  # the next new voxel's
+        later = rows[row, LATER]
+        if later >= 0:
+            prefetch(flat, later * ROW)
+            prefetch(flat, later * ROW + ROW // 2)
     elif state[ROWS_USED] < len(rows):
         row = state[ROWS_USED]
         state[ROWS_USED] = row + 1
-    else:
-        return np.int64(-1)
-    rows[row, :] = 0
-    rows[row, KEY] = key
-    insert_row(hashed, row, table, depth)
-    state[VOXELS] += 1
     return row
 
 
@@ -194,6 +199,7 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
     failure: a pass of checks before it would read every row from memory twice.
     """
     keys, count, _, _, _ = moments
+    directory, buckets, num_held, _ = table
     used, depth = state[ROWS_USED], state[DEPTH]
     flat = rows.ravel()
     emptied, versions = np.empty(len(keys), np.int32), np.empty(len(keys), np.int64)
@@ -228,10 +234,16 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
         num_points += n
     state[POINTS] -= num_points
     state[VOXELS] -= num_emptied
-    for place in emptied[:num_emptied]:
+    for i in range(num_emptied):
+        if i + AHEAD < num_emptied:
+            ahead = emptied[i + AHEAD]
+            prefetch(buckets, first_bucket(hash_key(keys[ahead]), directory, depth))
+            prefetch(flat, np.int64(found[ahead]) * ROW)
+        place = emptied[i]
         row = np.int64(found[place])
-        remove_row(keys[place], row, table, depth)
+        remove_entry(keys[place], row, directory, buckets, num_held, depth)
         rows[row, KEY] = state[FREE_ROW]
+        rows[row, LATER] = np.int64(found[emptied[i - AHEAD]]) if i >= AHEAD else np.int64(-1)
         state[FREE_ROW] = row
     return -1, num_fallen
 

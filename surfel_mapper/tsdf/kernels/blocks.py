@@ -16,10 +16,9 @@ from surfel_mapper.kernels.hashing import (
     FREE_ROW,
     hash_key,
     insert_row,
-    is_full,
+    makes_room,
     remove_row,
     ROWS_USED,
-    split_segment,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import KEY
@@ -77,9 +76,8 @@ def place_blocks(keys, head, table, state, limit, start, rows):
         row = find_row(key, head, table, depth)
         if row < 0 and state[VOXELS] < limit:
             hashed = hash_key(key)
-            while is_full(hashed, table, depth):
-                if not split_segment(hashed, table, state):
-                    return place
+            if not makes_room(hashed, table, state):
+                return place
             row = state[FREE_ROW]
             if row >= 0:
                 state[FREE_ROW] = head[row, KEY]
