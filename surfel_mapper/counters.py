@@ -21,6 +21,7 @@ import numpy as np
 STAGES = (
     'read',
     'decode',
+    'poses',
     'deskew',
     'images',
     'filter',

@@ -14,9 +14,15 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 import itertools
+import os
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
+
+
+def usable_cores() -> int:
+    """Return the number of cores that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @cache

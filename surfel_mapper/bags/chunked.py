@@ -45,10 +45,16 @@ KEPT_CHUNKS = 4
 """Number of chunks kept unpacked: neighbouring chunks overlap in time."""
 
 KEPT_BYTES = 32 << 20
-"""Limit of their size together; a larger chunk is kept alone."""
+"""
+Limit of their size together. A larger chunk is kept alone if it is compressed; else its messages
+are read one by one.
+"""
 
 MAX_COPIED_BYTES = 1 << 24
 """Size above which a message is a view into its chunk, not a copy."""
+
+MOST_OF_CHUNK = 0.5
+"""Share of its chunk above which it is a view too, which keeps at most twice its size."""
 
 CHECK_EVERY = 1024
 """Number of messages after which the budget is asked again."""
@@ -243,16 +249,19 @@ class ChunkedFile(BagFile):
             self.skip_reason = self.skip_reason or reason + kept
 
     def _message(self, number: int, at: int, size: int) -> bytes | memoryview:
-        """Return the bytes of a message: a copy, or a view into its chunk if it is large."""
+        """Return the bytes of a message: a copy, or a view into its chunk if it is most of it."""
         if number == LOOSE:
             return self._at(at, size)
         with self._budget.clock():
             self._budget.check_time()
-            head = self._head(self._chunks[number])
-            if is_plain(head):
-                return self._at(head.start + at, size)
-            view = memoryview(self._unpacked(number))[at : at + size]
-        return view if size > MAX_COPIED_BYTES else bytes(view)
+            if number not in self._kept:
+                head = self._head(self._chunks[number])
+                if is_plain(head):
+                    return self._at(head.start + at, size)
+            records = self._unpacked(number)
+            view = memoryview(records)[at : at + size]
+        is_most = size > MOST_OF_CHUNK * len(records)
+        return view if is_most or size > MAX_COPIED_BYTES else bytes(view)
 
     def _unpacked(self, number: int) -> bytes | bytearray:
         """Return the records of a chunk, up to the cut if the file ends in it."""
@@ -261,7 +270,8 @@ class ChunkedFile(BagFile):
             return self._kept[number]
         chunk = self._chunks[number]
         head = self._head(chunk)
-        while self._kept and not self._has_room(head.unpacked_size):
+        is_kept = not is_plain(head) or head.unpacked_size <= KEPT_BYTES
+        while is_kept and self._kept and not self._has_room(head.unpacked_size):
             _, dropped = self._kept.popitem(last=False)
             self._budget.give_back(len(dropped))
         self._check_room(head)
@@ -272,7 +282,7 @@ class ChunkedFile(BagFile):
                 raise ValueError(f'{len(records)} of {head.unpacked_size} bytes unpacked')
             if head.checksum and crc32(records) != head.checksum:
                 raise ValueError('wrong checksum')
-        if not is_plain(head):
+        if is_kept:
             self._budget.take(len(records), 'unpacked chunk')
             self._kept[number] = records
         return records

@@ -71,7 +71,11 @@ class MapConfig(Stage):
         live=True,
     )
     threads: int = setting(
-        1, 'Threads that share the work of a scan; the map does not depend on it.', low=1, high=64
+        0,
+        'Threads that share the work of a scan; the map does not depend on it. 0: one in a node, '
+        'two in a replay by one process if there are two cores.',
+        low=0,
+        high=64,
     )
     intensity: bool = setting(
         False, 'Sum the intensity of the points too; clouds without one are dropped.'

@@ -223,7 +223,8 @@ def feed(
         elif images and message.topic in infos:
             add_camera_info(reader, mapper, message, images)
         elif message.topic not in clouds:
-            add_poses(reader, mapper, message, poses)
+            with mapper.counters.timed('poses'):
+                add_poses(reader, mapper, message, poses)
         elif span.holds(message.record_ns):
             if seen[message.topic] % span.every == 0:
                 number = first[message.topic] + seen[message.topic]

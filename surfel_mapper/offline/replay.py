@@ -49,6 +49,9 @@ ALL_SCANS: Mapping[str, Any] = {
 }
 """Settings with which no scan leaves the map."""
 
+REPLAY_THREADS = 2
+"""Threads of a replay if there are the cores: one reduces the next scan."""
+
 SAME_TIME_NS = 10_000_000
 """A pose is compared with a true pose at most 10 ms apart."""
 
@@ -227,6 +230,10 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
         )
     if options.align:
         settings = settings.replace({'window.keep_points': True})
+    if not settings.map.threads:
+        from surfel_mapper.threads import usable_cores
+
+        settings = settings.replace({'map.threads': min(usable_cores(), REPLAY_THREADS)})
     return settings if options.window else settings.replace(ALL_SCANS)
 
 

@@ -105,7 +105,7 @@ class Inserter:
             drops,
             self._local_map,
         )
-        self._reduction = Reduction(self.map, config.map.threads)
+        self._reduction = Reduction(self.map, config.map.threads or 1)
         self._unreported: tuple[int, list[npt.NDArray[np.int32]]] | None = None
 
     def reconfigure(self, config: Config) -> None:

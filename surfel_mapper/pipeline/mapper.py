@@ -96,9 +96,8 @@ class Mapper:
         self._drops = Drops(self.counters)
         self._guard = StampGuard(self.config.input.reset_after_s)
         settings = self.config.map
-        self.map = SurfelMap(
-            settings.voxel_size_m, columns=settings.columns, threads=settings.threads
-        )
+        threads = settings.threads or 1
+        self.map = SurfelMap(settings.voxel_size_m, columns=settings.columns, threads=threads)
         self._origin = MapOrigin(self.config, self.map)
         self._poses = ScanPoses(self.config, self._drops, self._origin)
         self._inserter = Inserter(self.config, self.map, self._poses, self._drops)
