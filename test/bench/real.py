@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.memory import keep_freed_memory
 from test.bench.compare import check_equal
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
@@ -53,6 +54,7 @@ STAGES = ('reduce', 'insert', 'evict', 'normals')
 
 def run(options: Options) -> list[Row]:
     """Return a row for every scan and voxel size, and the geometric mean of their ratios."""
+    keep_freed_memory()  # as node and replay do
     rows: list[Row] = []
     with one_core():
         for size_m in options.voxel_sizes_m:
