@@ -10,14 +10,17 @@ the content of the file it writes.
 from __future__ import annotations
 
 import ast
+from importlib.util import find_spec
 import json
 import os
 from pathlib import Path
 import re
+import shutil
 import subprocess
 import sys
 
 import numpy as np
+from PIL import Image
 import pytest
 import yaml
 
@@ -141,6 +144,19 @@ def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     printed = run('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
     assert printed.startswith('2 shards')
     assert f'digest {digest_of(street / "mapped")}' in printed
+
+
+@pytest.mark.skipif(
+    not (find_spec('playwright') and any(map(shutil.which, ('chromium', 'google-chrome')))),
+    reason='needs Chromium and playwright',
+)
+def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_path):
+    text = run('street_picture.py', 'street.png', '4', folder=tmp_path)
+    assert int(re.search(r': ([\d,]+) surfels', text)[1].replace(',', '')) > 1000
+    rgb = np.asarray(Image.open(tmp_path / 'street.png').convert('RGB'), np.int64)
+    red, green, blue = rgb.reshape(-1, 3).T
+    assert (blue > red + 30).sum() > 2000  # level
+    assert (red > green + 30).sum() > 500  # walls along the street
 
 
 def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path):
