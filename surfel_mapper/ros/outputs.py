@@ -37,7 +37,7 @@ from surfel_mapper.messages.markers import marker_array
 from surfel_mapper.messages.pointcloud2 import from_columns
 from surfel_mapper.messages.scan_normals import scan_with_normals
 from surfel_mapper.messages.surfel_markers import disc_colors, surfel_markers
-from surfel_mapper.pipeline import Alignment, Mapper, Update
+from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.base_node import LATCHED, result_of, steady_timer
 from surfel_mapper.ros.changes import ChangeTracker, MapChange
 from surfel_mapper.ros.layer_outputs import LayerOutputs
@@ -112,9 +112,9 @@ class Outputs:
         if self._filtered.get_subscription_count():
             self._publish_filtered(update.filtered)
 
-    def publish_aligned(self, aligned: Alignment) -> None:
+    def publish_aligned(self) -> None:
         """Publish the result of ~/align; called in the mapping thread."""
-        self._alignment.publish_path(aligned)
+        self._alignment.publish_path()
         self.expire()
 
     def expire(self) -> None:

@@ -35,7 +35,7 @@ from std_msgs.msg import Header
 
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.geometry import q_xyzw, Transform
-from surfel_mapper.pipeline import Alignment, Mapper, Update
+from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.ros.base_node import LATCHED
@@ -148,21 +148,26 @@ class AlignmentOutputs:
     def publish(self, update: Update) -> None:
         """Publish the path if a scan led to an alignment, and the transform at its stamp."""
         if update.alignment is not None:
-            self.publish_path(update.alignment)
+            self.publish_path()
         if self._transform is not None:
             fixed = self._mapper.config.frames.fixed
             self._transform.publish(update.stamp_ns, fixed, self._mapper.T_map_fixed)
 
-    def publish_path(self, aligned: Alignment) -> None:
-        """Publish the poses of the scans after an alignment."""
-        stamps = aligned.stamps_ns.tolist()
+    def publish_path(self) -> None:
+        """Publish the poses of all scans if loops are closed, else of those of the window."""
+        loops = self._mapper.loops
+        if loops is not None:
+            stamps, poses_now = loops.stamps_ns, list(loops.T_map_sensor)
+        else:
+            stamps = [scan.stamp_ns for scan in self._mapper.window]
+            poses_now = [scan.T_map_sensor for scan in self._mapper.window]
         header = Header(stamp=time_message(stamps[-1]), frame_id=self._mapper.map_frame)
         poses = [
             PoseStamped(
                 header=Header(stamp=time_message(stamp_ns), frame_id=header.frame_id),
                 pose=pose_message(T_map_sensor),
             )
-            for stamp_ns, T_map_sensor in zip(stamps, aligned.T_map_sensor, strict=True)
+            for stamp_ns, T_map_sensor in zip(stamps, poses_now, strict=True)
         ]
         self._path.publish(Path(header=header, poses=poses))
 

@@ -151,10 +151,21 @@ class Services:
     # The methods below run in the mapping thread.
 
     def _align(self) -> str:
-        """Align the scans of the window with each other; return the corrections."""
-        aligned = self._mapper.align()
-        self._outputs.publish_aligned(aligned)
-        return str(aligned)
+        """
+        Close loops if their points are kept, and align the scans of the window if theirs are.
+
+        Returns the corrections in words.
+        """
+        mapper, done = self._mapper, []
+        try:
+            if mapper.loops is not None:
+                done.append(str(mapper.close_loops()))
+            if mapper.loops is None or mapper.config.window.keep_points:
+                done.append(str(mapper.align()))
+        finally:
+            if done:
+                self._outputs.publish_aligned()
+        return '; '.join(done)
 
     def _clear(self) -> str:
         """Remove all voxels and scans; return their numbers."""

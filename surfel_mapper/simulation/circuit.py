@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cache
-from itertools import pairwise
+from itertools import combinations, pairwise
 import math
 
 import numpy as np
@@ -31,8 +31,14 @@ from surfel_mapper.simulation.street import (
 Corners = Sequence[tuple[float, float]]
 """Places x y in the frame of the street, m."""
 
+Leg = tuple[tuple[float, float], ...]
+"""The two ends of a street."""
+
 TURN_RADIUS_M = 7.0
 """Radius of the arc at a corner, m."""
+
+OVERLAP_WIDTH_M, OVERLAP_LENGTH_M = 2.0 * PAVEMENT_Y_M[1], 1.0
+"""Legs so near and so long beside each other would be one street, m."""
 
 END_M = 12.0
 """Length of a street beyond its corners, m."""
@@ -106,12 +112,14 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
     Raises
     ------
     ConfigError
-        If the seed is negative or there are fewer than two corners.
+        If the seed is negative, there are fewer than two corners, or two different legs lie on one
+        another.
 
     """
     legs = sorted({tuple(sorted(leg)) for leg in pairwise(corners)})
     if not legs:
         raise ConfigError(f'corners: {len(corners)}, expected two or more')
+    check_overlap(legs)
     pose = street_pose()
     T_world_street = pose_matrix(pose[:3], pose[3:])
     kept = [_ground(T_world_street, np.array(corners, np.float64))]
@@ -132,6 +140,26 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
                 continue
             kept.append(_moved(primitive, move))
     return kept
+
+
+def check_overlap(legs: Sequence[Leg]) -> None:
+    """
+    Raise ConfigError if different legs share more than a corner or a crossing.
+
+    Both would have houses of their own in one street. A leg that is driven again has to have the
+    same corners.
+    """
+    for (a, b), (c, d) in combinations(legs, 2):
+        way = np.subtract(b, a) / math.dist(a, b)
+        aside = np.array([-way[1], way[0]])
+        ends = np.subtract((c, d), a)
+        along, across = ends @ way, ends @ aside
+        shared_m = min(max(along), math.dist(a, b)) - max(min(along), 0.0)
+        if np.abs(across).max() < OVERLAP_WIDTH_M and shared_m > OVERLAP_LENGTH_M:
+            raise ConfigError(
+                f'corners: the legs {a} to {b} and {c} to {d} share {shared_m:g} m of street, '
+                'expected the same corners, or other streets'
+            )
 
 
 def _leg_pose(first: tuple[float, float], last: tuple[float, float]) -> Transform:

@@ -173,7 +173,8 @@ class World:
         Raises
         ------
         ConfigError
-            If the seed is negative or there are fewer than two corners.
+            If the seed is negative, there are fewer than two corners, or two legs lie on one
+            another without the same corners.
 
         """
         return cls(circuit_primitives(seed, corners), street_pose())

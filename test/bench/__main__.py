@@ -33,6 +33,7 @@ BENCHES = (
     'accuracy',
     'registration',
     'tracking',
+    'loops',
     'outputs',
     'tsdf',
     'models',

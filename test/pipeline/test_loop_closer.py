@@ -185,3 +185,31 @@ def test_registration_follows_the_last_metres_alone():
     assert len(mapper.loops) == 30
     assert mapper._inserter._local_map.surfel_map.num_voxels < mapper.map.num_voxels
     np.testing.assert_allclose(found[:3, 3], expected[:3, 3], rtol=0, atol=0.2)
+
+
+def test_registered_odometry_goes_on_where_it_was_when_the_map_jumps():
+    seen = circuit(SAME_WAY)
+    mapper = mapper_of(**{'pose.source': 'registration'})
+
+    def tracked(first, last):
+        updates = []
+        for number in range(first, last):
+            stamp_ns = 10**9 + number * 10**8
+            points = seen.scans[number]
+            mapper.add_scan(Scan(points=points, stamp_ns=stamp_ns, frame_id='lidar'))
+            updates += mapper.insert_ready()
+        return updates
+
+    before = tracked(0, 6)
+    move = mapper.loops.move(closure_at(shifted(mapper.loops.T_map_sensor)), mapper.config)
+    mapper._inserter.aligner.correct(move.correction)
+    after = tracked(6, 9)
+
+    odometry = [update.T_fixed_body for update in (*before, *after)]
+    start = inverse(seen.poses[0])
+    for found, true in zip(odometry, seen.poses, strict=False):
+        np.testing.assert_allclose(found[:3, 3], (start @ true)[:3, 3], atol=0.05)
+    for update in after:  # the map alone has jumped
+        expected = compose(move.correction, update.T_fixed_body)
+        np.testing.assert_allclose(update.T_map_sensor, expected, rtol=0, atol=1e-9)
+    assert np.linalg.norm(move.correction[:3, 3]) > 0.5

@@ -118,3 +118,22 @@ def test_map_to_odom_is_published_with_every_scan(start, peer):
     (transform,) = transforms[-1].transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ('map', 'odom')
     assert transform.header.stamp == sent[-1][0].header.stamp
+
+
+def test_align_closes_loops_if_their_points_are_kept(start, peer, tmp_path):
+    settings = {'loops.enabled': True, 'loops.directory': str(tmp_path), 'window.max_scans': 0}
+    extra = [item for k, v in settings.items() for item in ('-p', f'{k}:={v}')]
+    node = start('node', *ARGUMENTS, *extra)
+    paths = peer.collect(Path, '/surfel_mapper/path', LATCHED)
+    sent = driven(peer)
+    peer.diagnosis({'scans.mapped': NUM_SCANS})
+
+    answer = peer.call('align')
+    peer.spin_until(lambda: paths)
+
+    assert answer.success, answer.message
+    loops, _, window = answer.message.partition('; ')
+    assert loops == 'no loops found'  # four scans in a row: only the window moves
+    assert window == str(aligned_twin(sent)[1])
+    assert len(paths[-1].poses) == NUM_SCANS
+    assert 'Traceback' not in node.output

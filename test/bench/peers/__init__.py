@@ -86,6 +86,22 @@ NORMAL_PEERS = (
 )
 """Peers whose normals are compared; a module has ``normals(points, support)``, (N, 3) each."""
 
+LOOP_PEERS = (
+    PeerSpec(
+        name='KISS-ICP',
+        module='test.bench.peers.kiss_icp_odometry',
+        requires=('kiss-icp==1.3.0',),
+        less='no loops',
+    ),
+    PeerSpec(
+        name='KISS-SLAM',
+        module='test.bench.peers.kiss_slam_odometry',
+        requires=('kiss-slam==0.0.2',),
+        less='no map at the end',
+    ),
+)
+"""Peers on a drive with loops; ``Odometry.finish()`` gives corrected poses, if there is one."""
+
 ODOMETRY_PEERS = (
     PeerSpec(
         name='KISS-ICP',

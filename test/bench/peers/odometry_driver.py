@@ -4,14 +4,15 @@
 Feeds scans to the odometry of one peer and times it; runs in the environment of the peer.
 
 The job comes as JSON on stdin: the module, voxel_size_m, the files of the scans, and where to
-write the poses, (S, 4, 4). The times leave as JSON on stdout: by the clock, and of the processor,
-which others that run hardly change.
+write the poses, (S, 4, 4), corrected at the end if the peer closes loops. The times leave as JSON
+on stdout: by the clock, and of the processor, which others that run hardly change; and the memory.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 import json
+import resource
 import sys
 from time import perf_counter, process_time
 
@@ -31,8 +32,16 @@ def main() -> None:
         milliseconds.append((perf_counter() - start) * 1e3)
         cpu_ms.append((process_time() - cpu_start) * 1e3)
         poses.append(np.array(pose))
-    np.save(job['poses'], np.array(poses))
-    json.dump({'milliseconds': milliseconds, 'cpu_ms': cpu_ms}, sys.stdout)
+    end = process_time()
+    corrected = odometry.finish() if hasattr(odometry, 'finish') else poses
+    np.save(job['poses'], np.array(corrected))
+    result = {
+        'milliseconds': milliseconds,
+        'cpu_ms': cpu_ms,
+        'finish_s': process_time() - end,
+        'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+    }
+    json.dump(result, sys.stdout)
 
 
 if __name__ == '__main__':

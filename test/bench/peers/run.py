@@ -87,9 +87,9 @@ def run_normals(
 
 def run_odometry(
     python: str | Path, peer: PeerSpec, scans: Sequence[Path], size_m: float
-) -> tuple[dict[str, list[float]], npt.NDArray[np.float64]]:
+) -> tuple[dict[str, Any], npt.NDArray[np.float64]]:
     """
-    Return times (milliseconds, cpu_ms) and pose of every scan, (S, 4, 4).
+    Return times (milliseconds, cpu_ms, finish_s), peak_mb, and pose of every scan, (S, 4, 4).
 
     Raises
     ------

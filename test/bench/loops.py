@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A drive of 5 km through streets with three loops: error before and after, memory, seconds.
+
+Scans have no poses. The error is the root mean square of the positions after the best rigid motion
+of the whole track; ``gap_m`` is the median error of the relative position of scans that are less
+than 5 m apart but more than 300 m of the path. Each runs in a process of its own, whose peak of
+memory is stated. Peers have their own defaults, but for one thread and a voxel of 1 m.
+
+``--scans N`` drives only the first N scans, 1.5 m apart.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+import json
+import math
+from pathlib import Path
+import resource
+import sys
+import tempfile
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from surfel_mapper.config import Config
+from surfel_mapper.evaluation.trajectory_errors import absolute_errors
+from surfel_mapper.memory import keep_freed_memory
+from surfel_mapper.offline.replay import ALL_SCANS
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
+from surfel_mapper.simulation import Drive, Lidar, Simulation, World
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.peers import LOOP_PEERS
+from test.bench.peers.run import environment, output, PeerError, ROOT, run_odometry
+from test.bench.registration import Recording, rms
+from test.bench.report import Row
+
+CORNERS = (
+    *((0.0, 0.0), (350.0, 0.0), (350.0, 300.0), (0.0, 300.0), (0.0, 0.0), (350.0, 0.0)),
+    *((800.0, 0.0), (800.0, 300.0), (350.0, 300.0), (350.0, 0.0), (800.0, 0.0)),
+    *((800.0, -350.0), (350.0, -350.0), (350.0, 0.0), (800.0, 0.0)),
+)
+"""Three blocks, each driven around and on along the street of its begin, m."""
+
+STEP_M = 1.5
+LIDAR = Lidar(beams=32, columns=512, range_noise_m=0.02)
+VOXEL_M = 1.0
+"""Voxel of the peers, m: their default for a range of 100 m."""
+
+NEAR_M, PATH_M = 5.0, 300.0
+
+
+def run(options: Options) -> list[Row]:
+    """Return a row for us and each peer."""
+    drive = recorded(options)
+    with one_core():
+        rows = [ours(drive)]
+        for peer in LOOP_PEERS if options.peers else ():
+            try:
+                python = environment(peer, options.cache)
+                figures, poses = run_odometry(python, peer, drive.paths, VOXEL_M)
+            except PeerError as error:
+                rows.append({'who': peer.name, 'not measured': str(error)})
+                continue
+            seconds = sum(figures['cpu_ms']) / 1e3 + figures['finish_s']
+            row = errors(poses, drive.poses)
+            rows.append({'who': peer.name, **row, 'cpu_s': seconds, 'peak_mb': figures['peak_mb']})
+    return [{'scans': len(drive.paths), 'path_m': path_m(drive.poses), **row} for row in rows]
+
+
+def recorded(options: Options) -> Recording:
+    """Return the scans of the drive as files, simulated once."""
+    directory = options.cache / 'loops'
+    directory.mkdir(parents=True, exist_ok=True)
+    legs = [math.dist(*leg) for leg in pairwise(CORNERS)]
+    number = int((sum(legs) - 100.0) / STEP_M)
+    number = number if options.scans == Options().scans else min(number, options.scans)
+    world = World.circuit(CORNERS, seed=5)
+    course = Drive(start=world.start, speed_m_s=10.0 * STEP_M, corners=CORNERS)
+    simulation = Simulation(world, LIDAR, course, num_scans=number)
+    paths = [directory / f'{place:05d}.npy' for place in range(number)]
+    for place, path in enumerate(paths):
+        if not path.exists():
+            points = simulation.scan(place).points
+            part = path.with_suffix('.part.npy')
+            np.save(part, points[np.isfinite(points).all(axis=1)])
+            part.rename(path)
+    stamps = [simulation.stamp_ns(place) for place in range(number)]
+    poses = np.array([course.T_odom_sensor(stamp_ns) for stamp_ns in stamps])
+    return Recording('loops', paths, stamps, poses)
+
+
+def ours(drive: Recording) -> Row:
+    """Return the errors of the Mapper before and after its loops, in a process of its own."""
+    with tempfile.TemporaryDirectory() as scratch:
+        job = {
+            'scans': [str(path) for path in drive.paths],
+            'stamps_ns': [int(stamp_ns) for stamp_ns in drive.stamps_ns],
+            'directory': scratch,
+        }
+        command = [sys.executable, '-m', 'test.bench.loops']
+        found: Row = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
+        before, after, at = (
+            np.load(Path(scratch) / f'{n}.npy') for n in ('before', 'after', 'at')
+        )
+    true = drive.poses[at]
+    return {
+        'who': 'ours',
+        'mapped': len(at),
+        **{f'{name}_before': value for name, value in errors(before, true).items()},
+        **errors(after, true),
+        **found,
+    }
+
+
+def errors(poses: npt.NDArray[np.float64], true: npt.NDArray[np.float64]) -> Row:
+    """Return the error of a track, and that between scans where it passes again."""
+    found = absolute_errors(poses, true).translation_m
+    return {'error_m': rms(found), 'max_m': float(found.max()), 'gap_m': gap_m(poses, true)}
+
+
+def gap_m(poses: npt.NDArray[np.float64], true: npt.NDArray[np.float64]) -> float | None:
+    """Return the median error of the relative positions of scans of one place."""
+    way = np.concatenate(
+        [[0.0], np.cumsum(np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1))]
+    )
+    pairs = cKDTree(true[:, :3, 3]).query_pairs(NEAR_M, output_type='ndarray')
+    pairs = pairs[np.abs(way[pairs[:, 0]] - way[pairs[:, 1]]) > PATH_M]
+    if not len(pairs):
+        return None
+    a, b = pairs.T
+    off = [np.linalg.inv(p[a]) @ p[b] for p in (poses, true)]
+    return float(np.median(np.linalg.norm(off[0][:, :3, 3] - off[1][:, :3, 3], axis=1)))
+
+
+def path_m(poses: npt.NDArray[np.float64]) -> float:
+    """Return the length of a track, m."""
+    return float(np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum())
+
+
+def main() -> None:
+    """Map the scans of the job on stdin by registration, close the loops, write the poses."""
+    job = json.load(sys.stdin)
+    directory = job['directory']
+    keep_freed_memory()
+    mapper = Mapper(
+        Config.from_mapping(
+            {
+                **ALL_SCANS,
+                'pose.source': 'registration',
+                'loops.enabled': True,
+                'loops.directory': directory,
+            }
+        )
+    )
+    mapper.warm_up()
+    start, begun = time.process_time(), time.perf_counter()
+    stamps: dict[int, npt.NDArray[np.float64]] = {}
+    for path, stamp_ns in zip(job['scans'], job['stamps_ns'], strict=True):
+        mapper.add_scan(Scan(points=np.load(path), stamp_ns=stamp_ns, frame_id='lidar'))
+        stamps.update({u.stamp_ns: u.T_map_sensor for u in mapper.insert_ready()})
+    mapper.finish()
+    assert mapper.loops is not None
+    middle, before = time.process_time(), mapper.loops.T_map_sensor
+    odometry_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    move = mapper.close_loops()
+    number = {stamp_ns: place for place, stamp_ns in enumerate(job['stamps_ns'])}
+    found = {'before': before, 'after': mapper.loops.T_map_sensor}
+    found['at'] = np.array([number[stamp_ns] for stamp_ns in mapper.loops.stamps_ns])
+    for name, array in found.items():
+        np.save(Path(directory) / f'{name}.npy', array)
+    said: dict[str, Any] = {
+        'loops': len(move.closure.loops),
+        'refused': len(move.closure.refusals),
+        'odometry_cpu_s': middle - start,
+        'loops_cpu_s': time.process_time() - middle,
+        'cpu_s': time.process_time() - start,
+        'wall_s': time.perf_counter() - begun,
+        'odometry_peak_mb': odometry_mb,
+        'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+        'spool_mb': mapper.loops.nbytes / 1e6,
+        'said': str(move),
+    }
+    json.dump(said, sys.stdout)
+
+
+if __name__ == '__main__':
+    main()
