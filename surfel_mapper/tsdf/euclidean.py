@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+EuclideanField: distances to the nearest obstacle, kept up to date with a block map (an ESDF).
+
+The distances of a truncated signed distance field are measured along rays and end at the
+truncation; planners need the Euclidean distance, farther out. Here every voxel of a block has the
+squared distance, in voxels, to the nearest occupied voxel; row r belongs to row r of the map:
+
+    squared  (R, N) uint16, FAR beyond ``max_m``
+    marks    (R, N) uint8, occupied before and now; see kernels/euclidean.py
+
+Only blocks changed since the last update are compared with their former occupancy, and only the
+balls about voxels that differ are visited. Distances stay exact, those of a transform of the whole
+(scipy.ndimage.distance_transform_edt), unlike wavefronts that pass on the nearest obstacle.
+
+Peers: voxblox (Oleynikova et al. 2017) and FIESTA (Han et al. 2019) propagate wavefronts, nvblox
+(Millane et al. 2024) sweeps whole blocks on the GPU; all are approximate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import ConfigError
+from surfel_mapper.kernels.layout import KEY
+from surfel_mapper.mapping.storage import Slab
+from surfel_mapper.tsdf.blocks import block_index, BlockMap, FIRST_ROWS, Int64
+from surfel_mapper.tsdf.kernels import euclidean as kernels
+from surfel_mapper.tsdf.kernels.blocks import FREE, VERSION
+from surfel_mapper.tsdf.queries import in_voxels
+
+MAX_VOXELS = 255
+"""Largest reach of a distance in voxels: its square fits 16 bits."""
+
+TRIED = 512
+"""Voxels that a stale voxel looks at; if all are free its block is computed anew: bulk removals."""
+
+MANY = 1 << 18
+"""Neighbours of blocks looked up, beyond which all blocks are sources."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class KnownDistances:
+    """
+    Distances of the observed voxels about a place.
+
+    Attributes
+    ----------
+    points : (P, 3) float64
+        Centres of the voxels, map frame, m.
+    distance : (P,) float32
+        Distance to the nearest obstacle, m, at most ``max_m``; 0 in obstacles.
+
+    """
+
+    points: npt.NDArray[np.float64]
+    distance: npt.NDArray[np.float32]
+
+
+class EuclideanField:
+    """
+    Euclidean distances from voxels to the nearest occupied voxel, between their centres.
+
+    A voxel is occupied up to half a voxel in front of a surface, as ``tsdf.queries.states`` has it.
+
+    Attributes
+    ----------
+    max_m : float
+        Distances are exact up to this, m.
+    radius_m : float
+        They are kept within this of the place given to ``update``, m; 0: everywhere.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The map.
+    max_m, radius_m : float
+        As above.
+
+    Raises
+    ------
+    ConfigError
+        If max_m is not positive or more than MAX_VOXELS voxels.
+
+    """
+
+    def __init__(self, blocks: BlockMap, *, max_m: float = 2.0, radius_m: float = 0.0) -> None:
+        size_m, voxels = blocks.config.voxel_size_m, blocks.voxels_per_block
+        if not size_m <= max_m <= MAX_VOXELS * size_m:
+            raise ConfigError(
+                f'layers.esdf.max_m: {max_m}, expected {size_m} to {MAX_VOXELS * size_m:g}, that '
+                f'is 1 to {MAX_VOXELS} voxels'
+            )
+        self.max_m, self.radius_m = max_m, radius_m
+        self._blocks = blocks
+        self._center = np.zeros(3)
+        self._most = int((max_m / size_m) ** 2 * (1.0 + 1e-9))
+        self._bits = blocks.config.voxels_per_side.bit_length() - 1
+        self._ball = ball(self._most)
+        self._squared, self._marks = (Slab(FIRST_ROWS, voxels * k // 8) for k in (2, 1))
+        self._keys = np.full(FIRST_ROWS, -1, np.int64)
+        self._seen = np.zeros(FIRST_ROWS, np.int64)
+        self._occupied = np.zeros(FIRST_ROWS, np.int64)
+
+    def update(self, center: npt.ArrayLike | None = None) -> int:
+        """
+        Follow the changes of the map.
+
+        Parameters
+        ----------
+        center : (3,) float, optional
+            Place about which distances are kept, map frame, m; needed with ``radius_m``. Others
+            are brought up to date when they come near.
+
+        Returns
+        -------
+        int
+            Number of voxels that became occupied or free.
+
+        """
+        if center is not None:
+            self._center = np.asarray(center, np.float64)
+        self._grow()
+        touched = np.zeros(len(self._keys), bool)
+        self._forget(touched)
+        rows = self._changed()
+        fresh = rows[self._keys[rows] < 0]
+        self._keys[fresh] = self._blocks.head[fresh, KEY]
+        self._squares[fresh] = kernels.FAR
+        counts = np.empty((len(rows), 3), np.int64)
+        config, field = self._blocks.config, self._blocks.field
+        occupied = np.float32(0.5 * config.voxel_size_m)
+        least = np.float32(np.finfo(np.float32).tiny)
+        kernels.mark_occupied(rows, field, least, occupied, self._mark_rows, counts)
+        self._seen[rows] = self._blocks.head[rows, VERSION]
+        self._occupied[rows] = counts[:, 2]
+        self._mark_stale(rows[counts[:, 0] > 0], touched)
+        behind = self._repair(np.flatnonzero(touched))
+        self._lower(rows[counts[:, 1] > 0], only_new=True, targets=self._keys >= 0)
+        behind[fresh] = True
+        if behind.any():
+            self._lower(self._sources_near(np.flatnonzero(behind)), only_new=False, targets=behind)
+        kernels.settle(rows[counts[:, :2].any(axis=1)], self._mark_rows)
+        return int(counts[:, :2].sum())
+
+    def sample(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
+        """
+        Return the distances of the voxels at points after the last update.
+
+        Parameters
+        ----------
+        points : (P, 3) float
+            In the map frame, m.
+
+        Returns
+        -------
+        (P,) float32
+            Distance to the nearest obstacle, m, at most ``max_m``; 0 in obstacles; nan if the voxel
+            was not observed or is out of the radius.
+
+        Raises
+        ------
+        ValueError
+            If points are of another shape.
+
+        """
+        places, bits = in_voxels(self._blocks, points)
+        near = np.abs(places).max(axis=1) < 1e12  # false for nan and for indices beyond int64
+        voxel = np.floor(np.where(near[:, None], places, 0.0)).astype(np.int64)
+        rows = np.where(near, self._blocks.find(voxel >> bits), -1)
+        x, y, z = (voxel & ((1 << bits) - 1)).T
+        numbers = x + ((y + (z << bits)) << bits)
+        known = (rows >= 0) & (rows < len(self._keys))
+        known[known] &= self._keys[rows[known]] == self._blocks.head[rows[known], KEY]
+        known[known] &= self._within(rows[known])
+        known[known] &= self._blocks.weight[rows[known], numbers[known]] > 0.0
+        found = np.full(len(rows), np.nan, np.float32)
+        found[known] = self._metres(self._squares[rows[known], numbers[known]])
+        return found
+
+    def known(self) -> KnownDistances:
+        """Return the distances of all observed voxels within the radius."""
+        rows = np.flatnonzero(self._keys >= 0)
+        rows = rows[self._within(rows)]
+        side, size_m = self._blocks.config.voxels_per_side, self._blocks.config.voxel_size_m
+        local = np.indices((side, side, side)).reshape(3, -1)[::-1].T
+        place, number = np.nonzero(self._blocks.weight[rows] > 0.0)
+        voxels = block_index(self._keys[rows])[place] * side + local[number]
+        return KnownDistances(
+            points=(voxels + 0.5) * size_m,
+            distance=self._metres(self._squares[rows[place], number]),
+        )
+
+    def _metres(self, squared: npt.NDArray[np.uint16]) -> npt.NDArray[np.float32]:
+        metres = np.sqrt(squared.astype(np.float64)) * self._blocks.config.voxel_size_m
+        return np.asarray(np.where(squared == kernels.FAR, self.max_m, metres), np.float32)
+
+    def _within(self, rows: Int64, margin_m: float = 0.0) -> npt.NDArray[np.bool_]:
+        """Return which blocks are within the radius, and a margin, of the last place."""
+        if self.radius_m <= 0.0:
+            return np.ones(len(rows), bool)
+        centers = (block_index(self._keys_of(rows)) + 0.5) * self._blocks.config.block_size_m
+        distance = np.linalg.norm(centers - self._center, axis=1)
+        return np.asarray(distance <= self.radius_m + margin_m)
+
+    def _keys_of(self, rows: Int64) -> Int64:
+        return self._blocks.head[rows, KEY]
+
+    @property
+    def _squares(self) -> npt.NDArray[np.uint16]:
+        return self._squared.array.view(np.uint16)
+
+    @property
+    def _mark_rows(self) -> npt.NDArray[np.uint8]:
+        return self._marks.array.view(np.uint8)
+
+    def _grow(self) -> None:
+        """Have as many rows as the map."""
+        number, before = len(self._blocks.head), len(self._keys)
+        if number == before:
+            return
+        self._squared.grow(number)
+        self._marks.grow(number)
+        more = number - before
+        self._keys = np.concatenate([self._keys, np.full(more, -1, np.int64)])
+        self._seen, self._occupied = (np.pad(a, (0, more)) for a in (self._seen, self._occupied))
+
+    def _forget(self, touched: npt.NDArray[np.bool_]) -> None:
+        """Forget blocks that are no longer in the map; mark distances to them as stale."""
+        head = self._blocks.head
+        kept = (head[:, KEY] == self._keys) & (head[:, VERSION] != FREE)
+        gone = np.flatnonzero((self._keys >= 0) & ~kept)
+        if not len(gone):
+            return
+        self._spread(gone, (kernels.OLD, kernels.OLD, kernels.OLD), False, kept, touched)
+        self._mark_rows[gone] = 0
+        self._keys[gone] = -1
+        self._occupied[gone] = 0
+
+    def _changed(self) -> Int64:
+        """Return the rows of blocks to compare with the map."""
+        rows = self._blocks.rows()
+        version = self._blocks.head[rows, VERSION]
+        rows = rows[(version > self._seen[rows]) | (self._keys[rows] < 0)]
+        margin_m = self.max_m + math.sqrt(3.0) * self._blocks.config.block_size_m
+        return rows[self._within(rows, margin_m)]
+
+    def _spread(
+        self,
+        rows: Int64,
+        source: tuple[np.uint8, np.uint8, np.uint8],
+        lowers: bool,
+        targets: npt.NDArray[np.bool_],
+        touched: npt.NDArray[np.bool_],
+    ) -> None:
+        kernels.spread(
+            rows,
+            block_index(self._keys[rows]),
+            source,
+            self._most,
+            lowers,
+            targets,
+            self._bits,
+            self._keys,
+            self._blocks.lookup,
+            self._mark_rows,
+            self._squares,
+            touched,
+        )
+
+    def _mark_stale(self, rows: Int64, touched: npt.NDArray[np.bool_]) -> None:
+        """Mark the distances to voxels that have become free."""
+        both = kernels.OLD | kernels.NEW
+        source = (both, kernels.OLD, kernels.OLD)
+        self._spread(rows, source, False, self._keys >= 0, touched)
+
+    def _lower(self, rows: Int64, *, only_new: bool, targets: npt.NDArray[np.bool_]) -> None:
+        """Lower distances about occupied voxels, or only about those that have become so."""
+        mask = kernels.OLD | kernels.NEW if only_new else kernels.NEW
+        self._spread(rows, (mask, kernels.NEW, kernels.NEW), True, targets, targets)
+
+    def _repair(self, rows: Int64) -> npt.NDArray[np.bool_]:
+        """Find the distances of stale voxels; return the blocks that must be computed anew."""
+        unfinished = np.zeros(len(self._keys), bool)
+        kernels.repair(
+            rows,
+            block_index(self._keys[rows]),
+            self._ball,
+            TRIED,
+            self._bits,
+            self._keys,
+            self._blocks.lookup,
+            self._mark_rows,
+            self._squares,
+            unfinished,
+        )
+        return unfinished
+
+    def _sources_near(self, rows: Int64) -> Int64:
+        """Return the blocks with occupied voxels that may be in reach of blocks."""
+        occupied = (self._keys >= 0) & (self._occupied > 0)
+        half = -(-math.isqrt(self._most) // self._blocks.config.voxels_per_side)
+        offsets = np.indices((2 * half + 1,) * 3).reshape(3, -1).T - half
+        if len(rows) * len(offsets) <= MANY:
+            near = np.unique(self._blocks.neighbours(rows, offsets))
+            near = near[near >= 0]
+            return near[occupied[near]]
+        return np.flatnonzero(occupied)
+
+
+def ball(most: int) -> tuple[Int64, npt.NDArray[np.uint16], Int64]:
+    """Return the offsets of squared length up to ``most`` in the form of kernels.repair."""
+    reach = math.isqrt(most)
+    offsets = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
+    lengths = (offsets * offsets).sum(axis=1)
+    offsets, lengths = offsets[lengths <= most], lengths[lengths <= most]
+    order = np.argsort(lengths, kind='stable')
+    first = np.searchsorted(lengths[order], np.arange(most + 1))
+    return offsets[order], lengths[order].astype(np.uint16), first
