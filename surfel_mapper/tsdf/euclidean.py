@@ -10,9 +10,9 @@ squared distance, in voxels, to the nearest occupied voxel; row r belongs to row
     squared  (R, N) uint16, FAR beyond ``max_m``
     marks    (R, N) uint8, occupied before and now; see kernels/euclidean.py
 
-Only blocks changed since the last update are compared with their former occupancy, and only the
-balls about voxels that differ are visited. Distances stay exact, those of a transform of the whole
-(scipy.ndimage.distance_transform_edt), unlike wavefronts that pass on the nearest obstacle.
+Blocks changed since the last update are compared with their former occupancy, and only blocks
+with a voxel whose distance differs are computed again. Distances stay exact, those of a transform
+of the whole (scipy.ndimage.distance_transform_edt), unlike those of wavefronts.
 
 Peers: voxblox (Oleynikova et al. 2017) and FIESTA (Han et al. 2019) propagate wavefronts, nvblox
 (Millane et al. 2024) sweeps whole blocks on the GPU; all are approximate.
@@ -37,12 +37,6 @@ from surfel_mapper.tsdf.queries import in_voxels
 MAX_VOXELS = 255
 """Largest reach of a distance in voxels: its square fits 16 bits."""
 
-TRIED = 512
-"""Voxels that a stale voxel looks at; if all are free its block is computed anew: bulk removals."""
-
-MANY = 1 << 18
-"""Neighbours of blocks looked up, beyond which all blocks are sources."""
-
 
 @dataclass(frozen=True, kw_only=True)
 class KnownDistances:
@@ -66,7 +60,7 @@ class EuclideanField:
     """
     Euclidean distances from voxels to the nearest occupied voxel, between their centres.
 
-    A voxel is occupied up to half a voxel in front of a surface, as ``tsdf.queries.states`` has it.
+    Voxels up to half a voxel in front of a surface are occupied, as in ``tsdf.queries.states``.
 
     Attributes
     ----------
@@ -101,7 +95,6 @@ class EuclideanField:
         self._center = np.zeros(3)
         self._most = int((max_m / size_m) ** 2 * (1.0 + 1e-9))
         self._bits = blocks.config.voxels_per_side.bit_length() - 1
-        self._ball = ball(self._most)
         self._squared, self._marks = (Slab(FIRST_ROWS, voxels * k // 8) for k in (2, 1))
         self._keys = np.full(FIRST_ROWS, -1, np.int64)
         self._seen = np.zeros(FIRST_ROWS, np.int64)
@@ -131,7 +124,6 @@ class EuclideanField:
         rows = self._changed()
         fresh = rows[self._keys[rows] < 0]
         self._keys[fresh] = self._blocks.head[fresh, KEY]
-        self._squares[fresh] = kernels.FAR
         counts = np.empty((len(rows), 3), np.int64)
         config, field = self._blocks.config, self._blocks.field
         occupied = np.float32(0.5 * config.voxel_size_m)
@@ -139,12 +131,10 @@ class EuclideanField:
         kernels.mark_occupied(rows, field, least, occupied, self._mark_rows, counts)
         self._seen[rows] = self._blocks.head[rows, VERSION]
         self._occupied[rows] = counts[:, 2]
-        self._mark_stale(rows[counts[:, 0] > 0], touched)
-        behind = self._repair(np.flatnonzero(touched))
-        self._lower(rows[counts[:, 1] > 0], only_new=True, targets=self._keys >= 0)
-        behind[fresh] = True
-        if behind.any():
-            self._lower(self._sources_near(np.flatnonzero(behind)), only_new=False, targets=behind)
+        touched[fresh] = True
+        self._touch(rows[counts[:, 0] > 0], kernels.OLD, self._keys >= 0, touched)
+        self._touch(rows[counts[:, 1] > 0], kernels.NEW, self._keys >= 0, touched)
+        self._transform(np.flatnonzero(touched))
         kernels.settle(rows[counts[:, :2].any(axis=1)], self._mark_rows)
         return int(counts[:, :2].sum())
 
@@ -160,8 +150,8 @@ class EuclideanField:
         Returns
         -------
         (P,) float32
-            Distance to the nearest obstacle, m, at most ``max_m``; 0 in obstacles; nan if the voxel
-            was not observed or is out of the radius.
+            Distance to the nearest obstacle, m, at most ``max_m``; 0 in obstacles; nan if the
+            voxel was not observed or is out of the radius.
 
         Raises
         ------
@@ -213,11 +203,13 @@ class EuclideanField:
 
     @property
     def _squares(self) -> npt.NDArray[np.uint16]:
-        return self._squared.array.view(np.uint16)
+        view: npt.NDArray[np.uint16] = self._squared.array.view(np.uint16)
+        return view
 
     @property
     def _mark_rows(self) -> npt.NDArray[np.uint8]:
-        return self._marks.array.view(np.uint8)
+        view: npt.NDArray[np.uint8] = self._marks.array.view(np.uint8)
+        return view
 
     def _grow(self) -> None:
         """Have as many rows as the map."""
@@ -231,14 +223,16 @@ class EuclideanField:
         self._seen, self._occupied = (np.pad(a, (0, more)) for a in (self._seen, self._occupied))
 
     def _forget(self, touched: npt.NDArray[np.bool_]) -> None:
-        """Forget blocks that are no longer in the map; mark distances to them as stale."""
+        """Forget blocks that are no longer in the map; touch those that were near."""
         head = self._blocks.head
         kept = (head[:, KEY] == self._keys) & (head[:, VERSION] != FREE)
         gone = np.flatnonzero((self._keys >= 0) & ~kept)
         if not len(gone):
             return
-        self._spread(gone, (kernels.OLD, kernels.OLD, kernels.OLD), False, kept, touched)
-        self._mark_rows[gone] = 0
+        marks = self._mark_rows
+        marks[gone] &= kernels.OLD
+        self._touch(gone, kernels.OLD, kept, touched)
+        marks[gone] = 0
         self._keys[gone] = -1
         self._occupied[gone] = 0
 
@@ -250,20 +244,19 @@ class EuclideanField:
         margin_m = self.max_m + math.sqrt(3.0) * self._blocks.config.block_size_m
         return rows[self._within(rows, margin_m)]
 
-    def _spread(
+    def _touch(
         self,
         rows: Int64,
-        source: tuple[np.uint8, np.uint8, np.uint8],
-        lowers: bool,
+        flips: np.uint8,
         targets: npt.NDArray[np.bool_],
         touched: npt.NDArray[np.bool_],
     ) -> None:
-        kernels.spread(
+        """Find the blocks that voxels of some blocks change; see kernels.touch."""
+        kernels.touch(
             rows,
             block_index(self._keys[rows]),
-            source,
+            flips,
             self._most,
-            lowers,
             targets,
             self._bits,
             self._keys,
@@ -273,52 +266,15 @@ class EuclideanField:
             touched,
         )
 
-    def _mark_stale(self, rows: Int64, touched: npt.NDArray[np.bool_]) -> None:
-        """Mark the distances to voxels that have become free."""
-        both = kernels.OLD | kernels.NEW
-        source = (both, kernels.OLD, kernels.OLD)
-        self._spread(rows, source, False, self._keys >= 0, touched)
-
-    def _lower(self, rows: Int64, *, only_new: bool, targets: npt.NDArray[np.bool_]) -> None:
-        """Lower distances about occupied voxels, or only about those that have become so."""
-        mask = kernels.OLD | kernels.NEW if only_new else kernels.NEW
-        self._spread(rows, (mask, kernels.NEW, kernels.NEW), True, targets, targets)
-
-    def _repair(self, rows: Int64) -> npt.NDArray[np.bool_]:
-        """Find the distances of stale voxels; return the blocks that must be computed anew."""
-        unfinished = np.zeros(len(self._keys), bool)
-        kernels.repair(
+    def _transform(self, rows: Int64) -> None:
+        kernels.transform(
             rows,
             block_index(self._keys[rows]),
-            self._ball,
-            TRIED,
+            self._most,
             self._bits,
             self._keys,
             self._blocks.lookup,
             self._mark_rows,
+            self._occupied,
             self._squares,
-            unfinished,
         )
-        return unfinished
-
-    def _sources_near(self, rows: Int64) -> Int64:
-        """Return the blocks with occupied voxels that may be in reach of blocks."""
-        occupied = (self._keys >= 0) & (self._occupied > 0)
-        half = -(-math.isqrt(self._most) // self._blocks.config.voxels_per_side)
-        offsets = np.indices((2 * half + 1,) * 3).reshape(3, -1).T - half
-        if len(rows) * len(offsets) <= MANY:
-            near = np.unique(self._blocks.neighbours(rows, offsets))
-            near = near[near >= 0]
-            return near[occupied[near]]
-        return np.flatnonzero(occupied)
-
-
-def ball(most: int) -> tuple[Int64, npt.NDArray[np.uint16], Int64]:
-    """Return the offsets of squared length up to ``most`` in the form of kernels.repair."""
-    reach = math.isqrt(most)
-    offsets = np.indices((2 * reach + 1,) * 3).reshape(3, -1).T - reach
-    lengths = (offsets * offsets).sum(axis=1)
-    offsets, lengths = offsets[lengths <= most], lengths[lengths <= most]
-    order = np.argsort(lengths, kind='stable')
-    first = np.searchsorted(lengths[order], np.arange(most + 1))
-    return offsets[order], lengths[order].astype(np.uint16), first
