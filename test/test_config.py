@@ -30,6 +30,8 @@ UNITS = {'m', 's', 'deg', 'hz', 'voxels', 'weight', 'ratio', 'overlap'}
 LEVEL = {'layers.tsdf.weight_dropoff': False}
 COMPANIONS = {
     'align.every_scans': {'window.keep_points': True},
+    'esdf.slice_min_m': {'esdf.slice_max_m': 1e5},
+    'esdf.slice_max_m': {'esdf.slice_min_m': -1e5},
     'input.min_range_m': {'input.max_range_m': 0.0},
     'layers.tsdf.min_range_m': {'layers.tsdf.max_range_m': 1e5},
     'layers.tsdf.max_range_m': {'layers.tsdf.min_range_m': 0.001},

@@ -23,6 +23,7 @@ from surfel_mapper.config.configuration import (
 )
 from surfel_mapper.config.layers import (
     DynamicConfig,
+    EsdfConfig,
     GridConfig,
     INTERPOLATIONS,
     ModelsConfig,
@@ -66,6 +67,7 @@ __all__ = [
     'DeskewConfig',
     'DiagnosticsConfig',
     'DynamicConfig',
+    'EsdfConfig',
     'FramesConfig',
     'GridConfig',
     'INTERPOLATIONS',

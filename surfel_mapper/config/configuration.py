@@ -15,6 +15,7 @@ from typing import Any
 
 from surfel_mapper.config.layers import (
     DynamicConfig,
+    EsdfConfig,
     GridConfig,
     ModelsLayerConfig,
     TsdfConfig,
@@ -72,6 +73,7 @@ class Config:
     grid: GridConfig = field(default_factory=GridConfig)
     output: OutputConfig = field(default_factory=OutputConfig)
     tsdf: TsdfConfig = field(default_factory=TsdfConfig)
+    esdf: EsdfConfig = field(default_factory=EsdfConfig)
     models: ModelsLayerConfig = field(default_factory=ModelsLayerConfig)
     dynamic: DynamicConfig = field(default_factory=DynamicConfig)
     clear: ClearConfig = field(default_factory=ClearConfig)

@@ -377,6 +377,47 @@ class TsdfConfig(Stage):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class EsdfConfig(Stage):
+    """Euclidean distances to the nearest obstacle, from the distance field (layers.tsdf)."""
+
+    rate_hz: float = setting(
+        0.0, 'Rate of ~/esdf, Hz; 0: never. Needs layers.tsdf.enabled.', low=0.0, high=100.0
+    )
+    slice_rate_hz: float = setting(
+        0.0, 'Rate of ~/esdf_slice, Hz; 0: never. Needs layers.tsdf.enabled.', low=0.0, high=100.0
+    )
+    max_m: float = setting(
+        2.0,
+        'Distances are exact up to this, m; at most 127 voxels of layers.tsdf.voxel_size_m.',
+        low=0.001,
+        high=1e4,
+    )
+    radius_m: float = setting(
+        20.0, 'Distances are kept within this of the sensor, m; 0: everywhere.', low=0.0, high=1e6
+    )
+    slice_min_m: float = setting(
+        0.3,
+        'Lowest height of obstacles in ~/esdf_slice, fixed frame, m; above the ground.',
+        low=-1e5,
+        high=1e5,
+    )
+    slice_max_m: float = setting(
+        1.5,
+        'Largest height of obstacles in ~/esdf_slice, fixed frame, m: that of the robot.',
+        low=-1e5,
+        high=1e5,
+    )
+
+    def check(self, stage: str) -> None:
+        """Check that the heights ascend."""
+        if self.slice_max_m < self.slice_min_m:
+            raise ConfigError(
+                f'{stage}.slice_max_m: {self.slice_max_m}, expected at least slice_min_m = '
+                f'{self.slice_min_m}'
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ModelsConfig(Stage):
     """Planes, B-spline surfaces and Gaussians."""
 

@@ -31,11 +31,8 @@ from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.mapping.storage import Slab
 from surfel_mapper.tsdf.blocks import block_index, BlockMap, FIRST_ROWS, Int64
 from surfel_mapper.tsdf.kernels import euclidean as kernels
-from surfel_mapper.tsdf.kernels.blocks import FREE, VERSION
+from surfel_mapper.tsdf.kernels.blocks import FREE, FREE_VISITS, VERSION
 from surfel_mapper.tsdf.queries import in_voxels
-
-MAX_VOXELS = 255
-"""Largest reach of a distance in voxels: its square fits 16 bits."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,16 +76,16 @@ class EuclideanField:
     Raises
     ------
     ConfigError
-        If max_m is not positive or more than MAX_VOXELS voxels.
+        If max_m is not positive or more than 127 voxels.
 
     """
 
     def __init__(self, blocks: BlockMap, *, max_m: float = 2.0, radius_m: float = 0.0) -> None:
         size_m, voxels = blocks.config.voxel_size_m, blocks.voxels_per_block
-        if not size_m <= max_m <= MAX_VOXELS * size_m:
+        if not size_m <= max_m <= kernels.MAX_REACH * size_m:
             raise ConfigError(
-                f'layers.esdf.max_m: {max_m}, expected {size_m} to {MAX_VOXELS * size_m:g}, that '
-                f'is 1 to {MAX_VOXELS} voxels'
+                f'esdf.max_m: {max_m}, expected {size_m} to {kernels.MAX_REACH * size_m:g}, that '
+                f'is 1 to {kernels.MAX_REACH} voxels'
             )
         self.max_m, self.radius_m = max_m, radius_m
         self._blocks = blocks
@@ -194,12 +191,9 @@ class EuclideanField:
         """Return which blocks are within the radius, and a margin, of the last place."""
         if self.radius_m <= 0.0:
             return np.ones(len(rows), bool)
-        centers = (block_index(self._keys_of(rows)) + 0.5) * self._blocks.config.block_size_m
+        centers = (self._blocks.index(rows) + 0.5) * self._blocks.config.block_size_m
         distance = np.linalg.norm(centers - self._center, axis=1)
         return np.asarray(distance <= self.radius_m + margin_m)
-
-    def _keys_of(self, rows: Int64) -> Int64:
-        return self._blocks.head[rows, KEY]
 
     @property
     def _squares(self) -> npt.NDArray[np.uint16]:
@@ -242,7 +236,13 @@ class EuclideanField:
         version = self._blocks.head[rows, VERSION]
         rows = rows[(version > self._seen[rows]) | (self._keys[rows] < 0)]
         margin_m = self.max_m + math.sqrt(3.0) * self._blocks.config.block_size_m
-        return rows[self._within(rows, margin_m)]
+        rows = rows[self._within(rows, margin_m)]
+        head = self._blocks.head
+        stays_free = (head[rows, FREE_VISITS] > 0) & (self._occupied[rows] == 0)
+        stays_free &= self._keys[rows] >= 0
+        self._seen[rows[stays_free]] = head[rows[stays_free], VERSION]
+        changed: Int64 = rows[~stays_free]
+        return changed
 
     def _touch(
         self,
@@ -267,9 +267,9 @@ class EuclideanField:
         )
 
     def _transform(self, rows: Int64) -> None:
+        tiles = np.unique(block_index(self._keys[rows]) // kernels.TILE, axis=0) * kernels.TILE
         kernels.transform(
-            rows,
-            block_index(self._keys[rows]),
+            tiles,
             self._most,
             self._bits,
             self._keys,

@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
@@ -104,6 +105,49 @@ def run(options: Options) -> list[Row]:
     for case in [*street_cases(options, scans), *room_cases(options, scans)]:
         with one_core():
             rows += case_rows(case, options)
+    with one_core():
+        rows += esdf_rows(street_cases(options, scans)[1])
+    return rows
+
+
+def esdf_rows(case: Case) -> list[Row]:
+    """Return rows of the update of Euclidean distances: the lidar drives, and stands with noise."""
+    rows: list[Row] = []
+    for stands in (False, True):
+        config = TsdfConfig(
+            voxel_size_m=case.voxel_size_m,
+            truncation_m=case.truncation_m,
+            threads=1,
+            min_range_m=1.5,
+            max_range_m=60.0,
+            **case.ours,
+        )
+        one = Integrator(BlockMap(config))
+        esdf = EuclideanField(one.blocks, max_m=2.0, radius_m=20.0)
+        found = []
+        for number, path in enumerate(case.files):
+            data, pose = (
+                np.load(case.files[0] if stands else path),
+                case.poses[0 if stands else number],
+            )
+            if stands:  # another noise of the same range
+                noise = np.random.default_rng(number).normal(0.0, 0.02, (len(data), 1))
+                length = np.linalg.norm(data, axis=1, keepdims=True)
+                data = (data * (1.0 + noise / np.maximum(length, 1.0))).astype(np.float32)
+            one.integrate(case.image(data), pose, number * 10**8)
+            busy = process_time()
+            changed = esdf.update(pose[:3, 3])
+            found.append((changed, (process_time() - busy) * 1e3))
+        late = np.array(found)[len(found) // 2 :]
+        rows.append(
+            {
+                'case': 'esdf 20 m, standing' if stands else 'esdf 20 m, driving',
+                'who': 'surfel_mapper',
+                'cpu_ms': float(np.median(late[:, 1])),
+                'voxels_changed': float(np.median(late[:, 0])),
+                'scans': len(late),
+            }
+        )
     return rows
 
 

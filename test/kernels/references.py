@@ -57,6 +57,7 @@ REFERENCES = {
     'tsdf/kernels/block_marks.py': 'tsdf/test_selection.py',
     'tsdf/kernels/blocks.py': 'tsdf/test_blocks.py',
     'tsdf/kernels/channels.py': 'tsdf/test_labels.py',
+    'tsdf/kernels/euclidean.py': 'tsdf/test_euclidean.py',
     'tsdf/kernels/free_space.py': 'tsdf/test_selection.py',
     'tsdf/kernels/integration.py': 'tsdf/test_twin.py',
     'tsdf/kernels/lookup.py': 'tsdf/test_range_image.py',

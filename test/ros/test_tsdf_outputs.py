@@ -14,7 +14,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from nav_msgs.msg import OccupancyGrid
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from surfel_mapper.sensors.depth import PinholeCamera
@@ -88,6 +88,32 @@ def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     assert len(distance) > 50
     assert distance.min() > RADIUS_M - 0.4
     assert (cost == 0).sum() > 500  # the space that rays passed through
+
+
+def test_distances_to_obstacles_come_as_cloud_and_slice(start, peer):
+    rates = {'esdf.rate_hz': 10.0, 'esdf.slice_rate_hz': 10.0, 'esdf.max_m': 1.0}
+    start_node(start, peer, **SETTINGS, **rates, **{'esdf.radius_m': 0.0})
+    clouds = peer.collect(PointCloud2, f'{BASE}/esdf', LATCHED)
+    slices = peer.collect(OccupancyGrid, f'{BASE}/esdf_slice', LATCHED)
+    directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
+    peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
+    peer.publish('/points', cloud(START_NS, RADIUS_M * directions))
+    peer.spin_until(lambda: clouds and clouds[-1].width > 1000)
+    assert [field.name for field in clouds[-1].fields] == ['x', 'y', 'z', 'distance']
+    assert clouds[-1].header.frame_id == 'odom'
+    rows = np.frombuffer(clouds[-1].data, np.float32).reshape(-1, 4)
+    away = RADIUS_M - np.linalg.norm(rows[:, :3] - (0.1, 0.0, 0.5), axis=1)
+    level = (np.abs(rows[:, 2] - 0.5) < 1.0) & (away > 0.0)  # the sphere above and below is open
+    assert level.sum() > 500
+    # between centres of voxels: half a diagonal of 0.2 m, and the half voxel in front
+    assert np.abs(rows[level, 3] - away[level]).max() < 0.3
+    assert rows[:, 3].min() == 0.0
+    assert rows[:, 3].max() < 1.0
+
+    peer.spin_until(lambda: slices and slices[-1].data)
+    cost = np.array(slices[-1].data)
+    assert {-1, 0, 100} <= set(cost.tolist())
+    assert ((cost > 0) & (cost < 100)).sum() > 300
 
 
 def test_colours_come_from_the_image_beside_a_depth_image(start, peer):

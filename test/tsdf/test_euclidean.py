@@ -140,7 +140,7 @@ def test_places_outside_of_the_map_are_unknown():
         field.sample((0.0, 0.0, 0.0))
 
 
-@pytest.mark.parametrize('max_m', [0.05, 26.0, float('nan')])
-def test_reaches_below_a_voxel_or_beyond_16_bits_are_refused(max_m):
-    with pytest.raises(ConfigError, match=r'layers.esdf.max_m: .*1 to 255 voxels'):
+@pytest.mark.parametrize('max_m', [0.05, 13.0, float('nan')])
+def test_reaches_below_a_voxel_or_beyond_127_are_refused(max_m):
+    with pytest.raises(ConfigError, match=r'esdf.max_m: .*1 to 127 voxels'):
         EuclideanField(BlockMap(TsdfConfig()), max_m=max_m)

@@ -19,6 +19,7 @@ from surfel_mapper.config import TsdfConfig
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
@@ -186,6 +187,25 @@ class DistanceField:
 
         """
         return obstacle_distances(self.blocks, low_m, high_m)
+
+    def esdf(self, *, max_m: float = 2.0) -> EuclideanField:
+        """
+        Return the Euclidean distances from all voxels to obstacles, to follow with ``update``.
+
+        Parameters
+        ----------
+        max_m : float
+            Distances are exact up to this, m.
+
+        Raises
+        ------
+        ConfigError
+            If max_m is not between 1 and 127 voxels.
+
+        """
+        found = EuclideanField(self.blocks, max_m=max_m)
+        found.update()
+        return found
 
     def mesh(self) -> Mesh:
         """Return the surface as triangles; only changed blocks are meshed again."""

@@ -26,7 +26,7 @@ from surfel_mapper.files.tsdf_archive import BlockArchive
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
-from surfel_mapper.layers.distance_field.obstacles import slice_at
+from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
     Contains,
@@ -41,8 +41,10 @@ from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
@@ -101,6 +103,9 @@ class TsdfLayer(Layer):
         self._mesher = Mesher(self.blocks)
         self._live_mesh = LiveMesh(self.blocks)
         self._whole_mesh = WholeMesh(self.blocks)
+        esdf = self.config.esdf
+        self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
+        self._position = np.zeros(3)
         self._waiting: dict[int, Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
         self._num_by_points = 0
@@ -152,7 +157,8 @@ class TsdfLayer(Layer):
             points, channels = self._measured(scan, sensor.max_range_m)
             image = from_points(sensor, points, **channels)
             done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
-        left = self.blocks.evict(T_map_sensor[:3, 3], scan.stamp_ns)
+        self._position = T_map_sensor[:3, 3].copy()
+        left = self.blocks.evict(self._position, scan.stamp_ns)
         if self._archive is not None:
             self._archive.add(left)
         self._num_scans += 1
@@ -164,6 +170,12 @@ class TsdfLayer(Layer):
     def field(self) -> DistanceField:
         """The field, to query, save or fuse into; valid until the layer is cleared."""
         return DistanceField(blocks=self.blocks)
+
+    @property
+    def esdf(self) -> EuclideanField:
+        """Euclidean distances to obstacles about the last scan, up to date; see ``esdf.*``."""
+        self._esdf.update(self._position)
+        return self._esdf
 
     def mesh(self) -> Mesh:
         """Return the surface; blocks that have not changed since the last call cost little."""
@@ -191,6 +203,8 @@ class TsdfLayer(Layer):
                 layer = TsdfLayer(config, around)
                 layer.insert(Scan(points=two_beams(dtype), stamp_ns=0, frame_id=''), np.eye(4))
         layer.mesh()
+        if self.config.esdf.rate_hz:
+            layer.esdf.known()
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of the field."""
@@ -235,6 +249,21 @@ class TsdfLayer(Layer):
                 rate_hz=lambda config: config.tsdf.slice_rate_hz,
                 is_eager=True,
             ),
+            Publication(
+                topic='~/esdf',
+                type_name='sensor_msgs/msg/PointCloud2',
+                messages=self._esdf_messages,
+                in_background=True,
+                version=lambda: (id(self.blocks), self.blocks.version),
+                rate_hz=lambda config: config.esdf.rate_hz,
+            ),
+            Publication(
+                topic='~/esdf_slice',
+                type_name='nav_msgs/msg/OccupancyGrid',
+                messages=self._clearance_messages,
+                rate_hz=lambda config: config.esdf.slice_rate_hz,
+                is_eager=True,
+            ),
         )
 
     def whole(self) -> BlockMap:
@@ -274,6 +303,24 @@ class TsdfLayer(Layer):
 
     def _slice_messages(self, now: Moment) -> list[bytes]:
         found = slice_at(self.blocks, self.config.tsdf.slice_height_m)
+        content = (found.resolution_m, found.origin, found.cost)
+        return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
+
+    def _esdf_messages(self, now: Moment) -> Iterable[bytes]:
+        """Return the cloud of the distances below esdf.max_m; serialised while iterated."""
+        known = self.esdf.known()
+        near = known.distance < self.config.esdf.max_m
+        points = known.points[near].astype(np.float32)
+        columns = dict(zip('xyz', points.T, strict=True)) | {'distance': known.distance[near]}
+        return (
+            cloud_bytes(from_columns(each), stamp_ns=now.stamp_ns, frame_id=now.frame_id)
+            for each in [columns]
+        )
+
+    def _clearance_messages(self, now: Moment) -> list[bytes]:
+        config = self.config.esdf
+        heights_m, area = (config.slice_min_m, config.slice_max_m), self._position[:2]
+        found = clearance_slice(self.blocks, heights_m, config.max_m, area, config.radius_m)
         content = (found.resolution_m, found.origin, found.cost)
         return [occupancy_grid(*content, stamp_ns=now.stamp_ns, frame_id=now.frame_id)]
 

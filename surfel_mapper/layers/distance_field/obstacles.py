@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Free space and obstacles for planners: slices at a height, and Euclidean distances in a box.
+Free space and obstacles for planners: slices at heights, and Euclidean distances in a box.
 
 The signed distances of the field are measured along rays and end at the truncation; a planner
 needs the Euclidean distance to the nearest obstacle at any position. It is computed on request
@@ -11,6 +11,7 @@ from the occupied voxels by scipy's exact transform (Maurer, Qi and Raghavan 200
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 
 import numpy as np
 import numpy.typing as npt
@@ -94,6 +95,85 @@ def slice_at(blocks: BlockMap, height_m: float) -> CostGrid:
     return CostGrid(resolution_m=size_m, origin=origin, cost=COSTS[found.T])
 
 
+def clearance_slice(
+    blocks: BlockMap,
+    heights_m: tuple[float, float],
+    max_m: float,
+    center: npt.ArrayLike = (0.0, 0.0),
+    radius_m: float = 0.0,
+) -> CostGrid:
+    """
+    Return costs by the horizontal distance to the nearest obstacle between two heights.
+
+    Parameters
+    ----------
+    blocks : BlockMap
+        The field.
+    heights_m : (float, float)
+        Lowest and largest height of obstacles, m, both included.
+    max_m : float
+        Distance from which a cell costs nothing, m.
+    center : (2,) float, m
+        Centre of the area.
+    radius_m : float
+        Blocks within this of the centre count, m; 0: all.
+
+    Returns
+    -------
+    CostGrid
+        100 in obstacles, else 100 (1 - distance / max_m), at most 99; -1 if none of the voxels
+        between the heights was observed.
+
+    Raises
+    ------
+    MapLimitError
+        If the blocks span more than MAX_VOXELS.
+
+    """
+    side, size_m = blocks.config.voxels_per_side, blocks.config.voxel_size_m
+    layers = np.floor(np.asarray(heights_m) / size_m).astype(np.int64)
+    rows = blocks.rows()
+    index = blocks.index(rows)
+    chosen = (index[:, 2] >= layers[0] // side) & (index[:, 2] <= layers[1] // side)
+    if radius_m > 0.0:
+        offsets = (index[:, :2] + 0.5) * blocks.config.block_size_m - np.asarray(center)
+        chosen &= np.linalg.norm(offsets, axis=1) <= radius_m
+    rows, index = rows[chosen], index[chosen]
+    if not len(rows):
+        return CostGrid(resolution_m=size_m, origin=np.zeros(2), cost=np.empty((0, 0), np.int8))
+    low, high = extent(blocks, index)
+    checked_size((high - low)[:2])
+    occupied, seen = columns_between(blocks, rows, layers)
+    distance = np.full(occupied.shape, max_m)
+    if occupied.any():
+        distance = np.minimum(distance_transform_edt(~occupied, sampling=size_m), max_m)
+    cost = np.minimum(np.rint(100.0 * (1.0 - distance / max_m)), OBSTACLE - 1)
+    cost = np.where(occupied, OBSTACLE, np.where(seen, cost, UNSEEN)).astype(np.int8)
+    origin = np.asarray(low[:2] * size_m, np.float64)
+    return CostGrid(resolution_m=size_m, origin=origin, cost=cost)
+
+
+def columns_between(
+    blocks: BlockMap, rows: npt.NDArray[np.int64], layers: npt.NDArray[np.int64]
+) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """Return which columns of voxels, (ny, nx), are occupied and observed between two layers."""
+    side, index = blocks.config.voxels_per_side, blocks.index(rows)
+    low, high = extent(blocks, index)
+    columns, lines = (high - low)[:2].tolist()
+    layer = index[:, 2:] * side + np.arange(side)
+    between = ((layer >= layers[0]) & (layer <= layers[1]))[:, :, None, None]
+    known = (blocks.weight[rows] > 0.0).reshape(-1, side, side, side) & between
+    near = blocks.distance[rows].reshape(known.shape) <= 0.5 * blocks.config.voxel_size_m
+    first = index[:, :2] * side - low[:2]
+    found = []
+    for here in (known & near, known):
+        cells = np.zeros((lines, columns), bool)
+        number, y, x = np.nonzero(here.any(axis=1))
+        cells[first[number, 1] + y, first[number, 0] + x] = True
+        found.append(cells)
+    return found[0], found[1]
+
+
 def obstacle_distances(
     blocks: BlockMap,
     low_m: npt.ArrayLike | None = None,
@@ -153,13 +233,7 @@ def box_states(
     blocks: BlockMap, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.uint8]:
     """Return the states of the voxels in [low, high), (nx, ny, nz)."""
-    shape = tuple((high - low).tolist())
-    num = int(np.prod(shape, dtype=object))
-    if num > MAX_VOXELS:
-        raise MapLimitError(
-            f'a box of {" x ".join(map(str, shape))} voxels; at most {MAX_VOXELS}: take a smaller '
-            'one, or set layers.tsdf.max_radius_m'
-        )
+    shape = tuple(checked_size(high - low).tolist())
     found = np.empty(shape, np.uint8)
     y, z = (np.arange(low[axis], high[axis]) for axis in (1, 2))
     for plane in range(shape[0]):
@@ -167,3 +241,14 @@ def box_states(
         centers = (places.reshape(-1, 3) + 0.5) * blocks.config.voxel_size_m
         found[plane] = states(blocks, centers).reshape(shape[1:])
     return found
+
+
+def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return the size of a box in voxels; raise MapLimitError beyond MAX_VOXELS."""
+    shape = size.tolist()
+    if math.prod(shape) > MAX_VOXELS:
+        raise MapLimitError(
+            f'a box of {" x ".join(map(str, shape))} voxels; at most {MAX_VOXELS}: take a smaller '
+            'one, or set layers.tsdf.max_radius_m'
+        )
+    return size
