@@ -206,7 +206,7 @@ class EuclideanField:
         return view
 
     def _grow(self) -> None:
-        """Have as many rows as the map."""
+        """Add rows until there are as many as in the map."""
         number, before = len(self._blocks.head), len(self._keys)
         if number == before:
             return

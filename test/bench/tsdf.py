@@ -111,7 +111,7 @@ def run(options: Options) -> list[Row]:
 
 
 def esdf_rows(case: Case) -> list[Row]:
-    """Return rows of the update of Euclidean distances: the lidar drives, and stands with noise."""
+    """Return rows of updates of Euclidean distances: the lidar drives, or stands and flickers."""
     rows: list[Row] = []
     for stands in (False, True):
         config = TsdfConfig(

@@ -12,6 +12,8 @@ a window instead of an envelope of parabolas: reaches are short, and plain loops
 instructions).
 
 Distances are integers and exact: the result does not depend on the order of changes.
+
+One module: both halves share the marks of voxels and the look-up of blocks.
 """
 
 from numba import njit
