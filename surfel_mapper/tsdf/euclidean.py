@@ -89,13 +89,13 @@ class EuclideanField:
             )
         self.max_m, self.radius_m = max_m, radius_m
         self._blocks = blocks
-        self._center = np.zeros(3)
+        self._center: npt.NDArray[np.float64] = np.zeros(3)
         self._most = int((max_m / size_m) ** 2 * (1.0 + 1e-9))
         self._bits = blocks.config.voxels_per_side.bit_length() - 1
         self._squared, self._marks = (Slab(FIRST_ROWS, voxels * k // 8) for k in (2, 1))
-        self._keys = np.full(FIRST_ROWS, -1, np.int64)
-        self._seen = np.zeros(FIRST_ROWS, np.int64)
-        self._occupied = np.zeros(FIRST_ROWS, np.int64)
+        self._keys: Int64 = np.full(FIRST_ROWS, -1, np.int64)
+        self._seen: Int64 = np.zeros(FIRST_ROWS, np.int64)
+        self._occupied: Int64 = np.zeros(FIRST_ROWS, np.int64)
 
     def update(self, center: npt.ArrayLike | None = None) -> int:
         """

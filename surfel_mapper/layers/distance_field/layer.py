@@ -107,7 +107,7 @@ class TsdfLayer(Layer):
         self._whole_mesh = WholeMesh(self.blocks)
         esdf = self.config.esdf
         self._esdf = EuclideanField(self.blocks, max_m=esdf.max_m, radius_m=esdf.radius_m)
-        self._position = np.zeros(3)
+        self._position: npt.NDArray[np.float64] = np.zeros(3)
         self._waiting: dict[int, Scan] = {}
         self._num_scans = self._num_refused = self._num_labels_lost = 0
         self._num_by_points = 0
