@@ -179,7 +179,7 @@ class EuclideanField:
         place, number = np.nonzero(self._blocks.weight[rows] > 0.0)
         voxels = block_index(self._keys[rows])[place] * side + local[number]
         return KnownDistances(
-            points=(voxels + 0.5) * size_m,
+            points=np.asarray((voxels + 0.5) * size_m, np.float64),
             distance=self._metres(self._squares[rows[place], number]),
         )
 
