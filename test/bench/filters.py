@@ -1,39 +1,42 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filters on one core, the voxel grid beside PCL's and Open3D's.
+Filters on one core, the voxel grid beside those of small_gicp, Open3D and PCL.
 
-Each row is the least of some repeats on one scan: a busy machine only ever adds to it. ``Mpt_s``
-are millions of points that come in, a second. PCL is compiled from peers/pcl_voxel_grid.cpp where
-a compiler and Debian's libpcl-dev are there (or where CPATH, LIBRARY_PATH and LD_LIBRARY_PATH
-lead to them); Open3D comes with --peers. Figures that are not measured here are marked as stated:
-they are of another machine and one scan of 124,668 points. libpointmatcher has no package.
+Each row is the median of the processor times of some repeats on one scan, on which other load of
+the machine has less effect than on clock times. ``Mpt_s`` are millions of points that come in, a
+second. Voxel grids are timed twice, before and after those of others; ``x_ours`` says how many
+times as long the others take. PCL is compiled from peers/pcl_voxel_grid.cpp where a compiler and
+Debian's libpcl-dev are there (or where CPATH, LIBRARY_PATH and LD_LIBRARY_PATH lead to them);
+small_gicp and Open3D come with --peers. libpointmatcher has no package: its figure is stated, of
+another machine and one scan of 124,668 points.
 
-Scans are the simulated street and, where SURFEL_MAPPER_TEST_DATA leads to it, one of a real lidar
-of 64 beams in columns, in which hardly two points that follow each other share a voxel.
+Scans are the simulated street and, where SURFEL_MAPPER_TEST_DATA leads to them, those of three
+real lidars in recorded order, in which hardly two points that follow each other share a voxel.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 import json
-import os
 from pathlib import Path
 import subprocess
 import tempfile
-from time import perf_counter
+from time import process_time
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.filters import Chain
+from surfel_mapper.memory import keep_freed_memory
 from surfel_mapper.scan import Scan
 from test.bench.machine import one_core
 from test.bench.options import Options
-from test.bench.peers import OPEN3D, PeerSpec
+from test.bench.peers import OPEN3D, PeerSpec, SMALL_GICP
 from test.bench.peers.pcl import compiled
 from test.bench.peers.run import environment, output, PeerError
+from test.bench.real import real_scans
 from test.bench.report import Row
 from test.bench.street import Street
 
@@ -42,11 +45,13 @@ SIZE_M = 0.5
 VOXEL = {'vSizeX': SIZE_M, 'vSizeY': SIZE_M, 'vSizeZ': SIZE_M}
 BOX = {'x_min_m': -20, 'x_max_m': 20, 'y_min_m': -20, 'y_max_m': 20, 'z_min_m': -2, 'z_max_m': 5}
 
+VOXEL_GRID = 'VoxelGrid'
+
 FAST = 200.0
 """Mpt/s asked of boxes, ranges and masks."""
 
 CHAINS: dict[str, tuple[Any, float | None]] = {
-    'VoxelGrid': ({'VoxelGridDataPointsFilter': VOXEL}, 3 * 13.6),
+    VOXEL_GRID: ({'VoxelGridDataPointsFilter': VOXEL}, 3 * 13.6),
     'remove_nan': ('remove_nan', FAST),
     'bounding_box, inside goes': ({'bounding_box': BOX}, FAST),
     'bounding_box, inside stays': ({'bounding_box': {**BOX, 'remove_inside': 0}}, FAST),
@@ -64,8 +69,18 @@ CHAINS: dict[str, tuple[Any, float | None]] = {
 }
 """Timed filters, and the rates they should reach, Mpt/s."""
 
-STATED = {'libpointmatcher': 13.6, 'PCL VoxelGrid': 30.8, 'PCL ApproximateVoxelGrid': 58.0}
-"""Mpt/s of others as stated for one real scan, 0.5 m voxels, one core."""
+STATED = {'libpointmatcher': 13.6}
+"""Mpt/s of another as stated for one real scan, 0.5 m voxels, one core."""
+
+REAL = ('VLS-128 street', 'OS2-128', '64 beams street')
+"""Real scans, by their names in real.py."""
+
+VOXEL_GRIDS = (
+    PeerSpec(
+        name='small_gicp', module='test.bench.peers.small_gicp_voxel_grid', requires=SMALL_GICP
+    ),
+    PeerSpec(name='Open3D', module='test.bench.peers.open3d_voxel_grid', requires=OPEN3D),
+)
 
 PCL_LIBRARIES = ('filters', 'common')
 
@@ -74,22 +89,29 @@ REPEATS = 40
 Points = npt.NDArray[np.float32]
 
 
+Figures = tuple[list[float], int]
+"""Milliseconds of each repeat, and how many points were left."""
+
+
 def run(options: Options) -> list[Row]:
     """Return a row for every filter and scan, and for the voxel grids of others."""
+    keep_freed_memory()  # as node and replay do
     program = compiled('pcl_voxel_grid', PCL_LIBRARIES, options)
     rows: list[Row] = []
     with one_core():
         for name, points in scans(options):
-            rows += [ours(name, points, each) for each in CHAINS]
+            rows += voxel_grids(name, points, program, options)
             rows += [
-                row(name, who, len(points), figures) for who, figures in others(points, program)
+                {
+                    **row(name, each, len(points), ours(points, each)),
+                    'asked_Mpt_s': CHAINS[each][1],
+                }
+                for each in CHAINS
+                if each != VOXEL_GRID
             ]
-            if options.peers:
-                rows += open3d_rows(name, points, options)
         rows += [
             {'scan': '124,668 points', 'filter': who, 'Mpt_s': rate, 'note': 'as stated'}
             for who, rate in STATED.items()
-            if program is None or not who.startswith('PCL')
         ]
     return rows
 
@@ -98,14 +120,32 @@ def scans(options: Options) -> Iterator[tuple[str, Points]]:
     """Yield names and points of the scans, finite ones."""
     points = Street(options).points(options.untimed)
     yield 'street', points[np.isfinite(points).all(axis=1)]
-    data = os.environ.get('SURFEL_MAPPER_TEST_DATA')
-    path = Path(data or '') / 'data/scans/rellis3d_os1_64_offroad_000104.bin'
-    if data and path.exists():
-        yield 'real', np.fromfile(path, np.float32).reshape(-1, 4)[:, :3]
+    yield from ((name, points) for name, points in real_scans() if name in REAL)
 
 
-def ours(name: str, points: Points, which: str) -> Row:
-    """Return the row of one of our filters."""
+def voxel_grids(
+    name: str, points: Points, program: Path | None, options: Options
+) -> Iterator[Row]:
+    """Yield the rows of our voxel grid and of those of others, in turns."""
+    before, left = ours(points, VOXEL_GRID)
+    others = dict(pcl(points, program)) if program else {}
+    notes: list[Row] = []
+    for spec in VOXEL_GRIDS if options.peers else ():
+        try:
+            others.update(peer(spec, points, options))
+        except PeerError as error:
+            notes.append({'scan': name, 'filter': spec.name, 'note': f'not measured: {error}'})
+    times = before + ours(points, VOXEL_GRID)[0]
+    asked = CHAINS[VOXEL_GRID][1]
+    yield {**row(name, VOXEL_GRID, len(points), (times, left)), 'asked_Mpt_s': asked}
+    for who, figures in others.items():
+        ratio = float(np.median(figures[0]) / np.median(times))
+        yield {**row(name, who, len(points), figures), 'x_ours': ratio}
+    yield from notes
+
+
+def ours(points: Points, which: str) -> Figures:
+    """Return the figures of one of our filters."""
     item, asked = CHAINS[which]
     columns = {
         'label_mask': {'label': np.arange(len(points)) % 7},
@@ -123,29 +163,28 @@ def ours(name: str, points: Points, which: str) -> Row:
     left = chain.apply(scan)
     times = []
     for _ in range(REPEATS if asked else 3):
-        start = perf_counter()
+        start = process_time()
         chain.apply(scan)
-        times.append((perf_counter() - start) * 1e3)
-    return {**row(name, which, len(points), (min(times), len(left))), 'asked_Mpt_s': asked}
+        times.append((process_time() - start) * 1e3)
+    return times, len(left)
 
 
-def row(name: str, who: str, num_points: int, figures: tuple[float, int]) -> Row:
+def row(name: str, who: str, num_points: int, figures: Figures) -> Row:
     """Return the row of a filter from its milliseconds and how many points it left."""
-    milliseconds, left = figures
+    times, left = figures
+    milliseconds = float(np.median(times))
     return {
         'scan': name,
         'filter': who,
         'points': num_points,
         'left': left,
-        'least_ms': milliseconds,
+        'median_ms': milliseconds,
         'Mpt_s': num_points / milliseconds * 1e-3,
     }
 
 
-def others(points: Points, program: Path | None) -> Iterator[tuple[str, tuple[float, int]]]:
-    """Yield the least milliseconds of PCL's voxel grids and their numbers of points."""
-    if program is None:
-        return
+def pcl(points: Points, program: Path) -> Iterator[tuple[str, Figures]]:
+    """Yield the figures of PCL's voxel grids."""
     done = subprocess.run(
         [program, str(len(points)), str(SIZE_M), str(REPEATS)],
         input=np.ascontiguousarray(points).tobytes(),
@@ -154,21 +193,24 @@ def others(points: Points, program: Path | None) -> Iterator[tuple[str, tuple[fl
     )
     lines = done.stdout.decode().splitlines()
     for who, line in zip(('PCL VoxelGrid', 'PCL ApproximateVoxelGrid'), lines, strict=True):
-        milliseconds, left = line.split()
-        yield who, (float(milliseconds), int(left))
+        left, *times = line.split()
+        yield who, ([float(each) for each in times], int(left))
 
 
-def open3d_rows(name: str, points: Points, options: Options) -> list[Row]:
-    """Return the rows of Open3D; if it cannot be had, only why."""
-    spec = PeerSpec(name='Open3D', module='test.bench.peers.open3d_voxel_grid', requires=OPEN3D)
-    try:
-        python = environment(spec, options.cache)
-        with tempfile.TemporaryDirectory() as scratch:
-            path = Path(scratch) / 'points.npy'
-            np.save(path, np.ascontiguousarray(points))
-            command = [str(python), '-m', spec.module, str(path), str(SIZE_M), str(REPEATS)]
-            said = output(command, cwd=Path(__file__).parents[2])
-    except PeerError as error:
-        return [{'scan': name, 'filter': 'Open3D', 'note': f'not measured: {error}'}]
-    found = json.loads(said.splitlines()[-1])
-    return [row(name, who, len(points), tuple(figures)) for who, figures in found.items()]
+def peer(spec: PeerSpec, points: Points, options: Options) -> dict[str, Figures]:
+    """
+    Return the figures of the voxel grids of a package.
+
+    Raises
+    ------
+    PeerError
+        If it cannot be had.
+
+    """
+    python = environment(spec, options.cache)
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / 'points.npy'
+        np.save(path, np.ascontiguousarray(points))
+        command = [str(python), '-m', spec.module, str(path), str(SIZE_M), str(REPEATS)]
+        said = output(command, cwd=Path(__file__).parents[2])
+    return {who: (times, left) for who, (times, left) in json.loads(said.splitlines()[-1]).items()}

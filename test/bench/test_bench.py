@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import json
 import os
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
-from test.bench import accuracy, real
+from test.bench import accuracy, filters, real
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -49,6 +50,28 @@ def options(tmp_path_factory):
         columns=64,
         cache=tmp_path_factory.mktemp('cache'),
     )
+
+
+def test_the_voxel_grid_is_timed_and_others_beside_it(options, monkeypatch):
+    monkeypatch.setattr(filters, 'REPEATS', 2)
+    points = np.random.default_rng(3).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
+
+    (row,) = filters.voxel_grids('cube', points, None, options)
+
+    lowest = points.min(axis=0).astype(np.float64)
+    occupied = np.unique(np.floor(points / 0.5 - lowest / 0.5), axis=0)
+    assert (row['points'], row['left']) == (500, len(occupied))
+    assert row['median_ms'] > 0.0
+
+    def missing(spec, points, options):
+        raise PeerError(f'no {spec.name} here')
+
+    monkeypatch.setattr(filters, 'peer', missing)
+    found = list(filters.voxel_grids('cube', points, None, replace(options, peers=True)))
+    assert [row.get('note') for row in found[1:]] == [
+        'not measured: no small_gicp here',
+        'not measured: no Open3D here',
+    ]
 
 
 def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_path):

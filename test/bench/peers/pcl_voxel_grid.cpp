@@ -5,33 +5,34 @@
 //
 //   pcl_voxel_grid POINTS SIZE_M REPEATS
 //
-// Prints two lines: the least milliseconds of each, and how many points it leaves.
+// Prints two lines: how many points each leaves, and the processor times in milliseconds.
 
 #include <pcl/filters/approximate_voxel_grid.h>
 #include <pcl/filters/voxel_grid.h>
 #include <pcl/point_types.h>
 
-#include <algorithm>
-#include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <ctime>
+#include <vector>
 
 using Cloud = pcl::PointCloud<pcl::PointXYZ>;
 
 template <typename Filter>
 void time(const Cloud::ConstPtr& cloud, float size, int repeats) {
-  double least = 1e9;
+  std::vector<double> times;
   Cloud left;
   for (int repeat = 0; repeat < repeats; ++repeat) {
-    const auto start = std::chrono::steady_clock::now();
+    const std::clock_t start = std::clock();
     Filter filter;
     filter.setInputCloud(cloud);
     filter.setLeafSize(size, size, size);
     filter.filter(left);
-    const std::chrono::duration<double, std::milli> took = std::chrono::steady_clock::now() - start;
-    least = std::min(least, took.count());
+    times.push_back(1e3 * (std::clock() - start) / CLOCKS_PER_SEC);
   }
-  std::printf("%.4f %zu\n", least, left.size());
+  std::printf("%zu", left.size());
+  for (const double took : times) std::printf(" %.4f", took);
+  std::printf("\n");
 }
 
 int main(int argc, char** argv) {
