@@ -252,14 +252,15 @@ class ChunkedFile(BagFile):
         """Return the bytes of a message: a copy, or a view into its chunk if it is most of it."""
         if number == LOOSE:
             return self._at(at, size)
-        with self._budget.clock():
-            self._budget.check_time()
-            if number not in self._kept:
+        if number not in self._kept:
+            with self._budget.clock():
+                self._budget.check_time()
                 head = self._head(self._chunks[number])
                 if is_plain(head):
                     return self._at(head.start + at, size)
-            records = self._unpacked(number)
-            view = memoryview(records)[at : at + size]
+                self._unpacked(number)
+        records = self._unpacked(number)
+        view = memoryview(records)[at : at + size]
         is_most = size > MOST_OF_CHUNK * len(records)
         return view if is_most or size > MAX_COPIED_BYTES else bytes(view)
 

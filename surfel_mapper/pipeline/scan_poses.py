@@ -89,7 +89,7 @@ class ScanPoses:
     ) -> None:
         """Add a pose, shifted by the origin of the map if it is in the fixed frame."""
         fixed = self._config.frames.fixed
-        if fixed in (parent, child):
+        if self.origin.has_own_frame and fixed in (parent, child):
             if not self.origin.is_known and child == fixed:
                 self._early.append((parent, child, stamp_ns, transform, static))
                 return

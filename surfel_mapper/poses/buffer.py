@@ -137,7 +137,8 @@ class TransformBuffer:
         edge.insert(stamp_ns, transform)
         edge.forget_before(edge.stamps[-1] - self._history_ns)
         self.num_transforms += len(edge.stamps) - before
-        self._enter(edge)
+        if child not in self._edges:
+            self._enter(edge)
         if is_back:
             self._newest = self._edge_of_newest()
         elif self._newest is None or edge.stamps[-1] > self._newest.stamps[-1]:
@@ -149,7 +150,8 @@ class TransformBuffer:
         """Set the transform of an edge for all time, in the place of an earlier one; see add."""
         edge = self._edge(parent, child, is_static=True)
         edge.transforms = [rigid(parent, child, T_parent_child)]
-        self._enter(edge)
+        if child not in self._edges:
+            self._enter(edge)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """
@@ -234,9 +236,7 @@ class TransformBuffer:
             self._enter(edge)
 
     def _enter(self, edge: PoseTrack) -> None:
-        """Keep an edge; a new one may raise the heights of the frames above it."""
-        if edge.child in self._edges:
-            return
+        """Keep a new edge; it may raise the heights of the frames above it."""
         self._edges[edge.child] = edge
         height = self._heights.setdefault(edge.child, 0)
         for above in self._edges_above(edge.child):
