@@ -84,6 +84,10 @@ def test_the_reference_has_every_name_that_pages_and_examples_import():
     assert missing == set()
 
 
+def test_the_readme_is_at_most_200_lines():
+    assert len(README.read_text(encoding='utf-8').splitlines()) <= 200
+
+
 def test_the_readme_names_every_verb():
     readme = README.read_text(encoding='utf-8')
     assert [verb for verb in VERBS if f'`surfel-mapper {verb}' not in readme] == []
