@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Fixtures and settings of all tests: real data, hypothesis without chance or clock."""
+"""Fixtures and settings of all tests: real data, hypothesis without randomness or deadlines."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ WAITING = ('test/ros/', 'test/docs/', 'test/examples/', 'test/cluster/')
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
-    Order the files so that one process calculates while the other waits, and none ends late.
+    Order the files so that one process computes while the other waits, and both end together.
 
-    Files that wait alternate with others from the beginning; those left over are short.
+    Files that wait alternate with others from the beginning; the remaining ones are short.
     """
     files: dict[str, list[pytest.Item]] = {}
     for item in items:
@@ -60,7 +60,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Leave modules and tests, which stay to the end, out of all further garbage collections."""
+    """Exclude modules and tests, which are kept to the end, from further garbage collections."""
     gc.enable()
     gc.freeze()
 

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Rigid transforms against scipy.spatial.transform and scipy.linalg, which compute otherwise.
+Rigid transforms against scipy.spatial.transform and scipy.linalg, which use other formulas.
 
 Tolerances are in units of the rounding of float64, EPS = 2^-52, times the few operations on
 numbers of order 1; translations count relative to their length.

@@ -3,8 +3,8 @@
 """
 The buffer of transforms: exact results, interpolation, refusals.
 
-The twin below knows nothing of edges in time or of common ancestors: it multiplies 4 by 4
-matrices from the root to each of two frames and solves for what lies between, with scipy's slerp.
+The twin below has no tracks and no common ancestors: it multiplies 4 by 4 matrices from the root
+to each of two frames and solves for the transform between them, with scipy's slerp.
 
 (Longer than other files: most tests need the twin.)
 """

@@ -36,7 +36,7 @@ def name_of(node):
 
 
 def dangers(source):
-    """Return what in a source runs code or programs that come from elsewhere."""
+    """Return the calls in a source that run external code or programs."""
     found = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):

@@ -16,7 +16,7 @@ from surfel_mapper.simulation import Drive, Lidar, Simulation, World
 STEP_M = 1.5
 
 SAME_WAY = ((0.0, 0.0), (70.0, 0.0), (70.0, 50.0), (0.0, 50.0), (0.0, 0.0), (65.0, 0.0))
-"""Around a block, and on along the first street."""
+"""Around a block, and further along the first street."""
 
 THERE_AND_BACK = (
     *((0.0, 0.0), (60.0, 0.0), (110.0, 0.0)),

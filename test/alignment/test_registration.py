@@ -79,7 +79,7 @@ def align(faces, start, deviation_m, points=None, **settings):
 
 
 def off(T_map_sensor):
-    """Return how far a pose is from TRUE: m, deg."""
+    """Return the difference of a pose from TRUE: m, deg."""
     error = compose(inverse(TRUE), T_map_sensor)
     return np.linalg.norm(error[:3, 3]), math.degrees(rotation_angle(error))
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Aligning the scans of a window: drift goes, surfels get thin, bad input is refused."""
+"""Aligning the scans of a window: drift is removed, surfels get thin, bad input is refused."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from surfel_mapper.simulation import Lidar
 from test.alignment.street import drifted, relative_errors, street_scans
 
 WALLS = ((2, -1.9), (2, 3.0), (1, 4.0), (1, -5.0))
-"""Axis across each wall of a tunnel, and how far it is from the sensor."""
+"""Axis across each wall of a tunnel, and its distance from the sensor."""
 
 NOTHING = Samples(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))
 

@@ -94,7 +94,7 @@ def run(names: Sequence[str], chosen: Options) -> list[Row]:
 
 
 def rounded(row: Row) -> Row:
-    """Return a row with no more digits than clocks are good for."""
+    """Round the numbers of a row to the accuracy of clocks."""
     return {k: round(v, 4) if isinstance(v, float) else v for k, v in row.items()}
 
 

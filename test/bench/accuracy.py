@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Errors of normals on the street, ours beside those of k nearest neighbours.
+Errors of normals on the street, beside normals from k nearest neighbours.
 
 The points of some scans are mapped at their true poses; the truth is the normal of the surface
-nearest to where a normal is said to be. ``surfels``: at every surfel of 5 points and more, the
-others at the point nearest to it. ``points``: at points drawn at random from those in such
-surfels, ours being the normal of the surfel that holds the point. Support is equal: k is the
-median number of points of a surfel. Angles are between axes, as some know no side.
+nearest to the position of a normal. ``surfels``: at every surfel of at least 5 points; other
+packages at the point nearest to it. ``points``: at points drawn at random from such surfels; ours
+is the normal of the surfel of the point. Support is equal: k is the median number of points of a
+surfel. Angles are between axes, as some packages do not orient normals.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for everyone, by voxel size and place."""
+    """Return a row for each package, by voxel size and place."""
     street = Street(options)
     street.prepare(NUM_SCANS)
     rows: list[Row] = []

@@ -34,7 +34,7 @@ Floats = npt.NDArray[np.float64]
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for the true poses, those that drift, and those found; with the time."""
+    """Return rows for the true, drifting and aligned poses, with the time."""
     street = Street(options)
     street.prepare(options.window)
     true = np.array([street.pose(number) for number in range(options.window)])
@@ -54,7 +54,7 @@ def run(options: Options) -> list[Row]:
 
 
 def mapped(street: Street, poses: Floats) -> Mapper:
-    """Return a mapper that has mapped scans at poses, and kept their points."""
+    """Return a mapper with scans mapped at poses, whose points it keeps."""
     settings = {'max_scans': len(poses), 'keep_points': True}
     pose = {'source': 'odometry'}
     frames = {'base': SENSOR}
@@ -85,7 +85,7 @@ def errors(poses: Floats, true: Floats) -> Row:
 
 
 def thickness_mm(street: Street, poses: Floats) -> float:
-    """Return how thick flat surfels are of scans mapped at poses."""
+    """Return the thickness of flat surfels of scans mapped at poses."""
     surfel_map = SurfelMap(0.5)
     for number, T in enumerate(poses):
         surfel_map.insert(surfel_map.reduce(street.points(number), T, origin=T[:3, 3]))

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Ours beside numpy alone and, with --peers, beside others, on one core.
+The map beside plain numpy and, with --peers, beside other packages, on one core.
 
-All are fed the same scans at the same poses, and ``x_ours`` is how many times as long as ours
-they take. Ours and numpy read PointCloud2 of 32-byte steps; the peers get packed points, which
-is less work. What else a peer does less stands in the last column; none of those marked is exact.
-That numpy and ours hold the same integers at the end is checked. A peer that needs more than a
-second for a scan is given fewer scans.
+All get the same scans at the same poses; ``x_ours`` is the ratio of their time to ours. Ours and
+numpy read PointCloud2 of 32-byte steps; the peers get packed points, which is less work. The last
+column states the work that a peer leaves out; none of the marked ones is exact. The integers of
+numpy and of the map are compared at the end. A peer that needs more than a second for a scan is
+given fewer scans.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from test.bench.street import Street
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for everyone, by voxel size; the first is ours."""
+    """Return a row for each package, by voxel size; the first is ours."""
     street = Street(options)
     street.prepare(options.untimed + options.scans)
     rows: list[Row] = []
@@ -71,7 +71,7 @@ def numpy_step(numpy_map: NumpyMap, message: RawCloud, pose: np.ndarray) -> None
 
 
 def check_equal(numpy_map: NumpyMap, surfel_map: SurfelMap) -> None:
-    """Refuse to compare maps that do not hold the same."""
+    """Raise an error if two maps differ."""
     key, moments = numpy_map.state()
     found = (key, *(moments[:, part] for part in (COUNT, SUM, PRODUCT, VIEW)))
     for ours, theirs in zip(surfel_map.moments().arrays, found, strict=True):
@@ -80,7 +80,7 @@ def check_equal(numpy_map: NumpyMap, surfel_map: SurfelMap) -> None:
 
 
 def peer_rows(options: Options, street: Street, size_m: float, reference_ms: float) -> list[Row]:
-    """Return a row for each peer; of one that cannot be had or fails, only why."""
+    """Return a row for each peer; only the reason if it is missing or fails."""
     rows: list[Row] = []
     for peer in PEERS:
         try:
@@ -102,7 +102,7 @@ def row(
     reference_ms: float,
     voxels: int,
 ) -> Row:
-    """Return the row of one of those compared."""
+    """Return the row of a package."""
     figures = spread(times)
     return {
         'voxel_m': size_m,

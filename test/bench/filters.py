@@ -4,15 +4,15 @@
 Filters on one core, the voxel grid beside those of small_gicp, Open3D and PCL.
 
 Each row is the median of the processor times of some repeats on one scan, on which other load of
-the machine has less effect than on clock times. ``Mpt_s`` are millions of points that come in, a
-second. Voxel grids are timed twice, before and after those of others; ``x_ours`` says how many
-times as long the others take. PCL is compiled from peers/pcl_voxel_grid.cpp where a compiler and
-Debian's libpcl-dev are there (or where CPATH, LIBRARY_PATH and LD_LIBRARY_PATH lead to them);
+the machine has less effect than on clock times. ``Mpt_s``: million input points per
+second. Voxel grids are timed twice, before and after those of peers; ``x_ours`` is the ratio of
+the time of a peer to ours. PCL is compiled from peers/pcl_voxel_grid.cpp if a compiler and
+Debian's libpcl-dev are installed (or CPATH, LIBRARY_PATH and LD_LIBRARY_PATH name them);
 small_gicp and Open3D come with --peers. libpointmatcher has no package: its figure is stated, of
 another machine and one scan of 124,668 points.
 
 Scans are the simulated street and, where SURFEL_MAPPER_TEST_DATA leads to them, those of three
-real lidars in recorded order, in which hardly two points that follow each other share a voxel.
+real lidars in recorded order, in which consecutive points rarely share a voxel.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ CHAINS: dict[str, tuple[Any, float | None]] = {
 """Timed filters, and the rates they should reach, Mpt/s."""
 
 STATED = {'libpointmatcher': 13.6}
-"""Mpt/s of another as stated for one real scan, 0.5 m voxels, one core."""
+"""Stated rate of another package for one real scan, 0.5 m voxels, one core, Mpt/s."""
 
 REAL = ('VLS-128 street', 'OS2-128', '64 beams street')
 """Real scans, by their names in real.py."""

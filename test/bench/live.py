@@ -42,7 +42,7 @@ RATES_HZ = (25.0, 30.0, 35.0, 40.0, 50.0, 60.0, 80.0)
 SECONDS, SECONDS_A_RATE, SECONDS_IDLE = 15.0, 6.0, 8.0
 TIMEOUT_S = 300.0
 SETTLE_S = 2.0
-"""From the last cloud until a node is idle: the full map goes out at 2 Hz, diagnostics at 1 Hz."""
+"""Time from the last cloud until a node is idle, s: maps are sent at 2 Hz, diagnostics at 1 Hz."""
 
 IDLE_BUDGET = 3.0
 BUDGET_VOXEL_M = 0.5
@@ -74,7 +74,7 @@ def run(options: Options) -> list[Row]:
 
 
 def isolate() -> None:
-    """Keep ROS traffic on this machine, in a domain of this run's own."""
+    """Keep ROS traffic on this machine, in a ROS domain for this run."""
     os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
     os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
 
@@ -224,7 +224,7 @@ class Node:
         self._output.close()
 
     def wait_for(self, text: str) -> None:
-        """Wait until the node has said something."""
+        """Wait until the output of the node contains a text."""
         end_s = time.monotonic() + TIMEOUT_S
         while text not in (output := Path(self._output.name).read_text(encoding='utf-8')):
             if self._process.poll() is not None or time.monotonic() > end_s:
@@ -242,7 +242,7 @@ class Node:
         return pages * os.sysconf('SC_PAGE_SIZE') / 2**20
 
     def cpu_percent(self, seconds: float) -> float:
-        """Return the share of a core that the node takes for some time."""
+        """Return the load of the node over a period, in cores."""
         before_s = self.cpu_s()
         time.sleep(seconds)
         return 100.0 * (self.cpu_s() - before_s) / seconds
@@ -255,7 +255,7 @@ def listening() -> Iterator[Any]:
     from sensor_msgs.msg import PointCloud2
 
     class Listener:
-        """Notes when a change came, by its stamp, and how old each full map is."""
+        """Records the arrival time of each change by its stamp, and the age of each full map."""
 
         def __init__(self, listen_until: Listen) -> None:
             self.arrivals: dict[int, int] = {}

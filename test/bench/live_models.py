@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models that follow a map: an update where some 5,000 of its voxels have changed.
+Models that follow a map: an update after about 5,000 changed voxels.
 
 A lidar drives through the simulated street; the voxels within a radius of it change with every
-scan. Times are of the processor (cpu_ms), as others may be using it, and by the clock (median_ms).
-``access`` is what handing out all surfels and models adds.
+scan. Times are processor time (cpu_ms), as the machine may be shared, and clock time (median_ms).
+``access`` is the time to read all surfels and models.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def run() -> list[Row]:
 
 
 def street_scans() -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
-    """Return points in the frame of the map and where the sensor was, for every scan."""
+    """Return points in the frame of the map and the sensor position, for every scan."""
     lidar = Lidar(beams=64, columns=1024, range_noise_m=0.01)
     simulation = Simulation(World.street(seed=1, length_m=200.0), lidar)
     found = []

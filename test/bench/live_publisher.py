@@ -3,9 +3,9 @@
 """
 The lidar and the odometry of the live bench, a process each, by the defaults of the middleware.
 
-The lidar starts the odometry, and tells it when the drive begins. The drive goes forth and back
-over the scans held in memory, so that poses stay smooth however long it lasts. Clouds are stamped
-with the time at which they are due; latency counts from there.
+The lidar starts the odometry, and signals the begin of the drive. The drive goes back and forth
+over the scans held in memory, so poses stay smooth for any duration. Clouds are stamped with the
+time at which they are due; latency counts from there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from test.bench.options import Options
 from test.bench.street import Street
 
 NUM_SCANS = 60
-"""Held in memory, 4 MiB each."""
+"""Number of scans held in memory, 4 MiB each."""
 
 ODOMETRY_HZ = 100.0
 FASTEST_HZ = 100.0

@@ -4,10 +4,10 @@
 LUM on one core, beside PCL's; then how it grows with the edges.
 
 ``compute`` is one call of all iterations from clouds and pairs just given, sums over the pairs
-included; an iteration is the time of each further one. PCL is compiled from peers/pcl_lum.cpp,
-where a compiler and Debian's libpcl-dev are there (or where CPATH, LIBRARY_PATH and
-LD_LIBRARY_PATH lead to them), and gets the same graph; else its figures are those stated for that
-package on another machine, and marked so.
+included; an iteration is the time of each further one. PCL is compiled from peers/pcl_lum.cpp if
+a compiler and Debian's libpcl-dev are installed (or CPATH, LIBRARY_PATH and LD_LIBRARY_PATH name
+them), and gets the same graph; else its figures are those stated for another machine, and marked
+so.
 
 All are medians of processor times, on which other load of the machine has less effect than on
 clock times. PCL's are taken between two halves of ours.
@@ -109,7 +109,7 @@ def points(case: Case) -> np.ndarray:
 
 
 def ours(case: Case, clouds: np.ndarray) -> list[tuple[float, float]]:
-    """Return milliseconds of compute, and of an iteration more, of each repeat."""
+    """Return the milliseconds of compute, and of a further iteration, for each repeat."""
     pairs = np.repeat(np.arange(case.pairs)[:, None], 2, axis=1)
     found = []
     for _ in range(REPEATS):

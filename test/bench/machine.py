@@ -14,7 +14,7 @@ from typing import Any
 
 
 def facts() -> dict[str, Any]:
-    """Return what stays the same during a run."""
+    """Return the properties that are constant during a run."""
     return {
         'cpu': cpu_model(),
         'cores': os.cpu_count(),
@@ -25,7 +25,7 @@ def facts() -> dict[str, Any]:
 
 
 def load() -> float:
-    """Return how many processes wanted to run, on average over the last minute."""
+    """Return the load average over the last minute."""
     return round(os.getloadavg()[0], 2)
 
 
@@ -46,7 +46,7 @@ def installed(package: str) -> str | None:
 
 
 def resident_bytes() -> int:
-    """Return how much memory this process has, as Linux counts it."""
+    """Return the memory of this process as Linux states it."""
     pages = int(Path('/proc/self/statm').read_text(encoding='ascii').split()[1])
     return pages * os.sysconf('SC_PAGE_SIZE')
 

@@ -3,11 +3,10 @@
 """
 From a PointCloud2 to the normals of all voxels that changed, by stage, on one core.
 
-``calls`` are the bare calls of map and decoder, ``Mapper`` is the pipeline that node and replay
-use, with poses from odometry (its insert includes evict). ``total`` is measured around all of
-it, so it is a little more than the stages. Points a second count those without return, as the
-sensor does. Bytes are a live voxel's in the map, its share of the hash table included, and those
-that a scan in the window keeps for each of its voxels.
+``calls`` are direct calls of map and decoder, ``Mapper`` is the pipeline of node and replay, with
+poses from odometry (its insert includes evict). ``total`` is measured around all stages, so it is
+slightly more than their sum. Points per second include missing returns. Bytes are those of a
+voxel in the map, with its share of the hash table, and of a voxel of a scan in the window.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ def run(options: Options) -> list[Row]:
 
 
 def by_calls(ours: Ours, options: Options, street: Street) -> Times:
-    """Return the times of the bare calls."""
+    """Return the times of the direct calls."""
     times: Times = {}
     for number, message, counts in street.drive(options.untimed, options.scans):
         pose = street.pose(number)

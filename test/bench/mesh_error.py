@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""How far a mesh is from the truth and the truth from the mesh, in points spread over both."""
+"""Distances from mesh to truth and from truth to mesh, at points spread over both."""
 
 from __future__ import annotations
 
@@ -36,19 +36,18 @@ def mesh_error(
     triangles : (T, 3)
         Likewise.
     distance : callable
-        How far (N, 3) points are from the true surface, m.
+        Distance of (N, 3) points from the true surface, m.
     truth : (N, 3) float64, m
         Points of the true surface that were in view.
     voxel_size_m : float
-        What counts as found lies within this.
+        Distance within which a point counts as found.
 
     Returns
     -------
     dict
         accuracy_mm: mean distance of the mesh to the truth; complete_mm: mean distance of the
-        truth to the mesh, cut at four voxels, to triangles and not to the samples on them, whose
-        spacing would drown it; f_score: harmonic mean of the shares of both within
-        a voxel.
+        truth to the mesh, cut at four voxels, to triangles, because the spacing of samples would
+        exceed it; f_score: harmonic mean of the shares of both within a voxel.
 
     Raises
     ------
@@ -75,7 +74,7 @@ def mesh_error(
 
 
 def spread_over(corners: FloatArray, spacing_m: float) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Return points spread evenly at random over (T, 3, 3) triangles, and which each is on."""
+    """Return random points spread evenly over (T, 3, 3) triangles, and the triangle of each."""
     sides = corners[:, 1:] - corners[:, :1]
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2.0
     count = int(np.clip(area.sum() / spacing_m**2, 1, MAX_SAMPLES))
@@ -89,7 +88,7 @@ def spread_over(corners: FloatArray, spacing_m: float) -> tuple[FloatArray, npt.
 
 
 def to_triangles(points: FloatArray, corners: FloatArray) -> FloatArray:
-    """Return how far each of (N, 3) points is from its triangle of (N, 3, 3), m."""
+    """Return the distance of each of (N, 3) points from its triangle of (N, 3, 3), m."""
     ends = np.roll(corners, -1, axis=1)
     normal = np.cross(ends[:, 0] - corners[:, 0], ends[:, 1] - corners[:, 1])
     length = np.linalg.norm(normal, axis=1)

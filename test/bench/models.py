@@ -5,9 +5,9 @@ Planes, surfaces and Gaussians of a depth camera's clouds of 640 x 480, by voxel
 
 A room of analytic surfaces without noise, and the same with that of a Kinect; on one core, from
 the organised points to the models, thinning included. Precision and completeness are against the
-points themselves, also of Gaussians alone (gmm_). Frames a second are by the least time of the
-processor (cpu_ms), as others may be using it. Open3D gets normals and finds planes only, from
-the cloud thinned to 1 cm and from all of it.
+points themselves, also of Gaussians alone (gmm_). Frames per second follow from the least
+processor time (cpu_ms), as the machine may be shared. Open3D gets normals and finds planes only,
+from the cloud thinned to 1 cm and from the whole cloud.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ def fastest_stages(models: Sequence[MultiModel]) -> dict[str, float]:
 
 
 def accuracy(points: npt.NDArray[np.float32], config: ModelsConfig) -> dict[str, Any]:
-    """Return how well the models, and Gaussians alone, stand for the points."""
+    """Return precision and completeness of the models, and of Gaussians alone."""
     found = evaluate(fit(points, config, VIEW), points)
     alone = ModelsConfig(
         voxel_size_m=config.voxel_size_m,

@@ -4,12 +4,12 @@
 The same exact windowed map in plain numpy, without compiled kernels.
 
 Its integers equal those of SurfelMap, views included (test_numpy_map.py; the bench compares them
-too). It is as fast as we could write it: runs of consecutive points in one voxel are summed by
-differences of a running sum, so only a sixth to a third as many keys need sorting; eviction
-knows its rows and searches nothing. Most of its time goes to numpy.linalg.eigh. Limits of
-indices and counts are not checked.
+too). It is optimised: runs of consecutive points in one voxel are summed by differences of a
+running sum, which leaves a sixth to a third of the keys to sort; eviction keeps its rows and
+needs no search. Most of its time goes to numpy.linalg.eigh. Limits of indices and counts are not
+checked.
 
-Imports numpy only, because others use it in environments without the package.
+Imports numpy only, because peers use it in environments without the package.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class NumpyMap:
     ----------
     voxel_size_m : float
     window : int
-        How many scans stay.
+        Number of scans in the window.
 
     """
 

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Replay of a bag of the simulated street, on one core: how many times faster than it was recorded.
+Replay of a bag of the simulated street, on one core, in times real time.
 
 The lidar turns at 10 Hz, so 10 ms a scan are ten times real time. ``read`` yields the messages of
 clouds and poses, ``decode`` makes scans and poses of them, ``replay`` maps them at 0.5 m with all
 scans kept, ``command`` is the whole of `surfel-mapper replay`: a process of its own, kernels
 loaded, map, picture, report and summary written. Each is the fastest of several runs, with the
-bag in the cache of the system; core_ms_scan is processor time, which changes little
-where others load the machine. The bag is kept beside the scans of the other benches.
+bag in the cache of the system; core_ms_scan is processor time, which depends little on other
+load. The bag is kept beside the scans of the other benches.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ RUNS = 3
 POINTS, ODOMETRY = '/points', '/odom'
 
 BUDGET_TIMES = 10.0
-"""How many times faster than recorded a replay has to be at least."""
+"""Least speed of a replay, times real time."""
 
 
 def run(options: Options) -> list[Row]:

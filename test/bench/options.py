@@ -9,11 +9,11 @@ import os
 from pathlib import Path
 
 WARM_SCANS = 5
-"""So many scans go through a full window before the clock starts: kernels are loaded by then."""
+"""Number of scans mapped into a full window before timing starts; by then kernels are loaded."""
 
 
 def cache_directory() -> Path:
-    """Return where simulated scans and environments of others are kept between runs."""
+    """Return the directory of simulated scans and of the environments of peers."""
     caches = os.environ.get('XDG_CACHE_HOME') or Path.home() / '.cache'
     return Path(caches) / 'surfel_mapper_bench'
 
@@ -32,13 +32,13 @@ class Options:
     windows : tuple of int
         Compared lengths of the window; times are divided by that of the first.
     map_voxels : tuple of int
-        Sizes of map that are compared, likewise.
+        Compared sizes of the map; times are divided by that of the first.
     voxel_sizes_m : tuple of float
         Edges of voxels.
     beams, columns : int
         Of the simulated lidar.
     peers : bool
-        Whether others are measured that have to be installed first.
+        Whether other packages are installed and measured too.
     cache : Path
         Directory of files kept between runs.
 
@@ -65,7 +65,7 @@ class Options:
         return self.window + WARM_SCANS
 
     def quick(self) -> Options:
-        """Return options by which everything takes seconds, for comparing while working."""
+        """Return options for runs of some seconds, for use while working."""
         return replace(
             self, scans=25, window=25, windows=(10, 50), map_voxels=(100_000, 1_000_000)
         )

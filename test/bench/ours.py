@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The job itself by the calls it consists of, each stage timed: what Mapper does, without Mapper.
+The mapping of a scan by direct calls, each stage timed, without Mapper.
 
 Decode a PointCloud2, reduce it to moments, insert them, evict the oldest scan, derive the normals
 of all voxels that changed.
@@ -32,7 +32,7 @@ class Ours:
     voxel_size_m : float
         Edge of a voxel.
     window : int
-        How many scans stay.
+        Number of scans in the window.
 
     """
 
@@ -56,7 +56,7 @@ class Ours:
         }
 
     def put(self, moments: ScanMoments, clock: Callable[[], float] = perf_counter) -> list[float]:
-        """Insert a reduced scan; return when that, evicting and deriving were done, s."""
+        """Insert a reduced scan; return the times at the end of insert, evict and derive, s."""
         version = self.map.version
         self.map.insert(moments)
         self.scans.append(moments)

@@ -5,8 +5,9 @@ Outputs of the node beside the map, and inputs beside clouds, on one core.
 
 Each is timed as the mapping thread does it, from the map to the bytes of the message: markers of
 20,000 discs (choosing them, their surfels, vertices, CDR), changes of one scan with and without
-exact moments, the scan with normals, the grid, the models; and the other way deskewing of a sweep,
-a depth image of 640 x 480, and the time of a mirror to follow one change. Publishing is not in it.
+exact moments, the scan with normals, the grid, the models; and of inputs: deskewing of a sweep, a
+depth image of 640 x 480, and the time of a mirror to follow one change. Publishing is not
+included.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ NOTHING = np.empty((0, 3), np.int32)
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for everything that goes out or comes in."""
+    """Return a row for every output and input."""
     keep_freed_memory()  # as the node does
     with one_core():
         mapper, update = mapped(options)
@@ -65,7 +66,7 @@ def run(options: Options) -> list[Row]:
 
 
 def row(name: str, task: Callable[[], Any]) -> Row:
-    """Return the times of a task, after one that does not count."""
+    """Return the times of a task, after a first run that is not counted."""
     task()
     times = []
     for _ in range(REPEATS):
@@ -99,7 +100,7 @@ def mapped(options: Options) -> tuple[Mapper, Update]:
 
 
 def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
-    """Return what draws, by colour."""
+    """Return functions that build the markers, by colour."""
     ages = Ages()
 
     def draw(kind: str) -> bytes:
@@ -133,7 +134,7 @@ def models(mapper: Mapper) -> dict[str, Callable[[], Any]]:
 
 
 def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
-    """Return what makes the clouds of one scan, and the grid."""
+    """Return functions that build the clouds of one scan, and the grid."""
     surfel_map, changed = mapper.map, update.changed
     center, limits = update.T_map_sensor[:2, 3], GridConfig()
 
@@ -152,7 +153,7 @@ def clouds(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
 
 
 def inputs(mapper: Mapper, update: Update) -> dict[str, Callable[[], Any]]:
-    """Return what deskews, turns depth into points, and mirrors."""
+    """Return functions that deskew, convert depth images to points, and mirror."""
     scan, camera = update.scan, PinholeCamera(640, 480, 600.0, 600.0, 320.0, 240.0)
     times = np.linspace(0.0, 0.09, len(scan), dtype=np.float32)
     sweep = replace(scan, columns={'time': times})

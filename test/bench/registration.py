@@ -1,16 +1,15 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Poses found by registration: drift and time a scan, ours and with --peers those of others.
+Poses by registration: drift and time a scan, with --peers also of other packages.
 
-All get the same scans, on one core, and are judged by one estimator against the same truth: the
-error of each step, the drift over stretches of the way, and how far the end is off. The time of
-ours is that of the Mapper, normals of all changed voxels included. Others run at the voxel sizes
-that suit them: KISS-ICP's default is 1 m for a range of 100 m.
+All get the same scans, on one core, and one estimator compares them with the same truth: the
+error of each step, the drift over segments of the path, and the error at the end. Our time is
+that of the Mapper, normals of all changed voxels included. Peers run at the voxel sizes that suit
+them: KISS-ICP's default is 1 m for a range of 100 m.
 
 The street has exact truth. The real sequences, if SURFEL_MAPPER_TEST_DATA names their folder,
-have the poses of another odometry, which drifts itself: all that fit the scans well agree on
-their difference from it.
+have the poses of another odometry, which drifts too.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ REAL = ('hall_os0_full', 'hall_os0_long')
 SIZES_M = (0.5, 1.0)
 
 Times = dict[str, list[float]]
-"""milliseconds by the clock and cpu_ms of the processor, which others hardly change."""
+"""Clock time and processor time of a scan, ms; the latter depends little on other load."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +63,7 @@ class Recording:
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for everyone, by sequence."""
+    """Return a row for each package, by sequence."""
     rows: list[Row] = []
     with one_core(), sequences(options) as found:
         for sequence in found:
@@ -98,7 +97,7 @@ def ours(sequence: Recording, size_m: float) -> tuple[Times, npt.NDArray[np.floa
 
 
 def peer_rows(options: Options, sequence: Recording) -> list[Row]:
-    """Return the rows of the peers; of one that cannot be had or fails, only why."""
+    """Return the rows of the peers; only the reason if one is missing or fails."""
     rows: list[Row] = []
     for peer in ODOMETRY_PEERS:
         for size_m in SIZES_M:
@@ -120,7 +119,7 @@ def row(
     times: Times,
     poses: npt.NDArray[np.float64],
 ) -> Row:
-    """Return the row of one of those compared."""
+    """Return the row of a package."""
     step = relative_errors(poses, sequence.poses)
     drift_m, drift_deg = drift(poses, sequence.poses)
     ends = [np.linalg.inv(track[0]) @ track[-1] for track in (poses, sequence.poses)]

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Rows of figures: how times are summed up, and rows as a table for people."""
+"""Rows of figures: statistics of times, and rows as a table."""
 
 from __future__ import annotations
 

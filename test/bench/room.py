@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-A room seen by a depth camera, both exact: walls, a table's block and a ball, and a camera's round.
+A room seen by a depth camera, both exact: walls, a block, a ball, a circling camera.
 
-Everything follows from equations, so that a mesh can be held against the true surface.
+Everything follows from equations, so a mesh can be compared with the true surface.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def depth(T_room_camera: FloatArray) -> npt.NDArray[np.float32]:
 
 
 def distance(points: FloatArray) -> FloatArray:
-    """Return how far (N, 3) points are from the nearest surface, m."""
+    """Return the distance of (N, 3) points from the nearest surface, m."""
     walls = np.abs(box_distance(points, ROOM))
     block = np.abs(box_distance(points, BLOCK))
     ball = np.abs(np.linalg.norm(points - BALL, axis=1) - BALL_RADIUS_M)

@@ -3,13 +3,12 @@
 """
 Cost of a scan in longer windows and larger maps, on one core.
 
-It should be the same. The compared maps take turns, scan by scan, so that other work that
-the machine does hits all alike, and every other scan in the opposite order, so that none always
-finds the scan in the cache. ``ratio`` is between medians, the first being 1.
-
-In a longer window the scan that leaves has seen other places than the one that comes, so more
-voxels change: ``changed`` is how many in the median, ``ratio_changed`` the ratio of the times by
-changed voxel. The larger maps hold voxels far from the street that no scan touches.
+It should be the same. The compared maps take turns, scan by scan, so that other load affects all
+equally, and every other scan in the opposite order, so that no map always finds the scan in the
+cache. ``ratio`` is between medians, the first being 1. In a longer window the evicted scan shares
+fewer voxels with the new one, so more voxels change: ``changed`` is their median number,
+``ratio_changed`` the ratio of the times by changed voxel. The larger maps hold voxels far from
+the street that no scan touches.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ FAR_INDEX = 20_000
 """Start of the block of filler voxels, far along x."""
 
 BATCH = 10_000
-"""So many are added at once: fewer than a scan has, for which the map keeps memory to reduce."""
+"""Number of voxels added at once; fewer than a scan has, so no more memory is kept."""
 
 Figures = dict[int, list[float]]
 """A figure a scan, by the varied quantity."""

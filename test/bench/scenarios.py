@@ -3,7 +3,7 @@
 """
 Scenarios that are hard for registration, simulated with known poses.
 
-A scan is measured from one pose, so that nobody has to deskew. Scans are 64 beams by 1024 columns
+A scan is measured from one pose, so no deskewing is needed. Scans are 64 beams by 1024 columns
 with 2 cm of noise at 10 Hz, if a scenario does not state otherwise.
 """
 

@@ -3,9 +3,9 @@
 """
 The scans of all benchmarks: a lidar of 131,072 points driving through the simulated street.
 
-Simulated once and kept as .npy, a file a scan, in a directory named by a hash of all that the
-points depend on. Messages are laid out as drivers do it, 32 bytes a point, and are 4 MiB each:
-of a list of them, none is in a cache any more when its turn comes.
+Simulated once and kept as .npy, a file a scan, in a directory named by a hash of the parameters.
+Messages have the layout of drivers, 32 bytes a point, 4 MiB each; in a list of them none is still
+in a cache when it is used.
 """
 
 from __future__ import annotations
@@ -101,8 +101,8 @@ class Street:
         """
         Yield number, message and whether it counts, of each run of scans.
 
-        All that count are in memory before the first of them is yielded, and so are cold in the
-        caches when their turn comes.
+        All counted ones are in memory before the first is yielded, and so are not in a cache when
+        used.
         """
         for number in range(untimed):
             yield number, self.message(number), False
@@ -111,7 +111,7 @@ class Street:
             yield untimed + later, message, True
 
     def _hash(self) -> str:
-        """Return a short hash of everything that points depend on."""
+        """Return a short hash of the parameters of the points."""
         world = self.simulation.world.to_mapping()
         state = [world, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:12]

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Planes as people see them: labelled Kinect frames of objects on a table (OSD), by voxel size.
+Planes of labelled Kinect frames of objects on a table (OSD), by voxel size.
 
 Means over the frames of: ``table``, the share of the flat table points in one plane; ``free``, the
 share of object points in no patch; ``impure``, the share of points in patches whose label is not

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmarks run, on a lidar of 512 points; how long anything takes is not tested."""
+"""The benchmarks run, on a lidar of 512 points; times are not tested."""
 
 from __future__ import annotations
 

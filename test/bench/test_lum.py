@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of LUM makes the graphs that it says it does; how fast is not tested."""
+"""The benchmark of LUM makes the stated graphs; times are not tested."""
 
 from __future__ import annotations
 

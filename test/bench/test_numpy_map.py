@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The composition in numpy that we compare with holds what our map holds, and says the same."""
+"""The map in plain numpy holds the same integers and surfels as SurfelMap."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZE_M, WINDOW = 0.5, 3
 
 
 def pose(number):
-    """Return where the sensor is at a scan, moving on so that voxels come and go."""
+    """Return the position of the sensor at a scan; it moves, so voxels come and go."""
     return pose_matrix((1.7 * number, -0.4 * number, 0.2), (0.1, 0.2, 0.3, np.sqrt(0.86)))
 
 
@@ -33,7 +33,7 @@ def scan(number):
 
 @pytest.fixture(scope='module')
 def maps():
-    """Return the numpy map, our map, and what both say changed after ten scans."""
+    """Return the numpy map, the SurfelMap, and the changes of both after ten scans."""
     numpy_map, surfel_map = NumpyMap(SIZE_M, WINDOW), SurfelMap(SIZE_M)
     scans: list[ScanMoments] = []
     for number in range(10):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The benchmark of replays runs; how long anything takes is not tested."""
+"""The benchmark of replays runs; times are not tested."""
 
 from test.bench import __main__ as bench
 from test.bench import offline

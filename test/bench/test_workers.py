@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The ways that the bench of workers compares make the same map; here without workers."""
+"""All ways compared by the bench of workers make the same map; here without workers."""
 
 import pytest
 

@@ -1,13 +1,13 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Two threads against one, the same scans through both: decode to normals.
+Two threads against one on the same scans, from decode to normals.
 
 ``calls``: one thread decodes and reduces the next scan while the other inserts this one and
 derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
-a replay or a node with a backlog. The two take turns, twenty scans at a time, and every other turn
-in the opposite order; ``ratio`` is the median of the ratios of the turns. Maps have to be equal
-in the end.
+a replay or a node with a backlog. The two take turns, twenty scans at a time, and every other
+turn in the opposite order; ``ratio`` is the median of the ratios of the turns. The maps are
+compared at the end.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Turn = Sequence[tuple[int, RawCloud]]
 
 
 class ByCalls(Ours):
-    """The bare calls, by one thread or two."""
+    """The direct calls, by one thread or two."""
 
     name = 'calls'
 

@@ -1,12 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tracking where it is hard: thinned scans, trucks that move along, spins, corridors, tunnels.
+Tracking on hard input: thinned scans, trucks that move along, spins, corridors, tunnels.
 
 Errors are the root mean square of the positions after the best fit of the whole track, all with
-one estimator. Ours comes with what the summary of a replay says about it: scans without a place,
-ambiguous and degenerate ones, parts that stayed apart. Peers run at 0.5 and 1 m voxels; the better
-is shown.
+one estimator. Our rows have the counts of the summary of a replay: lost, ambiguous and degenerate
+scans, parts that stayed apart. Peers run at 0.5 and 1 m voxels; the better is shown.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ def run(options: Options) -> list[Row]:
 
 
 def row(options: Options, sequence: Recording) -> Row:
-    """Return the errors of everyone on a sequence."""
+    """Return the errors of each package on a sequence."""
     result: dict[str, Any] = {'sequence': sequence.name, **ours(sequence)}
     for peer in ODOMETRY_PEERS if options.peers else ():
         errors = []
@@ -58,7 +57,7 @@ def row(options: Options, sequence: Recording) -> Row:
 
 
 def ours(sequence: Recording) -> Row:
-    """Return the error of the Mapper at 0.5 m voxels, and what it says itself."""
+    """Return the error of the Mapper at 0.5 m voxels, and its own counts."""
     mapper = Mapper(Config.from_mapping({'pose.source': 'registration'}))
     mapper.warm_up()
     found = {}
@@ -84,7 +83,7 @@ def ours(sequence: Recording) -> Row:
 
 
 def sequences(options: Options, scratch: Path) -> Iterator[Recording]:
-    """Yield the scans of all sequences as files; the real ones if their data is there."""
+    """Yield the scans of all sequences as files; the real ones if their data is present."""
     data = os.environ.get('SURFEL_MAPPER_TEST_DATA')
     for name, every in THINNED if data else ():
         whole = recorded(Path(str(data)) / 'data' / 'bags' / name, scratch)

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Fusing scans and depth images into a signed distance field, beside others, and the meshes' errors.
+Fusion of scans and depth images into a signed distance field, and errors of the meshes.
 
 The street's lidar at 0.2 m with a truncation of 3 voxels, with and without carving, and a depth
 camera that turns in a room at 4 cm and 1 cm with 4 voxels, and with colours; on one core.
-``x_ours`` is between the times of the processor, which others at work change less than those of
-the clock. Ours begins with points or depths in the frame of the sensor; VDBFusion is given points
-that are in the map already. The errors of meshes are taken against the equations of street and
-room; a mesh that is empty or less than half right fails.
+``x_ours`` is the ratio of processor times, which depend less on other load than clock times. Our
+input is points or depths in the frame of the sensor; VDBFusion gets points in the map frame.
+Errors of meshes are distances from the equations of street and room; a mesh that is empty or less
+than half complete fails.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from test.bench.street import Street
 FloatArray = npt.NDArray[np.float64]
 
 WARM = 3
-"""So many scans are not counted."""
+"""Number of first scans that are not counted."""
 
 LEAST_F_SCORE = 0.5
 
@@ -62,7 +62,7 @@ class Case:
     Attributes
     ----------
     name : str
-        As it stands in the table.
+        Name in the table.
     voxel_size_m, truncation_m, carve
         Of the field.
     files : list of Path
@@ -72,15 +72,15 @@ class Case:
     image : callable
         A range image of the content of a file.
     distance : callable
-        How far points are from the true surface, m.
+        Distance of points from the true surface, m.
     truth : (N, 3) float64, m
         Points of it that were in view.
     peers : tuple of PeerSpec
-        Whom to compare with.
+        Packages to compare with.
     settings : dict
-        What else those are told.
+        Further settings of the peers.
     ours : dict
-        Settings of ours beside the defaults.
+        Our settings beside the defaults.
 
     """
 
@@ -99,7 +99,7 @@ class Case:
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for everyone in every case; the first of each is ours."""
+    """Return a row for each package in every case; the first of each is ours."""
     rows: list[Row] = []
     scans = min(options.scans, 30)
     for case in [*street_cases(options, scans), *room_cases(options, scans)]:

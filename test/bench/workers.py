@@ -6,10 +6,9 @@ Bags with one process and two workers: speed, start, and memory for more input.
 ``speed``: one bag, four times; ``one process`` maps them without writing, workers end with a
 dataset of tiles and its digest. Kernels are loaded. They take turns and the fastest run of each
 counts. ``start``: until a fresh process, or its workers, have loaded all that mapping needs.
-``holds from`` is the length of recordings from which on workers, their start included, are as
-fast as they have to be, by these figures. ``memory``: a quarter, a half and all of the drive, with
-shards of one quarter, in fresh processes; the most that any had. The digests of all ways are
-compared.
+``holds from`` is the least length of a recording at which workers, their start included, reach
+the required speed-up, by these figures. ``memory``: a quarter, a half and all of the drive, with
+shards of one quarter, in fresh processes; the peak of any process. All digests are compared.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ LONGER = 4
 """Scans of the drive, as a multiple of other benches."""
 
 DRIVES = 4
-"""So many times it is mapped for the speed."""
+"""Number of runs for the speed."""
 
 RUNS = 2
 
@@ -60,7 +59,7 @@ STARTS = {
         'from surfel_mapper.cluster import map_reduce\nwith open_executor(workers=2):\n    say()'
     ),
 }
-"""Programs that say when they are ready to map."""
+"""Programs that print when they are ready to map."""
 
 SAY = 'import sys, time\ndef say(): print(time.time() - float(sys.argv[1]))\n'
 
@@ -74,7 +73,7 @@ def run(options: Options) -> list[Row]:
 
 
 def speed_rows(bag: Path) -> list[Row]:
-    """Return how fast each way is."""
+    """Return the speed of each way."""
     requests = [Request(path=bag) for _ in range(DRIVES)]
     seconds: dict[str, list[float]] = {}
     found: dict[str, tuple[str, float, float]] = {}
@@ -107,7 +106,7 @@ def speed_rows(bag: Path) -> list[Row]:
 
 
 def start_rows() -> list[Row]:
-    """Return how long each way takes to begin."""
+    """Return the start-up time of each way."""
     rows: list[Row] = []
     for name, program in STARTS.items():
         seconds = []
@@ -120,7 +119,7 @@ def start_rows() -> list[Row]:
 
 
 def holds_from(speed: list[Row], start: list[Row]) -> Row:
-    """Return from which length of recordings on workers are fast enough, start included."""
+    """Return the least length of a recording at which workers are fast enough, start included."""
     start_s = {row['who']: row['seconds'] for row in start}
     share = {row['who']: row['seconds'] / row['recorded_s'] for row in speed}
     late_s = BUDGET_RATIO * start_s['two workers'] - start_s['one process']
@@ -154,14 +153,14 @@ def by(executor: Executor, requests: list[Request]) -> tuple[str, float, float]:
 
 
 def tiled(executor: Executor, requests: list[Request], shard_s: float) -> MapReduceResult:
-    """Map drives into tiles that are thrown away."""
+    """Map drives into temporary tiles."""
     shards = [shard for request in requests for shard in cut(request, CONFIG, shard_s)]
     with tempfile.TemporaryDirectory() as directory:
         return map_bags(shards, executor, Path(directory))
 
 
 def memory_rows(bag: Path) -> list[Row]:
-    """Return how much memory each way needs for a quarter, a half and all of a drive."""
+    """Return the memory of each way for a quarter, a half and all of a drive."""
     with open_recording(Request(path=bag), CONFIG) as recording:
         whole_s = recording.recorded_s
     rows: list[Row] = []
@@ -182,13 +181,13 @@ def memory_rows(bag: Path) -> list[Row]:
 
 
 def peak_of_one(requests: list[Request]) -> tuple[str, int]:
-    """Map drives; return digest, and the most memory that this process had."""
+    """Map drives; return digest and peak memory of this process."""
     keep_freed_memory()
     digest, _, _ = in_one_process(requests)
     return digest, peak_bytes()
 
 
 def check_equal(digests: set[str]) -> None:
-    """Refuse to compare ways that do not make the same map."""
+    """Raise an error if two ways make different maps."""
     if len(digests) > 1:
         raise RuntimeError(f'the maps differ: {digests}')

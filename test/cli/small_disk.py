@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A disk of a few megabytes, mounted for one process alone, who may fill it up."""
+"""A disk of a few megabytes, mounted for one process only, to be filled."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper replay`` writes map, picture and summary, or says why it does not."""
+"""``surfel-mapper replay`` writes map, picture and summary, or states why it refuses."""
 
 import json
 import logging

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""``surfel-mapper replay --align`` takes the drift of the odometry out of map and poses."""
+"""``surfel-mapper replay --align`` removes the drift of the odometry from map and poses."""
 
 from __future__ import annotations
 

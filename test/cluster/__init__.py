@@ -1,3 +1,3 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Tests of shards, tiles and those who work on them."""
+"""Tests of shards, tiles and workers."""

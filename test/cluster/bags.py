@@ -117,7 +117,7 @@ def in_one_go(bag, config, **part):
 
 
 def counted(summary):
-    """Return those counts of a summary that have to be the same however bags are cut."""
+    """Return the counts of a summary that must not depend on the cuts of bags."""
     return {
         name: value
         if not isinstance(value, dict)

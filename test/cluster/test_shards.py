@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""However a bag is cut, its shards make the map and the counts that it makes in one go."""
+"""Shards of a bag, cut anywhere, give the map and the counts of one run."""
 
 from dataclasses import replace
 from itertools import pairwise

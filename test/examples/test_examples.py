@@ -3,8 +3,8 @@
 """
 Every example runs as a process of its own, and its output is true.
 
-What they print is compared with the command line, with a second way to the same number, or with
-the content of the file it writes.
+The output is compared with the command line, with another computation of the number, or with the
+content of the written file.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ def scan_of(points, stamp_ns=10**18, **columns):
 
 
 def random_scan(num_points=500, seed=0, dtype=np.float32):
-    """Return a scan with every column that some filter needs, and some that clouds bring."""
+    """Return a scan with every column that a filter needs, and further ones of clouds."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-4.0, -4.0, -1.0], [4.0, 4.0, 1.0], (num_points, 3)).astype(dtype)
     normals = rng.normal(size=(num_points, 3))

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Filters that add columns or go by them, against values known by hand."""
+"""Filters that add or use columns, against values computed by hand."""
 
 from __future__ import annotations
 

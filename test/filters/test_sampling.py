@@ -229,7 +229,7 @@ def test_normal_space_depends_on_seed_and_stamp():
 
 
 def stability(points, normals):
-    """Return the eigenvalues of what resists motions over the largest, ascending."""
+    """Return the eigenvalues of the information about motions over the largest, ascending."""
     arms = points - points.mean(axis=0)
     arms /= np.linalg.norm(arms, axis=1).mean()
     forces = np.hstack([np.cross(arms, normals), normals])

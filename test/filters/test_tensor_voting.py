@@ -38,7 +38,7 @@ def slow_first(points, ids, sigma, to_neighbours):
 
 
 def slow_closed_form(points, ids, tensors, sigma, symmetric):
-    """Return the votes in closed form as matrices, from equation 11 as it stands."""
+    """Return the votes in closed form as matrices, from equation 11."""
     found = np.zeros((len(ids), 3, 3))
     for votes, near in zip(found, ids, strict=True):
         for other in near[1:]:

@@ -4,8 +4,8 @@
 Search for inputs that break a harness: ``python -m test.fuzz [NAME ...] --seconds 60``.
 
 Each harness runs in a process of its own, which atheris ends at the first finding: an exception
-that is not ours, more memory than any input is worth, or too much time. What is found lies in a
-file whose name is printed; ``--input FILE`` tries it again.
+of another class, memory beyond the limit, or too much time. The input is written to a file whose
+name is printed; ``--input FILE`` runs it again.
 """
 
 from __future__ import annotations

@@ -35,13 +35,13 @@ def written(write: Callable[[Path], object], name: str) -> bytes:
 
 
 def noise() -> list[bytes]:
-    """Return bytes for harnesses that make choices of them."""
+    """Return bytes for harnesses that derive choices from them."""
     rng = np.random.default_rng(3)
     return [b'', *(rng.bytes(size) for size in (40, 200, 600))]
 
 
 def packed_images() -> list[bytes]:
-    """Return small images packed as PNG and JPEG, behind a byte that says how."""
+    """Return small images as PNG and JPEG, after a byte for the format."""
     from PIL import Image
 
     depth = np.arange(12, dtype=np.uint16).reshape(3, 4) * 900
@@ -75,7 +75,7 @@ def small_drive(store=recorded.ROS2) -> recorded.Entries:
 
 
 def clouds() -> list[bytes]:
-    """Return clouds as ROS 2 and ROS 1 serialise them, behind a byte that says which."""
+    """Return clouds serialised for ROS 2 and ROS 1, after a byte for the version."""
     found = []
     for store, first in ((recorded.ROS2, b'\0'), (recorded.ROS1, b'\xff')):
         message = next(m for _, type_, _, m in small_drive(store) if type_ == recorded.CLOUD)
@@ -155,7 +155,7 @@ def packed() -> list[bytes]:
 
 
 def columns() -> dict[str, np.ndarray]:
-    """Return a few points with more than their place."""
+    """Return a few points with further columns."""
     rng = np.random.default_rng(1)
     xyz = {name: rng.normal(size=NUM_POINTS).astype(np.float32) for name in 'xyz'}
     return {**xyz, 'ring': np.arange(NUM_POINTS, dtype=np.uint16), 'time': rng.uniform(size=7)}
@@ -240,7 +240,7 @@ def kitti_times() -> list[bytes]:
 
 
 def settings() -> list[bytes]:
-    """Return files of settings, with and without what ROS puts around them."""
+    """Return files of settings, with and without the keys of ROS."""
     lines = [f'  {k}: {v!r}' for k, v in list(Config().to_mapping().items())[:20]]
     return [
         b'map: {voxel_size_m: 0.5}\nwindow: {max_scans: 7}\n',

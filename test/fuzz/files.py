@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Harnesses of files: bags, maps, points, poses, settings; and of names of files asked for."""
+"""Harnesses of files: bags, maps, points, poses, settings; and of requested file names."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ MOST_MESSAGES = 10_000
 
 @cache
 def folder() -> tempfile.TemporaryDirectory:
-    """Return a directory for inputs that have to be files; it vanishes with the process."""
+    """Return a directory for inputs that have to be files; it is deleted with the process."""
     return tempfile.TemporaryDirectory(prefix='surfel_mapper-fuzz-')
 
 
@@ -62,7 +62,7 @@ def refused(function: Callable[..., object], name: str, data: bytes) -> None:
 
 
 def read_bag(path: Path) -> None:
-    """Read all of a bag that can be read; a message that cannot is no reason to end."""
+    """Read all messages of a bag; continue after those that cannot be read."""
     with BagReader(path) as reader:
         for topic in reader.topics:
             reader.is_latched(topic.name)
@@ -216,7 +216,7 @@ def settings(data: bytes) -> None:
 
 
 def chain(data: bytes) -> None:
-    """Read a chain of filters, and have it filter."""
+    """Read a chain of filters, and apply it."""
 
     def run(path: Path) -> None:
         chain_ = Chain.load(path)

@@ -28,7 +28,7 @@ def cloud_bytes(data: bytes) -> None:
 
 
 def cloud_message(data: bytes) -> None:
-    """Read the points of a message whose members are made up."""
+    """Read the points of a message with generated members."""
     source = Source(data)
     fields = [
         Field(
@@ -62,7 +62,7 @@ def cloud_message(data: bytes) -> None:
 
 
 def depth_image(data: bytes) -> None:
-    """Read a depth image and the calibration of its camera, whose members are made up."""
+    """Read a depth image and the calibration of its camera, with generated members."""
     source = Source(data)
     width, height = source.below(9), source.below(9)
     roi = SimpleNamespace(
@@ -97,7 +97,7 @@ def depth_image(data: bytes) -> None:
 
 
 def packed_image(data: bytes) -> None:
-    """Read an image that a transport has packed; the first byte says how."""
+    """Read a compressed image; the first byte selects the format."""
     ways = (
         ('16UC1; compressedDepth png', True),
         ('32FC1; compressedDepth png', True),
@@ -147,7 +147,7 @@ def drive(data: bytes) -> None:
 
 
 def add_pose(mapper: Mapper, source: Source, stamp_ns: int) -> None:
-    """Give a mapper a pose, now and then an impossible one."""
+    """Give a mapper a pose, sometimes an invalid one."""
     xyz = [source.real() if source.chance(6) else float(source.below(9)) for _ in range(3)]
     turn = [0.0, 0.0, 0.0, 1.0]
     if source.chance(4):
@@ -158,7 +158,7 @@ def add_pose(mapper: Mapper, source: Source, stamp_ns: int) -> None:
 
 
 def scan_of(source: Source, stamp_ns: int) -> Scan:
-    """Return a scan of a few points, some of them nowhere."""
+    """Return a scan of a few points, some of them not finite."""
     dtype = source.pick((np.float32, np.float64))
     points = np.frombuffer(source.bytes(24 * 3), '<f8').reshape(-1, 3).copy()
     if source.below(4):
@@ -176,7 +176,7 @@ def unsigned(source: Source) -> int:
 
 
 def header(source: Source) -> SimpleNamespace:
-    """Return the header of a message, sometimes with a stamp that is none."""
+    """Return the header of a message, sometimes with an invalid stamp."""
     stamp = SimpleNamespace(
         sec=source.number() if source.chance(8) else 1, nanosec=unsigned(source)
     )

@@ -10,7 +10,7 @@ import random
 EDGES = (0, 1, 0x7F, 0x80, 0xFF, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
 
 MAX_BYTES = 1 << 16
-"""Inputs do not grow beyond that."""
+"""Size limit of mutated inputs, bytes."""
 
 
 def mutations(corpus: Sequence[bytes], number: int, seed: int = 1) -> Iterator[bytes]:
@@ -31,7 +31,7 @@ def flip(rng, data, corpus):
 
 
 def overwrite(rng, data, corpus):
-    """Put an integer at the edge of a type somewhere."""
+    """Insert an integer at the limit of a type."""
     size = rng.choice((1, 2, 4, 8))
     value = rng.choice(EDGES) & ((1 << 8 * size) - 1)
     at = rng.randrange(len(data) + 1)
@@ -39,26 +39,26 @@ def overwrite(rng, data, corpus):
 
 
 def randomise(rng, data, corpus):
-    """Put any bytes somewhere."""
+    """Overwrite some bytes at random."""
     at = rng.randrange(len(data) + 1)
     data[at : at + rng.randrange(1, 9)] = rng.randbytes(rng.randrange(1, 9))
 
 
 def cut(rng, data, corpus):
-    """Leave out a piece, or the end."""
+    """Remove a slice, or the end."""
     at = rng.randrange(len(data) + 1)
     del data[at : at + rng.choice((1, 4, 16, len(data)))]
 
 
 def repeat(rng, data, corpus):
-    """Put a piece in twice or more often."""
+    """Repeat a slice."""
     at = rng.randrange(len(data) + 1)
     piece = data[at : at + rng.randrange(1, 65)]
     data[at:at] = piece * rng.choice((1, 2, 50))
 
 
 def splice(rng, data, corpus):
-    """Go on with the end of another input."""
+    """Append the end of another input."""
     other = rng.choice(corpus)
     data[rng.randrange(len(data) + 1) :] = other[rng.randrange(len(other) + 1) :]
 

@@ -21,7 +21,7 @@ import surfel_mapper
 
 MOST_MB = 2048
 SLOWEST_S = 60
-"""Far beyond what any input takes, also on a busy machine: what takes longer hangs."""
+"""Time after which an input counts as a hang, s; far above any valid one on a busy machine."""
 
 
 def main(name: str, corpus: str, seconds: str) -> None:

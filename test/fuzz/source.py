@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bytes as a source of choices, so that what mutates bytes makes up messages and files too."""
+"""Bytes as a source of choices, so that mutated bytes also generate messages and files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ class Source:
         return items[self.below(len(items))]
 
     def chance(self, one_in: int) -> bool:
-        """Return whether something rare is to happen; never when the bytes are used up."""
+        """Return whether to take a rare choice; False when the bytes are used up."""
         return self.below(one_in) == one_in - 1
 
     def number(self) -> int:
@@ -102,11 +102,11 @@ class Source:
         return self.pick(NUMBERS) if self.below(2) else self.below(1 << 16)
 
     def real(self) -> float:
-        """Return a number, often one that arithmetic stumbles over."""
+        """Return a number, often one at the limits of arithmetic."""
         if self.below(2):
             return self.pick(FLOATS)
         return struct.unpack('<d', self.bytes(8))[0]
 
     def text(self) -> str:
-        """Return a text that is more than a name."""
+        """Return a text with special characters."""
         return self.pick(TEXTS)

@@ -4,7 +4,7 @@
 Harnesses that build well-formed files from choices, with sizes and counts that do not agree.
 
 Mutated bytes rarely survive a checksum or a decompressor. Here checksums are right and packed data
-unpacks, so that the readers reach the sizes that lie: in headers of arrays and images, in chunks,
+unpacks, so that the readers reach the false sizes: in headers of arrays and images, in chunks,
 in footers, in aliases.
 """
 
@@ -46,7 +46,7 @@ def text(content: bytes) -> bytes:
 
 
 def mcap(data: bytes) -> None:
-    """Read an mcap file of chunks that may lie about their sizes and checksums."""
+    """Read an mcap file of chunks that may state false sizes and checksums."""
     source = Source(data)
     schema = struct.pack('<H', 1) + text(b'std_msgs/msg/String') + text(b'ros2msg') + text(b'')
     channel = struct.pack('<HH', 1, 1) + text(b'/a') + text(b'cdr') + struct.pack('<I', 0)

@@ -54,7 +54,7 @@ from test.fuzz.memory import reset_peak, resident
 LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
     f'a{i}: &a{i} [*a{i - 1}, *a{i - 1}, *a{i - 1}]\n' for i in range(1, 40)
 )
-"""3^39 texts, if written out."""
+"""A YAML file that expands to 3^39 texts."""
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The corpus of every harness and seeded mutations of it: no error but ours, and bounded memory.
+The corpus of every harness and seeded mutations of it: our errors only, and bounded memory.
 
-The same inputs in every run, a few thousand altogether; ``make fuzz`` searches on.
+The same inputs in every run, about 20,000; ``make fuzz`` searches on.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def test_a_change_in_a_file_with_checksums_is_harmless_or_told(tmp_path, caplog,
 
 
 def outline_of_bag(path):
-    """Return how many messages of which topics a bag has, and their sizes."""
+    """Return topic, type and size of the messages of a bag, sorted."""
     return sorted((topic, type_, len(raw)) for topic, type_, _, raw in bag_content(path))
 
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels and their parts: who can call them, and with which options they are compiled."""
+"""Kernels and their parts: callers, and options of the compilation."""
 
 import math
 

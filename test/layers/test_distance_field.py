@@ -45,7 +45,7 @@ def mapper_with(**settings):
 
 
 def insert(mapper, number, xyz=(0.0, 0.0, 0.0), **columns):
-    """Map the sphere about a place; return what became of it."""
+    """Map the sphere about a place; return the mapper and the updates."""
     mapper.add_pose('odom', 'lidar', number * S, xyz, (0.0, 0.0, 0.0, 1.0))
     mapper.add_scan(replace(sphere(ring=RING, **columns), stamp_ns=number * S))
     return list(mapper.insert_ready())

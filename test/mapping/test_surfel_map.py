@@ -4,8 +4,8 @@
 SurfelMap: adding, removing and merging whole scans, many voxels, and what changed.
 
 Random sequences of these are in test_surfel_map_sequences.py, limits and refusals in
-test_surfel_map_limits.py. What a map holds is compared with the exact integers of a slow twin, and
-maps with each other by digest: nothing here is nearly so.
+test_surfel_map_limits.py. Maps are compared with the exact integers of a slow twin, and with each
+other by digest; there are no tolerances.
 """
 
 import math

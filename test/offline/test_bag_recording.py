@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A bag maps to what its scans and poses say, whichever way the poses come."""
+"""The map of a bag is that of its scans and poses, for every source of poses."""
 
 import sqlite3
 

@@ -221,7 +221,7 @@ def mapped(simulation, **settings):
 
 
 def errors_deg(mapper, simulation):
-    """Return by how much the normals of planar voxels are off those of the nearest surface."""
+    """Return the angles between normals of planar voxels and those of the nearest surface."""
     surfels = mapper.map.surfels(20)
     surfels = surfels.select((surfels.planarity > 0.3) & (surfels.curvature < 1e-4))
     true = simulation.world.normal_at(surfels.position)

@@ -24,7 +24,7 @@ S = 10**9
 
 
 def organised(nothing, where, staggered_deg=0.0, order=slice(None), transpose=False):
-    """Return a scan of a sphere, what some of its pixels hold, and their true directions."""
+    """Return a scan of a sphere, the content of some pixels, and their true directions."""
     turn = np.radians(staggered_deg) * np.arange(LIDAR.rows)[:, None]
     d = LIDAR.directions.astype(float)
     rays = np.stack(

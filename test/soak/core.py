@@ -3,10 +3,10 @@
 """
 A long drive up and down the street through the mapper, as fast as it goes.
 
-Simulated once and then driven again and again, with stamps that go on and poses that move along
-by a millimetre a turn, so that no two scans put the same points at the same places. Every block
-of scans gives a row: memory of the process, times, voxels. In the end the map is compared with
-one made anew from the scans of its window.
+Simulated once and then driven repeatedly, with increasing stamps and poses that move by a
+millimetre a lap, so that no two scans have the same points at the same places. Every block of
+scans gives a row: memory of the process, times, voxels. In the end the map is compared with one
+made anew from the scans of its window.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 """
 A drive at a fixed rate with random faults between the scans, to watch memory and the map.
 
-Half of the scans are followed by a fault: a damaged cloud, a pose that is none, ever new frames,
+Half of the scans are followed by a fault: a damaged cloud, an invalid pose, new frames,
 a stamp that is repeated, back or ahead, or a save that fails. In the end the map is compared with
 one made anew from the scans that were mapped, and the file of the last save that succeeded with
 the digest at that time. ``python -m test.soak.faults 10`` drives for ten minutes.
@@ -46,7 +46,7 @@ PERIOD_NS = 50_000_000
 
 
 class FaultyDrive:
-    """A mapper that is driven along a street, and hurt on the way."""
+    """A mapper that is driven along a street, with faults on the way."""
 
     def __init__(self, options: Options, directory: Path, seed: int = 1) -> None:
         street = Street(options)
@@ -93,12 +93,12 @@ class FaultyDrive:
         self.mapper.add_scan(scan)
 
     def insert(self) -> None:
-        """Map what has its pose."""
+        """Map the scans whose poses are there."""
         for update in self.mapper.insert_ready():
             self.latest.append((update.scan.points.copy(), update.T_map_sensor.copy()))
 
     def fault(self, number: int, place: int) -> None:
-        """Do something wrong."""
+        """Inject a random fault."""
         kinds = (self.damaged_cloud, self.bad_pose, self.frames, self.odd_stamp, self.failing_save)
         kind = self.rng.choices(kinds, (8, 4, 4, 4, 1))[0]
         self.faults[kind.__name__] += 1
@@ -114,7 +114,7 @@ class FaultyDrive:
         self.decode(bytes(head + rest[: self.rng.choice((0, 1000, len(rest)))]))
 
     def bad_pose(self, stamp_ns: int, place: int) -> None:
-        """Send a pose that is none, or of another tree."""
+        """Send an invalid pose, or one of another tree."""
         xyz, q_xyzw = self.rng.choice(
             (
                 ((math.nan, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)),

@@ -40,7 +40,7 @@ UNDER_WAY = 15
 
 MAPS = 'maps'
 STALL_S = 60.0
-"""A node of which nothing is heard for so long hangs."""
+"""Silence after which a node counts as hung, s."""
 
 FIRST_NS = 1_700_000_000_000_000_000
 
@@ -64,7 +64,7 @@ class Drive:
         self.peer.advertise('/odom', '/points')
 
     def close(self) -> None:
-        """End both."""
+        """Stop the node and the peer."""
         self.peer.close()
         self.node.kill()
 
@@ -99,7 +99,7 @@ class Drive:
         )
 
     def resident_bytes(self) -> int:
-        """Return how much memory the node has."""
+        """Return the memory of the node."""
         statm = Path(f'/proc/{self.node._process.pid}/statm').read_text(encoding='ascii')
         return int(statm.split()[1]) * os.sysconf('SC_PAGE_SIZE')
 
@@ -126,7 +126,7 @@ def run(num_scans: int, block: int, options: Options, most_s: float = math.inf) 
 def blocks(
     drive: Drive, num_scans: int, block: int, options: Options, most_s: float
 ) -> Iterator[Row]:
-    """Send all scans; yield a row now and then."""
+    """Send all scans; yield a row for every block."""
     start = lap = time.monotonic()
     sent = 0
     for number, turn, place in there_and_back(num_scans, options.scans):

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The long drive, cut short: every scan is mapped, and the map is held against another."""
+"""A short run of the long drive: every scan is mapped, and the map equals a new one."""
 
 import pytest
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Range images of surfaces whose equations are known, and where the field's zero level lies."""
+"""Range images of surfaces with known equations, and the zero level of the field."""
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def voxels(blocks):
 
 def zero_crossings(blocks):
     """
-    Return where the field is 0 on the edges of cubes whose corners are all observed, (K, 3) m.
+    Return the zeros of the field on the edges of cubes whose corners are all observed, (K, 3) m.
 
     These are the vertices of marching cubes, found in a dense array without any of its tables.
     """

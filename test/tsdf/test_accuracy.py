@@ -13,7 +13,7 @@ ANGLES = (0.0, 45.0, 70.0)
 
 def interior(sensor, points):
     """
-    Return which points are in the middle of the view of a camera.
+    Return a mask of the points in the middle of the view of a camera.
 
     60 pixels are 6.5 deg: towards the edges of the image rays meet the plane at other angles.
     """
@@ -42,7 +42,7 @@ def test_distances_to_a_plane_are_those_along_the_rays(interpolation, bounds):
 
 
 def off_plane(blocks, normal):
-    """Return the vertices in the middle of the view, and how far from the plane, in voxels."""
+    """Return the vertices in the middle of the view, and their plane distances, voxels."""
     vertices = zero_crossings(blocks)
     vertices = vertices[interior(VGA, vertices)]
     return vertices, abs(vertices @ normal - 2.0 * normal[2]) / 0.05

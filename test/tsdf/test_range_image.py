@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T8, T9, T16: what pixels hold, where points fall, how images are read between pixels."""
+"""T8, T9, T16: content of pixels, projection of points, interpolation between pixels."""
 
 import math
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A real depth camera: what other images measured lies where field and mesh say the surface is."""
+"""A real depth camera: points of further images lie on the surface of field and mesh."""
 
 from dataclasses import astuple
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""T11: the blocks that are chosen, against all blocks and rays there are."""
+"""T11: the selected blocks, against all blocks and all rays."""
 
 import numpy as np
 import pytest

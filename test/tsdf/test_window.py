@@ -63,7 +63,7 @@ def test_blocks_flagged_updated_stay_until_the_flag_is_cleared():
 
 
 def drive(max_radius_m):
-    """Return how many blocks are added and removed while the sensor stands still."""
+    """Return the number of blocks added and removed while the sensor stands still."""
     one = integrator(voxel_size_m=0.1, truncation_m=0.3, max_radius_m=max_radius_m)
     added = removed = 0
     T = np.eye(4)

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""A history holds what every scan did, and counts surfels now and then, however long it is."""
+"""A history has a row for every scan, and a bounded number of counts of surfels."""
 
 from types import SimpleNamespace
 

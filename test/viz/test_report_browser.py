@@ -38,7 +38,7 @@ HIDE = """() => {
 """As a script's property: the policy of the page blocks further style sheets."""
 
 WAIT_S = 180.0
-"""At most, for what takes a second on an idle machine."""
+"""Longest wait for an event that takes a second on an idle machine, s."""
 
 
 @pytest.fixture(scope='module')

@@ -1,12 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Others that map point clouds, measured where their packages can be had.
+Other packages that map point clouds, measured if they can be installed.
 
 Each has a module here with a class ``Peer(voxel_size_m, window)``: ``step(points, T_map_sensor)``
-takes a scan, (N, 3) float32 with nan, and ``num_voxels`` says how much it holds. The module is
-loaded by ``driver`` in an environment of its own and imports nothing of surfel_mapper.
-Versions are fixed, so that figures can be repeated.
+takes a scan, (N, 3) float32 with nan, and ``num_voxels`` is the size of its map. The module is
+loaded by ``driver`` in an environment of its own and imports nothing of surfel_mapper. Versions
+are fixed, so that figures can be reproduced.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from dataclasses import dataclass
 @dataclass(frozen=True, kw_only=True)
 class PeerSpec:
     """
-    One of those that are compared.
+    A package to compare with.
 
     Attributes
     ----------
     name : str
-        As it stands in the table.
+        Name in the table.
     module : str
-        Where its class is.
+        Module of its class.
     requires : tuple of str
-        What pip installs for it.
+        Its requirements for pip.
     less : str
-        What it does less than we.
+        Work that it leaves out.
     python : str
-        Version of Python that it needs, where not ours: 3.10.
+        Version of Python that it needs, if another: 3.10.
 
     """
 

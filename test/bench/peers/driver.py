@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Feeds the scans to one peer and times it; runs in the environment of the peer.
+Feed the scans to one peer and time it; runs in the environment of the peer.
 
-The job comes as JSON on stdin, the times leave as JSON on stdout. Scans are in memory before
-the clock starts. It stops early once timed scans have taken a second each on average, so that a
-slow peer gets fewer.
+Reads the job as JSON from stdin and writes the times as JSON to stdout. Scans are in memory
+before timing starts. It stops early if scans take more than a second each on average.
 """
 
 from __future__ import annotations
@@ -18,11 +17,11 @@ from time import perf_counter
 import numpy as np
 
 LEAST_SCANS = 5
-"""So many scans are timed however long they take."""
+"""Number of scans that are timed in any case."""
 
 
 def main() -> None:
-    """Do the job."""
+    """Run the job."""
     job = json.load(sys.stdin)
     peer = import_module(job['module']).Peer(job['voxel_size_m'], job['window'])
     poses, untimed = np.load(job['poses']), job['untimed']

@@ -9,7 +9,7 @@ import numpy as np
 
 MAX_RANGE_M = 100.0
 POINTS_A_VOXEL = 20
-"""KISS-ICP's own defaults."""
+"""Defaults of KISS-ICP."""
 
 
 class Peer:

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""KISS-ICP with its own defaults on one thread; the scans have no times, so nothing to deskew."""
+"""KISS-ICP with its defaults on one thread; scans have no times, so none is deskewed."""
 
 from __future__ import annotations
 

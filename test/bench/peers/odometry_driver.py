@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Feeds scans to the odometry of one peer and times it; runs in the environment of the peer.
+Feed scans to the odometry of one peer and time it; runs in the environment of the peer.
 
-The job comes as JSON on stdin: the module, voxel_size_m, the files of the scans, and where to
-write the poses, (S, 4, 4), corrected at the end if the peer closes loops. The times leave as JSON
-on stdout: by the clock, and of the processor, which others that run hardly change; and the memory.
+The job is JSON on stdin: the module, voxel_size_m, the files of the scans, and the file for the
+poses, (S, 4, 4), corrected at the end if the peer closes loops. JSON on stdout has clock time,
+processor time, which depends little on other load, and the memory.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 
 
 def main() -> None:
-    """Do the job."""
+    """Run the job."""
     job = json.load(sys.stdin)
     odometry = import_module(job['module']).Odometry(job['voxel_size_m'])
     milliseconds, cpu_ms, poses = [], [], []

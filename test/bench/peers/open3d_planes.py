@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Has Open3D find planar patches, as one would who has a cloud without normals.
+Find planar patches with Open3D in a cloud without normals.
 
-Runs in an environment of its own. Arguments: the file of the points, the voxel size that they are
-thinned with before, 0 for none, and the number of runs. Says as JSON the milliseconds of each and
-how many planes it found.
+Runs in an environment of its own. Arguments: the file of the points, the voxel size of the
+thinning before, 0 for none, and the number of runs. Prints the milliseconds of each and the
+number of planes as JSON.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def planes(points, voxel_size_m):
 
 
 def main() -> None:
-    """Do the job."""
+    """Run the job."""
     file, voxel_size_m, runs = sys.argv[1:]
     points = np.load(file).astype(np.float64)
     times = []

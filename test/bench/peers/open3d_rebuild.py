@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The window anew for every scan: Open3D's downsampling, then normals from neighbours.
+Rebuild the window for every scan: Open3D's downsampling, then normals from neighbours.
 
-Every scan is downsampled when it comes and the rebuild starts from those, which is much kinder
-than from all points of the window.
+Every scan is downsampled once on arrival, and the rebuild uses the downsampled scans, which is
+much faster than from all points of the window.
 """
 
 from __future__ import annotations

@@ -61,7 +61,7 @@ def ransac(points, voxel_size_m):
 
 
 def main() -> None:
-    """Do the job."""
+    """Run the job."""
     source, result, method, voxel_size_m = sys.argv[1:]
     points = np.load(source).astype(np.float64)
     finite = np.isfinite(points).all(axis=1)

@@ -28,7 +28,7 @@ ROOT = Path(__file__).parents[3]
 COLOUR = re.compile(r'\x1b\[[\d;]*m')
 
 READY = 'ready'
-"""A file of this name says that everything is installed in an environment."""
+"""A file of this name marks an environment as complete."""
 
 
 class PeerError(RuntimeError):
@@ -135,7 +135,7 @@ def environment(peer: PeerSpec, cache: Path) -> Path:
 
 def interpreter(version: str) -> str:
     """
-    Return a Python of a version: ours, one on the path, or one that pyenv has.
+    Return a Python of a version: this one, one on the path, or one of pyenv.
 
     Raises
     ------

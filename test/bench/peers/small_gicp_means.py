@@ -3,7 +3,7 @@
 """
 small_gicp's map of Gaussian voxels, given bare points.
 
-It averages the covariances that points come with, so without them only its means say something.
+It averages the covariances of the points; without covariances only its means are valid.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import small_gicp
 
 
 class Peer:
-    """A map from which voxels leave that no scan of the window's length has touched."""
+    """A map that drops voxels not touched within the length of the window."""
 
     def __init__(self, voxel_size_m, window):
         self._map = small_gicp.GaussianVoxelMap(voxel_size_m)
@@ -25,7 +25,7 @@ class Peer:
         self._map.insert(self.prepared(small_gicp.PointCloud(finite)), T_map_sensor)
 
     def prepared(self, cloud):
-        """Return the scan as the map is to have it."""
+        """Return the scan in the form of the map."""
         return cloud
 
     @property

@@ -1,11 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-small_gicp's VGICP from scan to map, put together as in its own odometry benchmark.
+small_gicp's VGICP from scan to map, as in its odometry benchmark.
 
 Scans are downsampled to 0.25 m and given covariances of 10 neighbours, aligned to a map of
-Gaussian voxels from a prediction of constant velocity, and inserted; voxels leave the map when
-no scan has touched them for long. All on one thread.
+Gaussian voxels from a prediction of constant velocity, and inserted; voxels that are not touched
+for long leave the map. All on one thread.
 """
 
 from __future__ import annotations

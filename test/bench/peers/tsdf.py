@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Others that fuse a signed distance field, and how they are run.
+Other packages that fuse a signed distance field.
 
-Each has a module here with a class ``Peer(job)``: ``prepared(data, pose)`` gives its input the
-form that it takes, untimed, ``integrate`` fuses it, ``mesh`` returns vertices and triangles.
+Each has a module here with a class ``Peer(job)``: ``prepared(data, pose)`` converts its input,
+untimed, ``integrate`` fuses it, ``mesh`` returns vertices and triangles.
 """
 
 from __future__ import annotations

@@ -1,11 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Feeds scans or depth images to one TSDF and times it; runs in the environment of the peer.
+Feed scans or depth images to one TSDF and time it; runs in the environment of the peer.
 
-The job comes as JSON on stdin; the times of every scan, of the clock and of the processor, leave
-as JSON on stdout, the mesh as a file. What a peer
-wants of its input in another form is done before its clock starts.
+The job is JSON on stdin; clock and processor time of every scan are JSON on stdout, the mesh is a
+file. Inputs are converted before timing starts.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ import numpy as np
 
 
 def main() -> None:
-    """Do the job."""
+    """Run the job."""
     job = json.load(sys.stdin)
     peer = import_module(job['module']).Peer(job)
     times: list[tuple[float, float]] = []

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Open3D's ScalableTSDFVolume, which 0.20 still has but extracts nothing from."""
+"""Open3D's ScalableTSDFVolume; in 0.20 its extraction returns nothing."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Peer:
         )
 
     def prepared(self, data, pose):
-        """Return image and extrinsic as it takes them."""
+        """Return image and extrinsic in the form of Open3D."""
         black = open3d.geometry.Image(np.zeros((*data.shape, 3), np.uint8))
         image = open3d.geometry.RGBDImage.create_from_color_and_depth(
             black, open3d.geometry.Image(data), 1.0, self._far_m, convert_rgb_to_intensity=False

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Open3D's VoxelBlockGrid: hashed blocks of 16 voxels a side, those that the depth image meets."""
+"""Open3D's VoxelBlockGrid: hashed blocks of 16 voxels a side, those in the depth image."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Peer:
         )
 
     def prepared(self, data, pose):
-        """Return image and extrinsic as it takes them."""
+        """Return image and extrinsic in the form of Open3D."""
         image = open3d.t.geometry.Image(core.Tensor(data))
         return image, core.Tensor(np.linalg.inv(pose), core.float64)
 

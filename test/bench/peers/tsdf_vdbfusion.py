@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""VDBFusion: a volume of VDB leaves that every point's ray is walked through."""
+"""VDBFusion: a volume of VDB leaves, traversed by the ray of every point."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Bisection of bisected and overlapping surfaces: which are bisected, and where."""
+"""Bisection of bent and overlapping surfaces."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ SIZE = (24, 31)
 
 
 def twin(discs, colours, image):
-    """Paint as the kernel says it does, all pixels at a time."""
+    """Paint by the formula of the kernel, all pixels at a time."""
     rows, columns = np.mgrid[: image.shape[0], : image.shape[1]].astype(np.float64)
     for (u, v, length, breadth, angle), colour in zip(discs, colours, strict=True):
         offset = np.stack([columns - u, rows - v])
