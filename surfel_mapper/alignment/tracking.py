@@ -199,7 +199,7 @@ class Tracker:
         return distance_m / ((stamp_ns - self._stamp_ns) / 1e9)
 
     def _shares(self, found: RegistrationResult) -> str:
-        """Return in words how well a scan fits."""
+        """Return the quality of the fit of a scan, in words."""
         return (
             f'{found.overlap:.0%} of its {found.num_cells} cells meet a surfel and '
             f'{found.fit:.0%} of these fit it'

@@ -7,7 +7,8 @@ rosbags reads indexes and unpacks chunks without limits of memory or time, and r
 without an index, which is missing if the recorder was killed, the disk was full or a copy was
 interrupted. So bags are read here: mcap and ROS 1 in chunked.py and the module of each format,
 sqlite3 through SQLite in sqlite.py, or page by page in sqlite_pages.py if it is truncated. Damage
-is told: ``cut_at`` is the byte at which a file ends too early, ``skipped_at`` the damaged chunks.
+is reported: ``cut_at`` is the byte at which a file ends too early, ``skipped_at`` the damaged
+chunks.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the node until it is told to end."""
+    """Run the node until a signal or a shutdown."""
     try:
         with Signals() as signals:
             with loading_ros():

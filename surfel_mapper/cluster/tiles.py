@@ -271,7 +271,7 @@ def merge_parts(
 def at_origin(
     parts: list[dict[Tile, Part]], origin_m: tuple[float, ...] | None, work: Path
 ) -> list[dict[Tile, Part]]:
-    """Return the parts of a map, cut anew if the map has another origin."""
+    """Return the parts of a map, cut again if the map has another origin."""
     every = [part for tiles in parts for part in tiles.values()]
     if origin_m is None or not every or origin_of(every[0].path) == origin_m:
         return parts

@@ -191,7 +191,7 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     path : str or Path
         The file. KITTI poses take their stamps from a times.txt beside it, if there is one.
     format_ : str, optional
-        tum, kitti or csv; by default told from the first line: 8 numbers, 12 numbers, or commas.
+        tum, kitti or csv; by default that of the first line: 8 numbers, 12 numbers, or commas.
 
     Raises
     ------

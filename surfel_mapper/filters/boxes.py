@@ -258,7 +258,7 @@ class Ellipsoids(BoxFilter):
     keep_indices: bool = parameter(
         False,
         'Add pointIds, rows of the points of the box in the scan given, -1 past the last, their '
-        'pointX, pointY, pointZ, m, and numOfNN, how many they are.',
+        'pointX, pointY, pointZ, m, and numOfNN, their number.',
         libpointmatcher='keepIndices',
     )
 

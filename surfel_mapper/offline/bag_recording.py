@@ -184,7 +184,7 @@ def feed(
     mapper : Mapper
         Maps it.
     cloud_topics : str or collection of str
-        One topic of clouds, or several; their sensors are told apart by their frames.
+        One topic of clouds, or several; their sensors are distinguished by their frames.
     poses : PoseTopics
         Source of the poses.
     span : Span

@@ -29,7 +29,7 @@ INTERNAL = 'internal_error'
 """Cause of drops by errors that no stage expects, out of memory among them."""
 
 REMEDIES = {
-    'apart': 'it is in a map of its own; /initialpose tells where the robot is',
+    'apart': 'it is in a map of its own; publish the pose of the robot on /initialpose',
     'bad_cloud': 'the log describes the damage',
     'empty_frame_id': 'set the frame in the driver of the sensor',
     'filter': 'compare the filters with the fields of the clouds',

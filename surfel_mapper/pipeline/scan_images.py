@@ -39,7 +39,7 @@ class ScanImages:
     Parameters
     ----------
     wanted : Images
-        The kinds of images that layers want, and how far stamps may differ.
+        The kinds of images that layers want, and the tolerance of their stamps.
 
     Attributes
     ----------

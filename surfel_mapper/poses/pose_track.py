@@ -63,7 +63,7 @@ class PoseTrack:
         del self.stamps[:number], self.transforms[:number]
 
     def gap_ns(self, stamp_ns: int) -> int:
-        """Return how far apart the transforms around a stamp held are; 0 at a stored stamp."""
+        """Return the gap between the transforms around a held stamp, ns; 0 at a stored stamp."""
         if self.is_static:
             return 0
         row = bisect_left(self.stamps, stamp_ns)

@@ -154,7 +154,7 @@ class Inputs:
         return self._subscriptions.reliabilities()
 
     def loss(self) -> str:
-        """Return how many clouds were lost on the way and the remedy; empty if none."""
+        """Return the number of lost clouds and the remedy, as text; empty if none was lost."""
         return '; '.join(self._loss_of(topic) for topic in self.lost)
 
     def _loss_of(self, topic: str) -> str:
@@ -274,7 +274,7 @@ class Inputs:
 
 
 def image_message(topic: str) -> Any:
-    """Return the message class of an image topic, which its name tells."""
+    """Return the message class of an image topic, by its name."""
     return CompressedImage if is_packed(topic) else Image
 
 

@@ -77,7 +77,7 @@ class LayerOutputs:
                 topic.publish_if_read()
 
     def expire(self) -> None:
-        """Publish all topics anew, at once or at their next time; called in the mapping thread."""
+        """Publish all topics again, now or at their next time; called in the mapping thread."""
         for topic in self._topics:
             topic.expire()
             if not topic.has_rate:

@@ -157,7 +157,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         )
         if self._config.pose.source == 'identity':
             self.get_logger().info(
-                'pose.source identity tells no position of the sensor, so normals are not '
+                'pose.source identity gives no position of the sensor, so normals are not '
                 'oriented towards it: their component of largest magnitude is positive'
             )
 

@@ -4,16 +4,16 @@
 The executor of the node's inputs: it takes poses before clouds, and follows publishers' QoS.
 
 An executor of rclpy takes one message of each subscription per turn, and a turn costs 1.2 ms,
-because it collects all timers, services and subscriptions of the node anew: with odometry at
-200 Hz a backlog of clouds is taken before its poses and dropped for want of them. This thread
-waits for its own subscriptions only, as ``rclpy.wait_for_message`` does, and takes all waiting
-poses before every cloud; a pose costs a sixth. Timers, services and parameters stay with rclpy's
+because it collects all timers, services and subscriptions of the node each time: with odometry at
+200 Hz a backlog of clouds is taken before its poses and dropped without them. This thread waits
+for its own subscriptions only, as ``rclpy.wait_for_message`` does, and takes all waiting poses
+before every cloud; a pose costs a sixth. Timers, services and parameters stay with rclpy's
 executor.
 
 A subscription is reliable while all publishers of its topic are, and best effort as soon as one is
 not, since a reliable subscription receives nothing from that one. Messages above 0.5 MB need a
 reliable subscription: Fast DDS sends them in UDP fragments, and of the best-effort ones most are
-lost. The middleware reports publishers that come and go; the subscription is then created anew,
+lost. The middleware reports publishers that come and go; the subscription is then created again,
 and the earlier one kept until the new one is connected.
 
 (Longer than others: taking messages and changing subscriptions have to happen in one thread.)
@@ -281,7 +281,7 @@ class SubscriptionExecutor:
         return BEST_EFFORT if BEST_EFFORT in offered else RELIABLE
 
     def _follow_publishers(self) -> None:
-        """Subscribe anew to topics whose publishers now offer another reliability."""
+        """Subscribe again to topics whose publishers now offer another reliability."""
         now_s = time.monotonic()
         for reader in (*self._eager, *self._others):
             if reader.retiring is not None:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Fit the projection model of a lidar to the points of a scan, and check how well it fits.
+Fit the projection model of a lidar to the points of a scan, and check the quality of the fit.
 
 Candidates for the beams are the median elevations of the rings, the clusters of the elevations,
 and evenly spaced rows; the steps of azimuth follow from the angles between neighbouring points of

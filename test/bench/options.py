@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Options: how large a benchmark is; the defaults are those that figures are quoted for."""
+"""Options: the size of a benchmark; quoted figures are for the defaults."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ def markers(mapper: Mapper) -> dict[str, Callable[[], Any]]:
 
 
 def models(mapper: Mapper) -> dict[str, Callable[[], Any]]:
-    """Return a function that describes the models, with shapes made anew or cached."""
+    """Return a function that describes the models, with new or cached shapes."""
     live = LiveModels(ModelsLayerConfig(enabled=True), mapper.map)
     live.update()
     model, versions = live.model, live.versions

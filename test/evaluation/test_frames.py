@@ -42,7 +42,7 @@ MOTION = se3_exp(np.array([0.4, -0.3, 0.2, 0.02, -0.03, 0.05]))
 
 
 def off(found, expected):
-    """Return how far a motion is from another, m and deg."""
+    """Return the difference of two motions, m and deg."""
     rest = compose(inverse(expected), found)
     return np.linalg.norm(rest[:3, 3]), np.degrees(rotation_angle(rest))
 

@@ -56,7 +56,7 @@ REFERENCES = {
     'simulation/kernels/surfaces.py': 'simulation/kernels/test_raycast.py',
     'tsdf/kernels/block_marks.py': 'tsdf/test_selection.py',
     'tsdf/kernels/blocks.py': 'tsdf/test_blocks.py',
-    'tsdf/kernels/channels.py': 'tsdf/test_labels.py',
+    'tsdf/kernels/channels.py': 'tsdf/test_queries.py',
     'tsdf/kernels/euclidean.py': 'tsdf/test_euclidean.py',
     'tsdf/kernels/free_space.py': 'tsdf/test_selection.py',
     'tsdf/kernels/integration.py': 'tsdf/test_twin.py',

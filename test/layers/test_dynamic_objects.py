@@ -3,7 +3,7 @@
 """
 A box moves through a room: its former places are cleared, the room stays, nothing drifts.
 
-The room and the box are simulated anew for every scan, so that the truth is known.
+The room and the box are simulated for every scan, so that the truth is known.
 """
 
 from dataclasses import replace

@@ -3,7 +3,7 @@
 """
 Coarser maps from finer ones, against the points regrouped; copies, subtraction and equality.
 
-The expected moments of a coarse voxel are made from the lattice coordinates of all points anew.
+The expected moments of a coarse voxel are summed from the lattice coordinates of all points.
 """
 
 import numpy as np

@@ -120,7 +120,7 @@ def test_bytes_of_ros1_give_the_poses_of_the_message(parent):
 
 
 def serialised(kind):
-    """Return a message, and how many of its bytes hold its pose."""
+    """Return a message, and the number of its bytes up to the end of its pose."""
     entries = Entries()
     entries.odometry('/odom', STAMP_NS, XYZ)
     entries.transform('/tf', STAMP_NS, 'odom', 'base_link', XYZ)

@@ -212,7 +212,7 @@ def star(num, seed):
 
 
 def crossings(points, around):
-    """Return how many sides of rings a ray to the right of each point crosses, one by one."""
+    """Return the number of sides of rings that a ray to the right of each point crosses."""
     found = np.zeros(len(points), int)
     for ring in around:
         for (x0, y0), (x1, y1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
@@ -224,7 +224,7 @@ def crossings(points, around):
 
 
 def num_covering(points, triangles):
-    """Return in how many triangles each point is."""
+    """Return the number of triangles that contain each point."""
     found = np.zeros(len(points), int)
     for a, b, c in triangles:
         sides = ((a, b), (b, c), (c, a))

@@ -48,7 +48,7 @@ class Process:
     """A verb running as a process in a folder, which also gets its output."""
 
     def __init__(self, arguments, folder, prefork=None):
-        """Start the verb anew, or fork it where modules and kernels are loaded."""
+        """Start the verb in a new Python, or fork it from one with modules and kernels loaded."""
         self._output = Path(folder) / f'{arguments[0]}_{time.monotonic_ns()}.txt'
         if prefork is not None:
             self._process = prefork.start(arguments, self._output, folder, dict(os.environ))

@@ -6,7 +6,8 @@ Verbs as processes that are forked from one which has loaded all modules and ker
 A node needs 2 s of processor time to load numba, rclpy and its kernels, and the tests start more
 than a hundred. A fork needs a tenth of that, and is otherwise the same process: nothing that was
 loaded has a thread, a ROS context or an open file. Its parent exits at once, so that it becomes
-a child of the test run, which waits for it. Linux only; elsewhere verbs are started anew.
+a child of the test run, which waits for it. Linux only; elsewhere each verb gets a
+new Python.
 
 `python -m test.ros.prefork SOCKET` is the process that forks.
 """

@@ -72,7 +72,7 @@ def verdict(rows: Sequence[Row]) -> str:
         f'{name} {last[name] / first[name] - 1.0:+.1%}'
         for name in ('rss_MB', 'median_ms', 'p99_ms')
     )
-    return f'from block 2 to {len(rows)}: {changes}; the map equals one made anew'
+    return f'from block 2 to {len(rows)}: {changes}; the map equals a new one'
 
 
 if __name__ == '__main__':

@@ -5,8 +5,8 @@ A long drive up and down the street through the mapper, as fast as it goes.
 
 Simulated once and then driven repeatedly, with increasing stamps and poses that move by a
 millimetre a lap, so that no two scans have the same points at the same places. Every block of
-scans gives a row: memory of the process, times, voxels. In the end the map is compared with one
-made anew from the scans of its window.
+scans gives a row: memory of the process, times, voxels. In the end the map is compared with a
+new map of the scans of its window.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def row(num_scans: int, times: list[float], mapper: Mapper) -> Row:
 
 
 def check(mapper: Mapper, latest: Iterable[RawCloud]) -> None:
-    """Compare the map with one made anew from the clouds of its window."""
+    """Compare the map with a new map of the clouds of its window."""
     anew = SurfelMap(mapper.map.voxel_size_m)
     for scan, message in zip(mapper.window, latest, strict=True):
         pose = scan.T_map_sensor

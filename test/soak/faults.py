@@ -5,7 +5,7 @@ A drive at a fixed rate with random faults between the scans, to watch memory an
 
 Half of the scans are followed by a fault: a damaged cloud, an invalid pose, new frames,
 a stamp that is repeated, back or ahead, or a save that fails. In the end the map is compared with
-one made anew from the scans that were mapped, and the file of the last save that succeeded with
+a new map of the scans that were mapped, and the file of the last save that succeeded with
 the digest at that time. ``python -m test.soak.faults 10`` drives for ten minutes.
 """
 
@@ -126,7 +126,7 @@ class FaultyDrive:
         self.mapper.add_pose(BASE, 'odom', stamp_ns, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
 
     def frames(self, stamp_ns: int, place: int) -> None:
-        """Send transforms of ever new frames, some in long chains."""
+        """Send transforms of new frames, some in long chains."""
         names = [f'frame_{self.rng.randrange(10**9)}' for _ in range(100)]
         parents = [*names[:-1], 'odom'] if self.rng.random() < 0.5 else ['tree'] * 100
         for parent, child in zip(parents, [*names[1:], 'last'], strict=True):
@@ -219,4 +219,4 @@ if __name__ == '__main__':
 
     for row in run(10**9, Options(scans=300, beams=32, columns=256), 60.0 * float(sys.argv[1])):
         print(json.dumps(row), flush=True)
-    print('the map equals one made anew, the file the map of its time')
+    print('the map equals a new one, the file the map of its time')

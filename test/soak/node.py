@@ -5,7 +5,7 @@ The long drive of core.py through the node: a process of its own, fed over DDS a
 
 Stamps are those of a lidar of 10 Hz, so an hour of driving takes minutes. No more clouds are under
 way than the node keeps waiting, and every one of them has to be mapped. In the end the node saves
-its map, which is compared with one made anew from the clouds of its window.
+its map, which is compared with a new map of the clouds of its window.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def row(drive: Drive, sent: int, rate_hz: float) -> Row:
 
 
 def check(drive: Drive, folder: Path) -> None:
-    """Compare the map that the node saves with one made anew from the clouds of its window."""
+    """Compare the map that the node saves with a new map of the clouds of its window."""
     answer = drive.peer.call('save_map')
     if not answer.success:
         raise RuntimeError(answer.message)

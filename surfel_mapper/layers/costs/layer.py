@@ -22,7 +22,7 @@ class CostsLayer(Layer):
     name = 'grid'
 
     def publications(self) -> Sequence[Publication]:
-        """Return the grid, made anew when the map has changed."""
+        """Return the grid, computed again when the map has changed."""
         return (
             Publication(
                 topic='~/grid',

@@ -119,7 +119,7 @@ class TsdfLayer(Layer):
         Raises
         ------
         CloudFormatError
-            If the sensor cannot be told from the points of a scan.
+            If the sensor cannot be recognised from the points of a scan.
         MapLimitError
             If the field cannot hold a scan; it is as before then.
 
@@ -378,7 +378,7 @@ def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
     """
     Return the colours of the points: (N, 3), or (N, 4) with a fourth value of 0 if unknown.
 
-    Alpha tells which points have a colour, unless it is 0 everywhere, as some drivers leave it.
+    Alpha marks the points that have a colour, unless it is 0 everywhere, as some drivers leave it.
     """
     columns = scan.columns
     if not {'rgb', 'rgba'} & columns.keys():

@@ -51,7 +51,7 @@ class DynamicObjectsLayer(Layer):
         Raises
         ------
         CloudFormatError
-            If the sensor cannot be told from the points.
+            If the sensor cannot be recognised from the points.
 
         """
         keys = self.around.surfel_map.keys()
@@ -85,7 +85,7 @@ class DynamicObjectsLayer(Layer):
         Raises
         ------
         CloudFormatError
-            If the sensor cannot be told from the points.
+            If the sensor cannot be recognised from the points.
 
         """
         verdict = self._verdict(scan, T_map_sensor, keys)
