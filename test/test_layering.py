@@ -194,6 +194,17 @@ def test_forbidden_imports_are_found_and_others_accepted():
     assert [case for case in ALLOWED if faults(case[0], [case[1]])] == []
 
 
+def test_shared_kernels_are_used_by_two_parts():
+    users: dict[str, set[str]] = {}
+    for module, path in MODULES.items():
+        part = module.split('/')[0]
+        for name in imports(path):
+            if name.startswith('surfel_mapper.kernels.'):
+                users.setdefault(name.split('.')[2], set()).add(part)
+    shared = {path.stem for path in (PACKAGE / 'kernels').glob('[a-z]*.py')}
+    assert {name for name in shared if len(users[name]) < 2} == set()
+
+
 def test_the_package_itself_imports_nothing_foreign():
     names = imports(PACKAGE / '__init__.py')
     foreign = {name.split('.')[0] for name in names} - sys.stdlib_module_names

@@ -63,13 +63,13 @@ def as_mapping(cls: type[Filter]) -> dict[str, Any]:
 
 def described(content: dict[str, Any]) -> str:
     """Return a filter for people: a line about it, and below one for each parameter."""
-    theirs = f' ({content["libpointmatcher"]})' if content['libpointmatcher'] else ''
-    lines = [f'{content["name"]}{theirs}', *textwrap.wrap(content['meaning'], WIDTH - 2)]
+    libpointmatcher = f' ({content["libpointmatcher"]})' if content['libpointmatcher'] else ''
+    lines = [f'{content["name"]}{libpointmatcher}', *textwrap.wrap(content['meaning'], WIDTH - 2)]
     for each in content['parameters']:
-        name = f'{each["name"]} ({each["libpointmatcher"]})' if theirs else each['name']
+        name = f'{each["name"]} ({each["libpointmatcher"]})' if libpointmatcher else each['name']
         name = name.removesuffix(' ()')
         default = each['default'] or "''"
-        if theirs and each['libpointmatcher_default'] != each['default']:
+        if libpointmatcher and each['libpointmatcher_default'] != each['default']:
             default += f' ({each["libpointmatcher_default"]} under the other name)'
         allowed = f' in {each["allowed"]}' if each['allowed'].startswith('[') else ''
         choices = f' of {each["allowed"]}' if each['allowed'] and not allowed else ''

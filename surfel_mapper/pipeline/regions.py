@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.polygons import mark_inside
+from surfel_mapper.pipeline.kernels.polygons import mark_inside
 
 MAX_CORNERS = 10_000
 """Limit of the corners of a polygon; 400,000 surfels take 3 s then."""
