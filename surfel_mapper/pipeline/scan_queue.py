@@ -141,6 +141,6 @@ class ScanQueue:
 
 
 def longest_wait_s(error: PoseNotYetError, config: PoseConfig) -> float:
-    """Return how far data may be ahead of a scan whose pose is missing for this cause, s."""
+    """Return the limit of the wait of a scan whose pose is missing for this cause, s of data."""
     is_late = isinstance(error, PosesLateError)
     return max(config.max_wait_s, config.max_delay_s) if is_late else config.max_wait_s

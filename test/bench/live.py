@@ -132,7 +132,7 @@ def measure(
 
 
 def latencies(stamps: Sequence[int], arrivals: Mapping[int, int]) -> dict[str, Any]:
-    """Return how many clouds came, and how late."""
+    """Return the number of clouds received, and their latencies."""
     came = [(arrivals[s] - s) / 1e6 for s in stamps if s in arrivals]
     return {
         'clouds': len(stamps),
