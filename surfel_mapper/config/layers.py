@@ -65,6 +65,16 @@ class TsdfConfig(Stage):
         'Optical centre of the lidar in the frame of its clouds, x y z in m; empty: the origin. '
         'For clouds that are not given in the frame of the lidar.',
     )
+    sensor_frame: str = setting(
+        '',
+        'Frame of the optical centre of the lidar, for clouds that are given in another, such as '
+        'base_link; its pose comes from TF or frames.sensors. Empty: the frame of the clouds.',
+    )
+    sensor_azimuth_deg: tuple[float, ...] = setting(
+        (),
+        'Azimuth of the last and the first column of a lidar that does not turn full circle, deg, '
+        'x ahead, y left; empty: full circle. Needs sensor_rows or sensor_beams_deg.',
+    )
     fusion: str = setting(
         'auto',
         'How scans are fused: images, voxels are looked up in the range image of a sensor; '
@@ -333,6 +343,26 @@ class TsdfConfig(Stage):
                 'another without semantics',
             ),
             ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
+            (
+                'sensor_center_m',
+                not (self.sensor_center_m and self.sensor_frame),
+                'empty where sensor_frame is given',
+            ),
+            (
+                'sensor_azimuth_deg',
+                not self.sensor_azimuth_deg
+                or (
+                    len(self.sensor_azimuth_deg) == 2
+                    and -360.0 <= self.sensor_azimuth_deg[0] < self.sensor_azimuth_deg[1] <= 360.0
+                    and self.sensor_azimuth_deg[1] - self.sensor_azimuth_deg[0] <= 360.0
+                ),
+                'two ascending angles between -360 and 360, at most 360 apart',
+            ),
+            (
+                'sensor_azimuth_deg',
+                not self.sensor_azimuth_deg or bool(self.sensor_rows or self.sensor_beams_deg),
+                'empty without sensor_rows or sensor_beams_deg',
+            ),
         )
 
     @property

@@ -10,7 +10,7 @@ frame has no model, and layers work without one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import logging
 from typing import Any
 
@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import CloudFormatError
+from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
@@ -78,11 +79,14 @@ class SensorModels:
     ----------
     config : TsdfConfig
         Rows, columns, angles and ranges of the sensors, as far as configured.
+    transforms : TransformBuffer, optional
+        Tree of frames, in which ``sensor_frame`` is looked up.
 
     """
 
-    def __init__(self, config: TsdfConfig) -> None:
+    def __init__(self, config: TsdfConfig, transforms: TransformBuffer | None = None) -> None:
         self._config = config
+        self._transforms = transforms
         self.frames: dict[str, FrameModel] = {}
         self.num_refits = 0
         self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
@@ -113,6 +117,28 @@ class SensorModels:
                 self._check_fitted(frame, scan)
             self._checked = scan, frame.model
         return self._checked[1]
+
+    def pose_in(self, scan: Scan) -> npt.NDArray[np.float64] | None:
+        """
+        Return the pose of the sensor in the frame of a scan, T_scan_sensor; None: its origin.
+
+        Raises
+        ------
+        PoseError
+            If ``sensor_frame`` is set and no transform leads from there to the frame of the scan.
+
+        """
+        config = self._config
+        if config.sensor_center_m:
+            T = np.eye(4)
+            T[:3, 3] = config.sensor_center_m
+            return T
+        if not config.sensor_frame or self._transforms is None:
+            return None
+        try:
+            return self._transforms.lookup(scan.frame_id, config.sensor_frame, scan.stamp_ns)
+        except PoseError as error:
+            raise PoseError(f'layers.tsdf.sensor_frame: {error}') from error
 
     def summary(self) -> dict[str, Any]:
         """Return the model and the share of fitting points of each frame, and the refits."""
@@ -156,6 +182,12 @@ class SensorModels:
             **self._ranges,
         )
         angles: dict[str, Any] = {'rows': fitted.rows, 'columns': fitted.columns}
+        if config.sensor_azimuth_deg:
+            last, first = config.sensor_azimuth_deg
+            share = (first - last) / 360.0
+            columns = config.sensor_columns or max(round(fitted.columns * share), 2)
+            angles |= {'columns': columns, 'horizontal_fov_deg': first - last}
+            angles['first_azimuth_deg'] = first
         if config.sensor_beams_deg:
             beams = tuple(sorted(config.sensor_beams_deg, reverse=True))
             return LidarModel(beam_elevations_deg=beams, **angles, **self._ranges)
@@ -163,7 +195,7 @@ class SensorModels:
             low, high = config.sensor_fov_deg
             angles |= {'vertical_fov_deg': high - low, 'vertical_fov_top_deg': high}
             return LidarModel(**angles, **self._ranges)
-        return fitted
+        return replace(fitted, **angles)
 
     def _check_fitted(self, frame: FrameModel, scan: Scan) -> None:
         """Check the model of a frame on a scan; fit it again if the scan does not fit."""
@@ -196,7 +228,7 @@ class SensorModels:
                 logger.warning(
                     'layers.tsdf: no model of a lidar fits the points in %s (%.0f %% of them, '
                     'expected %.0f %%): they are fused point by point, which is slower. For a '
-                    'single lidar set layers.tsdf.sensor_center_m or sensor_rows',
+                    'single lidar set layers.tsdf.sensor_frame or sensor_rows',
                     *(scan.frame_id, 100.0 * frame.share, 100.0 * LEAST_FIT),
                 )
             frame.due, frame.retry = frame.retry, min(2 * frame.retry, LAST_RETRY)

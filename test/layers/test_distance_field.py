@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
@@ -139,6 +140,31 @@ def test_cloud_about_another_origin_is_fused_about_the_optical_centre():
     assert np.abs(radii(mapper.tsdf.mesh(), mounted) - RADIUS_M).max() < 0.02
     with pytest.raises(ConfigError, match=r'sensor_center_m: .*x y z'):
         mapper_with(**{name: [1.0, 2.0]})
+
+
+def test_the_optical_centre_of_a_cloud_in_base_link_comes_from_its_frame():
+    turn, T = Rotation.from_euler('zy', [90.0, 12.0], degrees=True), np.eye(4)
+    T[:3, :3], T[:3, 3] = turn.as_matrix(), (0.5, 0.0, 1.8)
+    mapper = mapper_with(**{'layers.tsdf.sensor_frame': 'top', 'layers.tsdf.carve': True})
+    mapper.add_pose('odom', 'lidar', S, (3.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+    mapper.add_pose('lidar', 'top', 0, T[:3, 3], turn.as_quat(), static=True)
+    scan = sphere()
+    points = scan.points @ T[:3, :3].T + T[:3, 3]
+    mapper.add_scan(replace(scan, points=points.astype(np.float32), stamp_ns=S))
+    assert len(list(mapper.insert_ready())) == 1
+    summary = mapper.tsdf.summary()
+    assert (summary['scans'], summary['scans_by_points']) == (1, 0)  # a model fits
+    mesh = mapper.tsdf.mesh()
+    assert len(mesh) > 1000
+    assert np.abs(radii(mesh, T[:3, 3] + (3.0, 0.0, 0.0)) - RADIUS_M).max() < 0.02
+
+
+def test_an_unknown_frame_of_the_sensor_is_named(caplog):
+    mapper = mapper_with(**{'layers.tsdf.sensor_frame': 'nowhere'})
+    insert(mapper, 1)
+    assert 'layers.tsdf.sensor_frame: ' in caplog.text
+    assert 'nowhere' in caplog.text
+    assert mapper.tsdf.summary()['scans'] == 0
 
 
 def test_a_depth_image_is_fused_as_its_camera_saw_it():

@@ -73,6 +73,10 @@ def test_configured_angles_are_used_and_checked(caplog):
     assert model.beam_elevations_deg == pytest.approx(beams)
     assert model.columns == 512
     assert caplog.text == ''
+    front = SensorModels(config(sensor_rows=64, sensor_azimuth_deg=(-90.0, 90.0)))
+    points = wall_around(FIRST)
+    model = front.of(scan_of(points[points[:, 0] > 0.0]))
+    assert (model.first_azimuth_deg, model.horizontal_fov_deg, model.columns) == (90.0, 180.0, 512)
     wrong = SensorModels(config(sensor_rows=16, sensor_fov_deg=(-10.0, 0.0)))
     assert wrong.of(scan_of(wall_around(FIRST))).rows == 16
     assert 'fit this sensor' in caplog.text
@@ -82,6 +86,8 @@ def test_configured_angles_are_used_and_checked(caplog):
     'settings',
     [
         {'sensor_fov_deg': (-10.0, 10.0)},
+        {'sensor_azimuth_deg': (-90.0, 90.0)},
+        {'sensor_rows': 16, 'sensor_azimuth_deg': (90.0, -90.0)},
         {'sensor_rows': 16, 'sensor_fov_deg': (10.0, -10.0)},
         {'sensor_rows': 16, 'sensor_fov_deg': (10.0,)},
         {'sensor_beams_deg': (1.0,)},

@@ -122,6 +122,8 @@ class TsdfLayer(Layer):
             If the sensor cannot be recognised from the points of a scan.
         MapLimitError
             If the field cannot hold a scan; it is as before then.
+        PoseError
+            If ``sensor_frame`` is not connected with the frame of a scan.
 
         """
         if not self.config.tsdf.when_final:
@@ -141,12 +143,13 @@ class TsdfLayer(Layer):
 
         Raises
         ------
-        CloudFormatError, MapLimitError
+        CloudFormatError, MapLimitError, PoseError
             See follow.
 
         """
-        if self.config.tsdf.sensor_center_m:
-            scan, T_map_sensor = self._centered(scan, T_map_sensor)
+        if (T_scan_sensor := self.around.sensors.pose_in(scan)) is not None:
+            scan = centered(scan, T_scan_sensor)
+            T_map_sensor = T_map_sensor @ T_scan_sensor
         sensor = self._sensor(scan)
         self.blocks.clear_updated()
         if sensor is None:
@@ -198,6 +201,8 @@ class TsdfLayer(Layer):
                 sensor_columns=0,
                 sensor_fov_deg=(),
                 sensor_beams_deg=(),
+                sensor_azimuth_deg=(),
+                sensor_frame='',
             )
             config = replace(self.config, tsdf=tsdf)
             for dtype in (np.float32, np.float64):
@@ -344,15 +349,6 @@ class TsdfLayer(Layer):
             return None
         return sensor
 
-    def _centered(
-        self, scan: Scan, T_map_sensor: npt.NDArray[np.float64]
-    ) -> tuple[Scan, npt.NDArray[np.float64]]:
-        """Return a scan about the optical centre of its sensor, and the pose of the centre."""
-        center = np.array(self.config.tsdf.sensor_center_m)
-        T = T_map_sensor.copy()
-        T[:3, 3] += T[:3, :3] @ center
-        return replace(scan, points=(scan.points - center).astype(scan.points.dtype)), T
-
     def _measured(
         self, scan: Scan, max_range_m: float
     ) -> tuple[npt.NDArray[Any], dict[str, npt.NDArray[Any] | None]]:
@@ -372,6 +368,13 @@ class TsdfLayer(Layer):
         """Fuse a scan of the window at its final pose, if it waits for that."""
         scan = self._waiting.pop(windowed.stamp_ns, None)
         return [] if scan is None else [self.insert(scan, windowed.T_map_sensor)]
+
+
+def centered(scan: Scan, T_scan_sensor: npt.NDArray[np.float64]) -> Scan:
+    """Return a scan with points and free rays in the frame of its sensor."""
+    R, center = T_scan_sensor[:3, :3], T_scan_sensor[:3, 3]
+    points = ((scan.points - center) @ R).astype(scan.points.dtype)
+    return replace(scan, points=points, free=None if scan.free is None else scan.free @ R)
 
 
 def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
