@@ -9,7 +9,8 @@ loads no ROS. A verb prints its result on stdout and everything else on stderr. 
 --ros-args are ``args.ros_args``. Modules with a leading underscore are shared by verbs.
 
 Exit code 0: done; 1: refused, with a message; 2: usage; 3: done, but the bag is cut off, with
---strict; 4: done, but some scans have no certain place on the map; 130: interrupted.
+--strict; 4: done, but some scans have no certain place on the map, or their surroundings seem to
+move along; 130: interrupted.
 """
 
 from __future__ import annotations

@@ -7,7 +7,8 @@ Ctrl-C ends the recording early, and the scans mapped until then are written; pr
 ends at once. Several bags, --workers and --scheduler make a map in tiles.
 
 Exit code 3: done, but the recording is cut off and --strict was given. 4: done, but registration
-could not place some scans on the map, which became maps of their own.
+could not place some scans on the map, which became maps of their own, or the surroundings seem to
+move along.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from surfel_mapper.errors import MapError
 from surfel_mapper.offline.outputs import FORMATS, output_directory
 from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.offline.request import Request
-from surfel_mapper.offline.summary import apart_text, as_text
+from surfel_mapper.offline.summary import as_text, uncertain_text
 
 if TYPE_CHECKING:
     from surfel_mapper.config import Config
@@ -186,8 +187,8 @@ def run(args: argparse.Namespace) -> int:
             return INTERRUPTED
         if stopped():  # while files were written
             raise KeyboardInterrupt
-    if apart := apart_text(summary):
-        print(f'surfel-mapper: {apart}', file=sys.stderr)
+    if uncertain := uncertain_text(summary):
+        print(f'surfel-mapper: {uncertain}', file=sys.stderr)
         return APART
     return CUT if args.strict and summary['cut'] else 0
 

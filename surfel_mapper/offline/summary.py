@@ -8,6 +8,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+MOST_SURROUNDED = 5
+"""Scans that may seem to be surrounded by what moves along, before a replay says so."""
+
 
 def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     """
@@ -37,7 +40,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'{summary[name]["text"]}\n' for name in ('loops', 'alignment') if name in summary
     )
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
-    apart = apart_text(summary)
+    apart = uncertain_text(summary)
     speed = summary['recorded_s'] / summary['replay_s']
     deskewed = ', deskewed' if summary.get('deskewed') else ''
     poses = (
@@ -57,8 +60,24 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     )
 
 
-def apart_text(summary: Mapping[str, Any]) -> str:
+def uncertain_text(summary: Mapping[str, Any]) -> str:
     """Return which scans have no certain place on the map, and why; empty if there are none."""
+    return '\n'.join(filter(None, (apart_text(summary), surrounded_text(summary))))
+
+
+def surrounded_text(summary: Mapping[str, Any]) -> str:
+    """Return how long most of the surroundings seemed to move along; empty if hardly."""
+    found = summary.get('registration', {}).get('tracking', {}).get('surrounded')
+    if found is None or found['scans'] < MOST_SURROUNDED:
+        return ''
+    return (
+        f'in {found["scans"]} of {summary["scans"]["received"]} scans ({found["seconds"]:.1f} s) '
+        'most of what is seen seems to move along with the sensor: their poses may be wrong'
+    )
+
+
+def apart_text(summary: Mapping[str, Any]) -> str:
+    """Return the parts that stayed apart, and why; empty if there are none."""
     tracking = summary.get('registration', {})
     parts = tracking.get('apart', [])
     if not parts:

@@ -32,22 +32,26 @@ from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.map_part import ApartMap, LEAST_SCANS, MapPart, MOST_SCANS, Sighting
 from surfel_mapper.pipeline.prepared import Prepared
+from surfel_mapper.pipeline.surroundings import SurroundingMotion
 from surfel_mapper.poses import TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
 
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
+STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded')
+"""States of tracking; surrounded: most of what is seen seems to move along."""
+
 MAX_STEP_S = 10.0
 """Longest time between two scans that counts for a state, s; more is a gap of the recording."""
 
 
 class StateTimes:
-    """Scans and seconds in each state of tracking: lost, unconfirmed, ambiguous, degenerate."""
+    """Scans and seconds in each state of tracking."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
-        self._scans = dict.fromkeys(('lost', 'unconfirmed', 'ambiguous', 'degenerate'), 0)
+        self._scans = dict.fromkeys(STATES, 0)
         self._seconds = dict.fromkeys(self._scans, 0.0)
 
     def add(self, stamp_ns: int, states: list[str]) -> None:
@@ -95,6 +99,7 @@ class RegisteredPoses:
         self._part: MapPart | None = None
         self.apart: list[ApartMap] = []
         self._states = StateTimes()
+        self._surroundings = SurroundingMotion()
         self._registration = Registration(config.registration, config.map.voxel_size_m)
         start = config.registration.start
         self._start = pose_matrix(start[:3], start[3:]) if start else np.eye(4)
@@ -225,7 +230,8 @@ class RegisteredPoses:
             placed = self._track(seen, surfel_map, T_map_fixed)
         else:
             placed = self._recover(seen, self._part, surfel_map, T_map_fixed)
-        self._count_state(scan.stamp_ns, placed)
+        is_surrounded = self._is_surrounded(seen, placed, surfel_map)
+        self._count_state(scan.stamp_ns, placed, is_surrounded)
         return placed
 
     def finish(self) -> None:
@@ -365,9 +371,26 @@ class RegisteredPoses:
             T_fixed_body=T_fixed_body,
         )
 
-    def _count_state(self, stamp_ns: int, placed: list[Prepared]) -> None:
+    def _is_surrounded(
+        self, seen: Sighting, placed: list[Prepared], surfel_map: SurfelMap
+    ) -> bool:
+        """Return whether most of what a scan on the track sees seems to move along; warn then."""
+        if len(placed) != 1 or placed[0].registration is None:
+            self._surroundings.clear()
+            return False
+        T_map_middle = placed[0].registration.T_map_sensor
+        found = self._surroundings.move_along(seen.cells, T_map_middle, surfel_map)
+        if found:
+            self._drops.warn(
+                'surrounded',
+                f'scan at {seen.stamp_ns / 1e9:.6f} s: more of it is new than its motion '
+                'explains; most of what it sees seems to move along, and its pose may be wrong',
+            )
+        return found
+
+    def _count_state(self, stamp_ns: int, placed: list[Prepared], is_surrounded: bool) -> None:
         """Count the time since the scan before under the states of this one."""
-        states = []
+        states = ['surrounded'] if is_surrounded else []
         if self._part is not None:
             states.append('unconfirmed' if self._part.has_place else 'lost')
             states += ['ambiguous'] if 'ambiguous' in self._part.reason else []

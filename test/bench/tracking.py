@@ -79,6 +79,7 @@ def ours(sequence: Recording) -> Row:
         'max_m': float(np.max(errors.translation_m)),
         'ambiguous': said['ambiguous'],
         'degenerate': said['degenerate'],
+        'surrounded': said['tracking']['surrounded']['scans'],
     }
 
 

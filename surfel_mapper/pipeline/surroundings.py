@@ -1,0 +1,81 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+SurroundingMotion that seem to move along with the sensor, as trucks on all sides do.
+
+They fit the map well, at a pose that hardly moves, while the world between them streams past: scan
+after scan has voxels that the map does not know, more than the motion explains. Boxed in by nine
+trucks (test/bench/scenarios.py) 8 % of the voxels of a scan are new, at 0.1 m a scan; in the same
+street 0.1 % are new at rest, 2 % at rest with three trucks that pass, 9 % at 0.9 m a scan.
+
+It stands alone because it judges the result of tracking and has no part in it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
+from surfel_mapper.mapping.moments import point_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+
+SCANS = 10
+"""Number of scans over which motion and new voxels are averaged."""
+
+NEW_AT_REST = 0.04
+"""Share of new voxels that vehicles which pass a sensor at rest explain."""
+
+NEW_A_VOXEL = 0.1
+"""Further share that a motion of one voxel a scan explains."""
+
+LEVER_M = 5.0
+"""Distance at which rotations count as motion, m."""
+
+YOUNG = 10
+"""Number of scans after which a map holds what stands around it."""
+
+
+class SurroundingMotion:
+    """Shares of new voxels and motions of the latest scans."""
+
+    def __init__(self) -> None:
+        self._latest: deque[tuple[float, float]] = deque(maxlen=SCANS)
+        self._num_scans = 0
+        self._before: Transform | None = None
+
+    def clear(self) -> None:
+        """Forget all scans, after a loss."""
+        self._latest.clear()
+        self._before = None
+
+    def move_along(
+        self, cells: npt.NDArray[np.float64], T_map_body: Transform, surfel_map: SurfelMap
+    ) -> bool:
+        """
+        Take a scan; return whether most of what the latest scans saw seems to move along.
+
+        Parameters
+        ----------
+        cells : (K, 3) float64, m
+            Cells of the scan in the tracked frame.
+        T_map_body : (4, 4) float64
+            Its pose.
+        surfel_map : SurfelMap
+            The map before the scan.
+
+        """
+        keys = np.unique(point_keys(cells, T_map_body, surfel_map.voxel_size_m))
+        share = float((surfel_map.find(keys) < 0).mean()) if len(keys) else 0.0
+        self._num_scans += 1
+        if self._before is not None and self._num_scans > YOUNG:
+            off = compose(inverse(self._before), T_map_body)
+            way_m = float(np.linalg.norm(off[:3, 3])) + LEVER_M * rotation_angle(off)
+            self._latest.append((share, way_m / surfel_map.voxel_size_m))
+        self._before = T_map_body
+        if len(self._latest) < SCANS:
+            return False
+        new, way = np.mean(self._latest, axis=0)
+        return bool(new > NEW_AT_REST + NEW_A_VOXEL * way)
