@@ -13,7 +13,7 @@ Source: Fibonacci hashing, Knuth, The Art of Computer Programming, vol. 3, 6.4.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.prefetch import prefetch
 
 CHUNK = 1024
@@ -41,7 +41,7 @@ def home(key, shift):
     return np.int64((np.uint64(key) * _MIX) >> shift)
 
 
-@kernel()
+@part()
 def find_runs(keys, num, starts):
     """
     Find the runs of consecutive points of one voxel; return their number.
@@ -60,7 +60,7 @@ def find_runs(keys, num, starts):
     return num_runs
 
 
-@kernel()
+@part()
 def find_run_rows(chunk_keys, starts, num_runs, table, keys, sums, num_rows, run_rows):
     """
     Look up the row of each run's voxel, adding rows of zeros for new voxels; return their number.

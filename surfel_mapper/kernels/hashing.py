@@ -23,7 +23,7 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after Knuth, vol. 3, 6.4
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
@@ -97,7 +97,7 @@ def is_full(hashed, directory, held, depth):
     return held[segment] >= FULLEST - (segment * 79) % (SEGMENT // 4)
 
 
-@kernel()
+@part()
 def find_row(key, rows, table, depth):
     """
     Return the row of a voxel, or -1 if not found.
@@ -118,7 +118,7 @@ def find_row(key, rows, table, depth):
     return np.int64(-1)
 
 
-@kernel()
+@part()
 def insert_row(hashed, row, table, depth):
     """Insert the row of a voxel that is not in the table."""
     directory, buckets, held, _ = table
@@ -139,7 +139,7 @@ def insert_entry(hashed, row, directory, buckets, held, depth):
     buckets[bucket] = (hashed << 32) | (row + 1)
 
 
-@kernel()
+@part()
 def remove_row(key, row, table, depth):
     """
     Remove the row of a voxel from the table and close the gap.
@@ -169,7 +169,7 @@ def remove_entry(key, row, directory, buckets, held, depth):
     buckets[gap] = 0
 
 
-@kernel()
+@part()
 def split_segment(hashed, table, state):
     """
     Split the segment of a hash by the next bit of the hashes; return whether there was room.
@@ -189,15 +189,18 @@ def split_segment(hashed, table, state):
         return False
     state[SEGMENTS] = new + 1
     local_depth[old] = local_depth[new] = bits + 1
-    entries = buckets[old * SEGMENT : (old + 1) * SEGMENT].copy()
-    buckets[old * SEGMENT : (old + 1) * SEGMENT] = 0
-    buckets[new * SEGMENT : (new + 1) * SEGMENT] = 0
+    entries = np.empty(SEGMENT, np.int64)
+    for place in range(SEGMENT):
+        entries[place] = buckets[old * SEGMENT + place]
+        buckets[old * SEGMENT + place] = buckets[new * SEGMENT + place] = 0
     # the upper half of the directory entries with the old prefix gets the new segment
     span = 1 << (depth - bits)
     first = (hashed >> (32 - bits)) << (depth - bits) if bits > 0 else 0
-    directory[first + span // 2 : first + span] = new
+    for prefix in range(first + span // 2, first + span):
+        directory[prefix] = new
     held[old] = held[new] = 0
-    for entry in entries:
+    for place in range(SEGMENT):
+        entry = entries[place]
         if entry != 0:
             insert_row((entry >> 32) & _LOW, (entry & _LOW) - 1, table, depth)
     return True

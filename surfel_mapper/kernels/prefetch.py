@@ -12,7 +12,7 @@ Stands alone: it is the one place that emits an instruction of LLVM.
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, overload
+from numba.extending import lower_builtin, type_callable
 
 
 def prefetch(array, index):
@@ -24,28 +24,24 @@ def prefetch(array, index):
     """
 
 
-@intrinsic
-def _prefetch(typingctx, array, index):
-    """Emit the prefetch instruction of the machine."""
-
-    def codegen(context, builder, signature, arguments):
-        array_type, _ = signature.args
-        struct = context.make_array(array_type)(context, builder, arguments[0])
-        pointer = cgutils.get_item_pointer(
-            context, builder, array_type, struct, [arguments[1]], wraparound=False
-        )
-        pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
-        number = ir.IntType(32)
-        takes = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
-        function = builder.module.declare_intrinsic('llvm.prefetch', [pointer.type], takes)
-        for_write, keep_close, data = number(1), number(3), number(1)
-        builder.call(function, [pointer, for_write, keep_close, data])
-        return context.get_dummy_value()
-
-    return types.none(array, index), codegen
+@type_callable(prefetch)
+def _returns_nothing(context):
+    return lambda array, index: types.none
 
 
-@overload(prefetch, inline='always')
-def _compiled_prefetch(array, index):
-    # compiled code emits the instruction; the interpreter runs the empty function above
-    return lambda array, index: _prefetch(array, index)
+# compiled code emits the instruction, the interpreter runs the empty function above; an overload
+# of it would be compiled once more for every kernel that calls it
+@lower_builtin(prefetch, types.Array, types.Integer)
+def _emit(context, builder, signature, arguments):
+    array_type, _ = signature.args
+    struct = context.make_array(array_type)(context, builder, arguments[0])
+    pointer = cgutils.get_item_pointer(
+        context, builder, array_type, struct, [arguments[1]], wraparound=False
+    )
+    pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
+    number = ir.IntType(32)
+    takes = ir.FunctionType(ir.VoidType(), [pointer.type, number, number, number])
+    function = builder.module.declare_intrinsic('llvm.prefetch', [pointer.type], takes)
+    for_write, keep_close, data = number(1), number(3), number(1)
+    builder.call(function, [pointer, for_write, keep_close, data])
+    return context.get_dummy_value()

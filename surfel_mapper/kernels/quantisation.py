@@ -12,11 +12,11 @@ taken as three arrays, because x y z x y z takes three times as long (1.1 agains
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.compiling import kernel
+from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.layout import BITS, HALF, INDEX_BITS, INDEX_OFFSET
 
 
-@kernel(error_model='numpy')
+@part(error_model='numpy')
 def quantise(x, y, z, pose, scale, range_sq, keys, places):
     """
     Quantise the points of a chunk, without branches, so that the compiler vectorises the loop.

@@ -121,7 +121,8 @@ class MomentMap:
 
         """
         self._check_lattice(moments)
-        self._check_possible(moments)
+        if not moments.is_reduced:
+            self._check_possible(moments)
         self._check_counts(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)

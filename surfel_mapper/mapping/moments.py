@@ -58,6 +58,9 @@ class ScanMoments:
     rows : (K,) int32, optional
         Rows of the voxels in the map that inserted these moments last. Only hints, which save
         the look-up at removal: a map confirms each by the key in the row.
+    is_reduced : bool
+        Whether a Reducer made these moments of points, so that a map need not test if points can
+        have them. Copies with other values are not.
 
     """
 
@@ -72,6 +75,7 @@ class ScanMoments:
     channels: npt.NDArray[np.int64] = None  # type: ignore[assignment]  # none: (K, 0)
     left_out: Mapping[str, int] = field(default_factory=dict)
     rows: npt.NDArray[np.int32] | None = field(default=None, init=False, repr=False)
+    is_reduced: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Default to zero channels for every voxel."""

@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import check_rigid
-from surfel_mapper.kernels.grouping import build_table
+from surfel_mapper.kernels.grouping import build_table, CHUNK
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised
 from surfel_mapper.mapping.kernels.reduction import (
@@ -59,6 +59,12 @@ class Scratch:
 
     def __init__(self) -> None:
         self.left_out = np.zeros(4, np.int64)
+        self._chunk = (
+            np.empty(CHUNK, np.int64),
+            np.empty((3, CHUNK)),
+            np.empty(CHUNK + 1, np.int32),
+            np.empty(CHUNK, np.int32),
+        )
         self.reserve(2048)
 
     def reserve(self, num_voxels: int) -> None:
@@ -70,7 +76,7 @@ class Scratch:
     def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
         """Sum points by voxel, enlarging the memory if needed; return the number of voxels."""
         while True:
-            arrays = self.table, self.keys, self.sums
+            arrays = self.table, self.keys, self.sums, *self._chunk
             num = reduce_points(xyz, *quantisation, arrays, self.left_out)
             if num >= 0:
                 return int(num)
@@ -142,6 +148,7 @@ class Reducer:
             scratch.table.fill(-1)
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
         self._idle.append(scratch)
+        object.__setattr__(moments, 'is_reduced', True)
         return moments
 
     def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:

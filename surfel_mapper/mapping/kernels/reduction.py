@@ -44,17 +44,15 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
               keys (E,) int64, out: voxel keys in the order of first appearance, E <= B / 2;
               sums (E, 10) float64, out: count, sum (3), products (6: xx xy xz yy yz zz) of
-              the places in the voxel, in lattice units about its centre
+              the places in the voxel, in lattice units about its centre;
+              of one chunk: chunk_keys (CHUNK,) int64, places (3, CHUNK) float64,
+              starts (CHUNK + 1,) int32, run_rows (CHUNK,) int32
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
 
     After -1 the table is clear again: call with larger arrays.
     """
-    table, keys, sums = scratch
-    chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty((3, CHUNK))
-    starts = np.empty(CHUNK + 1, np.int32)
-    run_rows = np.empty(CHUNK, np.int32)
+    table, keys, sums, chunk_keys, places, starts, run_rows = scratch
     left_out[:] = 0
     num_rows = np.int64(0)  # an int here would compile find_run_rows for a literal 0 too
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
@@ -77,13 +75,14 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     return num_rows
 
 
-@part(fastmath={'contract'})
+@kernel(fastmath={'contract'})
 def add_runs(places, starts, num_runs, run_rows, sums):
     """
     Add count, sums and products of the places of each run to the sums of its voxel.
 
     One call for all runs, with unsigned indices, takes half the time of a call for each run. All
-    values are integers that float64 holds, so a fused multiply and add gives the same sums.
+    values are integers that float64 holds, so a fused multiply and add gives the same sums; no part
+    of the kernel, whose other products have to be rounded.
     """
     all_x, all_y, all_z = places[0], places[1], places[2]
     for run in range(np.uint32(num_runs)):
@@ -158,12 +157,11 @@ def look_back(keys, origin, voxel_size, view):
     Chunks without branches, so that the compiler vectorises the loop.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
-    x, y, z = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    towards = np.empty((3, CHUNK))
     for start in range(0, len(keys), CHUNK):
-        chunk = slice(start, start + CHUNK)
-        chunk_keys, views = keys[chunk], view[chunk]
-        for i in range(len(chunk_keys)):
-            key = chunk_keys[i]
+        num = min(CHUNK, len(keys) - start)
+        for i in range(num):
+            key = keys[start + i]
             ix = np.int32((key >> (2 * INDEX_BITS)) - INDEX_OFFSET)
             iy = np.int32(((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET)
             iz = np.int32((key & INDEX_MASK) - INDEX_OFFSET)
@@ -172,11 +170,12 @@ def look_back(keys, origin, voxel_size, view):
             dz = oz - (iz + 0.5) * voxel_size
             length = math.sqrt((dx * dx + dy * dy) + dz * dz)
             known = length > 0.0  # false for nan
-            x[i] = np.rint(VIEW_SCALE * (dx / length)) if known else 0.0
-            y[i] = np.rint(VIEW_SCALE * (dy / length)) if known else 0.0
-            z[i] = np.rint(VIEW_SCALE * (dz / length)) if known else 0.0
-        for i in range(len(chunk_keys)):
-            views[i, 0], views[i, 1], views[i, 2] = np.int16(x[i]), np.int16(y[i]), np.int16(z[i])
+            towards[0, i] = np.rint(VIEW_SCALE * (dx / length)) if known else 0.0
+            towards[1, i] = np.rint(VIEW_SCALE * (dy / length)) if known else 0.0
+            towards[2, i] = np.rint(VIEW_SCALE * (dz / length)) if known else 0.0
+        for i in range(num):
+            for axis in range(3):
+                view[start + i, axis] = np.int16(towards[axis, i])
 
 
 @kernel(error_model='numpy')

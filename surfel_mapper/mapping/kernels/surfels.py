@@ -67,12 +67,11 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
-        part = slice(start, start + num)
         most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(rows, chosen[part], scatter)
-        place(mean, num, voxel_size, bits, voxel_index[part], position[part])
+            center_exactly(rows, chosen, start, num, scatter)
+        place(mean, start, num, voxel_size, bits, voxel_index, position)
         decompose(scatter, num, values, normals)
         derive_shape(values, num, moments, voxel_size / (1 << bits), planarity, curvature, start)
         turn(normals, num, moments)
@@ -103,7 +102,7 @@ def derive_covariances(rows, chosen, voxel_size, bits, covariance):
         most = gather(rows, chosen, start, num, moments, num_points, voxel_index)
         center(moments, num, mean, scatter)
         if most >= many:
-            center_exactly(rows, chosen[start : start + num], scatter)
+            center_exactly(rows, chosen, start, num, scatter)
         for i in range(num):
             scale = unit * unit / max(moments[N, i] - 1.0, 1.0)
             for pair in range(6):
@@ -171,10 +170,10 @@ def center(moments, num, mean, scatter):
 
 
 @part(error_model='numpy')
-def center_exactly(rows, chosen, scatter):
+def center_exactly(rows, chosen, start, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
-    for i in range(len(chosen)):
-        row = np.int64(chosen[i])
+    for i in range(num):
+        row = np.int64(chosen[start + i])
         n = rows[row, COUNT]
         inverse = 1.0 / n
         pair = 0
@@ -192,14 +191,14 @@ def center_exactly(rows, chosen, scatter):
 
 
 @part(error_model='numpy')
-def place(mean, num, voxel_size, bits, voxel_index, position):
-    """Convert the means of a chunk to positions, (num, 3) m."""
+def place(mean, start, num, voxel_size, bits, voxel_index, position):
+    """Convert the means of a chunk to positions, m, from row start on."""
     cell = 1.0 / (1 << bits)
     half = (1 << (bits - 1)) + 0.5  # a lattice coordinate stands for the middle of its cell
     for i in range(num):
         for axis in range(3):
             inside = (mean[axis, i] + half) * cell
-            position[i, axis] = (voxel_index[i, axis] + inside) * voxel_size
+            position[start + i, axis] = (voxel_index[start + i, axis] + inside) * voxel_size
 
 
 @part(error_model='numpy')
@@ -222,7 +221,7 @@ def derive_shape(values, num, moments, unit, planarity, curvature, start):
         values[2, i] = e2 * scale
 
 
-@kernel()
+@part()
 def turn(normals, num, moments):
     """
     Turn the normals (3, CHUNK) of a chunk towards the sensor.

@@ -52,7 +52,9 @@ def some_points(num, dtype=np.float64, seed=0):
 def scratch_for(num_voxels):
     size = 1 << (2 * num_voxels - 1).bit_length()
     keys, sums = np.full(num_voxels, -7, np.int64), np.full((num_voxels, 10), np.nan)
-    return np.full(size, -1, np.int32), keys, sums
+    chunk_keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
+    starts, run_rows = np.empty(CHUNK + 1, np.int32), np.empty(CHUNK, np.int32)
+    return np.full(size, -1, np.int32), keys, sums, chunk_keys, places, starts, run_rows
 
 
 @both
@@ -117,7 +119,8 @@ def test_runs_add_count_sums_and_products_to_their_voxels(call):
 @pytest.mark.parametrize('num', [0, 1, 50, CHUNK - 1, CHUNK, CHUNK + 1, 2 * CHUNK + 5])
 def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
     points = some_points(num)
-    table, keys, sums = scratch = scratch_for(max(2 * num, 1))
+    scratch = scratch_for(max(2 * num, 1))
+    table, keys, sums = scratch[:3]
     left_out = np.full(4, -1, np.int64)
 
     found = call(reduce_points, points.T.copy(), *AS_THEY_ARE, scratch, left_out)
@@ -134,14 +137,13 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
 @both
 @pytest.mark.parametrize('room', [1, 8, 60])
 def test_a_scan_that_does_not_fit_leaves_the_table_clean(call, room):
-    table, keys, sums = scratch_for(room)
+    scratch = scratch_for(room)
     left_out = np.zeros(4, np.int64)
     points = np.random.default_rng(2).uniform(-9.0, 9.0, (3 * CHUNK, 3))
     points[: CHUNK + 9] = 0.1  # the first chunk fits
-    scratch = (table, keys, sums)
     asked = (points.T, *AS_THEY_ARE, scratch, left_out)
     assert call(reduce_points, *asked) == -1
-    assert (table == -1).all()
+    assert (scratch[0] == -1).all()
 
 
 @both
