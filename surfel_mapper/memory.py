@@ -47,18 +47,27 @@ collection the garbage of the compiler takes 60 MB."""
 
 
 @contextmanager
-def lasting_objects() -> Iterator[None]:
-    """
-    Collect garbage rarely in a with-block, and never visit the objects made so far after it.
-
-    For the start of a process whose objects stay: imported libraries and compiled kernels.
-    """
+def rare_collections() -> Iterator[None]:
+    """Collect garbage rarely in a with-block that compiles kernels."""
     before = gc.get_threshold()
     gc.set_threshold(RARELY, *before[1:])
     try:
         yield
     finally:
         gc.set_threshold(*before)
+
+
+@contextmanager
+def lasting_objects() -> Iterator[None]:
+    """
+    Collect garbage rarely in a with-block, and never visit the objects made so far after it.
+
+    For the start of a process whose objects stay: imported libraries and compiled kernels.
+    """
+    try:
+        with rare_collections():
+            yield
+    finally:
         gc.collect()
         gc.freeze()
 

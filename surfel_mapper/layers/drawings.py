@@ -11,12 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.tsdf.mesh import Mesh
+if TYPE_CHECKING:  # a map without a distance field does not load its kernels
+    from surfel_mapper.tsdf.mesh import Mesh
 
 Array = npt.NDArray[np.float64]
 

@@ -109,7 +109,8 @@ def changed_config(config: Config, parameters: Iterable[Parameter]) -> Config:
 
     """
     names = {declared.name for declared in declarations()}
-    return config.replace({p.name: p.value for p in parameters if p.name in names})
+    changed = {p.name: p.value for p in parameters if p.name in names}
+    return config.replace(changed) if changed else config
 
 
 def refusal(node: Node, parameters: Iterable[Parameter]) -> str:

@@ -16,7 +16,7 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
-from surfel_mapper.memory import lasting_objects
+from surfel_mapper.memory import lasting_objects, rare_collections
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.ros.inputs import Inputs
@@ -75,7 +75,7 @@ class Session:
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, the first time a quarter of a minute')
         before, later = self.mapper.warm_up_steps()
-        with lasting_objects():
+        with rare_collections():
             for step in before:
                 step()
         self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *later]

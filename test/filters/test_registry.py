@@ -80,10 +80,15 @@ def test_a_filter_that_filters_nothing_is_refused():
 
 
 def test_the_package_exports_every_filter():
-    exported = {cls for cls in vars(filters).values() if isinstance(cls, type)}
+    exported = {name: getattr(filters, name) for name in filters.__all__}
     built_in = [c for c in all_filters() if c.__module__.startswith('surfel_mapper.filters.')]
-    assert [cls.__name__ for cls in built_in if cls not in exported] == []
-    assert all(cls.__name__ in filters.__all__ for cls in built_in)
+    assert [cls.__name__ for cls in built_in if exported.get(cls.__name__) is not cls] == []
+
+
+def test_a_name_that_the_package_has_not_is_an_attribute_error():
+    assert set(filters.__all__) <= set(dir(filters))
+    with pytest.raises(AttributeError, match="no attribute 'Typo'"):
+        _ = filters.Typo
 
 
 def test_an_entry_point_is_found_by_its_name(monkeypatch):
