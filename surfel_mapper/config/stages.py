@@ -218,7 +218,8 @@ class FramesConfig(Stage):
     base_to_sensor: tuple[float, ...] = setting(
         (),
         'Pose of the sensor in the base frame, x y z in m, qx qy qz qw, followed by those of '
-        'further sensors; empty: from /tf_static.',
+        'further sensors; empty: from /tf_static. With pose.source identity: the place of a '
+        'sensor that does not move, in the fixed frame; normals are oriented towards it.',
     )
 
     def check(self, stage: str) -> None:

@@ -127,7 +127,26 @@ def moments_at(
 
 def viewpoint(T_map_sensor: Transform, config: Config) -> Transform | None:
     """Return the position of the sensor; None if unknown, and normals stay as they are."""
-    return None if config.pose.source == 'identity' else T_map_sensor[:3, 3]
+    if config.pose.source != 'identity':
+        return T_map_sensor[:3, 3]
+    place = standing_sensor(config)
+    if place is None:
+        return None
+    moved: npt.NDArray[np.float64] = (T_map_sensor[:3, :3] * place).sum(axis=1)
+    return moved + T_map_sensor[:3, 3]
+
+
+def standing_sensor(config: Config) -> npt.NDArray[np.float64] | None:
+    """
+    Return where the sensor stands with ``pose.source: identity``, (3,) m in the fixed frame.
+
+    Only ``frames.base_to_sensor`` tells: clouds in the fixed frame may be those of a sensor that
+    stands in its origin, or made of the scans of one that moves.
+    """
+    values = config.frames.base_to_sensor
+    if config.pose.source != 'identity' or config.frames.sensors or not values:
+        return None
+    return np.array(values[:3])
 
 
 def warm_up_steps(config: Config) -> tuple[list[Step], list[Step]]:
@@ -154,10 +173,11 @@ def compile_adding(config: Config, dtype: npt.DTypeLike) -> None:
 
 
 def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile removing points of a type, the digest, and coarser maps if they are published."""
+    """Compile removing points of a type, the digest, checks, and coarser maps if published."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {n: np.zeros(1) for n in CHANNELS}
     moments = surfel_map.add(np.zeros((1, 3), dtype), columns=columns)
+    surfel_map.insert(replace(moments))  # a copy is checked
     surfel_map.digest()
     if config.publish.levels:
         surfel_map.coarsen(1).surfels()

@@ -23,6 +23,8 @@ import numpy as np
 from rclpy.node import Node
 from std_msgs.msg import Header
 
+from surfel_mapper.config import Config
+from surfel_mapper.pipeline.reduction import standing_sensor
 from surfel_mapper.ros.base_node import CountedPublisher, steady_timer
 from surfel_mapper.ros.health import ERROR, findings, Interval, OFF_S, OK
 from surfel_mapper.ros.messages import time_message
@@ -155,6 +157,11 @@ class Totals:
         }
 
 
+def is_oriented(config: Config) -> bool:
+    """Return whether the positions of the sensors are known, so that normals turn to them."""
+    return config.pose.source != 'identity' or standing_sensor(config) is not None
+
+
 def figures(session: Session) -> dict[str, Any]:
     """Return the counts, times and sizes of a session."""
     mapper, counters = session.mapper, session.mapper.counters
@@ -170,7 +177,7 @@ def figures(session: Session) -> dict[str, Any]:
         },
         **counters.summary(),
         **({'registration': mapper.registered.summary()} if mapper.registered else {}),
-        'normals': 'not oriented' if mapper.config.pose.source == 'identity' else 'oriented',
+        'normals': 'oriented' if is_oriented(mapper.config) else 'not oriented',
         'voxels': mapper.map.num_voxels,
         'map_bytes': mapper.map.nbytes,
         'window_scans': len(mapper.window),

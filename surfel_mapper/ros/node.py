@@ -33,6 +33,7 @@ from rclpy.parameter import Parameter
 
 from surfel_mapper.errors import ConfigError, SurfelMapperError
 from surfel_mapper.filters.chain import Chain
+from surfel_mapper.pipeline.reduction import standing_sensor
 from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
@@ -156,9 +157,14 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             f'of {self._config.map.voxel_size_m:g} m'
         )
         if self._config.pose.source == 'identity':
+            place = standing_sensor(self._config)
             self.get_logger().info(
                 'pose.source identity gives no position of the sensor, so normals are not '
-                'oriented towards it: their component of largest magnitude is positive'
+                'oriented towards it: their component of largest magnitude is positive; '
+                'frames.base_to_sensor gives that of a sensor that does not move'
+                if place is None
+                else f'normals are oriented towards a sensor that stands at {place.tolist()} m '
+                f'in {self._config.frames.fixed}: frames.base_to_sensor with pose.source identity'
             )
 
     def _deactivate(self) -> None:

@@ -276,3 +276,16 @@ def test_after_the_warm_up_nothing_is_compiled_any_more():
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == '{}\n'
+
+
+@pytest.mark.parametrize(
+    ('mount', 'up'),
+    [((), 1.0), ((0.0, 0.0, 2.0, *LEVEL), 1.0), ((0.0, 0.0, -2.0, *LEVEL), -1.0)],
+)
+def test_normals_turn_to_a_standing_sensor_only_if_its_place_is_given(mount, up):
+    mapper = mapper_with(pose__source='identity', frames__base_to_sensor=mount)
+    grid = np.stack(np.meshgrid(np.arange(0.05, 2.0, 0.1), np.arange(0.05, 2.0, 0.1), [0.1]), -1)
+
+    (update,) = insert(mapper, scan_at(1.0, points=grid.reshape(-1, 3).astype(np.float32)))
+
+    assert np.allclose(update.changed.normal, [0.0, 0.0, up], atol=1e-6)

@@ -127,7 +127,9 @@ def test_stamps_of_several_sensors_are_in_order_each_for_itself():
 
 
 def test_a_stamp_that_goes_back_far_clears_the_map_and_says_so(caplog):
-    mapper = mapper_with(pose__source='identity', input__reset_after_s=1.0)
+    mapper = mapper_with(
+        pose__source='identity', frames__base_to_sensor=(), input__reset_after_s=1.0
+    )
     insert(mapper, scan_at(5.0), scan_at(6.0))
     later = [scan_at(4.999999999), scan_at(5.5)]
     with caplog.at_level(logging.WARNING):

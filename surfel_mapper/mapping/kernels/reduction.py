@@ -81,8 +81,8 @@ def add_runs(places, starts, num_runs, run_rows, sums):
     Add count, sums and products of the places of each run to the sums of its voxel.
 
     One call for all runs, with unsigned indices, takes half the time of a call for each run. All
-    values are integers that float64 holds, so a fused multiply and add gives the same sums; no part
-    of the kernel, whose other products have to be rounded.
+    values are integers that float64 holds, so a fused multiply and add gives the same sums. Not a
+    part of its kernel, whose other products have to be rounded.
     """
     all_x, all_y, all_z = places[0], places[1], places[2]
     for run in range(np.uint32(num_runs)):
