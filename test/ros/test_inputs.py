@@ -134,13 +134,13 @@ def test_depth_images_are_mapped_with_their_calibration(start, peer, encoding):
         *('-r', f'depth/image:={image}'),
     )
     peer.advertise('/odom', image, info, kinds={image: Image, info: CameraInfo})
-    camera = PinholeCamera(width=80, height=60, fx=70.0, fy=70.0, cx=39.5, cy=29.5)
+    camera = PinholeCamera(width=640, height=480, fx=560.0, fy=560.0, cx=319.5, cy=239.5)
     dtype = np.uint16 if encoding == '16UC1' else np.float32
     rng = np.random.default_rng(1)
     images, poses = [], []
     for number in range(4):
         stamp_ns = START_NS + number * PERIOD_NS
-        depth = rng.uniform(2.0, 2.2, (60, 80)) * (1000 if dtype == np.uint16 else 1)
+        depth = rng.uniform(2.0, 2.2, (480, 640)) * (1000 if dtype == np.uint16 else 1)
         depth[:5] = 0
         images.append(depth_image(stamp_ns, depth.astype(dtype), encoding))
         poses.append(odometry(stamp_ns, (0.1 * number, 0.0, 0.0)))
