@@ -36,7 +36,8 @@ from surfel_mapper.bags.bag_file import (
     MESSAGE_BYTES,
 )
 from surfel_mapper.bags.compression import max_unpacked_bytes, unpacked
-from surfel_mapper.budget import VARIABLE
+from surfel_mapper.budget import stated_limit, VARIABLE
+from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection
@@ -58,6 +59,10 @@ MOST_OF_CHUNK = 0.5
 
 CHECK_EVERY = 1024
 """Number of messages after which the budget is asked again."""
+
+MAX_MESSAGES, LEAST_BYTES = 100_000, 16
+"""Limit of the messages of a small file, and bytes of a file for each further one; the entries in
+the index of a chunk have 16, and finding a message takes 1.5 us."""
 
 LOOSE = -1
 """Number of the chunk of messages that are outside of chunks."""
@@ -154,8 +159,12 @@ class ChunkedFile(BagFile):
         """Return the head of a chunk; raise one of DAMAGE if it is inconsistent."""
 
     @abstractmethod
-    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
-        """Yield the messages in unpacked records; keep or check connections; raise at a cut."""
+    def _walk(self, number: int, records: bytes | bytearray, index: array[int]) -> None:
+        """
+        Append the messages in unpacked records to an index; keep or check connections.
+
+        After each CHECK_EVERY messages ``_charge`` is called. Raises one of DAMAGE at a cut.
+        """
 
     def _survey_chunk(self, chunk: Chunk) -> None:
         """Search a chunk that no index describes; keep its span and counts."""
@@ -169,6 +178,7 @@ class ChunkedFile(BagFile):
             first_ns, last_ns = int(index[:, 0].min()), int(index[:, 0].max())
             self._chunks[number] = chunk._replace(start_ns=first_ns, end_ns=last_ns, counts=found)
             self._note_chunk(self._chunks[number])
+            self._check_number(sum(self._counts.values()))
         self._budget.give_back(MESSAGE_BYTES * len(index))
 
     def _note_chunk(self, chunk: Chunk) -> None:
@@ -189,6 +199,7 @@ class ChunkedFile(BagFile):
 
         The first chunk with a message of a connection describes it, so few chunks are unpacked.
         """
+        self._check_number(sum(self._counts.values()))
         left = {key for key, count in self._counts.items() if count}
         if not left <= self._by_id.keys():
             raise ValueError('the index has messages of unknown connections')
@@ -226,20 +237,31 @@ class ChunkedFile(BagFile):
         numbers, chunk = array('q'), self._chunks[number]
         try:
             records = self._unpacked(number)
-            for found in self._walk(number, records):
-                if len(numbers) % (INDEX_COLUMNS * CHECK_EVERY) == 0:
-                    self._budget.check_time()
-                    count = len(numbers) // INDEX_COLUMNS + CHECK_EVERY
-                    self._budget.take(CHECK_EVERY * MESSAGE_BYTES, f'index of {count} messages')
-                numbers.extend((found.record_ns, found.connection, *found.place))
+            self._walk(number, records, numbers)
         except DAMAGE as error:
             if chunk.is_whole:
                 reason = f'no field {error}' if isinstance(error, KeyError) else str(error)
                 self._note_damage(chunk.start, reason, len(numbers) // INDEX_COLUMNS)
         index = as_index(numbers)
-        rounding = -len(index) % CHECK_EVERY  # memory is charged in steps
-        self._budget.give_back(MESSAGE_BYTES * rounding)
+        rest = len(index) % CHECK_EVERY  # the others were charged by _walk
+        self._budget.take(MESSAGE_BYTES * rest, f'index of {len(index)} messages')
         return index
+
+    def _charge(self, index: array[int]) -> None:
+        """Ask the budget for the last CHECK_EVERY messages of an index, and for the time."""
+        self._budget.check_time()
+        count = len(index) // INDEX_COLUMNS
+        self._budget.take(CHECK_EVERY * MESSAGE_BYTES, f'index of {count} messages')
+        self._check_number(count)
+
+    def _check_number(self, count: int) -> None:
+        """Raise BagError if there are more messages than a file of this size may have."""
+        most = max(MAX_MESSAGES, stated_limit() // MESSAGE_BYTES, self.size // LEAST_BYTES)
+        if count > most:
+            raise BagError(
+                f'{self.path}: over {most} messages in {self.size} bytes; is it damaged? '
+                f'Otherwise set {VARIABLE}'
+            )
 
     def _note_damage(self, start: int, reason: str, num_found: int) -> None:
         """Note a damaged chunk, and the number of messages before the damage."""
@@ -252,14 +274,16 @@ class ChunkedFile(BagFile):
         """Return the bytes of a message: a copy, or a view into its chunk if it is most of it."""
         if number == LOOSE:
             return self._at(at, size)
-        if number not in self._kept:
+        records = self._kept.get(number)
+        if records is None:
             with self._budget.clock():
                 self._budget.check_time()
                 head = self._head(self._chunks[number])
                 if is_plain(head):
                     return self._at(head.start + at, size)
-                self._unpacked(number)
-        records = self._unpacked(number)
+                records = self._unpacked(number)
+        else:
+            self._kept.move_to_end(number)
         view = memoryview(records)[at : at + size]
         is_most = size > MOST_OF_CHUNK * len(records)
         return view if is_most or size > MAX_COPIED_BYTES else bytes(view)

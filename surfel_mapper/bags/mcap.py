@@ -14,14 +14,15 @@ Source: the specification of the format, mcap.dev/spec.
 
 from __future__ import annotations
 
+from array import array
 from collections import Counter
 from collections.abc import Iterator
 import struct
 from zlib import crc32
 
 from surfel_mapper.bags._rosbags import is_same, ros2_connection
-from surfel_mapper.bags.bag_file import FoundMessage
-from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.bag_file import FoundMessage, INDEX_COLUMNS
+from surfel_mapper.bags.chunked import CHECK_EVERY, Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
 STATISTICS, DATA_END = 11, 15
@@ -31,6 +32,9 @@ MESSAGE_HEAD = struct.Struct('<HIQQ')
 CHUNK_HEAD = struct.Struct('<QQQI')
 CHUNK_INDEX_HEAD = struct.Struct('<QQQQ')
 FOOTER_CONTENT = struct.Struct('<QQI')
+
+MAX_NS = 2**63
+"""End of record times."""
 
 INDEX_RECORD_BYTES = 15
 """Bytes of a message index record without its entries, of 16 bytes each."""
@@ -143,8 +147,11 @@ class McapFile(ChunkedFile):
     def _note_record(self, kind: int, start: int, size: int) -> None:
         """Keep the message, schema or channel in a record outside of chunks."""
         if kind == MESSAGE:
-            head = self._at(start, MESSAGE_HEAD.size)
-            self._note_loose(self._found(head, 0, start, size, LOOSE))
+            channel, _, record_ns, _ = MESSAGE_HEAD.unpack(self._at(start, MESSAGE_HEAD.size))
+            if channel not in self._by_id or size < MESSAGE_HEAD.size or record_ns >= MAX_NS:
+                raise ValueError(f'message of channel {channel} at {record_ns} ns')
+            place = (LOOSE, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size, 0)
+            self._note_loose(FoundMessage(record_ns, channel, place))
         elif kind in (SCHEMA, CHANNEL):
             self._note(kind, self._at(start, size))
 
@@ -164,25 +171,21 @@ class McapFile(ChunkedFile):
         left = min(packed_size, chunk.size - start)
         return Packed(chunk.start + start, left, compression, unpacked_size, checksum)
 
-    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
-        """Yield the messages in the records of a chunk; keep or check schemas and channels."""
+    def _walk(self, number: int, records: bytes | bytearray, index: array[int]) -> None:
+        """Append the messages in the records of a chunk; keep or check schemas and channels."""
+        known, head, size = self._by_id, MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
+        charge_at = CHECK_EVERY * INDEX_COLUMNS
         for kind, at, length in records_in(records):
-            if kind == MESSAGE:
-                yield self._found(records, at, at, length, number)
-            else:
+            if kind != MESSAGE:
                 self._note(kind, bytes(records[at : at + length]))
-
-    def _found(
-        self, records: bytes | bytearray, head_at: int, start: int, size: int, number: int
-    ) -> FoundMessage:
-        """Return the entry of a message, of which bytes with its head are given."""
-        channel, _, record_ns, _ = MESSAGE_HEAD.unpack_from(records, head_at)
-        if record_ns >= 2**63:
-            raise ValueError(f'record time of {record_ns} ns')
-        if channel not in self._by_id or size < MESSAGE_HEAD.size:
-            raise ValueError(f'message of the unknown channel {channel}')
-        place = (number, start + MESSAGE_HEAD.size, size - MESSAGE_HEAD.size, 0)
-        return FoundMessage(record_ns, channel, place)
+                continue
+            channel, _, record_ns, _ = head(records, at)
+            if channel not in known or length < size or record_ns >= MAX_NS:
+                raise ValueError(f'message of channel {channel} at {record_ns} ns')
+            index.extend((record_ns, channel, number, at + size, length - size, 0))
+            if len(index) == charge_at:
+                self._charge(index)
+                charge_at += CHECK_EVERY * INDEX_COLUMNS
 
     def _note(self, kind: int, content: bytes) -> None:
         """Keep a schema or channel; raise ValueError if it differs from an earlier one."""

@@ -23,6 +23,9 @@ PACKED_SUFFIX = '.zstd'
 ROS1_SUFFIXES = ('.bag', '.bag.active')
 METADATA = 'metadata.yaml'
 
+MAX_NODES = 100_000
+"""Limit of the nodes of a metadata.yaml, which has 13 for each file of the bag."""
+
 
 def files_of(path: Path) -> list[Path]:
     """
@@ -98,7 +101,7 @@ def metadata(directory: Path) -> Mapping[str, Any] | None:
 @lru_cache(maxsize=16)
 def information_in(path: Path, _mtime_ns: int, _size: int) -> Mapping[str, Any]:
     """Return the content of a metadata.yaml, cached: parsing takes 10 ms."""
-    information = read_yaml(path)['rosbag2_bagfile_information']
+    information = read_yaml(path, max_nodes=MAX_NODES)['rosbag2_bagfile_information']
     if not isinstance(information, Mapping):
         raise TypeError(f'rosbag2_bagfile_information is a {type(information).__name__}')
     return information

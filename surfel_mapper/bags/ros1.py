@@ -15,15 +15,23 @@ Source: wiki.ros.org/Bags/Format/2.0.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from array import array
 import re
 import struct
 
 from surfel_mapper.bags._rosbags import is_same, ros1_connection
-from surfel_mapper.bags.bag_file import FoundMessage
-from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.bag_file import FoundMessage, INDEX_COLUMNS
+from surfel_mapper.bags.chunked import CHECK_EVERY, Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
+
+WORD = struct.Struct('<I')
+
+MESSAGE_HEAD = struct.Struct('<9sI8s9sII')
+"""Header of a message as rosbag writes it: its three fields, each after its length."""
+
+USUAL = b'\x09\0\0\0conn=', b'\x04\0\0\0op=\x02', b'\x0d\0\0\0time='
+"""The constant parts of such a header."""
 
 MOST_HEADER_BYTES = 1 << 20
 """A longer header is damaged; message definitions are in the data."""
@@ -132,23 +140,35 @@ class Ros1File(ChunkedFile):
         left = min(size, self.size - start)
         return Packed(start, left, fields['compression'].decode(), unpacked_size)
 
-    def _walk(self, number: int, records: bytes | bytearray) -> Iterator[FoundMessage]:
-        """Yield the messages in the records of a chunk; keep or check connections."""
-        at = 0
+    def _walk(self, number: int, records: bytes | bytearray, index: array[int]) -> None:
+        """Append the messages in the records of a chunk; keep or check connections."""
+        at, word, head = 0, WORD.unpack_from, MESSAGE_HEAD.unpack_from
+        charge_at = CHECK_EVERY * INDEX_COLUMNS
         while at < len(records):
-            (length,) = struct.unpack_from('<I', records, at)
+            (length,) = word(records, at)
             data = at + 8 + length
             if length > MOST_HEADER_BYTES:
                 raise ValueError(f'header of {length} bytes')
-            (size,) = struct.unpack_from('<I', records, data - 4)
+            (size,) = word(records, data - 4)
             if data + size > len(records):
                 raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
-            fields = header_fields(bytes(records[at + 4 : data - 4]))
-            kind = fields['op'][0]
-            if kind == CONNECTION:
-                self._note_connection(fields, bytes(records[data : data + size]))
-            elif kind == MESSAGE:
-                yield self._found(fields, data, size, number)
+            is_usual = length == MESSAGE_HEAD.size
+            if is_usual:
+                conn, key, op, time, seconds, rest = head(records, at + 4)
+                is_usual = (conn, op, time) == USUAL and key in self._by_id
+            if is_usual:
+                index.extend((seconds * 10**9 + rest, key, number, data, size, 0))
+            else:
+                fields = header_fields(bytes(records[at + 4 : data - 4]))
+                kind = fields['op'][0]
+                if kind == CONNECTION:
+                    self._note_connection(fields, bytes(records[data : data + size]))
+                elif kind == MESSAGE:
+                    found = self._found(fields, data, size, number)
+                    index.extend((found.record_ns, found.connection, *found.place))
+            if len(index) == charge_at:
+                self._charge(index)
+                charge_at += CHECK_EVERY * INDEX_COLUMNS
             at = data + size
 
     def _found(self, fields: Fields, start: int, size: int, number: int) -> FoundMessage:

@@ -6,25 +6,36 @@ Reading of YAML files, in time and memory bounded by their size.
 A YAML alias (``*name``) repeats an anchored node (``&name``). A few lines of nested aliases expand
 to a tree that no memory holds, so an alias inside of an anchored node is refused, and aliases
 count as the nodes that they expand to. Nesting deeper than any setting, which would exhaust the
-recursion of the parser, is refused too. Only regular files of at most 1 MiB are read.
+recursion of the parser, is refused too, and numbers of thousands of digits: those of base 60
+(``1:1:1``) take time by the square of their length. Only regular files of at most 1 MiB are read.
 
 Alone in its module because chains of filters and bags are read by it too, not only settings.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
+import re
 from typing import Any
 
 from surfel_mapper.budget import read_small_file
 
 MAX_DEPTH = 50
 
-MAX_EXPANDED = 100_000
-"""Limit of the nodes that the aliases of a file expand to; a chain of filters has some hundred."""
+MAX_NODES = 20_000
+"""Limit of the nodes of a file, and of those that its aliases expand to; settings have 600, and a
+node takes 10 us."""
+
+MAX_NUMBER = 4300
+"""Limit of the length of a number, that of Python."""
 
 
-def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
+NUMBER = re.compile(r'[-+.0-9]')
+"""First character of a number."""
+
+
+def read_yaml(path: str | Path, *, as_text: bool = False, max_nodes: int = MAX_NODES) -> Any:
     """
     Return the content of a YAML file.
 
@@ -34,26 +45,30 @@ def read_yaml(path: str | Path, *, as_text: bool = False) -> Any:
         The file.
     as_text : bool
         Leave every scalar as text.
+    max_nodes : int
+        Limit of the nodes, and of those that aliases expand to.
 
     Raises
     ------
     OSError
         If the file cannot be read.
     ValueError
-        If it is not a regular file of at most 1 MiB, not YAML, is nested too deeply, or has
-        aliases that expand to too much.
+        If it is not a regular file of at most 1 MiB, not YAML, is nested too deeply, has too many
+        nodes, with those that aliases expand to, or a number of too many digits.
 
     """
-    return parse_yaml(read_small_file(path).decode(), as_text=as_text)
+    return parse_yaml(read_small_file(path).decode(), as_text=as_text, max_nodes=max_nodes)
 
 
-def parse_yaml(text: str, *, as_text: bool = False) -> Any:
+def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) -> Any:
     """Return the content of a YAML text; raises ValueError as read_yaml does."""
     import yaml
 
+    # by libyaml, if PyYAML was built with it: 1 us a token instead of 10
+    base = getattr(yaml, 'CBaseLoader', yaml.BaseLoader)
     try:
-        check_nesting(text)
-        return yaml.load(text, yaml.BaseLoader if as_text else yaml.SafeLoader)
+        check_nodes(yaml.parse(text, base), max_nodes, as_text=as_text)
+        return yaml.load(text, base if as_text else getattr(yaml, 'CSafeLoader', yaml.SafeLoader))
     except yaml.MarkedYAMLError as error:
         # without the line itself: a caller may pass a path whose content is not theirs to read
         raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
@@ -61,26 +76,30 @@ def parse_yaml(text: str, *, as_text: bool = False) -> Any:
         raise ValueError('characters that YAML does not allow') from error
 
 
-def check_nesting(text: str) -> None:
-    """Raise ValueError if YAML is nested too deeply or has aliases that expand to too much."""
+def check_nodes(events: Iterable[Any], max_nodes: int, *, as_text: bool) -> None:
+    """Raise ValueError if YAML has too many nodes, nested too deeply, or too long numbers."""
     import yaml
 
     open_nodes: list[tuple[str | None, int]] = []  # anchor, and number of the first node inside
     sizes: dict[str, int] = {}
     num_nodes = expanded = 0
-    for event in yaml.parse(text, yaml.BaseLoader):
+    for event in events:
         if isinstance(event, yaml.AliasEvent):
             if any(anchor is not None for anchor, _ in open_nodes):
                 raise ValueError(f'an alias inside of an anchored node{place(event.start_mark)}')
             expanded += sizes.get(event.anchor, 1)
-            if expanded > MAX_EXPANDED:
+            if expanded > max_nodes:
                 raise ValueError(
-                    f'aliases that expand to over {MAX_EXPANDED} nodes{place(event.start_mark)}'
+                    f'aliases that expand to over {max_nodes} nodes{place(event.start_mark)}'
                 )
         elif isinstance(event, yaml.NodeEvent):
             num_nodes += 1
+            if num_nodes > max_nodes:
+                raise ValueError(f'over {max_nodes} nodes{place(event.start_mark)}')
             if isinstance(event, yaml.CollectionStartEvent):
                 open_nodes.append((event.anchor, num_nodes))
+            elif not as_text and len(event.value) > MAX_NUMBER and NUMBER.match(event.value):
+                raise ValueError(f'over {MAX_NUMBER} digits{place(event.start_mark)}')
         elif isinstance(event, yaml.CollectionEndEvent):
             anchor, first = open_nodes.pop()
             if anchor is not None:

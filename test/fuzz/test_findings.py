@@ -80,6 +80,24 @@ def test_yaml_that_expands_or_is_malformed_is_refused(tmp_path, text):
         Chain.load(path)
 
 
+@pytest.mark.parametrize(
+    ('text', 'problem'),
+    [
+        ('map: {voxel_size_m: ' + '1:' * 300_000 + '1}', 'over 4300 digits in line 1'),
+        ('map: [' + '1, ' * 300_000 + '1]', 'over 20000 nodes in line 1'),
+    ],
+    ids=['base 60', 'nodes'],
+)
+def test_yaml_that_takes_long_is_refused(tmp_path, text, problem):
+    """A number of base 60 takes hours, a node of a list 10 us."""
+    path = tmp_path / 'a.yaml'
+    path.write_text(text)
+    start_s = time.thread_time()
+    with pytest.raises(ConfigError, match=problem):
+        load_config(path)
+    assert time.thread_time() - start_s < 1.0
+
+
 def test_aliases_are_allowed_in_yaml(tmp_path):
     path = tmp_path / 'a.yaml'
     path.write_text('- &a {range_limit: {min_m: 2}}\n- *a\n')
@@ -314,9 +332,9 @@ def test_settings_are_read_from_small_regular_files_only(tmp_path, name):
 
 def test_yaml_aliases_count_as_the_nodes_that_they_expand_to(tmp_path):
     path = tmp_path / 'a.yaml'
-    anchor = '- &a {range_limit: {min_m: [' + ', '.join('1' * 5000) + ']}}\n'
+    anchor = '- &a {range_limit: {min_m: [' + ', '.join('1' * 1000) + ']}}\n'
     path.write_text(anchor + '- *a\n' * 30)
-    with pytest.raises(ConfigError, match='aliases that expand to over 100000 nodes'):
+    with pytest.raises(ConfigError, match='aliases that expand to over 20000 nodes'):
         Chain.load(path)
     path.write_text('- &a {range_limit: {min_m: 1}}\n' + '- *a\n' * 50)
     assert len(Chain.load(path)) == 51
@@ -448,6 +466,14 @@ def cost_of_reading(path):
     except BagError as error:
         found = str(error)
     return found, resident('VmHWM') - before, time.thread_time() - start_s
+
+
+def test_more_messages_than_a_file_has_room_for_are_refused(tmp_path):
+    path = tmp_path / 'a.mcap'
+    path.write_bytes(mcap_of_empty_messages(6, 20_000))
+    found, _, seconds = cost_of_reading(path)
+    assert 'over 100000 messages in' in found
+    assert seconds < 3.0  # .2 s
 
 
 def test_overlapping_chunks_of_an_indexed_mcap_are_not_held_at_once(tmp_path):
@@ -635,9 +661,9 @@ def test_messages_of_unknown_topics_are_told(small_database):
 def test_large_chunks_are_unpacked_one_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(chunked, 'KEPT_BYTES', 1 << 20)
     path = tmp_path / 'a.mcap'
-    path.write_bytes(mcap_of_empty_messages(4, 30_000))
+    path.write_bytes(mcap_of_empty_messages(4, 20_000))
     with BagReader(path) as reader:
-        assert sum(1 for _ in reader.messages()) == 4 * 30_000
+        assert sum(1 for _ in reader.messages()) == 4 * 20_000
         ((_, storage),) = reader._storages
         assert len(storage._kept) == 1
 
