@@ -110,7 +110,7 @@ def bad_clouds(stamp_ns):
         ('no_points', made(points[:0])),
         ('no_valid_points', made(np.full_like(points, np.nan))),
         ('no_valid_points', made(np.full_like(points, np.inf))),
-        ('no_valid_points', made(points + np.float32(1e9))),
+        ('map_limit', made(points + np.float32(1e9))),
     ]
 
 
