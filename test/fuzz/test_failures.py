@@ -11,6 +11,7 @@ sampled; memory that NumPy and kernels get from the system is not among them.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import signal
@@ -18,10 +19,12 @@ import signal
 import numpy as np
 import pytest
 
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, SurfelMapperError
 from surfel_mapper.files import atomic, pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.offline.replay import replay
+from test.bags import recorded
 
 pytestmark = pytest.mark.skipif(not hasattr(os, 'fork'), reason='needs fork')
 
@@ -212,3 +215,22 @@ def in_child(testcapi, surfel_map, call, number, allowed):
             os._exit(code)
     status = os.waitpid(child, 0)[1]
     return os.waitstatus_to_exitcode(status)
+
+
+def test_a_replay_that_cannot_write_once_leaves_the_whole_map_or_none(tmp_path):
+    bag = recorded.write_rosbag2(tmp_path / 'bag', recorded.drive())
+    with pytest.MonkeyPatch.context() as patch:
+        steps = Steps(patch)
+        expected = replay(bag, output=tmp_path / 'whole').mapper.map.digest()
+    assert load_map(tmp_path / 'whole')[0].digest() == expected
+    every = bool(os.environ.get('SURFEL_MAPPER_EVERY_FAILURE'))
+    numbers = range(steps.done) if every else range(0, steps.done, -(-steps.done // 2))
+    for number in numbers:
+        output = tmp_path / str(number)
+        with pytest.MonkeyPatch.context() as patch:
+            Steps(patch, number)
+            with contextlib.suppress(SurfelMapperError):
+                replay(bag, output=output)
+        if (output / 'map.npz').is_file():
+            assert load_map(output)[0].digest() == expected, number
+        assert not [*output.rglob('*.part')], number
