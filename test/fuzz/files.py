@@ -27,6 +27,7 @@ from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.chain import example as example_scan
+from test.fuzz.memory import reset_peak, resident
 from test.fuzz.source import Source
 
 MOST_MESSAGES = 10_000
@@ -39,18 +40,20 @@ def folder() -> tempfile.TemporaryDirectory:
     return tempfile.TemporaryDirectory(prefix='surfel_mapper-fuzz-')
 
 
-READS: list[tuple[float, int]] = []
-"""Processor time, s, and bytes of each read of an input, for harnesses that build their files."""
+READS: list[tuple[float, int, int]] = []
+"""Processor time, s, bytes and memory of each read of an input, for harnesses that build files."""
 
 
 @contextlib.contextmanager
 def timed_read(num_bytes: int) -> Iterator[None]:
-    """Time the reading in a block, apart from the building of its file."""
-    start_s = time.process_time()
+    """Measure the reading in a block, apart from the building of its file."""
+    reset_peak()
+    before, start_s = resident('VmRSS'), time.process_time()
     try:
         yield
     finally:
-        READS.append((time.process_time() - start_s, num_bytes))
+        seconds = time.process_time() - start_s
+        READS.append((seconds, num_bytes, resident('VmHWM') - before))
 
 
 def refused(function: Callable[..., object], name: str, data: bytes) -> None:

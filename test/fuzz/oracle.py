@@ -20,9 +20,6 @@ from test.fuzz.memory import reset_peak, resident
 MOST_BYTES = 64 << 20
 """Memory that any input may take: the heap grows in steps, and chunks may unpack to 64 MiB."""
 
-BUILT_BYTES = {'mcap_structure': 32 << 20}
-"""Further memory of harnesses that build chunks of 20 MB in memory before they are read."""
-
 MOST_RATIO = 20
 """Memory per input byte."""
 
@@ -58,22 +55,24 @@ class TooExpensive(AssertionError):
 def checked_cost(name: str, one_input: Callable[[bytes], None], data: bytes) -> Cost:
     """Return the cost of an input; raise TooExpensive if it costs too much at every attempt."""
     factor, _ = SLOW.get(name, (1.0, ''))
-    most = MOST_BYTES + BUILT_BYTES.get(name, 0)
     for _ in range(ATTEMPTS):
-        found = cost(one_input, data, most)
+        found = cost(one_input, data)
         if found.ratio < MOST_RATIO and found.share <= factor:
             return found
     raise TooExpensive(f'{name}: {found} for {data[:100]!r}')
 
 
-def cost(one_input: Callable[[bytes], None], data: bytes, most_bytes: int) -> Cost:
+def cost(one_input: Callable[[bytes], None], data: bytes) -> Cost:
     """Return the cost of an input; of harnesses that build files only the reads count."""
     reset_peak()
     files.READS.clear()
     before, start_s = resident('VmRSS'), time.process_time()
     one_input(data)
     used, seconds = resident('VmHWM') - before, time.process_time() - start_s
-    reads = files.READS or [(seconds, len(data))]
-    share = max(taken / (MOST_S + MOST_S_PER_BYTE * size) for taken, size in reads)
-    size = max(1, *(size for _, size in reads))
-    return Cost(used, max(taken for taken, _ in reads), share, max(0, used - most_bytes) / size)
+    reads = files.READS or [(seconds, len(data), used)]
+    return Cost(
+        used=max(memory for _, _, memory in reads),
+        seconds=max(taken for taken, _, _ in reads),
+        share=max(taken / (MOST_S + MOST_S_PER_BYTE * size) for taken, size, _ in reads),
+        ratio=max(max(0, memory - MOST_BYTES) / max(size, 1) for _, size, memory in reads),
+    )
