@@ -72,7 +72,8 @@ def read_scan(path: str | Path) -> tuple[npt.NDArray[Any], Columns]:
         raise FileFormatError(f'{path}: x, y, z of {kinds}, expected float or double')
     if {'red', 'green', 'blue'} <= columns.keys():
         columns['rgb'] = np.stack([columns.pop(n) for n in ('red', 'green', 'blue')], axis=1)
-    return np.stack(xyz, axis=1), {ALIASES.get(n, n): values for n, values in columns.items()}
+    points = np.stack(xyz).T  # column by column, as clouds are: other layouts compile anew
+    return points, {ALIASES.get(n, n): values for n, values in columns.items()}
 
 
 def read_raw(path: Path) -> tuple[npt.NDArray[Any], Columns]:

@@ -24,6 +24,9 @@ def test_every_format_gives_the_same_scan(tmp_path):
 
     for name in ('a.ply', 'a.pcd', 'a.bin', 'a.pcd.bin'):
         points, columns = read_scan(tmp_path / name)
+        assert (
+            points.flags.f_contiguous
+        )  # as decoded clouds are; others would compile kernels anew
         np.testing.assert_array_equal(points, POINTS)
         assert points.dtype == np.float32
         np.testing.assert_array_equal(columns['intensity'], COLUMNS['intensity'])
