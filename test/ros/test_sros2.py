@@ -62,7 +62,10 @@ def test_the_policy_allows_exactly_the_topics_and_services_of_the_node(start, pe
         (graph.get_service_names_and_types_by_node, ('service', 'reply'), NOT_SERVED),
     ):
         needed = allowed(*policy) - {full(name) for name in missing}
-        peer.spin_until(lambda f=find, n=needed: n <= shown(f))
+        peer.spin_until(
+            lambda f=find, n=needed: n <= shown(f),
+            what=lambda f=find, n=needed: f'missing: {n - shown(f)}; shown: {shown(f)}',
+        )
         assert shown(find) <= allowed(*policy)
 
 
