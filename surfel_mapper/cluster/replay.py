@@ -191,7 +191,7 @@ def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResul
         f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
         f'{tiled.surfels} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
     )
-    draw_map(tiled.sample, picture, title)
+    draw_map(tiled.sample, picture, title, origin_m=summary['origin_m'])
     write_report(page, title, summary, tiled.sample, picture=picture)
     write_json(figures, summary)
     return [tiled.directory, picture, page, figures]

@@ -92,6 +92,7 @@ class TileResult:
     """Figures of a tile, and a sample of its surfels."""
 
     voxel_size_m: float
+    origin_m: tuple[float, ...]
     voxels: int
     points: int
     surfels: int
@@ -110,6 +111,8 @@ class TiledMap:
     directory : Path
         The dataset.
     voxel_size_m : float
+    origin_m : tuple of 3 float
+        Origin of the map in the fixed frame, m.
     digest : str
         Equal to SurfelMap.digest of the same map.
     voxels, points, surfels, tiles, nbytes : int
@@ -125,6 +128,7 @@ class TiledMap:
 
     directory: Path
     voxel_size_m: float
+    origin_m: tuple[float, ...]
     digest: str
     voxels: int
     points: int
@@ -143,6 +147,7 @@ class TiledMap:
             'tiles': self.tiles,
             'bytes': self.nbytes,
             'voxel_size_m': self.voxel_size_m,
+            'origin_m': list(self.origin_m),
             'digest': self.digest,
         }
 
@@ -170,6 +175,7 @@ def merge_tile(task: TileTask) -> TileResult:
     rows = np.linspace(0, len(surfels) - 1, wanted).astype(np.int64)
     return TileResult(
         voxel_size_m=surfel_map.voxel_size_m,
+        origin_m=tuple(surfel_map.origin_m.tolist()),
         voxels=surfel_map.num_voxels,
         points=surfel_map.num_points,
         surfels=len(surfels),
@@ -256,6 +262,7 @@ def merge_parts(
     return TiledMap(
         directory=directory / DATASET,
         voxel_size_m=tiles[0].voxel_size_m,
+        origin_m=tiles[0].origin_m,
         digest=digest,
         voxels=sum(tile.voxels for tile in tiles),
         points=sum(tile.points for tile in tiles),

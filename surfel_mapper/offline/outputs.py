@@ -245,7 +245,8 @@ def write_files(
         f'{rounded(summary["points"])} points, '
         f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
-    draw_map(surfels, picture, title, trajectory=trajectory.positions)
+    origin_m = mapper.map.origin_m
+    draw_map(surfels, picture, title, trajectory=trajectory.positions, origin_m=origin_m)
     write_report(page, title, summary, surfels, history, picture, meshes, sections)
     write_json(figures, summary)
     maps = [output / FORMATS[name] for name in formats]

@@ -80,7 +80,11 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """A view of the map in pixels; left and top are its upper left corner as in ``View.seen``."""
+    """
+    A view of the map in pixels; left and top are its upper left corner as in ``View.seen``.
+
+    ``origin_m`` holds what is added to the coordinates along both axes at the ticks.
+    """
 
     view: View
     left: float
@@ -88,13 +92,22 @@ class Frame:
     width: int
     height: int
     px_per_m: float
+    origin_m: tuple[float, float] = (0.0, 0.0)
 
     @classmethod
-    def of(cls, view: View, box: tuple[Array, Array], px_per_m: float) -> Frame:
-        """Return the frame that shows a box."""
+    def of(
+        cls,
+        view: View,
+        box: tuple[Array, Array],
+        px_per_m: float,
+        origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
+    ) -> Frame:
+        """Return the frame that shows a box of a map with an origin."""
         low, high = (view.seen(corner[None])[:2, 0] for corner in box)
         width, height = (max(round(abs(side) * px_per_m), 1) for side in high - low)
-        return cls(view, low[0], max(low[1], high[1]), width, height, px_per_m)
+        place = np.asarray(origin_m, np.float64)
+        at = (float(place[view.right]), float(place[view.up]))
+        return cls(view, low[0], max(low[1], high[1]), width, height, px_per_m, at)
 
     def placed(self, positions: Array) -> Array:
         """Return the columns and rows of (K, 3) positions, (K, 2) px."""
@@ -110,14 +123,16 @@ class Frame:
         return (across * self.left, across * right), (up * bottom, up * self.top)
 
     def ticks(self) -> tuple[Array, Array]:
-        """Return the positions of the ticks along both axes, round numbers of metres."""
+        """Return the positions of the ticks along both axes, round numbers with the origin added."""
         from matplotlib.ticker import MaxNLocator
 
         found = []
         rooms = (self.width // TICK_COLUMNS, self.height // TICK_ROWS)
-        for ends, number in zip(self.bounds, rooms, strict=True):
-            values = np.asarray(MaxNLocator(max(number, 1)).tick_values(min(ends), max(ends)))
-            found.append(values[(values >= min(ends)) & (values <= max(ends))])
+        for ends, number, origin_m in zip(self.bounds, rooms, self.origin_m, strict=True):
+            low, high = min(ends), max(ends)
+            locator = MaxNLocator(max(number, 1))
+            values = np.asarray(locator.tick_values(low + origin_m, high + origin_m)) - origin_m
+            found.append(values[(values >= low) & (values <= high)])
         return found[0], found[1]
 
     def gridded(self) -> npt.NDArray[np.float32]:
@@ -218,6 +233,9 @@ WIDTH_PX, HEIGHT_PX, DPI = 1760, 1440, 160
 LEFT, RIGHT, BELOW, ABOVE = 120, 170, 90, 60
 """Margins around each view for its labels, on the right for the colour bar, px."""
 
+DIGIT_PX, BESIDE = 15, 55
+"""Width of a digit of a number at a tick, and of what is beside the numbers on the left, px."""
+
 SMALLEST_PX = 640
 """Smallest width of the picture."""
 
@@ -235,6 +253,7 @@ def draw_map(
     *,
     trajectory: Array | None = None,
     colouring: str = 'normal',
+    origin_m: npt.ArrayLike = (0.0, 0.0, 0.0),
 ) -> None:
     """
     Draw a map as a PNG file, written whole or not at all.
@@ -251,6 +270,9 @@ def draw_map(
         Positions of the sensor; drawn as a line.
     colouring : str
         ``normal``: shaded by normal and light; ``planarity``: by a colour map.
+    origin_m : (3,) float64, m
+        Origin of the map in the fixed frame, ``SurfelMap.origin_m``; the axes have the coordinates
+        of the fixed frame.
 
     Raises
     ------
@@ -270,7 +292,7 @@ def draw_map(
     px_per_m = min(
         WIDTH_PX / extent[both[0].right], HEIGHT_PX / sum(extent[view.up] for view in both)
     )
-    frames = [Frame.of(view, box, px_per_m) for view in both]
+    frames = [Frame.of(view, box, px_per_m, origin_m) for view in both]
     pixels, corners = framed(frames, title, colouring)
     for frame, (row, column) in zip(frames, corners, strict=True):
         image = frame.gridded()
@@ -315,14 +337,20 @@ def framed(
     """
     Return a picture with empty axes, one below the other; of planarity with a colour bar.
 
-    The second value holds row and column of the upper left corner of each pair of axes.
+    The second value holds row and column of the upper left corner of each pair of axes. Numbers of
+    UTM need a wider margin than LEFT.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
 
     across = frames[0].width
-    width = max(LEFT + across + (RIGHT if colouring == 'planarity' else RIGHT // 3), SMALLEST_PX)
+    digits = max(
+        (len(f'{tick + frame.origin_m[1]:.10g}') for frame in frames for tick in frame.ticks()[1]),
+        default=0,
+    )
+    left = max(LEFT, BESIDE + DIGIT_PX * digits)
+    width = max(left + across + (RIGHT if colouring == 'planarity' else RIGHT // 3), SMALLEST_PX)
     height = ABOVE + sum(frame.height + BELOW for frame in frames)
     figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI)
     canvas = FigureCanvasAgg(figure)
@@ -333,11 +361,11 @@ def framed(
 
     corners, row = [], ABOVE
     for frame in frames:
-        label(axes_at(row, LEFT, frame.height, across), frame)
-        corners.append((row, LEFT))
+        label(axes_at(row, left, frame.height, across), frame)
+        corners.append((row, left))
         row += frame.height + BELOW
     if colouring == 'planarity':
-        bar = axes_at(ABOVE, LEFT + across + 30, height - ABOVE - BELOW, 25)
+        bar = axes_at(ABOVE, left + across + 30, height - ABOVE - BELOW, 25)
         figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label(colouring)
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(title), 1))
     figure.axes[0].set_title(title, fontsize=min(TITLE_PT, points), x=0.0, ha='left')
@@ -348,6 +376,11 @@ def framed(
 
 def label(ax: Axes, frame: Frame) -> None:
     """Set limits, ticks and labels of axes from a frame."""
-    (along, up), (xticks, yticks) = frame.bounds, frame.ticks()
     names = [f'{"xyz"[axis]} (m)' for axis in (frame.view.right, frame.view.up)]
-    ax.set(xlim=along, ylim=up, xlabel=names[0], ylabel=names[1], xticks=xticks, yticks=yticks)
+    ends, ticks = (
+        [np.add(values, origin_m) for values, origin_m in zip(both, frame.origin_m, strict=True)]
+        for both in (frame.bounds, frame.ticks())
+    )
+    ax.set(xlim=ends[0], ylim=ends[1], xlabel=names[0], ylabel=names[1])
+    ax.set(xticks=ticks[0], yticks=ticks[1])
+    ax.ticklabel_format(useOffset=False, style='plain')

@@ -154,6 +154,9 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
         'surfels': f'{summary["surfels"]:,}',
         'voxels': f'{summary["voxels"]:,} of {summary["voxel_size_m"]:g} m',
     }
+    origin_m = summary.get('origin_m', [0.0, 0.0, 0.0])
+    if any(origin_m):
+        shown['origin of the map'] = ', '.join(f'{value:.12g}' for value in origin_m) + ' m'
     if len(history) > 1:
         steps = np.diff(history.trajectory, axis=0)
         shown['distance driven'] = f'{np.sqrt((steps * steps).sum(axis=1)).sum():.1f} m'

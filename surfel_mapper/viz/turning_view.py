@@ -58,7 +58,8 @@ def turning_view(
     for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES:
             note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
-    data = json.dumps(view_data(shown, trajectory, layers)).replace('<', '\\u003c')
+    height_m = summary.get('origin_m', (0.0, 0.0, 0.0))[2]
+    data = json.dumps(view_data(shown, trajectory, layers, height_m)).replace('<', '\\u003c')
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
@@ -85,8 +86,14 @@ def within_sight(surfels: Surfels) -> Surfels:
     return surfels.select(np.asarray(inside.all(axis=1)))
 
 
-def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -> dict[str, Any]:
-    """Return the data for page/view.js, in metres from the middle of the map."""
+def view_data(
+    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh], height_m: float
+) -> dict[str, Any]:
+    """
+    Return the data for page/view.js, in metres from the middle of the map.
+
+    Heights are stated with that of the map's origin added.
+    """
     from matplotlib import colormaps
 
     low, high = np.zeros(3), np.ones(3)
@@ -97,6 +104,7 @@ def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -
     size = np.maximum(high - low, 1e-3)
     radius = 0.5 * SPREAD * sides_m(surfels)
     largest = float(radius.max(initial=1e-3))
+    decimals = max(2 - int(np.floor(np.log10(size[2]))), 0)
     packed = np.zeros(len(surfels), SURFEL)
     packed['place'] = np.rint((surfels.position - low) / size * 65535.0)
     packed['radius'] = np.ceil(radius / largest * 255.0)
@@ -111,7 +119,7 @@ def view_data(surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh]) -
         'size': [float(side) for side in size],
         'largest': largest,
         'layers': [mesh_data(mesh, low, size) for mesh in layers.values()],
-        'heights': [f'{low[2]:.3g} m', f'{high[2]:.3g} m'],
+        'heights': [f'{height_m + end:.{decimals}f} m' for end in (low[2], high[2])],
     }
 
 

@@ -6,6 +6,9 @@ Viewer: shows a replay in rerun, in a window or as an .rrd file.
 Every scan logs the sensor with its points, the changed surfels, and the positions of the scans in
 the window. The whole map is logged when a quarter of it has changed since the last time, so a
 recording holds each surfel about five times instead of once a scan.
+
+Positions in rerun are float32, so all is shown in the frame of the map; where that has an origin
+in the fixed frame, the entity ``map`` states it as ``origin_m``, three float64.
 """
 
 from __future__ import annotations
@@ -94,6 +97,9 @@ class Viewer:
     def add(self, update: Update) -> None:
         """Log a scan and its changes of the map."""
         rerun, pose = self._rerun, update.T_map_sensor
+        origin_m = self._mapper.map.origin_m
+        if not self._positions and origin_m.any():
+            self._stream.log('map', rerun.AnyValues(origin_m=origin_m), static=True)
         self._positions.append(pose[:3, 3])
         self._stream.set_time('stamp', timestamp=np.datetime64(update.stamp_ns, 'ns'))
         self._stream.log(

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory, write_tum
 from surfel_mapper.offline.replay import ReplayOptions
 from surfel_mapper.offline.request import Request
+from surfel_mapper.viz import picture
 from test.bags.recorded import drive, HEIGHT_M, NUM_SCANS, PERIOD_NS, START_NS, write_rosbag2
 
 UTM = np.array([400_000.0, 5_400_000.0, 250.0])
@@ -94,6 +96,32 @@ def test_every_file_has_the_coordinates_of_the_poses(near, far):
         assert np.dot(other['normal'], other['mean']) + other['offset_m'] == pytest.approx(0.0)
     for run in (near, far):
         assert run.summary['pose_errors']['absolute']['translation_m']['max'] < 1e-6
+
+
+def test_the_report_states_heights_and_the_origin_in_the_fixed_frame(near, far):
+    pages = [(out_of(run) / 'report.html').read_text() for run in (near, far)]
+
+    assert 'origin of the map</dt><dd>400000, 5400000, 250 m<' in pages[1]
+    assert 'origin of the map' not in pages[0]
+    data = [json.loads(re.search('id="map">(.*?)</script>', text)[1]) for text in pages]
+    expected, found = (
+        [float(height.removesuffix(' m')) for height in view['heights']] for view in data
+    )
+    np.testing.assert_allclose(found, np.array(expected) + 250.0, rtol=0, atol=1e-9)
+
+
+def test_map_png_has_the_coordinates_of_the_fixed_frame(bag, far, monkeypatch, tmp_path):
+    found = []
+    draw = picture.label
+    monkeypatch.setattr(picture, 'label', lambda ax, frame: (draw(ax, frame), found.append(ax)))
+
+    replayed(bag, tmp_path / 'again', '400000 5400000 250', UTM)
+
+    trajectory = read_trajectory(out_of(far) / 'trajectory.tum').xyz
+    assert all(ax.get_xlabel() == 'x (m)' for ax in found)
+    for ax, axis in zip(found, (1, 2), strict=True):  # from above y is up, from the side z
+        for (low, high), column in ((ax.get_xlim(), 0), (ax.get_ylim(), axis)):
+            assert low < trajectory[:, column].min() <= trajectory[:, column].max() < high
 
 
 @pytest.mark.parametrize('name', ['map.npz', 'map.parquet', 'map.ply', '.'])

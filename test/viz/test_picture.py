@@ -4,13 +4,15 @@
 
 import dataclasses
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 import pytest
 
 from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.viz.picture import draw_map, Frame, limits, views, X, Y, Z
+from surfel_mapper.viz.picture import draw_map, Frame, label, limits, views, X, Y, Z
 
 YELLOW, PURPLE = np.array([[0.993, 0.906, 0.144], [0.267, 0.005, 0.329]])
 """Both ends of viridis, the colours of planarity 1 and 0."""
@@ -128,6 +130,26 @@ def test_pixels_lie_where_the_axes_say_whichever_way_they_run():
     for value, column in ((20.0, 100), (40.0, 300)):
         assert value in above.ticks()[0]
         assert (image[:, column] < 255.0).all()
+
+
+def test_the_axes_have_the_coordinates_of_the_fixed_frame():
+    low, high = np.array([-3.0, 10.0, 0.0]), np.array([5.0, 50.0, 2.0])
+    origin_m = np.array([400_000.3, 5_400_000.7, 0.0])
+    frame = Frame.of(views(high - low)[0], (low, high), 10.0, origin_m)
+    axes = FigureCanvasAgg(Figure()).figure.add_subplot()
+
+    label(axes, frame)
+
+    axes.figure.canvas.draw()
+    across, up = (axis.get_ticklocs() for axis in (axes.xaxis, axes.yaxis))
+    np.testing.assert_allclose(across, [5_400_020.0, 5_400_040.0])
+    np.testing.assert_allclose(up, [400_000.0, 400_005.0])
+    assert [text.get_text() for text in axes.get_xticklabels()] == ['5400020', '5400040']
+    assert axes.get_xlim() == pytest.approx((5_400_010.7, 5_400_050.7), abs=1e-6)
+    assert axes.get_ylim() == pytest.approx((400_005.3, 399_997.3), abs=1e-6)
+    local = frame.ticks()[0]
+    np.testing.assert_allclose(local, [19.3, 39.3])  # where the grid is drawn
+    assert (frame.gridded()[:, np.rint((local - 10.0) * 10.0 - 0.5).astype(int)] < 255.0).all()
 
 
 def test_the_trajectory_is_drawn(tmp_path):

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.cli.main import main
+from surfel_mapper.config import Config
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
 from surfel_mapper.viz import viewer as viewer_module
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
@@ -68,6 +70,23 @@ def test_the_mesh_of_a_tsdf_is_recorded(tmp_path):
         for update in insert(mapper, 1):
             viewer.add(update)
     assert '/map/mesh' in rerun('print', tmp_path / 'a.rrd').stdout
+
+
+def test_the_origin_of_the_map_is_recorded(tmp_path):
+    origin_m = [400_000.25, 5_400_000.0, 250.0]
+    settings = {'pose.source': 'identity', 'map.origin': ' '.join(map(str, origin_m))}
+    mapper = Mapper(Config.from_mapping(settings))
+    points = np.random.default_rng(1).uniform(0.0, 5.0, (50, 3)) + origin_m
+    mapper.add_scan(Scan(points=points, stamp_ns=10**9, frame_id='odom'))
+    with Viewer(mapper, tmp_path / 'a.rrd') as viewer:
+        for update in mapper.insert_ready():
+            viewer.add(update)
+
+    printed = rerun('print', '-vvv', tmp_path / 'a.rrd').stdout
+
+    assert 'origin_m' in printed
+    for value in origin_m:
+        assert f'{value:.12g}' in printed
 
 
 WINDOW = """#!/bin/sh
