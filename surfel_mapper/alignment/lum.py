@@ -21,7 +21,6 @@ from dataclasses import dataclass, field
 from functools import partial
 import logging
 import math
-import operator
 
 import numpy as np
 import numpy.typing as npt
@@ -164,13 +163,11 @@ class LUM:
 
     @max_iterations.setter
     def max_iterations(self, value: int) -> None:
-        try:
-            number = operator.index(value)
-        except TypeError:
-            raise AlignmentError(f'max_iterations {value!r}, expected an integer') from None
-        if number < 1:
-            raise AlignmentError(f'max_iterations {number}, expected one or more')
-        self._max_iterations = number
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise AlignmentError(f'max_iterations {value!r}, expected an integer')
+        if value < 1:
+            raise AlignmentError(f'max_iterations {value}, expected one or more')
+        self._max_iterations = int(value)
 
     @property
     def convergence_threshold(self) -> float:

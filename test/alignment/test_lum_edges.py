@@ -47,6 +47,10 @@ def pair():
         (lambda lum: lum.set_point_cloud(1, np.eye(3)[:2]), 'names point 2 of vertex 1'),
         (lambda lum: setattr(lum, 'max_iterations', 0), 'max_iterations 0'),
         (
+            lambda lum: setattr(lum, 'max_iterations', True),
+            'max_iterations True, expected an integer',
+        ),
+        (
             lambda lum: setattr(lum, 'max_iterations', 2.5),
             'max_iterations 2.5, expected an integer',
         ),
