@@ -123,7 +123,7 @@ class Frame:
         return (across * self.left, across * right), (up * bottom, up * self.top)
 
     def ticks(self) -> tuple[Array, Array]:
-        """Return the positions of the ticks along both axes, round numbers with the origin added."""
+        """Return the ticks along both axes, which are round numbers once the origin is added."""
         from matplotlib.ticker import MaxNLocator
 
         found = []
