@@ -377,10 +377,10 @@ def framed(
 def label(ax: Axes, frame: Frame) -> None:
     """Set limits, ticks and labels of axes from a frame."""
     names = [f'{"xyz"[axis]} (m)' for axis in (frame.view.right, frame.view.up)]
-    ends, ticks = (
-        [np.add(values, origin_m) for values, origin_m in zip(both, frame.origin_m, strict=True)]
-        for both in (frame.bounds, frame.ticks())
-    )
-    ax.set(xlim=ends[0], ylim=ends[1], xlabel=names[0], ylabel=names[1])
-    ax.set(xticks=ticks[0], yticks=ticks[1])
+    for axis, ends, ticks, origin_m in zip(
+        (ax.xaxis, ax.yaxis), frame.bounds, frame.ticks(), frame.origin_m, strict=True
+    ):
+        axis.set_ticks(ticks + origin_m)
+        axis.set_view_interval(ends[0] + origin_m, ends[1] + origin_m, ignore=True)
+    ax.set(xlabel=names[0], ylabel=names[1])
     ax.ticklabel_format(useOffset=False, style='plain')
