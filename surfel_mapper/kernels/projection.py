@@ -25,12 +25,16 @@ LIDAR_TABLE = 2
 
 OUTSIDE = np.float32(-2.0)
 
+MOST_CORRECTED = 16
+"""Beams between points beyond which a search is faster than corrections."""
+
 _PI = np.float32(math.pi)
 _HALF_PI = np.float32(math.pi / 2.0)
 _ZERO = np.float32(0.0)
 _HALF = np.float32(0.5)
 _ONE = np.float32(1.0)
 _TINY = np.float32(1e-30)
+_STEPS = np.float32(2.0**20)
 _LARGE = np.float32(1e30)
 
 # atan(a) / a as a polynomial of a^2 through the Chebyshev nodes of [0, 1]: error below 1.2e-8 rad.
@@ -131,8 +135,55 @@ def rows_of_table(elevations, v):
     """
     Convert elevations to rows of unevenly spaced beams, in place.
 
-    The search starts from the row of the point before: neighbours in a block differ by few rows,
-    so it takes a third of the time of a binary search.
+    If the points are between few beams, as those of a block far from the sensor, the rows are
+    first computed as if the gap below the highest were that of all, and then corrected beam by
+    beam in loops that are vectorised; that is faster than a search.
+    """
+    low, high = np.int32(2**31 - 1), np.int32(-(2**31))
+    for n in range(len(v)):
+        elevation = v[n] if abs(v[n]) < _HALF_PI else _ZERO  # nan too
+        number = np.int32(elevation * _STEPS)
+        low = min(low, number)
+        high = max(high, number)
+    first = row_above(elevations, np.float32(high + 1) / _STEPS)
+    last = row_above(elevations, np.float32(low - 1) / _STEPS)
+    if last - first > MOST_CORRECTED:
+        search_rows(elevations, v)
+        return
+    top, gap = elevations[first], elevations[first] - elevations[first + 1]
+    per_rad = _ONE / gap
+    for n in range(len(v)):
+        v[n] = (top - v[n]) * per_rad
+    for row in range(first + 1, last + 1):
+        below = elevations[row] - elevations[row + 1]
+        change, at = gap / below - _ONE, np.float32(row - first)
+        gap = below
+        for n in range(len(v)):
+            v[n] = v[n] + max(v[n] - at, _ZERO) * change
+    start = np.float32(first)
+    for n in range(len(v)):
+        v[n] = v[n] + start
+
+
+@njit(cache=True, nogil=True)
+def row_above(elevations, elevation):
+    """Return the last row but one at most whose elevation is not below the given one, else 0."""
+    low, high = 0, len(elevations) - 2
+    while low < high:
+        middle = (low + high + 1) // 2
+        if elevations[middle] >= elevation:
+            low = middle
+        else:
+            high = middle - 1
+    return low
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def search_rows(elevations, v):
+    """
+    Convert elevations to rows by search, in place; from the row of the point before.
+
+    Neighbours in a block differ by few rows, so it takes a third of the time of a binary search.
     """
     last, low = len(elevations) - 2, 0
     for n in range(len(v)):

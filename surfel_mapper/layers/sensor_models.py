@@ -181,7 +181,11 @@ class SensorModels:
             columns=config.sensor_columns,
             **self._ranges,
         )
-        angles: dict[str, Any] = {'rows': fitted.rows, 'columns': fitted.columns}
+        angles: dict[str, Any] = {
+            'rows': fitted.rows,
+            'columns': fitted.columns,
+            'first_azimuth_deg': fitted.first_azimuth_deg,
+        }
         if config.sensor_azimuth_deg:
             last, first = config.sensor_azimuth_deg
             share = (first - last) / 360.0

@@ -159,6 +159,7 @@ def candidates(
                 LidarModel(
                     rows=len(beams),
                     columns=steps,
+                    first_azimuth_deg=first_azimuth(angles, steps),
                     beam_elevations_deg=tuple(beams.tolist()),
                     **ranges,
                 )
@@ -166,10 +167,12 @@ def candidates(
     rows = rows or USUAL_ROWS
     low, high = float(elevations.min()), float(elevations.max())
     even: Float64 = np.asarray(np.linspace(high, low, rows), np.float64)
+    steps = columns or azimuth_steps(angles, nearest_beam(elevations, even))
     found.append(
         LidarModel(
             rows=rows,
-            columns=columns or azimuth_steps(angles, nearest_beam(elevations, even)),
+            columns=steps,
+            first_azimuth_deg=first_azimuth(angles, steps),
             vertical_fov_deg=high - low,
             vertical_fov_top_deg=high,
             **ranges,
@@ -254,6 +257,19 @@ def azimuth_steps(angles: Angles, beam: npt.NDArray[np.int64]) -> int:
     median = float(np.median(steps))
     step = float(np.mean(steps[(steps > 0.6 * median) & (steps < 1.4 * median)]))
     return int(np.clip(round(360.0 / step), 2, MAX_COLUMNS))
+
+
+def first_azimuth(angles: Angles, columns: int) -> float:
+    """
+    Return the azimuth of the first of the columns of a full circle, within half a step of 180 deg.
+
+    The columns go through the points: half a step beside them every point is moved by as much,
+    and the error of the mesh of a street doubles. It is the circular mean of the points' places
+    between columns; if they are spread evenly, any place is as good.
+    """
+    step = 360.0 / columns
+    turns = np.exp(2j * np.pi * ((angles.azimuth - 180.0) / step))
+    return 180.0 + step * float(np.angle(turns.mean())) / (2.0 * np.pi)
 
 
 def fit_share(

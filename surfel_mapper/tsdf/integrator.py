@@ -43,7 +43,6 @@ from surfel_mapper.tsdf.selection import (
     BlockSelection,
     NO_COSINE,
     reach_behind_m,
-    without_surface,
 )
 from surfel_mapper.tsdf.sensors import LidarModel, Sensor
 
@@ -137,13 +136,13 @@ class Integrator:
         self._warn_of_radius(image.sensor)
         if self.blocks.config.distance == 'to_plane' and image.cosine is None:
             image = image.with_cosines(self.blocks.config.voxel_size_m)
-        index = self._selection.blocks(image, T)
+        index, near = self._selection.blocks(image, T)
         blocks = self.blocks
         before = blocks.num_blocks
         rows = blocks.place(index) if allocate_blocks else blocks.find(index)
         there = rows >= 0
         try:
-            skipped = there & self._free_for_long(image, T, index, rows)
+            skipped = there & ~near & self._free_for_long(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
             fused = there & ~skipped
             found, num_lost = self._fuse(image, T, stamp_ns, index[fused], rows[fused])
@@ -178,7 +177,7 @@ class Integrator:
         rates = self.blocks.forgetting_rates(rows, stamp_ns)
         common = (
             self.blocks.field,
-            sensor.projection,
+            (*sensor.projection, sensor.row_gaps_rad),
             self._images(image),
             image_settings(config, image),
             (INTERPOLATIONS.index(config.interpolation), POWERS[config.weight_mode]),
@@ -194,26 +193,21 @@ class Integrator:
         lost = [helpers.submit(fuse, part) for part in parts[1:]] if helpers else []
         return found, fuse(parts[0]) + sum(one.result() for one in lost)
 
-    def _free_for_long(
-        self, image: RangeImage, T_map_sensor: Float64, index: Int64, rows: Int64
-    ) -> npt.NDArray[np.bool_]:
+    def _free_for_long(self, rows: Int64) -> npt.NDArray[np.bool_]:
         """
-        Return which blocks need no fusion: free in the last measurements and in this one, (K,).
+        Return which blocks were free in the last measurements, and need no fusion now, (K,).
 
         One in RECHECK of them is fused all the same, in turn, so that voxels between the beams
-        are found free too.
+        are found free too, and surfaces that no ray meets in the block itself.
         """
         config = self.blocks.config
         self._num_images += 1
-        skipped = np.zeros(len(rows), bool)
         if config.tracking or not config.carve:
-            return skipped
+            return np.zeros(len(rows), bool)
         visits = np.where(rows >= 0, self.blocks.head[rows, FREE_VISITS], 0)
-        settled = (visits >= SETTLED) & ((rows + self._num_images) % RECHECK != 0)
-        if not settled.any():
-            return skipped
-        skipped[settled] = without_surface(config, image, T_map_sensor, index[settled])
-        return skipped
+        settled: npt.NDArray[np.bool_] = visits >= SETTLED
+        settled &= (rows + self._num_images) % RECHECK != 0
+        return settled
 
     def _warn_of_radius(self, sensor: Sensor) -> None:
         """Warn once if the window is smaller than the reach of the sensor."""

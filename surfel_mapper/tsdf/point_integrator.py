@@ -208,7 +208,7 @@ class PointIntegrator:
             config.max_range_m,
         )
         reach[4] = float(config.carve)
-        mark_rays(image, NO_COSINE, directions[None], pose, reach, side, marks)
+        mark_rays(image, NO_COSINE, directions[None], pose, reach, side, marks, marks[:0])
         limits = config.min_range_m / config.voxel_size_m, config.max_range_m / config.voxel_size_m
         origin = T_map_sensor[:3, 3] / config.voxel_size_m
         kernels.mark_corners(surfaces, origin, low, side, self._bits, limits, marks)

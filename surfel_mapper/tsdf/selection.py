@@ -4,8 +4,8 @@
 Selection of the blocks that a range image updates: touched by its rays, or in its field of view.
 
 The cost of the first grows with the number of rays, of the second with the volume in view. Blocks
-are fused independently, so a block that both select gets the same values. Blocks in which an
-image shows no surface, which need no fusion if they are free already, are found here too.
+are fused independently, so a block that both select gets the same values. Blocks through which
+rays only pass, which need no fusion if they are free already, are found here too.
 """
 
 from __future__ import annotations
@@ -15,18 +15,22 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.tsdf.blocks import UPPER
-from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
-from surfel_mapper.tsdf.kernels.free_space import find_ends, find_free, RUN
+from surfel_mapper.tsdf.kernels.block_marks import (
+    count_marks,
+    list_marks,
+    look_up_marks,
+    mark_rays,
+)
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 NO_COSINE = np.empty((0, 0), np.float32)
 
 MAX_SIDE = 2048
-"""Largest side of the cube about the sensor, blocks: 1 GiB of bits."""
+"""Largest side of the cube about the sensor, blocks: 1 GiB of bits, twice that if carving."""
 
 SPACING_VOXELS = 0.7
 """Largest spacing of the rays walked through the band, voxels; the smallest is half of it."""
@@ -45,11 +49,18 @@ class BlockSelection:
 
     def __init__(self, config: TsdfConfig) -> None:
         self._config = config
-        self._marks = np.zeros(0, np.int64)
+        self._marks = np.zeros((2, 0), np.int64)
 
-    def blocks(self, image: RangeImage, T_map_sensor: Float64) -> Int64:
+    def blocks(self, image: RangeImage, T_map_sensor: Float64) -> tuple[Int64, Flags]:
         """
-        Return the blocks that a range image updates, (K, 3) int64, ascending.
+        Return the blocks that a range image updates, and those near its surface.
+
+        Returns
+        -------
+        index : (K, 3) int64
+            The blocks, ascending.
+        near : (K,) bool
+            False for blocks that rays only pass through; True for all if nothing is carved.
 
         Raises
         ------
@@ -57,34 +68,48 @@ class BlockSelection:
             If the range is more than MAX_SIDE / 2 blocks.
 
         """
-        half = half_side(self._config, image)
+        config = self._config
+        half = half_side(config, image)
         if half == 0:
-            return np.empty((0, 3), np.int64)
-        if 2 * half + 1 > MAX_SIDE:
+            return np.empty((0, 3), np.int64), np.empty(0, bool)
+        side = 2 * half + 1
+        if side > MAX_SIDE:
             raise MapLimitError(
                 f'a range of {image.largest_m:g} m is {half} blocks of '
-                f'{self._config.block_size_m:g} m, expected at most {MAX_SIDE // 2}; use larger '
+                f'{config.block_size_m:g} m, expected at most {MAX_SIDE // 2}; use larger '
                 'voxels or a smaller max_range_m'
             )
-        if self._config.allocation == 'frustum':
-            return in_view(self._config, image, T_map_sensor, half)
-        return self._touched(image, T_map_sensor, half)
+        if config.allocation == 'frustum' and not config.carve:
+            index = in_view(config, image, T_map_sensor, half)
+            return index, np.ones(len(index), bool)
+        marks, near, low = self._marked(image, T_map_sensor, half)
+        index = np.empty((count_marks(marks), 3), np.int64)
+        list_marks(marks, side, low, index)
+        if config.allocation == 'frustum':
+            index = in_view(config, image, T_map_sensor, half)
+        is_near = np.ones(len(index), bool)
+        if config.carve:
+            look_up_marks(near, side, low, index, is_near)
+        return index, is_near
 
-    def _touched(self, image: RangeImage, T_map_sensor: Float64, half: int) -> Int64:
-        """Return the blocks that rays touch."""
+    def _marked(
+        self, image: RangeImage, T_map_sensor: Float64, half: int
+    ) -> tuple[Int64, Int64, Int64]:
+        """Return the marks of blocks that rays touch, of those in the band, and the corner."""
         config, side = self._config, 2 * half + 1
-        if len(self._marks) < side**3 // 64 + 1:
-            self._marks = np.zeros(side**3 // 64 + 1, np.int64)
-        marks = self._marks[: side**3 // 64 + 1]
+        num_words = side**3 // 64 + 1
+        if self._marks.shape[1] < num_words:
+            self._marks = np.zeros((1 + config.carve, num_words), np.int64)
+        marks, near = self._marks[0, :num_words], self._marks[1:].ravel()[:num_words]
+        near[:] = 0
         pose = T_map_sensor[:3] / config.block_size_m
         low = np.floor(pose[:, 3]).astype(np.int64) - half
         pose[:, 3] -= low
         cosine = NO_COSINE if image.cosine is None else image.cosine
         directions = image.sensor.directions
-        mark_rays(image.range_m, cosine, directions, pose, reach(config, image), side, marks)
-        index = np.empty((count_marks(marks), 3), np.int64)
-        list_marks(marks, side, low, index)
-        return index
+        limits = reach(config, image)
+        mark_rays(image.range_m, cosine, directions, pose, limits, side, marks, near)
+        return marks, near, low
 
 
 def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:
@@ -125,27 +150,3 @@ def in_view(config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, half: 
         far = distance <= image.largest_m + reach_behind_m(config, image) + radius_m
         found.append(index[near & far & sensor.sees(centres, radius_m)])
     return np.concatenate(found)
-
-
-def without_surface(
-    config: TsdfConfig, image: RangeImage, T_map_sensor: Float64, index: Int64
-) -> npt.NDArray[np.bool_]:
-    """Return in which blocks (K, 3) an image shows no surface, (K,); in doubt it does."""
-    shape, sensor = image.range_m.shape, image.sensor
-    runs = np.empty((shape[0], -(-shape[1] // RUN), 2), np.float32)
-    cosine = NO_COSINE if image.cosine is None else image.cosine
-    is_mixed = config.interpolation == 'bilinear'  # across edges, so before is not unknown
-    behind = np.inf if is_mixed else config.reach_behind_m
-    find_ends(image.range_m, cosine, config.truncation_m, behind, runs)
-    lower = index * config.block_size_m - T_map_sensor[:3, 3]
-    corners = (lower[:, None] + config.block_size_m * UPPER).reshape(-1, 3)
-    free = np.empty(len(index), bool)
-    find_free(
-        np.ascontiguousarray((corners @ T_map_sensor[:3, :3]).T, np.float32),
-        config.block_size_m,
-        sensor.projection,
-        (sensor.rows, sensor.columns, sensor.wraps),
-        runs,
-        free,
-    )
-    return free

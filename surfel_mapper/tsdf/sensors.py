@@ -80,6 +80,9 @@ def range_checks(sensor: Ranging) -> list[Check]:
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 
+NO_ELEVATIONS: Float32 = np.zeros(0, np.float32)
+"""The rows of a camera are not at one elevation."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class CameraModel:
@@ -150,15 +153,15 @@ class CameraModel:
             [self.fx, self.fy, self.cx, self.cy, self.columns, self.rows, 0.0, 0.0], np.float32
         )
 
-    @cached_property
-    def elevations(self) -> Float32:
-        """Empty: the rows of a camera are not at one elevation."""
+    @property
+    def row_gaps_rad(self) -> Float32:
+        """Empty: the angles between the rows of a camera are not constant."""
         return np.zeros(0, np.float32)
 
     @property
     def projection(self) -> tuple[Any, ...]:
-        """Kind, parameters and elevations, the form that kernels take."""
-        return self.kind, self.parameters, self.elevations
+        """Kind, parameters and no elevations, the form that kernels take."""
+        return self.kind, self.parameters, NO_ELEVATIONS
 
     @property
     def density(self) -> float:
@@ -313,6 +316,12 @@ class LidarModel:
         top = self.vertical_fov_top_deg
         beams = np.linspace(top, top - self.vertical_fov_deg, self.rows, dtype=np.float64)
         return np.asarray(np.deg2rad(beams), np.float64)
+
+    @cached_property
+    def row_gaps_rad(self) -> Float32:
+        """Angle between each row and the next, (rows - 1,)."""
+        gaps: Float32 = -np.diff(self.elevations_rad).astype(np.float32)
+        return gaps
 
     @cached_property
     def elevations(self) -> Float32:

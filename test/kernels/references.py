@@ -58,7 +58,6 @@ REFERENCES = {
     'tsdf/kernels/blocks.py': 'tsdf/test_blocks.py',
     'tsdf/kernels/channels.py': 'tsdf/test_queries.py',
     'tsdf/kernels/euclidean.py': 'tsdf/test_euclidean.py',
-    'tsdf/kernels/free_space.py': 'tsdf/test_selection.py',
     'tsdf/kernels/integration.py': 'tsdf/test_twin.py',
     'tsdf/kernels/lookup.py': 'tsdf/test_range_image.py',
     'tsdf/kernels/marching_cubes.py': 'tsdf/test_mesh.py',

@@ -19,6 +19,7 @@ from surfel_mapper.kernels.projection import (
     LIDAR_TABLE,
     OUTSIDE,
     project,
+    rows_of_table,
 )
 from test.kernels.modes import both
 
@@ -83,12 +84,29 @@ def test_a_lidar_projects_by_azimuth_and_elevation(call, is_full_turn):
 
 
 @both
-def test_rows_of_uneven_beams_are_interpolated(call):
-    beams = np.array([0.4, 0.3, 0.1, 0.05, -0.2], np.float32)
-    sensor = [0.0, 2 * math.pi / 512, 0, 0, 512, 5, 512, 0]
+@pytest.mark.parametrize('beams', [(0.4, 0.3, 0.1, 0.05, -0.2), 0.5 - np.arange(40) ** 1.1 / 60])
+def test_rows_of_uneven_beams_are_interpolated(call, beams):
+    beams, last = np.array(beams, np.float32), len(beams) - 1
+    sensor = [0.0, 2 * math.pi / 512, 0, 0, 512, len(beams), 512, 0]
     (x, y, z), u, v = projected(call, LIDAR_TABLE, sensor, beams)
     elevation = np.arctan2(z, np.hypot(x, y))
-    expected = np.interp(elevation, beams[::-1], np.arange(5)[::-1].astype(float))
-    inside = (elevation < 0.4) & (elevation > -0.2) & (u != OUTSIDE)
+    expected = np.interp(elevation, beams[::-1], np.arange(last + 1.0)[::-1])
+    inside = (elevation < beams[0]) & (elevation > beams[-1]) & (u != OUTSIDE)
     assert inside.sum() > 50
     np.testing.assert_allclose(v[inside], expected[inside], atol=1e-3)
+
+
+@both
+@pytest.mark.parametrize('num_beams', [2, 3, 16, 17, 18, 40])
+def test_rows_of_few_and_many_uneven_beams_equal_an_interpolation(call, num_beams):
+    rng = np.random.default_rng(num_beams)
+    beams = np.cumsum(-rng.uniform(0.002, 0.02, num_beams)).astype(np.float32) + np.float32(0.2)
+    beyond = rng.uniform(beams[-1] - 0.01, beams[0] + 0.01, 300).astype(np.float32)
+    for part in (beyond, beams, beyond[np.abs(beyond - beams[num_beams // 2]) < 0.01]):
+        rows = np.append(part, np.float32(np.nan))
+        call(rows_of_table, beams, rows)
+        between = np.clip(np.searchsorted(-beams, -part, side='right') - 1, 0, num_beams - 2)
+        gap = (beams[between] - beams[between + 1]).astype(float)
+        expected = between + (beams[between].astype(float) - part) / gap  # straight on beyond them
+        np.testing.assert_allclose(rows[:-1], expected, atol=1e-4)
+        assert np.isnan(rows[-1])

@@ -82,6 +82,23 @@ def test_part_of_a_revolution_gives_the_columns_of_all():
     assert fitted_lidar(points[part], ring[part], **RANGES).columns == 1024
 
 
+@pytest.mark.parametrize('share', [-0.4, 0.0, 0.3])
+@pytest.mark.parametrize('rows', [0, 16])
+def test_columns_go_through_the_points(share, rows):
+    step = 360.0 / 1024
+    first = 180.0 + share * step
+    true = LidarModel(
+        rows=16, columns=1024, vertical_fov_deg=30.0, first_azimuth_deg=first, max_range_m=40.0
+    )
+    points, ring = points_of(true)
+    found = fitted_lidar(points, None if rows else ring, rows=rows, **RANGES)
+    assert found.columns == 1024
+    assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
+    part = np.arctan2(points[:, 1], points[:, 0]) > 2.0
+    found = fitted_lidar(points[part], None if rows else ring[part], rows=rows, **RANGES)
+    assert found.first_azimuth_deg == pytest.approx(first, abs=1e-3 * step)
+
+
 def test_rings_of_missing_points_do_not_count():
     points, ring = points_of(LidarModel(rows=16, columns=1024, vertical_fov_deg=30.0))
     missing = np.full((50_000, 3), np.nan, np.float32)

@@ -65,7 +65,8 @@ def test_the_weight_drops_off_behind_the_surface(signed, share):
     assert one.blocks.weight[row, n] == pytest.approx(max(share, 1e-4), abs=2e-5)
 
 
-def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap():
+def test_a_scan_again_changes_nothing_but_the_weight_up_to_its_cap(monkeypatch):
+    monkeypatch.setattr('surfel_mapper.tsdf.integrator.SETTLED', 10**9)  # free blocks too
     one, cap = integrator(**SIZES, weight_mode='constant', max_weight=4.5), 4.5
     one.integrate(wall(SMALL, 2.0), np.eye(4))
     first = field(one)

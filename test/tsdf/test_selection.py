@@ -10,9 +10,9 @@ from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.kernels.integration import OBSERVED
-from surfel_mapper.tsdf.selection import BlockSelection, without_surface
+from surfel_mapper.tsdf.selection import BlockSelection
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
-from test.tsdf.scenes import image_of, SMALL
+from test.tsdf.scenes import image_of
 
 SENSORS = {
     'camera': CameraModel(
@@ -46,7 +46,7 @@ def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
     config = TsdfConfig(**SIZES, allocation='frustum')
     for _ in range(20):
         T, image = random_pose(rng), random_image(sensor, rng)
-        chosen = {*map(tuple, BlockSelection(config).blocks(image, T))}
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T)[0])}
         one = Integrator(BlockMap(config))
         index = everywhere(T, 5.4, config.block_size_m)
         rows = one.blocks.place(index)
@@ -54,7 +54,7 @@ def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
         observed = found[:, OBSERVED]
         assert (observed > 0).sum() > 100
         assert {*map(tuple, index[observed > 0])} <= chosen
-        touched = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T)
+        touched, _ = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T)
         assert {*map(tuple, touched)} <= chosen
 
 
@@ -83,7 +83,7 @@ def test_rays_touch_every_block_of_their_band(sensor, extra_m):
     for _ in range(5):
         # So far away pixels are more than half a voxel apart, and none is passed over.
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
-        chosen = {*map(tuple, BlockSelection(config).blocks(image, T))}
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T)[0])}
         range_m = image.range_m[:, : sensor.columns]
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
@@ -120,7 +120,7 @@ def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
     range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
     image, T = image_of(sensor, range_m), random_pose(rng)
     config = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3)
-    chosen = BlockSelection(config).blocks(image, T)
+    chosen, _ = BlockSelection(config).blocks(image, T)
     keys = {*map(tuple, chosen)}
     rays = sensor.directions.astype(float) @ T[:3, :3].T
     size, deep, missed = config.block_size_m, 0, 0
@@ -140,25 +140,35 @@ def test_without_a_measurement_there_is_no_block():
     for allocation in ('band', 'frustum'):
         image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
         config = TsdfConfig(**SIZES, allocation=allocation)
-        assert BlockSelection(config).blocks(image, np.eye(4)).shape == (0, 3)
+        index, near = BlockSelection(config).blocks(image, np.eye(4))
+        assert (index.shape, near.shape) == ((0, 3), (0,))
 
 
-def test_blocks_without_a_surface_are_before_the_band_of_a_wall_or_behind_it():
-    config = TsdfConfig(voxel_size_m=0.05, truncation_m=0.15, voxels_per_side=4)
-    image = image_of(SMALL, 2.5 * SMALL.ray_length)
-    steps = np.arange(-10, 11)
-    index = np.stack(np.meshgrid(steps, steps, steps + 10, indexing='ij'), -1).reshape(-1, 3)
-    free = without_surface(config, image, np.eye(4), index)
+@pytest.mark.parametrize('sensor', SENSORS)
+@pytest.mark.parametrize('allocation', ['band', 'frustum'])
+def test_blocks_near_the_surface_are_those_of_the_band(sensor, allocation):
+    rng, sensor = np.random.default_rng(9), SENSORS[sensor]
+    config = TsdfConfig(**SIZES, carve=True, allocation=allocation)
+    selection = BlockSelection(config)  # its marks are used again
+    for _ in range(5):
+        T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
+        index, near = selection.blocks(image, T)
+        range_m = image.range_m[:, : sensor.columns]
+        rays = sensor.directions.astype(float) @ T[:3, :3].T
+        sampled = set()
+        for along in np.linspace(-0.3, 0.3, 40):
+            at = (range_m + along)[..., None] * rays + T[:3, 3]
+            sampled |= {*map(tuple, np.floor(at[range_m > 0] / config.block_size_m).astype(int))}
+        found = {*map(tuple, index[near])}
+        assert sampled <= found
+        assert len(found) < 1.2 * len(sampled)
+        assert len(found) < 0.95 * len(index)
 
-    size_m, inner = config.block_size_m, np.linspace(0.0, 1.0, 6)
-    within = np.stack(np.meshgrid(inner, inner, inner, indexing='ij'), -1).reshape(-1, 3)
-    points = (index[:, None] + within) * size_m  # in the frame of the camera, z forward
-    distance = np.linalg.norm(points, axis=2)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        wall = 2.5 * distance / points[..., 2]  # range of the wall in the direction of each point
-    in_band = (distance > wall - config.truncation_m) & (distance < wall + config.reach_behind_m)
-    assert not in_band[free].any()
-    ahead = (points[..., 2] > 1.0).all(axis=1) & (points[..., 2] < 2.0).all(axis=1)
-    central = ahead & (np.abs(points[..., :2]) < 0.4).all(axis=(1, 2))
-    assert central.sum() >= 8
-    assert free[central].all()
+
+def test_clearing_pixels_have_no_blocks_near_a_surface():
+    image = image_of(SENSORS['camera'], np.full((36, 48), np.inf))
+    index, near = BlockSelection(TsdfConfig(**SIZES, carve=True)).blocks(image, np.eye(4))
+    assert len(index) > 100
+    assert not near.any()
+    index, near = BlockSelection(TsdfConfig(**SIZES, carve=False)).blocks(image, np.eye(4))
+    assert near.all()

@@ -13,6 +13,9 @@ neighbours (columns and rows divisible by larger powers of two) are an eighth of
 end: a lidar with a range of 100 m traverses 6 blocks a ray instead of 40. Blocks missed that way
 are touched at their corners only, less than a quarter of a block deep, in free space.
 
+Blocks in the band about a surface are marked in a cube of their own: all others can only become
+free. That costs one comparison a block and ray.
+
 Source: Amanatides and Woo 1987 for the traversal; the number of steps along each axis is computed
 beforehand, so rounding can neither lose the last block nor run past it.
 """
@@ -61,9 +64,9 @@ def covered(image, row, column, down, across, reach):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mark_rays(image, cosine, directions, pose, reach, side, marks):
+def mark_rays(image, cosine, directions, pose, reach, side, marks, near):
     """
-    Mark the blocks that rays touch.
+    Mark the blocks that rays touch, and those in the band about a surface.
 
     image       (rows, columns or more) float32 m
     cosine      same shape, or no rows; the band is longer by 1 / cosine
@@ -72,12 +75,13 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
     reach       (NUM_REACH,) float64
     side        side of the cube in blocks; all rays stay inside
     marks       (side^3 / 64,) int64, one bit a block, z fastest
+    near        same shape, marks of the band; or no rows
     """
     rows, columns = directions.shape[0], directions.shape[1]
     down, across = lowest_bits(rows), lowest_bits(columns)
     least_column = (reach[COLUMN_BAND] / 2.0 / across).astype(np.float32)
-    near, max_range = reach[NEAR], reach[MAX_RANGE]
-    carve = reach[CARVE] != 0.0
+    least_m, max_range = reach[NEAR], reach[MAX_RANGE]
+    carve, separate = reach[CARVE] != 0.0, near.shape[0] > 0
     for row in range(rows):
         least_row = np.float32(reach[ROW_BAND] / 2.0 / down[row])
         for column in range(columns):
@@ -92,10 +96,11 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
             end = range_m + reach[BEHIND] * longer if in_band else start
             if clears:
                 start, end = max_range, max_range
+            surface = start if separate and in_band and not clears else np.inf
             if carve:
                 free = covered(image, row, column, down[row], across[column], reach)
                 start = min(free, start) if in_band else free
-            start = max(start, near)
+            start = max(start, least_m)
             if end < start or (clears and not carve):
                 continue
             x = np.float64(directions[row, column, 0])
@@ -111,6 +116,7 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
             cell += place
             marks[cell >> 6] |= np.int64(1) << (cell & 63)
             for _ in range(nx + ny + nz):
+                left, leaves = cell, min(tx, ty, tz)
                 if tx <= ty and tx <= tz:
                     cell += sx
                     nx -= 1
@@ -124,6 +130,10 @@ def mark_rays(image, cosine, directions, pose, reach, side, marks):
                     nz -= 1
                     tz = tz + iz if nz > 0 else np.inf
                 marks[cell >> 6] |= np.int64(1) << (cell & 63)
+                if leaves >= surface:
+                    near[left >> 6] |= np.int64(1) << (left & 63)
+            if surface < np.inf:
+                near[cell >> 6] |= np.int64(1) << (cell & 63)
 
 
 @njit(cache=True, nogil=True, error_model='numpy', inline='always')
@@ -176,3 +186,19 @@ def list_marks(marks, side, low, index):
                 index[place, 1] = low[1] + cell // side % side
                 index[place, 2] = low[2] + cell % side
                 place += 1
+
+
+@njit(cache=True, nogil=True)
+def look_up_marks(marks, side, low, index, marked):
+    """
+    Look up whether blocks are marked.
+
+    low     (3,) int64, block at the lower corner of the cube
+    index   (K, 3) int64; blocks beyond the cube are not marked
+    marked  (K,) bool, out
+    """
+    for n in range(len(index)):
+        i, j, k = index[n, 0] - low[0], index[n, 1] - low[1], index[n, 2] - low[2]
+        cell = (i * side + j) * side + k
+        within = min(i, j, k) >= 0 and max(i, j, k) < side
+        marked[n] = within and (marks[cell >> 6] >> (cell & 63)) & 1 == 1

@@ -37,6 +37,7 @@ from surfel_mapper.tsdf.kernels.lookup import (
     DROPOFF,
     EXTRA,
     gather,
+    has_single,
     LEAST,
     locate,
     MAX_OFFSET,
@@ -81,7 +82,7 @@ def integrate_blocks(
     rates     (K,) float32, least share of contradicting measurements, in [0, 1)
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
-    sensor    (kind, parameters, elevations), see kernels/projection.py
+    sensor    (kind, parameters, elevations, gaps), see kernels/projection.py and row_gaps
     images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
               subtract, fuse_color, vote_labels, apply_mask; missing images have no rows
     settings  (NUM_SETTINGS,) float32
@@ -98,7 +99,7 @@ def integrate_blocks(
     pixels, value, fused = scratch[8:12], scratch[12], scratch[13]
     place = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
-    kind, parameters, elevations = sensor
+    kind, parameters, elevations, gaps = sensor
     image, cosine, color_image, label_image, mask = images
     color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
     tau, most, overflow = settings[TAU], settings[MAX_WEIGHT], 0
@@ -111,8 +112,8 @@ def integrate_blocks(
         locate(distance, u, v, image.shape[1], settings, place)
         gather(image.ravel(), image.shape[1], place, pixels)
         mix(pixels[0], pixels[1], pixels[2], pixels[3], u, v, modes[0], settings, value)
-        if settings[MAX_OFFSET] > _ZERO:
-            row_gaps(kind, parameters, elevations, v, weight)
+        if settings[MAX_OFFSET] > _ZERO and has_single(value):
+            row_gaps(kind, gaps, v, weight)
             drop_far(x, y, u, v, distance, weight, settings, value)
         slant(cosine, image.shape[1], place, u, v, weight)
         subtract(value, distance, weight, settings, signed)

@@ -109,15 +109,28 @@ def mix(q00, q10, q01, q11, u, v, method, settings, value):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def row_gaps(kind, parameters, elevations, v, gap):
-    """Find the angle between the rows about every voxel, (N,) float32 rad, out."""
-    for n in range(len(v)):
-        gap[n] = parameters[3]
-    if kind == LIDAR_TABLE:
-        last = len(elevations) - 2
+def row_gaps(kind, gaps, v, gap):
+    """
+    Find the angle between the rows about every voxel, (N,) float32 rad, out.
+
+    gaps  (rows - 1,) float32 rad, between each row and the next; not used for cameras
+    """
+    if kind != LIDAR_TABLE:
         for n in range(len(v)):
-            above = min(max(np.int64(v[n]), 0), last)
-            gap[n] = elevations[above] - elevations[above + 1]
+            gap[n] = gaps[0]
+        return
+    last = np.int32(len(gaps) - 1)
+    for n in range(len(v)):
+        gap[n] = gaps[np.int64(min(max(np.int32(v[n]), np.int32(0)), last))]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def has_single(value):
+    """Return whether any range is that of a single pixel."""
+    found = np.int32(0)
+    for n in range(len(value)):
+        found |= np.int32(value[n] < _ZERO)
+    return found != 0
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
