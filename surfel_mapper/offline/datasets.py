@@ -5,9 +5,9 @@ Folders of public data sets, recognised by their layout: scans, times, poses, ca
 
 ``find_dataset`` tries the layouts of KITTI odometry and raw, nuScenes, MulRan, HeLiPR, Newer
 College, NCLT and Boreas. Poses are returned as poses of the lidar, if the folder has them and the
-calibration they need; without, the scans are registered.
+calibration they need; without, the scans are registered. Each file is read under a budget.
 
-One module of 370 lines: a list of layouts, a function each.
+One module: a list of layouts, a function each.
 
 Sources: development kits and papers of the data sets. Poses of Newer College, NCLT and Boreas are
 not read, because the folders do not contain the calibration of the lidar.
@@ -15,7 +15,8 @@ not read, because the folders do not contain the calibration of the lidar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from array import array
+from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
 from datetime import datetime, timezone
 import json
@@ -26,10 +27,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.trajectory import Trajectory
+from surfel_mapper.files.trajectory import (
+    check_pose,
+    floats,
+    is_rotation,
+    nanoseconds,
+    numbered_lines,
+    read_trajectory,
+    Trajectory,
+)
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 
 Floats = npt.NDArray[np.float64]
@@ -56,6 +66,9 @@ MULRAN_MOUNT = (1.7042, -0.021, 1.8047, 0.0001, 0.0003, 179.6654)
 """Pose of MulRan's Ouster in its base: x y z in m, roll pitch yaw in deg; of its calibration."""
 
 EARTH_M = 6378137.0
+
+OBJECT_BYTES, LIST_BYTES, VALUE_BYTES = 240, 90, 70
+"""Upper bounds of the memory of an object, a list and a value of JSON once it is read."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,18 +125,19 @@ def kitti_odometry(path: Path) -> Dataset | None:
     files, times = scans_in(path / 'velodyne', '.bin'), path / 'times.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = [round(float(word) * 1e9) for word in words(times)]
+    stamps_ns = [nanoseconds(line, where) for where, line in lines_of(times)]
     check_number(times, stamps_ns, files)
     candidates = (path / 'poses.txt', path.parent.parent / 'poses' / f'{path.name}.txt')
     poses_path = next((each for each in candidates if each.is_file()), None)
     mount = calibration(path / 'calib.txt').get('Tr')
     if poses_path is None or mount is None:
         return Dataset('KITTI odometry', files, stamps_ns)
-    rows = table(poses_path, 12)
-    check_number(poses_path, rows, files)
-    T_cam_velo = square(mount)
-    poses = [np.linalg.inv(T_cam_velo) @ square(row) @ T_cam_velo for row in rows]
-    return Dataset('KITTI odometry', files, stamps_ns, trajectory(stamps_ns, poses), poses_path)
+    cameras = read_trajectory(poses_path, 'kitti')
+    check_number(poses_path, cameras, files)
+    T_cam_velo = rigid(path / 'calib.txt', mount)
+    poses = [np.linalg.inv(T_cam_velo) @ pose @ T_cam_velo for pose in cameras.matrices]
+    found = trajectory(times, stamps_ns, poses)
+    return Dataset('KITTI odometry', files, stamps_ns, found, poses_path)
 
 
 def kitti_raw(path: Path) -> Dataset | None:
@@ -132,20 +146,23 @@ def kitti_raw(path: Path) -> Dataset | None:
     files, times = scans_in(folder / 'data', '.bin'), folder / 'timestamps.txt'
     if not files or not times.is_file():
         return None
-    lines = [line for line in times.read_text(encoding='utf-8').splitlines() if line.strip()]
-    stamps_ns = [date_ns(line, times) for line in lines]
+    stamps_ns = [date_ns(line, where) for where, line in lines_of(times)]
     check_number(times, stamps_ns, files)
     drive = folder.parent
     oxts = scans_in(drive / 'oxts' / 'data', '.txt')
-    mount = calibration(drive.parent / 'calib_imu_to_velo.txt')
+    calibrated = drive.parent / 'calib_imu_to_velo.txt'
+    mount = calibration(calibrated)
     if len(oxts) != len(files) or not {'R', 'T'} <= mount.keys():
         return Dataset('KITTI raw', files, stamps_ns)
-    T_velo_imu = square(np.column_stack([np.reshape(mount['R'], (3, 3)), mount['T']]).ravel())
-    poses = oxts_poses([table(file, None)[0] for file in oxts])
-    lidar = [T_map_imu @ np.linalg.inv(T_velo_imu) for T_map_imu in poses]
-    return Dataset(
-        'KITTI raw', files, stamps_ns, trajectory(stamps_ns, lidar), drive / 'oxts' / 'data'
-    )
+    R, t = mount['R'], mount['T']
+    if len(R) != 9 or len(t) != 3:
+        raise FileFormatError(
+            f'{calibrated}: {len(R)} numbers of R and {len(t)} of T, expected 9, 3'
+        )
+    T_velo_imu = rigid(calibrated, np.column_stack([R.reshape(3, 3), t]).ravel())
+    lidar = [T_map_imu @ np.linalg.inv(T_velo_imu) for T_map_imu in oxts_poses(oxts)]
+    found = trajectory(times, stamps_ns, lidar)
+    return Dataset('KITTI raw', files, stamps_ns, found, drive / 'oxts' / 'data')
 
 
 def nuscenes(path: Path) -> Dataset | None:
@@ -157,24 +174,36 @@ def nuscenes(path: Path) -> Dataset | None:
     ]
     if not found:
         return None
-    by_time = sorted((int(name_number(file)) * 1000, file) for file in found)
+    by_time = sorted((stamp_in_name(file, 1000), file) for file in found)
     stamps_ns, files = [stamp for stamp, _ in by_time], [file for _, file in by_time]
     tables = next(iter(sorted(path.glob('v1.0-*/sample_data.json'))), None)
     if tables is None:
         return Dataset('nuScenes', files, stamps_ns)
-    rows = {Path(row['filename']).name: row for row in json.loads(tables.read_text())}
-    ego, mounts = (
-        {row['token']: row for row in json.loads((tables.parent / name).read_text())}
-        for name in ('ego_pose.json', 'calibrated_sensor.json')
-    )
-    poses = []
-    for file in files:
-        row = rows.get(file.name)
-        if row is None:
-            raise FileFormatError(f'{tables}: no entry for {file.name}')
-        T_map_ego = wxyz_pose(ego[row['ego_pose_token']])
-        poses.append(T_map_ego @ wxyz_pose(mounts[row['calibrated_sensor_token']]))
-    return Dataset('nuScenes', files, stamps_ns, trajectory(stamps_ns, poses), tables)
+    poses = nuscenes_poses(tables, files)
+    return Dataset('nuScenes', files, stamps_ns, trajectory(tables, stamps_ns, poses), tables)
+
+
+def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
+    """Return the poses of the lidar, T_map_lidar (4, 4), of scans in nuScenes."""
+    try:
+        rows = {Path(row['filename']).name: row for row in json_of(tables)}
+        ego, mounts = (
+            {row['token']: row for row in json_of(tables.parent / name)}
+            for name in ('ego_pose.json', 'calibrated_sensor.json')
+        )
+        poses = []
+        for file in files:
+            row = rows.get(file.name)
+            if row is None:
+                raise FileFormatError(f'{tables}: no entry for {file.name}')
+            T_map_ego = wxyz_pose(ego[row['ego_pose_token']])
+            poses.append(T_map_ego @ wxyz_pose(mounts[row['calibrated_sensor_token']]))
+    except (KeyError, TypeError, ValueError) as error:
+        raise FileFormatError(
+            f'{tables.parent}: its tables are not those of nuScenes: '
+            f'{type(error).__name__}: {error}'
+        ) from error
+    return poses
 
 
 def mulran(path: Path) -> Dataset | None:
@@ -183,15 +212,14 @@ def mulran(path: Path) -> Dataset | None:
     files = next(filter(None, (scans_in(folder, '.bin') for folder in folders)), [])
     if not files:
         return None
-    stamps_ns = [int(name_number(file)) for file in files]
+    stamps_ns = [stamp_in_name(file, 1) for file in files]
     poses_path = path / 'global_pose.csv'
     if not poses_path.is_file():
         return Dataset('MulRan', files, stamps_ns)
-    rows = [line.split(',') for line in poses_path.read_text().splitlines() if line.strip()]
+    times_ns, rows = stamped_rows(poses_path, 12, ',')
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    poses = [square(np.array(row[1:], np.float64)) @ T_base_lidar for row in rows]
-    times_ns = [int(row[0]) for row in rows]
-    return Dataset('MulRan', files, stamps_ns, trajectory(times_ns, poses), poses_path)
+    poses = [rigid(poses_path, row) @ T_base_lidar for row in rows]
+    return Dataset('MulRan', files, stamps_ns, trajectory(poses_path, times_ns, poses), poses_path)
 
 
 def helipr(path: Path) -> Dataset | None:
@@ -199,13 +227,15 @@ def helipr(path: Path) -> Dataset | None:
     files = scans_in(path / 'LiDAR' / 'Ouster', '.bin')
     if not files:
         return None
-    stamps_ns, read = [int(name_number(file)) for file in files], structured(HELIPR_OUSTER)
+    stamps_ns, read = [stamp_in_name(file, 1) for file in files], structured(HELIPR_OUSTER)
     poses_path = path / 'LiDAR_GT' / 'Ouster_gt.txt'
     if not poses_path.is_file():
         return Dataset('HeLiPR', files, stamps_ns, read=read)
-    rows = [line.split() for line in poses_path.read_text().splitlines() if line.strip()]
-    numbers = np.array([row[1:8] for row in rows], np.float64).reshape(-1, 7)
-    found = Trajectory(np.array([int(row[0]) for row in rows]), numbers[:, :3], numbers[:, 3:])
+    times_ns, rows = stamped_rows(poses_path, 7)
+    for row in rows:
+        check_pose(str(poses_path), row.tolist())
+    poses = [pose_matrix(row[:3], row[3:]) for row in rows]
+    found = trajectory(poses_path, times_ns, poses)
     return Dataset('HeLiPR', files, stamps_ns, found, poses_path, read)
 
 
@@ -215,8 +245,12 @@ def newer_college(path: Path) -> Dataset | None:
     files = next(filter(None, (scans_in(folder, '.pcd') for folder in folders)), [])
     if not files or not all(file.name.startswith('cloud_') for file in files):
         return None
-    parts = [file.stem.split('_')[1:3] for file in files]
-    stamps_ns = [int(second) * 10**9 + int(rest) for second, rest in parts]
+    stamps_ns = []
+    for file in files:
+        second, _, rest = file.stem.removeprefix('cloud_').partition('_')
+        if not (second.isdecimal() and rest.isdecimal() and len(second) < 11 and len(rest) < 10):
+            raise FileFormatError(f'{file}: expected a name cloud_SECONDS_NANOSECONDS.pcd')
+        stamps_ns.append(int(second) * 10**9 + int(rest))
     return Dataset('Newer College', files, stamps_ns)
 
 
@@ -225,7 +259,7 @@ def nclt(path: Path) -> Dataset | None:
     files = scans_in(path / 'velodyne_sync', '.bin')
     if not files:
         return None
-    stamps_ns = [int(name_number(file)) * 1000 for file in files]
+    stamps_ns = [stamp_in_name(file, 1000) for file in files]
     return Dataset('NCLT', files, stamps_ns, read=read_nclt)
 
 
@@ -234,7 +268,7 @@ def boreas(path: Path) -> Dataset | None:
     files = scans_in(path / 'lidar', '.bin')
     if not files or not ((path / 'applanix').is_dir() or (path / 'calib').is_dir()):
         return None
-    stamps_ns = [int(name_number(file)) * 1000 for file in files]
+    stamps_ns = [stamp_in_name(file, 1000) for file in files]
     return Dataset('Boreas', files, stamps_ns, read=structured(BOREAS_POINT))
 
 
@@ -270,10 +304,7 @@ def read_nclt(path: Path) -> tuple[npt.NDArray[Any], Columns]:
 
 def packed(path: Path, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     """Return the points of a file of one type; raise FileFormatError for a part of a point."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    content = content_of(path)
     if len(content) % dtype.itemsize:
         raise FileFormatError(
             f'{path}: {len(content)} bytes, expected {dtype.itemsize} for every point'
@@ -281,26 +312,61 @@ def packed(path: Path, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
     return np.frombuffer(content, dtype)
 
 
-def words(path: Path) -> list[str]:
-    """Return the words of a text file."""
-    return path.read_text(encoding='utf-8').split()
-
-
-def table(path: Path, columns: int | None) -> Floats:
-    """Return the numbers of a text file, (R, columns)."""
+def content_of(path: Path) -> bytes:
+    """Return the content of a file; raise FileFormatError if it cannot be read."""
     try:
-        rows = np.loadtxt(path, np.float64, ndmin=2)
-    except ValueError as error:
-        raise FileFormatError(f'{path}: no table of numbers: {error}') from error
-    if columns is not None and rows.shape[1] != columns:
-        raise FileFormatError(f'{path}: {rows.shape[1]} columns, expected {columns}')
+        Budget.of_file(path, FileFormatError).take(path.stat().st_size, 'its content')
+        return path.read_bytes()
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+
+
+def json_of(path: Path) -> list[dict[str, Any]]:
+    """Return the rows of a table in JSON, of which the memory is known from its characters."""
+    content = content_of(path)
+    budget = Budget(path, len(content), FileFormatError)
+    num_values = content.count(b',') + content.count(b':') + 1
+    budget.take(
+        OBJECT_BYTES * content.count(b'{')
+        + LIST_BYTES * content.count(b'[')
+        + VALUE_BYTES * num_values
+        + 4 * len(content),
+        'a table in JSON',
+    )
+    try:
+        rows = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise FileFormatError(f'{path}: no JSON: {error}') from error
+    if not isinstance(rows, list):
+        raise FileFormatError(f'{path}: expected a list of rows')
     return rows
+
+
+def lines_of(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield file:line and text of all lines but comments."""
+    budget = Budget.of_file(path, FileFormatError)
+    with budget.clock():
+        yield from numbered_lines(path, budget)
+
+
+def stamped_rows(
+    path: Path, columns: int, separator: str | None = None
+) -> tuple[list[int], Floats]:
+    """Return the times, ns, and the numbers (R, columns) of lines that begin with a time in ns."""
+    stamps_ns, numbers = [], array('d')
+    for where, line in lines_of(path):
+        texts = line.split(separator)
+        if len(texts) != columns + 1:
+            raise FileFormatError(f'{where}: {len(texts)} columns, expected {columns + 1}')
+        stamps_ns.append(nanoseconds(texts[0], where, 'ns'))
+        numbers.extend(floats(texts[1:], where))
+    return stamps_ns, np.array(numbers, np.float64).reshape(-1, columns)
 
 
 def calibration(path: Path) -> dict[str, Floats]:
     """Return the numbers of a file of lines NAME: NUMBERS; empty without the file."""
     found: dict[str, Floats] = {}
-    for line in path.read_text(encoding='utf-8').splitlines() if path.is_file() else []:
+    for _, line in lines_of(path) if path.is_file() else ():
         name, _, rest = line.partition(':')
         try:
             found[name.strip()] = np.array(rest.split(), np.float64)
@@ -309,30 +375,47 @@ def calibration(path: Path) -> dict[str, Floats]:
     return found
 
 
-def check_number(path: Path, rows: Sequence[object] | Floats, files: Sequence[Path]) -> None:
+def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:
+    """Return the (4, 4) pose of 12 numbers, row by row; raise FileFormatError if it is none."""
+    flat = np.ravel(np.asarray(numbers, np.float64))
+    if (
+        len(flat) != 12
+        or not np.isfinite(flat).all()
+        or not is_rotation(flat.reshape(3, 4)[:, :3])
+    ):
+        raise FileFormatError(
+            f'{path}: {flat.tolist()}, expected 3 rows of a rotation and a place'
+        )
+    return np.vstack([flat.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+
+
+def check_number(path: Path, rows: Sized, files: Sequence[Path]) -> None:
     """Raise FileFormatError unless a file has one row for each scan."""
     if len(rows) != len(files):
         raise FileFormatError(f'{path}: {len(rows)} rows for {len(files)} scans, expected as many')
 
 
-def name_number(file: Path) -> str:
-    """Return the number at the end of the name of a file."""
-    return file.name.partition('.')[0].rpartition('__')[2]
+def stamp_in_name(file: Path, unit_ns: int) -> int:
+    """Return the time, ns, that ends the name of a file as a number of a unit."""
+    digits = file.name.partition('.')[0].rpartition('__')[2]
+    if not digits.isdecimal() or len(digits) > 19 or int(digits) * unit_ns >= 2**63:
+        raise FileFormatError(
+            f'{file}: expected a name that ends with its time, {unit_ns} ns a unit'
+        )
+    return int(digits) * unit_ns
 
 
-def date_ns(line: str, path: Path) -> int:
+def date_ns(line: str, where: str) -> int:
     """Return the time of a line 2011-09-26 13:02:25.594360375, ns since 1970."""
     date, _, fraction = line.strip().partition('.')
     try:
         second = datetime.strptime(date, '%Y-%m-%d %H:%M:%S').replace(tzinfo=timezone.utc)
-        return int(second.timestamp()) * 10**9 + int(fraction.ljust(9, '0')[:9])
+        stamp_ns = int(second.timestamp()) * 10**9 + int(fraction.ljust(9, '0')[:9])
     except ValueError as error:
-        raise FileFormatError(f'{path}: {line!r} is no time') from error
-
-
-def square(numbers: npt.ArrayLike) -> Floats:
-    """Return the (4, 4) matrix of 12 numbers, row by row."""
-    return np.vstack([np.reshape(numbers, (3, 4)), [0.0, 0.0, 0.0, 1.0]])
+        raise FileFormatError(f'{where}: {line!r} is no time') from error
+    if not 0 <= stamp_ns < 2**63:
+        raise FileFormatError(f'{where}: {line!r}, expected a time after 1970')
+    return stamp_ns
 
 
 def euler_pose(xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> Floats:
@@ -355,21 +438,34 @@ def wxyz_pose(row: dict[str, Any]) -> Floats:
     return pose_matrix(row['translation'], (x, y, z, w))
 
 
-def oxts_poses(rows: Sequence[Floats]) -> list[Floats]:
+def oxts_poses(files: Sequence[Path]) -> list[Floats]:
     """Return the poses of the IMU by lat lon alt roll pitch yaw, Mercator from the first one."""
-    scale, origin, poses = math.cos(math.radians(rows[0][0])) * EARTH_M, None, []
-    for latitude, longitude, altitude, roll, pitch, yaw in (row[:6] for row in rows):
+    scale, first = 0.0, np.zeros(3)
+    poses: list[Floats] = []
+    for file in files:
+        where, line = next(lines_of(file), (str(file), ''))
+        numbers = floats(line.split()[:6], where)
+        if len(numbers) != 6 or not abs(numbers[0]) < 90.0:
+            raise FileFormatError(f'{where}: expected latitude, longitude, altitude, three angles')
+        latitude, longitude, altitude, *angles = numbers
+        scale = scale or math.cos(math.radians(latitude)) * EARTH_M
         north = scale * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
         position = np.array([scale * math.radians(longitude), north, altitude])
-        origin = position if origin is None else origin
-        poses.append(euler_pose(position - origin, (roll, pitch, yaw)))
+        first = first if poses else position
+        poses.append(euler_pose(position - first, angles))
     return poses
 
 
-def trajectory(stamps_ns: Sequence[int], poses: Sequence[Floats]) -> Trajectory:
-    """Return a trajectory of poses (4, 4)."""
+def trajectory(path: Path, stamps_ns: Sequence[int], poses: Sequence[Floats]) -> Trajectory:
+    """Return a trajectory of poses (4, 4); raise FileFormatError unless stamps ascend."""
+    times_ns = np.array(stamps_ns, np.int64)
+    back = np.flatnonzero(np.diff(times_ns) <= 0)
+    if len(back):
+        raise FileFormatError(
+            f'{path}: row {back[0] + 2}: time {times_ns[back[0] + 1]} ns is not after that before'
+        )
     return Trajectory(
-        np.array(stamps_ns, np.int64),
+        times_ns,
         np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3),
         np.array([q_xyzw(pose) for pose in poses]).reshape(-1, 4),
     )

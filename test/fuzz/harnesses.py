@@ -46,6 +46,8 @@ HARNESSES = {
     'png_structure': Harness(structures.png, corpus.noise, 100),
     'yaml_structure': Harness(structures.yaml, corpus.noise, 25),
     'npz_structure': Harness(structures.npz, corpus.noise, 200),
+    'cloud_structure': Harness(structures.cloud, corpus.noise, 200),
+    'data_set': Harness(structures.data_set, corpus.noise, 400),
     'parquet_structure': Harness(structures.parquet, corpus.noise, 40),
     'map_url': Harness(files.map_url, corpus.map_url, 1000),
     'map_name': Harness(files.map_name, corpus.map_url, 1000),

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import bz2
 import contextlib
+from functools import cache
 import io
 import json
 from pathlib import Path
@@ -29,8 +30,14 @@ from surfel_mapper.errors import CloudFormatError, SurfelMapperError
 from surfel_mapper.files.state import content_sha256, FORMAT, VERSION
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.messages.compressed_image import unpacked
+from surfel_mapper.messages.pointcloud2 import MAX_FIELDS, parse_cloud, to_scan
+from surfel_mapper.offline.datasets import find_dataset
+from test.bags.recorded import CLOUD, Entries
 from test.fuzz.files import folder, read_bag, read_state, refused, timed_read
+from test.fuzz.messages import read
+from test.fuzz.mutations import mutations
 from test.fuzz.source import Source
+from test.offline.dataset_folders import ALL
 
 SIZES = (0, 1, 7, 1000, 65_536, 1 << 24, 1 << 31, 1 << 40, (1 << 63) - 1)
 
@@ -282,3 +289,116 @@ def parquet(data: bytes) -> None:
     pq.write_table(table, path, row_group_size=-(-len(table) // groups), **options)
     with timed_read(path.stat().st_size), contextlib.suppress(SurfelMapperError):
         read_map(path)
+
+
+ITEMS = {1: 'i1', 2: 'u1', 3: 'i2', 4: 'u2', 5: 'i4', 6: 'u4', 7: 'f4', 8: 'f8'}
+"""NumPy types of the datatypes of a PointField."""
+
+
+def cloud(data: bytes) -> None:
+    """
+    Read a cloud of up to some thousand points and fields, whose sizes may not agree.
+
+    Where they agree, the coordinates are those that NumPy reads at the same places.
+    """
+    source = Source(data)
+    store = Entries()
+    wide = source.pick(('f4', 'f8'))
+    fields, offset = [], source.pick((0, 0, 3))
+    others = source.pick((0, 1, 5, 60, 1021, 1022))
+    false = 3 + others > MAX_FIELDS
+    for number in range(3 + others):
+        name = (
+            'xyz'[number] if number < 3 else source.pick((f'c{number}', 'a' * 300 + str(number)))
+        )
+        code = 7 + (wide == 'f8') if number < 3 else 1 + source.below(8)
+        count = 1 if number < 3 else source.pick((1, 1, 2, 30))
+        place = offset
+        if source.chance(200):
+            false = True
+            name, code = source.pick(('x', '', 'c3')), source.below(12)
+            place, count = source.number() % 2**32, source.pick(SIZES) % 2**32
+        fields.append(
+            store.make(
+                'sensor_msgs/msg/PointField', name=name, offset=place, datatype=code, count=count
+            )
+        )
+        offset += np.dtype(ITEMS.get(code, 'u1')).itemsize * min(count, 30)
+    sizes = {
+        'height': source.pick((1, 1, 16)),
+        'width': source.pick((0, 1, 100, 4000)),
+        'point_step': offset + source.pick((0, 0, 5)),
+    }
+    sizes['width'] = min(sizes['width'], (1 << 20) // (sizes['height'] * offset))
+    sizes['row_step'] = sizes['width'] * sizes['point_step'] + source.pick((0, 0, 7))
+    content = np.resize(np.arange(251, dtype=np.uint8), sizes['row_step'] * sizes['height'])
+    if source.chance(4):
+        false = True
+        name = source.pick(sorted(sizes))
+        sizes[name] = source.pick(SIZES) % 2**32
+    if source.chance(8):
+        false = True
+        content = content[: source.below(1 << 16)]
+    big = source.chance(3)
+    message = store.make(
+        CLOUD,
+        header=store.header(5, 'lidar'),
+        fields=fields,
+        is_bigendian=big,
+        data=content,
+        is_dense=True,
+        **sizes,
+    )
+    raw = bytes(store.store.serialize_cdr(message, CLOUD))
+    scan = None
+    with timed_read(len(raw)), contextlib.suppress(SurfelMapperError):
+        scan = to_scan(parse_cloud(raw))
+        read(scan)
+    if not false:
+        assert scan is not None
+        order = '>' if big else '<'
+        layout = np.dtype(
+            {
+                'names': ['x', 'y', 'z'],
+                'formats': [order + wide] * 3,
+                'offsets': [field.offset for field in fields[:3]],
+                'itemsize': sizes['point_step'],
+            }
+        )
+        used = sizes['width'] * sizes['point_step']
+        rows = content.reshape(sizes['height'], -1)[:, :used].tobytes()
+        expected = np.frombuffer(rows, layout)
+        for axis, name in enumerate('xyz'):
+            np.testing.assert_array_equal(scan.points[:, axis], expected[name])
+
+
+@cache
+def data_sets() -> list[tuple[Path, list[Path]]]:
+    """Return a small folder of each data set, and its files."""
+    found = []
+    for make in ALL:
+        root = Path(folder().name, make.__name__)
+        root.mkdir()
+        path, _, _ = make(root)
+        found.append((path, sorted(file for file in root.rglob('*') if file.is_file())))
+    return found
+
+
+def data_set(data: bytes) -> None:
+    """Read the folder of a data set, one file of which is changed."""
+    source = Source(data)
+    path, files = source.pick(data_sets())
+    file = source.pick(files)
+    original = file.read_bytes()
+    *_, content = mutations([original], 1, seed=source.below(1 << 16))
+    if file.suffix == '.json' and source.chance(4):
+        content = b'[' + source.pick((b'{},', b'[],', b'"",', b'0,')) * 100_000 + b'0]'
+    file.write_bytes(content)
+    try:
+        size = sum(each.stat().st_size for each in files)
+        with timed_read(size), contextlib.suppress(SurfelMapperError):
+            found = find_dataset(path)
+            for each in found.files if found is not None else []:
+                found.read(each)
+    finally:
+        file.write_bytes(original)

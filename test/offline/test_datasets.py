@@ -10,130 +10,12 @@ import pytest
 from surfel_mapper import Config
 from surfel_mapper.cli.main import main
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import pcd
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.offline.datasets import EARTH_M, find_dataset, HELIPR_OUSTER, NCLT_POINT
+from surfel_mapper.offline.datasets import find_dataset
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
-
-US, NS = 1_700_000_000_000_000, 1_700_000_000_000_000_000
-POINTS = np.random.default_rng(1).uniform(-5.0, 5.0, (50, 3)).astype(np.float32)
-
-
-def write(path, content):
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if isinstance(content, str):
-        path.write_text(content)
-    else:
-        np.asarray(content).tofile(path)
-
-
-def raw(width):
-    return np.column_stack([POINTS, np.zeros((50, width - 3))]).astype('<f4')
-
-
-def lines(rows):
-    return '\n'.join(' '.join(map(str, np.ravel(row))) for row in rows) + '\n'
-
-
-def lidar_poses():
-    """Return three poses of a lidar that drives ahead and turns."""
-    return [
-        pose_matrix((2.0 * i, 0.1 * i, 0.0), (0.0, 0.0, np.sin(0.05 * i), np.cos(0.05 * i)))
-        for i in range(3)
-    ]
-
-
-def kitti_odometry(root):
-    path = root / 'sequences' / '07'
-    mount = np.array([[0, -1, 0, 0.1], [0, 0, -1, -0.2], [1, 0, 0, -0.3], [0, 0, 0, 1.0]])
-    for i in range(3):
-        write(path / 'velodyne' / f'{i:06}.bin', raw(4))
-    write(path / 'times.txt', '0.0\n0.1\n0.2\n')
-    write(path / 'calib.txt', f'P0: 1 0\nTr: {lines([mount[:3]])}')
-    cameras = [mount @ pose @ np.linalg.inv(mount) for pose in lidar_poses()]
-    write(root / 'poses' / '07.txt', lines(pose[:3] for pose in cameras))
-    return path, 'KITTI odometry', [0, 10**8, 2 * 10**8]
-
-
-def kitti_raw(root):
-    path = root / '2011_09_26' / '2011_09_26_drive_0001_sync'
-    for i in range(3):
-        write(path / 'velodyne_points' / 'data' / f'{i:010}.bin', raw(4))
-        east, north, _ = lidar_poses()[i][:3, 3]
-        degree = np.degrees(1.0 / EARTH_M)
-        oxts = [north * degree, 8.0 + east * degree, 100.0, 0.0, 0.0, 0.1 * i, 7.0]
-        write(path / 'oxts' / 'data' / f'{i:010}.txt', lines([oxts]))
-    write(path.parent / 'calib_imu_to_velo.txt', 'R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n')
-    times = [f'2011-09-26 13:02:25.{i}00000007' for i in range(3)]
-    write(path / 'velodyne_points' / 'timestamps.txt', '\n'.join(times))
-    start = 1317042145 * 10**9 + 7
-    return path, 'KITTI raw', [start, start + 10**8, start + 2 * 10**8]
-
-
-def nuscenes(root):
-    rows, ego = [], []
-    for i, pose in enumerate(lidar_poses()):
-        folder = 'samples' if i == 1 else 'sweeps'
-        name = f'{folder}/LIDAR_TOP/n0__LIDAR_TOP__{US + i * 50_000}.pcd.bin'
-        write(root / name, raw(5))
-        rows.append({'filename': name, 'ego_pose_token': f'e{i}', 'calibrated_sensor_token': 'c'})
-        rotation = [np.cos(0.05 * i), 0.0, 0.0, np.sin(0.05 * i)]
-        place = (pose @ np.array([-1.0, 0.0, 0.0, 1.0]))[:3]
-        ego.append({'token': f'e{i}', 'translation': place.tolist(), 'rotation': rotation})
-    mount = {'token': 'c', 'translation': [1.0, 0.0, 0.0], 'rotation': [1.0, 0.0, 0.0, 0.0]}
-    tables = {'sample_data': rows, 'ego_pose': ego, 'calibrated_sensor': [mount]}
-    for name, content in tables.items():
-        write(root / 'v1.0-mini' / f'{name}.json', json.dumps(content))
-    return root, 'nuScenes', [(US + i * 50_000) * 1000 for i in range(3)]
-
-
-def helipr(root):
-    points = np.zeros(50, HELIPR_OUSTER)
-    for axis, values in zip('xyz', POINTS.T, strict=True):
-        points[axis] = values
-    points['t'] = np.arange(50) * 2_000_000
-    rows = []
-    for i, pose in enumerate(lidar_poses()):
-        write(root / 'LiDAR' / 'Ouster' / f'{NS + i}.bin', points)
-        turn = [0.0, 0.0, np.sin(0.05 * i), np.cos(0.05 * i)]
-        rows.append(f'{NS + i} ' + ' '.join(map(str, [*pose[:3, 3], *turn])))
-    write(root / 'LiDAR_GT' / 'Ouster_gt.txt', '\n'.join(rows))
-    return root, 'HeLiPR', [NS, NS + 1, NS + 2]
-
-
-def mulran(root):
-    for i in range(3):
-        write(root / 'sensor_data' / 'Ouster' / f'{NS + i}.bin', raw(4))
-    return root, 'MulRan', [NS, NS + 1, NS + 2]
-
-
-def newer_college(root):
-    for i in range(3):
-        path = root / 'raw_format' / 'ouster_scan' / f'cloud_1583836591_{i:09}.pcd'
-        path.parent.mkdir(parents=True, exist_ok=True)
-        pcd.write_points(path, dict(zip('xyz', POINTS.T, strict=True)))
-    return root, 'Newer College', [1583836591 * 10**9 + i for i in range(3)]
-
-
-def nclt(root):
-    points = np.zeros(50, NCLT_POINT)
-    for axis, values in zip('xyz', POINTS.T, strict=True):
-        points[axis] = np.round((values + 100.0) / 0.005)
-    for i in range(3):
-        write(root / 'velodyne_sync' / f'{US + i}.bin', points)
-    return root, 'NCLT', [(US + i) * 1000 for i in range(3)]
-
-
-def boreas(root):
-    (root / 'applanix').mkdir()
-    for i in range(3):
-        write(root / 'lidar' / f'{US + i}.bin', raw(6))
-    return root, 'Boreas', [(US + i) * 1000 for i in range(3)]
-
-
-WITH_POSES = (kitti_odometry, kitti_raw, nuscenes, helipr)
-ALL = (*WITH_POSES, mulran, newer_college, nclt, boreas)
+from test.offline import dataset_folders as folders
+from test.offline.dataset_folders import ALL, lidar_poses, POINTS
 
 
 @pytest.mark.parametrize('make', ALL)
@@ -146,13 +28,13 @@ def test_a_layout_is_recognised_with_its_scans_and_times(tmp_path, make, capsys)
     np.testing.assert_allclose(scan.points, POINTS, atol=0.0026)  # NCLT rounds to 5 mm
 
     assert main(['info', str(path)]) == 0
-    source = 'file' if make in WITH_POSES else 'registration'
+    source = 'file' if make in (*folders.WITH_POSES, folders.mulran) else 'registration'
     printed = capsys.readouterr().out
     assert f'{name} data set, 3 scans' in printed
     assert f'replay takes poses from {source}' in printed
 
 
-@pytest.mark.parametrize('make', WITH_POSES)
+@pytest.mark.parametrize('make', folders.WITH_POSES)
 def test_poses_are_those_of_the_lidar(tmp_path, make):
     path, _, stamps_ns = make(tmp_path)
 
@@ -164,9 +46,7 @@ def test_poses_are_those_of_the_lidar(tmp_path, make):
 
 
 def test_poses_of_mulran_are_moved_to_the_lidar(tmp_path):
-    path, _, stamps_ns = mulran(tmp_path)
-    rows = [[stamp, *np.eye(4)[:3].ravel()] for stamp in stamps_ns]
-    write(path / 'global_pose.csv', '\n'.join(','.join(map(str, row)) for row in rows))
+    path, _, _ = folders.mulran(tmp_path)
 
     found = find_dataset(path).trajectory
 
@@ -175,15 +55,100 @@ def test_poses_of_mulran_are_moved_to_the_lidar(tmp_path):
 
 
 def test_a_wrong_number_of_times_is_refused(tmp_path):
-    path, _, _ = kitti_odometry(tmp_path)
+    path, _, _ = folders.kitti_odometry(tmp_path)
     (path / 'times.txt').write_text('0.0\n0.1\n')
     with pytest.raises(FileFormatError, match='2 rows for 3 scans'):
         find_dataset(path)
 
 
 def test_points_of_helipr_carry_times(tmp_path):
-    path, _, _ = helipr(tmp_path)
+    path, _, _ = folders.helipr(tmp_path)
     (path / 'LiDAR_GT' / 'Ouster_gt.txt').unlink()
     with open_recording(Request(path=path), Config()) as recording:
         assert recording.config.pose.source == 'registration'
         assert recording.config.deskew.enabled
+
+
+def replaced(name, old, new):
+    """Return a change of a text file: the first occurrence of a text becomes another."""
+
+    def change(folder):
+        file = next(folder.rglob(name))
+        text = file.read_text()
+        assert old in text
+        file.write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def renamed(name):
+    """Return a change of the name of the last scan."""
+
+    def change(folder):
+        last = max(folder.rglob('*.bin'), default=None) or max(folder.rglob('*.pcd'))
+        last.rename(last.with_name(name))
+
+    return change
+
+
+DAMAGE = {
+    'a time that is none': (folders.kitti_odometry, replaced('times.txt', '0.1', 'noon')),
+    'times that go back': (folders.kitti_odometry, replaced('times.txt', '0.1', '0.3')),
+    'poses that are none': (folders.kitti_odometry, replaced('07.txt', '1.0 0.0', '7.0 0.0')),
+    'a calibration that is none': (folders.kitti_odometry, replaced('calib.txt', ' 1.0', ' 5.0')),
+    'a short calibration': (folders.kitti_odometry, replaced('calib.txt', ' 0.1', '')),
+    'bytes that are no text': (
+        folders.kitti_odometry,
+        lambda folder: next(folder.rglob('times.txt')).write_bytes(b'\xff\xfe0\n'),
+    ),
+    'a date that is none': (folders.kitti_raw, replaced('timestamps.txt', '13:02', '25:02')),
+    'a date before 1970': (folders.kitti_raw, replaced('timestamps.txt', '2011', '1911')),
+    'a pole': (folders.kitti_raw, replaced('0000000000.txt', '0.0 8.0', '90.0 8.0')),
+    'a mount of eight numbers': (
+        folders.kitti_raw,
+        replaced('calib_imu_to_velo.txt', '1 0 0', '1 0'),
+    ),
+    'a file of five numbers': (folders.kitti_raw, replaced('0000000002.txt', ' 100.0 0.0', '')),
+    'a table that is no JSON': (folders.nuscenes, replaced('sample_data.json', '[', '')),
+    'a table of another kind': (folders.nuscenes, replaced('ego_pose.json', '"token"', '"name"')),
+    'a table that is no list': (
+        folders.nuscenes,
+        lambda folder: next(folder.rglob('ego_pose.json')).write_text('{}'),
+    ),
+    'nesting without end': (
+        folders.nuscenes,
+        lambda folder: next(folder.rglob('ego_pose.json')).write_text('[' * 100_000),
+    ),
+    'a rotation that is none': (
+        folders.nuscenes,
+        replaced('ego_pose.json', '[1.0, 0.0', '[7.0, 0.0'),
+    ),
+    'no number in a name of nuScenes': (folders.nuscenes, renamed('n0__LIDAR_TOP__x.pcd.bin')),
+    'eleven numbers': (folders.mulran, replaced('global_pose.csv', ',1.0', '')),
+    'no number in a name': (folders.mulran, renamed('x.bin')),
+    'a number beyond int64': (folders.nclt, renamed(f'{10**19}.bin')),
+    'a turn of length zero': (folders.helipr, replaced('Ouster_gt.txt', ' 1.0', ' 0.0')),
+    'not a number': (folders.helipr, replaced('Ouster_gt.txt', ' 0.0', ' nan')),
+    'no nanoseconds in a name': (folders.newer_college, renamed('cloud_1583836591.pcd')),
+}
+
+
+@pytest.mark.parametrize(('make', 'damage'), DAMAGE.values(), ids=DAMAGE)
+def test_damage_is_refused_with_the_name_of_the_file(tmp_path, make, damage, capsys):
+    path, _, _ = make(tmp_path / 'set')
+    damage(tmp_path / 'set')
+
+    with pytest.raises(FileFormatError, match=str(tmp_path)):
+        find_dataset(path)
+
+    assert main(['info', str(path)]) == 1
+    assert 'Traceback' not in capsys.readouterr().err
+
+
+def test_a_table_beyond_the_budget_is_refused_before_it_is_read(tmp_path, monkeypatch):
+    path, _, _ = folders.nuscenes(tmp_path)
+    next(path.rglob('sample_data.json')).write_text('[' + '{},' * 1_000_000 + '{}]')
+    monkeypatch.setattr(json, 'loads', lambda text: pytest.fail('it was read'))
+
+    with pytest.raises(FileFormatError, match=r'sample_data.json: .* needs \d+ bytes'):
+        find_dataset(path)
