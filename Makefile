@@ -8,7 +8,7 @@
 PYTHON ?= python3
 PYTEST_ARGS ?=
 TEST_PROCESSES ?= 2
-FUZZ_SECONDS ?= 60
+FUZZ_SECONDS ?= 10
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
@@ -64,8 +64,9 @@ bench: $(STAMP)  ## milliseconds a scan
 soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map drift?
 	$(BIN)/python -m test.soak
 
-fuzz: $(STAMP)  ## search for inputs that break readers, a minute of each; FUZZ_SECONDS=600
+fuzz: $(STAMP)  ## let every write and allocation fail; then search for inputs that break readers, a minute of each; FUZZ_SECONDS=600
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
+	SURFEL_MAPPER_EVERY_FAILURE=1 $(BIN)/python -m pytest -q -rP test/fuzz/test_failures.py
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
 lint: $(LINT_STAMP)  ## style, format, types, layers, language; needs no ROS

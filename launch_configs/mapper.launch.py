@@ -79,6 +79,12 @@ ARGUMENTS = [
         description='Configure and activate at once; false: wait for these transitions.',
     ),
     DeclareLaunchArgument(
+        'respawn',
+        default_value='true',
+        choices=BOOLEAN,
+        description='Start the node again 2 s after its process ended, at most five times.',
+    ),
+    DeclareLaunchArgument(
         'use_sim_time',
         default_value='false',
         choices=BOOLEAN,
@@ -159,6 +165,9 @@ def nodes(context: LaunchContext) -> list[Node]:
             parameters=[settings_file(values), overrides(values)],
             remappings=[(topic, values[argument]) for argument, topic in TOPICS.items()],
             ros_arguments=['--log-level', f'surfel_mapper:={values["log_level"]}'],
+            respawn=values['respawn'] == 'true',
+            respawn_delay=2.0,
+            respawn_max_retries=5,  # a setting that is refused ends the node each time
         )
     ]
     if values['rviz'] == 'true':

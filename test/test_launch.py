@@ -78,6 +78,14 @@ def test_the_default_is_the_node_with_the_default_settings(launch):
     assert ('points', 'points') in node.remappings
 
 
+def test_the_node_is_started_again_a_few_times_unless_refused(launch):
+    (node,), (once,) = (
+        launch.nodes(values(launch, **given)) for given in ({}, {'respawn': 'false'})
+    )
+    assert (node.respawn, node.respawn_delay, node.respawn_max_retries) == (True, 2.0, 5)
+    assert not once.respawn
+
+
 def test_a_settings_file_that_does_not_exist_ends_the_launch(launch, tmp_path):
     with pytest.raises(FileNotFoundError, match=r'config:=.*typo\.yaml: no such file'):
         launch.nodes(values(launch, config=str(tmp_path / 'typo.yaml')))

@@ -5,16 +5,22 @@ Every step of saving, and allocations of insert, remove and load, fail once in t
 
 Afterwards a file has the digest of the old map or of the new one, and a map in memory that of
 before or after. A step is an open, write, flush, fsync or rename; it fails with a full disk, or
-the process is killed there (SIGKILL). Allocations are those of Python (_testcapi.set_nomemory),
-sampled; memory that NumPy and kernels get from the system is not among them.
+the process is killed there (SIGKILL). Allocations are those of Python (_testcapi.set_nomemory);
+memory that NumPy and kernels get from the system is not among them.
+
+Allocations, and steps of a replay, are sampled; with SURFEL_MAPPER_EVERY_FAILURE=1, which
+``make fuzz`` sets, each is tried, and of a replay every allocation whose number is a power of 1.2.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+from itertools import count
 import os
 import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -27,6 +33,11 @@ from surfel_mapper.offline.replay import replay
 from test.bags import recorded
 
 pytestmark = pytest.mark.skipif(not hasattr(os, 'fork'), reason='needs fork')
+
+EVERY = bool(os.environ.get('SURFEL_MAPPER_EVERY_FAILURE'))
+
+AFTER_LAST = 50
+"""Successes in a row after which an operation is taken to make no more allocations."""
 
 
 class Steps:
@@ -189,10 +200,16 @@ def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, opera
     def run():
         operation(surfel_map, moments, path)
 
-    for number in [*range(30), *(30 + 15 * step for step in range(30))]:
+    successes = 0
+    sampled = (*range(30), *(30 + 15 * step for step in range(30)))
+    for number in count() if EVERY else sampled:
         code = in_child(testcapi, surfel_map, run, number, allowed)
         assert code in (0, 1), (operation.__name__, number, code)
         failures += code
+        successes = 0 if code else successes + 1
+        if EVERY and successes == AFTER_LAST:
+            break
+    print(f'{operation.__name__}: {failures} allocations failed')
     assert failures > 5
 
 
@@ -223,8 +240,7 @@ def test_a_replay_that_cannot_write_once_leaves_the_whole_map_or_none(tmp_path):
         steps = Steps(patch)
         expected = replay(bag, output=tmp_path / 'whole').mapper.map.digest()
     assert load_map(tmp_path / 'whole')[0].digest() == expected
-    every = bool(os.environ.get('SURFEL_MAPPER_EVERY_FAILURE'))
-    numbers = range(steps.done) if every else range(0, steps.done, -(-steps.done // 2))
+    numbers = range(steps.done) if EVERY else range(0, steps.done, -(-steps.done // 2))
     for number in numbers:
         output = tmp_path / str(number)
         with pytest.MonkeyPatch.context() as patch:
@@ -234,3 +250,28 @@ def test_a_replay_that_cannot_write_once_leaves_the_whole_map_or_none(tmp_path):
         if (output / 'map.npz').is_file():
             assert load_map(output)[0].digest() == expected, number
         assert not [*output.rglob('*.part')], number
+
+
+def test_a_replay_out_of_memory_once_leaves_the_whole_map_or_none(tmp_path):
+    pytest.importorskip('_testcapi', reason='this Python lacks _testcapi')
+    bag = recorded.write_rosbag2(tmp_path / 'bag', recorded.drive())
+    expected = replay(bag, output=tmp_path / 'whole').mapper.map.digest()
+    numbers = (int(1000 * 1.2**power) for power in count())
+    failures = 0
+    for number in numbers if EVERY else (200_000, 2_000_000):
+        output = tmp_path / str(number)
+        command = [sys.executable, '-m', 'test.fuzz.allocation', str(number), bag, output]
+        done = subprocess.run([*map(str, command)], capture_output=True, text=True)
+        assert done.returncode in (0, 1), (number, done.returncode, done.stderr)
+        failures += done.returncode
+        if (output / 'map.npz').is_file():
+            assert load_map(output)[0].digest() == expected, number
+        assert not [*output.rglob('*.part')], number
+        if number > LAST_ALLOCATION:
+            break
+    print(f'replay: {failures} allocations failed')
+    assert failures
+
+
+LAST_ALLOCATION = 20_000_000
+"""More than the allocations of the replay of a small bag with its imports."""
