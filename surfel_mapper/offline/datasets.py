@@ -440,7 +440,8 @@ def wxyz_pose(row: dict[str, Any]) -> Floats:
 
 def oxts_poses(files: Sequence[Path]) -> list[Floats]:
     """Return the poses of the IMU by lat lon alt roll pitch yaw, Mercator from the first one."""
-    scale, first = 0.0, np.zeros(3)
+    scale = 0.0
+    first: Floats = np.zeros(3)
     poses: list[Floats] = []
     for file in files:
         where, line = next(lines_of(file), (str(file), ''))
