@@ -25,6 +25,7 @@ def estimate_normals(
     num_neighbours: int = 16,
     max_distance_m: float = np.inf,
     viewpoint: npt.ArrayLike | None = (0.0, 0.0, 0.0),
+    threads: int = 1,
 ) -> npt.NDArray[np.float64]:
     """
     Return the normal of every point of a cloud, from its nearest neighbours.
@@ -39,6 +40,8 @@ def estimate_normals(
         Largest distance of a neighbour.
     viewpoint : (3,) float, m, optional
         Position of the sensor, to which the normals are turned; None: their signs are arbitrary.
+    threads : int
+        Threads that share the search; the result does not depend on it.
 
     Returns
     -------
@@ -53,7 +56,9 @@ def estimate_normals(
         If a number is out of bounds.
 
     """
-    chosen = SurfaceNormal(num_neighbours=num_neighbours, max_distance_m=max_distance_m)
+    chosen = SurfaceNormal(
+        num_neighbours=num_neighbours, max_distance_m=max_distance_m, threads=threads
+    )
     given: npt.NDArray[Any] = as_scan(points).points
     finite = np.isfinite(given).all(axis=1)
     result = np.full((len(given), 3), np.nan)

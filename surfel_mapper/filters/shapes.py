@@ -33,7 +33,14 @@ from surfel_mapper.filters.columns import (
     NORMALS,
 )
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
-from surfel_mapper.filters.neighbours import coordinates, Ids, neighbourhoods, Points
+from surfel_mapper.filters.neighbours import (
+    coordinates,
+    Ids,
+    Points,
+    Rows,
+    threads_of_search,
+    visit_neighbours,
+)
 from surfel_mapper.filters.registry import register
 from surfel_mapper.kernels.symmetric3 import decompose, eigenvectors
 from surfel_mapper.scan import Scan
@@ -81,24 +88,14 @@ class Moments:
         return cls(count, mean, covariance, radius)
 
     @classmethod
-    def of_neighbours(cls, points: Points, ids: Ids) -> Moments:
-        """Return the moments of neighbours from their rows (M, K), padded by N at the end."""
-        count, mean = np.empty(len(ids), np.int64), np.empty((len(ids), 3))
-        covariance, radius = np.empty((6, len(ids))), np.empty(len(ids))
-        neighbour_moments(points, ids, count, mean, covariance, radius)
-        return cls(count, mean, covariance, radius)
+    def empty(cls, number: int) -> Moments:
+        """Return moments of a number of sets, to be filled."""
+        count, mean = np.empty(number, np.int64), np.empty((number, 3))
+        return cls(count, mean, np.empty((6, number)), np.empty(number))
 
-    @classmethod
-    def joined(cls, parts: list[Moments]) -> Moments:
-        """Return the moments of all parts, one after another."""
-        if not parts:
-            return cls(np.empty(0, np.int64), np.empty((0, 3)), np.empty((6, 0)), np.empty(0))
-        return cls(
-            np.concatenate([part.count for part in parts]),
-            np.concatenate([part.mean for part in parts]),
-            np.concatenate([part.covariance for part in parts], axis=1),
-            np.concatenate([part.radius for part in parts]),
-        )
+    def fill(self, rows: Rows, points: Points, ids: Rows) -> None:
+        """Fill rows (P,) with the moments of neighbours, ids (P, K) padded by N at the end."""
+        neighbour_moments(points, rows, ids, self.count, self.mean, self.covariance, self.radius)
 
     @property
     def density(self) -> Points:
@@ -240,7 +237,7 @@ class SurfaceNormal(ShapeFilter):
     )
     epsilon: float = parameter(
         0.0,
-        'Relative error of the distance of neighbours that the search may make.',
+        'No effect here: the search is exact.',
         low=0.0,
         libpointmatcher='epsilon',
     )
@@ -265,18 +262,28 @@ class SurfaceNormal(ShapeFilter):
     smooth_normals: bool = parameter(
         False, 'Average the normals over the neighbours.', libpointmatcher='smoothNormals'
     )
+    threads: int = threads_of_search()
 
     def apply_finite(self, scan: Scan) -> Scan:
         """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))
         ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
-        parts = []
-        for rows, near, _ in neighbourhoods(points, number, self.max_distance_m, self.epsilon):
-            parts.append(Moments.of_neighbours(points, near))
+        moments = Moments.empty(len(points))
+
+        def describe(rows: Rows, near: Rows, _: Points) -> None:
+            moments.fill(rows, points, near)
             if ids is not None:
                 ids[rows] = np.where(near < len(points), near, -1)
-        moments = Moments.joined(parts)
+
+        visit_neighbours(
+            describe,
+            points,
+            number,
+            self.max_distance_m,
+            ordered=self.needs_ids,
+            threads=self.threads,
+        )
         columns: dict[str, npt.NDArray[Any]] = self.shape_columns(
             *eigen(moments.covariance), moments.count
         )

@@ -44,7 +44,12 @@ from surfel_mapper.filters.base import (
 )
 from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.kernels.tensor_voting import closed_form_votes, first_votes
-from surfel_mapper.filters.neighbours import coordinates, neighbourhoods, Points
+from surfel_mapper.filters.neighbours import (
+    coordinates,
+    Points,
+    threads_of_search,
+    visit_neighbours,
+)
 from surfel_mapper.filters.registry import register
 from surfel_mapper.filters.shapes import eigen, eigen_by_size, PAIRS
 from surfel_mapper.scan import Scan
@@ -123,8 +128,11 @@ class Voting:
         """Return the voting of the nearest neighbours of each point, with a filter's settings."""
         number = min(filter_.num_neighbours + 1, len(points))  # the nearest is the point itself
         ids = np.empty((len(points), number), np.int32)
-        for rows, near, _ in neighbourhoods(points, number):
+
+        def gather(rows: npt.NDArray[np.int32], near: npt.NDArray[np.int32], _: Points) -> None:
             ids[rows] = near
+
+        visit_neighbours(gather, points, number, ordered=True, threads=filter_.threads)
         return cls(points, ids, filter_.sigma, filter_.symmetric_votes)
 
     def first(self) -> Votes:
@@ -176,6 +184,7 @@ class VotingFilter(FiniteFilter):
         'Add sticks, plates and balls: their size and directions.',
         libpointmatcher='keepTensors',
     )
+    threads: int = threads_of_search()
 
     def with_votes(self, scan: Scan, votes: Votes, **more: npt.NDArray[Any]) -> Scan:
         """Return the scan with the selected columns."""

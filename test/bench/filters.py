@@ -1,15 +1,16 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Filters on one core, the voxel grid beside those of small_gicp, Open3D and PCL.
+Filters on one core, beside those of small_gicp, Open3D and PCL.
 
 Each row is the median of the processor times of some repeats on one scan, on which other load of
 the machine has less effect than on clock times. ``Mpt_s``: million input points per
-second. Voxel grids are timed twice, before and after those of peers; ``x_ours`` is the ratio of
-the time of a peer to ours. PCL is compiled from peers/pcl_voxel_grid.cpp if a compiler and
-Debian's libpcl-dev are installed (or CPATH, LIBRARY_PATH and LD_LIBRARY_PATH name them);
-small_gicp and Open3D come with --peers. libpointmatcher has no package: its figure is stated, of
-another machine and one scan of 124,668 points.
+second. Voxel grids, normals and outliers by neighbours are timed twice, before and after those of
+peers; ``x_ours`` is the ratio of the time of a peer to ours. PCL is compiled from
+peers/pcl_voxel_grid.cpp if a compiler and Debian's libpcl-dev are installed (or CPATH,
+LIBRARY_PATH and LD_LIBRARY_PATH name them); small_gicp and Open3D come with --peers.
+libpointmatcher has no package: its figure is stated, of another machine and one scan of 124,668
+points.
 
 Scans are the simulated street and, where SURFEL_MAPPER_TEST_DATA leads to them, those of three
 real lidars in recorded order, in which consecutive points rarely share a voxel.
@@ -65,7 +66,10 @@ CHAINS: dict[str, tuple[Any, float | None]] = {
     'octree_grid': ({'octree_grid': {'max_size_m': SIZE_M}}, None),
     'ground': ('ground', None),
     'sampling_surface_normal': ('sampling_surface_normal', None),
-    'surface_normal': ('surface_normal', None),
+    'normals 10': ({'surface_normal': {'num_neighbours': 10}}, None),
+    'normals 30': ({'surface_normal': {'num_neighbours': 30}}, None),
+    'outliers 20': ({'statistical_outliers': {'num_neighbours': 20}}, None),
+    'radius_outliers': ('radius_outliers', None),
 }
 """Timed filters, and the rates they should reach, Mpt/s."""
 
@@ -80,6 +84,16 @@ VOXEL_GRIDS = (
         name='small_gicp', module='test.bench.peers.small_gicp_voxel_grid', requires=SMALL_GICP
     ),
     PeerSpec(name='Open3D', module='test.bench.peers.open3d_voxel_grid', requires=OPEN3D),
+)
+
+NEIGHBOURS = ('normals 10', 'normals 30', 'outliers 20')
+"""Filters that search for that many neighbours, as peers do too."""
+
+SEARCHES = (
+    PeerSpec(
+        name='small_gicp', module='test.bench.peers.small_gicp_neighbours', requires=SMALL_GICP
+    ),
+    PeerSpec(name='Open3D', module='test.bench.peers.open3d_neighbours', requires=OPEN3D),
 )
 
 PCL_LIBRARIES = ('filters', 'common')
@@ -101,13 +115,14 @@ def run(options: Options) -> list[Row]:
     with one_core():
         for name, points in scans(options):
             rows += voxel_grids(name, points, program, options)
+            rows += searches(name, points, options)
             rows += [
                 {
                     **row(name, each, len(points), ours(points, each)),
                     'asked_Mpt_s': CHAINS[each][1],
                 }
                 for each in CHAINS
-                if each != VOXEL_GRID
+                if each not in (VOXEL_GRID, *NEIGHBOURS)
             ]
         rows += [
             {'scan': '124,668 points', 'filter': who, 'Mpt_s': rate, 'note': 'as stated'}
@@ -144,6 +159,27 @@ def voxel_grids(
     yield from notes
 
 
+def searches(name: str, points: Points, options: Options) -> Iterator[Row]:
+    """Yield the rows of our normals and outliers and of those of others, in turns."""
+    before = {each: ours(points, each) for each in NEIGHBOURS}
+    others: list[tuple[str, str, list[float]]] = []
+    for spec in SEARCHES if options.peers else ():
+        try:
+            found = json.loads(run_peer(spec, points, [','.join(NEIGHBOURS), '5'], options))
+        except PeerError as error:
+            yield {'scan': name, 'filter': spec.name, 'note': f'not measured: {error}'}
+        else:
+            others += [(each, spec.name, times) for each, times in found.items() if times]
+    for each, (times, left) in before.items():
+        mine = times + ours(points, each)[0]
+        yield row(name, each, len(points), (mine, left))
+        for job, who, peer_times in others:
+            if job == each:
+                ratio = float(np.median(peer_times) / np.median(mine))
+                figures = row(name, f'{who} {each}', len(points), (peer_times, left))
+                yield {**figures, 'left': None, 'x_ours': ratio}
+
+
 def ours(points: Points, which: str) -> Figures:
     """Return the figures of one of our filters."""
     item, asked = CHAINS[which]
@@ -162,7 +198,7 @@ def ours(points: Points, which: str) -> Figures:
     chain = Chain.from_list([item])
     left = chain.apply(scan)
     times = []
-    for _ in range(REPEATS if asked else 3):
+    for _ in range(REPEATS if asked else 5):
         start = process_time()
         chain.apply(scan)
         times.append((process_time() - start) * 1e3)
@@ -207,10 +243,23 @@ def peer(spec: PeerSpec, points: Points, options: Options) -> dict[str, Figures]
         If it cannot be had.
 
     """
+    said = run_peer(spec, points, [str(SIZE_M), str(REPEATS)], options)
+    return {who: (times, left) for who, (times, left) in json.loads(said).items()}
+
+
+def run_peer(spec: PeerSpec, points: Points, arguments: list[str], options: Options) -> str:
+    """
+    Return the last line that a peer prints, given the file of the points and arguments.
+
+    Raises
+    ------
+    PeerError
+        If it cannot be had.
+
+    """
     python = environment(spec, options.cache)
     with tempfile.TemporaryDirectory() as scratch:
         path = Path(scratch) / 'points.npy'
         np.save(path, np.ascontiguousarray(points))
-        command = [str(python), '-m', spec.module, str(path), str(SIZE_M), str(REPEATS)]
-        said = output(command, cwd=Path(__file__).parents[2])
-    return {who: (times, left) for who, (times, left) in json.loads(said.splitlines()[-1]).items()}
+        command = [str(python), '-m', spec.module, str(path), *arguments]
+        return output(command, cwd=Path(__file__).parents[2]).splitlines()[-1]

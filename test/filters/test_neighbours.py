@@ -6,15 +6,23 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
-from surfel_mapper.filters.neighbours import neighbourhoods, worth_searching
+from surfel_mapper.filters.neighbours import visit_neighbours
 from surfel_mapper.filters.shapes import as_matrices, eigen, Moments, PAIRS, shares
 from test.filters.examples import filter_of, kept, random_scan, scan_of
 
 
-def all_neighbours(points, number, *limits):
-    pieces = list(neighbourhoods(points, number, *limits))
-    return (np.concatenate([piece[i] for piece in pieces]) for i in (1, 2))
+def all_neighbours(points, number, *limits, threads=1):
+    ids = np.full((len(points), number), -7)
+    distances = np.full((len(points), number), np.nan)
+
+    def gather(rows, near, squared):
+        assert (ids[rows] == -7).all()  # no point is visited twice
+        ids[rows], distances[rows] = near, np.sqrt(squared)
+
+    visit_neighbours(gather, points, number, *limits, ordered=True, threads=threads)
+    return ids, distances
 
 
 def cloud(number=400, seed=1):
@@ -41,7 +49,6 @@ def test_points_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
 def test_a_crowd_at_one_place_is_answered_without_searching_all_of_it():
     # every beam without return at the origin: a tree with all of them takes minutes
     points = np.concatenate([np.zeros((50_000, 3)), cloud()])
-    assert len(worth_searching(points, 5)) == 405
     ids, distances = all_neighbours(points, 5)
     np.testing.assert_array_equal(distances[:50_000], 0.0)
     np.testing.assert_array_equal(points[ids[:50_000]], 0.0)
@@ -49,15 +56,68 @@ def test_a_crowd_at_one_place_is_answered_without_searching_all_of_it():
     np.testing.assert_array_equal(ids[50_000:] >= 50_000, tail[5:] >= 5)
 
 
+def uneven_cloud():
+    """Return points as hard for the search as those of scans: rings, crowds and stray points."""
+    rng = np.random.default_rng(7)
+    turn = np.linspace(0.0, 2.0 * np.pi, 2000)
+    rings = [
+        np.stack([r * np.cos(turn), r * np.sin(turn), np.full(2000, h)], axis=1)
+        for r, h in ((2.0, -1.5), (3.0, -1.5), (40.0, 2.0))
+    ]
+    places = np.repeat(rng.normal(size=(30, 3)), 20, axis=0)
+    lattice = np.stack(np.meshgrid(*3 * [np.arange(8.0)]), axis=-1).reshape(-1, 3)
+    dense = 1e-3 * rng.normal(size=(1000, 3)) + [7.0, 7.0, 0.0]
+    stray = rng.uniform(-500.0, 500.0, (100, 3))
+    cloud = np.concatenate([*rings, places, lattice, dense, stray])
+    return cloud[rng.permutation(len(cloud))]
+
+
+@pytest.mark.parametrize(
+    ('number', 'limit'), [(2, np.inf), (10, np.inf), (40, np.inf), (10, 0.05)]
+)
+def test_distances_equal_those_of_scipy_on_rings_crowds_and_stray_points(number, limit):
+    points = uneven_cloud()
+    ids, distances = all_neighbours(points, number, limit)
+    expected, _ = cKDTree(points).query(points, number, distance_upper_bound=limit)
+    np.testing.assert_allclose(distances, expected, rtol=1e-14)
+    found = ids < len(points)
+    np.testing.assert_array_equal(found, np.isfinite(distances))
+    apart = np.linalg.norm(points[np.minimum(ids, len(points) - 1)] - points[:, None], axis=2)
+    np.testing.assert_allclose(apart[found], distances[found], rtol=1e-14)
+    assert all(len(set(row[row < len(points)])) == (row < len(points)).sum() for row in ids)
+
+
+@pytest.mark.parametrize('number', [4, 30])
+def test_threads_make_no_difference_to_neighbours(number):
+    points = uneven_cloud()
+    one = all_neighbours(points, number)
+    three = all_neighbours(points, number, threads=3)
+    for alone, shared in zip(one, three, strict=True):
+        np.testing.assert_array_equal(alone, shared)
+
+
+@pytest.mark.parametrize(
+    'name', ['statistical_outliers', 'radius_outliers', 'surface_normal', 'saliency']
+)
+def test_threads_make_no_difference_to_filters(name):
+    scan = random_scan(6000)
+    one, two = (filter_of(name, threads=threads).apply(scan) for threads in (1, 2))
+    np.testing.assert_array_equal(one.points, two.points)
+    assert set(one.columns) == set(two.columns)
+    for column in one.columns:
+        np.testing.assert_array_equal(one.columns[column], two.columns[column])
+
+
 def test_without_points_there_is_nothing_to_search():
-    assert list(neighbourhoods(np.empty((0, 3)), 3)) == []
+    visit_neighbours(pytest.fail, np.empty((0, 3)), 3)
 
 
 def test_moments_are_those_of_numpy():
     points = cloud(60)
     rows = np.arange(60) % 7
     by_group = Moments.of_groups(points, rows, 7)
-    by_ids = Moments.of_neighbours(points, np.array([np.flatnonzero(rows == 3)]))
+    by_ids = Moments.empty(1)
+    by_ids.fill(np.array([0], np.int32), points, np.flatnonzero(rows == 3)[None].astype(np.int32))
     inside = points[rows == 3]
     expected = np.cov(inside.T)
     for found, i in ((by_group, 3), (by_ids, 0)):

@@ -10,6 +10,7 @@ memory and a pass for each of two dozen products.
 import math
 
 from numba import njit
+import numpy as np
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -51,30 +52,32 @@ def group_moments(points, rows, count, mean, covariance, radius):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def neighbour_moments(points, ids, count, mean, covariance, radius):
+def neighbour_moments(points, rows, ids, count, mean, covariance, radius):
     """
     Compute the moments of the neighbours of points.
 
     points      (N, 3) float64, m
-    ids         (P, K) int64, rows of the neighbours, padded by N at the end
-    count       (P,) int64, out: number of neighbours
-    mean        (P, 3) float64, out, m
-    covariance  (6, P) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
-    radius      (P,) float64, out: from the mean to the farthest, m
+    rows        (P,) int32, where to write the moments
+    ids         (P, K) int32, rows of the neighbours, padded by N at the end
+    count       (M,) int64, out: number of neighbours
+    mean        (M, 3) float64, out, m
+    covariance  (6, M) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
+    radius      (M,) float64, out: from the mean to the farthest, m
     """
-    for i in range(len(ids)):
-        number = 0
+    for i in range(np.uint64(len(ids))):
+        number = np.uint64(0)
         sx, sy, sz = 0.0, 0.0, 0.0
         while number < ids.shape[1] and ids[i, number] < len(points):
-            row = ids[i, number]
+            row = np.uint64(ids[i, number])
             sx += points[row, 0]
             sy += points[row, 1]
             sz += points[row, 2]
-            number += 1
-        mx, my, mz = sx / number, sy / number, sz / number
+            number += np.uint64(1)
+        held = np.float64(number)
+        mx, my, mz = sx / held, sy / held, sz / held
         xx, xy, xz, yy, yz, zz, far_sq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(number):
-            row = ids[i, k]
+            row = np.uint64(ids[i, k])
             x, y, z = points[row, 0] - mx, points[row, 1] - my, points[row, 2] - mz
             xx += x * x
             xy += x * y
@@ -83,9 +86,11 @@ def neighbour_moments(points, ids, count, mean, covariance, radius):
             yz += y * z
             zz += z * z
             far_sq = max(far_sq, (x * x + y * y) + z * z)
-        free = float(max(number - 1, 1))
-        count[i] = number
-        mean[i, 0], mean[i, 1], mean[i, 2] = mx, my, mz
-        covariance[0, i], covariance[1, i], covariance[2, i] = xx / free, xy / free, xz / free
-        covariance[3, i], covariance[4, i], covariance[5, i] = yy / free, yz / free, zz / free
-        radius[i] = math.sqrt(far_sq)
+        free = max(held - 1.0, 1.0)
+        out = np.uint64(rows[i])
+        count[out] = np.int64(number)
+        mean[out, 0], mean[out, 1], mean[out, 2] = mx, my, mz
+        covariance[0, out], covariance[1, out] = xx / free, xy / free
+        covariance[2, out], covariance[3, out] = xz / free, yy / free
+        covariance[4, out], covariance[5, out] = yz / free, zz / free
+        radius[out] = math.sqrt(far_sq)

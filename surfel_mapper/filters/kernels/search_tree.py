@@ -1,0 +1,113 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The search tree of a scan: boxes of points, halved at the median along their longest edge.
+
+A leaf holds LEAF consecutive points of the tree's order. A node is the tight box of a run of
+leaves; children follow their parent in preorder, so that the subtree of a node with m leaves has
+2 m - 1 nodes and can be built separately, by another thread.
+
+The tree as a tuple: xyz (3, L * LEAF) float64, points in the tree's order, padded with inf; order
+(N,) int32, their rows; links (3, 2 L) int32, of each node FIRST its first leaf, RIGHT its right
+child or -1, PARENT its parent or -1; boxes (2 L, 6) float64, lowest and highest corner; leaves
+(L,) int32, the node of each leaf.
+
+Source: Bentley 1975 (k-d trees).
+"""
+
+import math
+
+import numpy as np
+
+from surfel_mapper.kernels.compiling import kernel, part
+
+LEAF = 16
+"""Points of a leaf; 8 and 12 were slower."""
+
+FIRST, RIGHT, PARENT = range(3)
+
+U = np.uint64
+"""Unsigned indices: numba tests signed ones for being negative, and loops are not vectorised."""
+
+
+@kernel(fastmath={'nnan'})
+def build_nodes(points, order, links, boxes, values, node, begin, end, least, tasks):
+    """
+    Build the subtree of a node; return the number of nodes that were left as tasks.
+
+    points      (N, 3) float64, m, finite
+    order       (N,) int32, in and out: rows of the points; those of the node are permuted
+    values      (N,) float64, scratch; only the part of the node is used
+    begin, end  first leaf of the node, and the one after its last
+    least       nodes of at most this number of leaves are left unsplit
+    tasks       (T, 3) int64, out: node, begin and end of each
+    """
+    stack = np.empty((64, 3), np.int64)
+    stack[0, 0], stack[0, 1], stack[0, 2] = node, begin, end
+    top, num_tasks = 1, 0
+    while top > 0:
+        top -= 1
+        node, begin, end = stack[top, 0], stack[top, 1], stack[top, 2]
+        first, last = begin * LEAF, min(end * LEAF, len(points))
+        axis = bound_points(points, order, first, last, boxes, node)
+        links[FIRST, node], links[RIGHT, node] = begin, -1
+        if end - begin == 1:
+            continue
+        if end - begin <= least:
+            tasks[num_tasks, 0], tasks[num_tasks, 1], tasks[num_tasks, 2] = node, begin, end
+            num_tasks += 1
+            continue
+        middle = (begin + end) >> 1
+        for i in range(first, last):
+            values[U(i)] = points[U(order[U(i)]), axis]
+        split_at(values, order, first, last - 1, middle * LEAF)
+        left, right = node + 1, node + 2 * (middle - begin)
+        links[RIGHT, node] = right
+        links[PARENT, left] = links[PARENT, right] = node
+        stack[top, 0], stack[top, 1], stack[top, 2] = right, middle, end
+        stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = left, begin, middle
+        top += 2
+    return num_tasks
+
+
+@part()
+def bound_points(points, order, first, last, boxes, node):
+    """Compute the box of the points from first to last - 1; return its longest axis."""
+    low_x = low_y = low_z = math.inf
+    high_x = high_y = high_z = -math.inf
+    for i in range(U(first), U(last)):
+        row = U(order[i])
+        x, y, z = points[row, 0], points[row, 1], points[row, 2]
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+        low_z, high_z = min(low_z, z), max(high_z, z)
+    boxes[node, 0], boxes[node, 1], boxes[node, 2] = low_x, low_y, low_z
+    boxes[node, 3], boxes[node, 4], boxes[node, 5] = high_x, high_y, high_z
+    dx, dy, dz = high_x - low_x, high_y - low_y, high_z - low_z
+    y_or_z = 1 if dy >= dz else 2
+    return 0 if dx >= max(dy, dz) else y_or_z
+
+
+@kernel(fastmath={'nnan'})
+def split_at(values, order, low, high, middle):
+    """Permute values and order from low to high so that no value before middle is larger."""
+    while low < high:
+        a, b, c = values[U(low)], values[U((low + high) >> 1)], values[U(high)]
+        pivot = max(min(a, b), min(max(a, b), c))
+        i, j = low, high
+        while i <= j:
+            while values[U(i)] < pivot:
+                i += 1
+            while values[U(j)] > pivot:
+                j -= 1
+            if i <= j:
+                values[U(i)], values[U(j)] = values[U(j)], values[U(i)]
+                order[U(i)], order[U(j)] = order[U(j)], order[U(i)]
+                i += 1
+                j -= 1
+        if middle <= j:
+            high = j
+        elif middle >= i:
+            low = i
+        else:
+            return
