@@ -37,6 +37,7 @@ VERBS = (
     'extract',
     'simulate',
     'merge',
+    'view',
     'evaluate',
 )
 

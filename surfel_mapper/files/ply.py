@@ -59,6 +59,8 @@ ORDERS = {'binary_little_endian': '<', 'binary_big_endian': '>', 'ascii': '<'}
 
 MAX_HEADER_BYTES = 65536
 
+RGB = ('red', 'green', 'blue')
+
 
 def write_surfels(
     path: str | Path, surfels: Surfels, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)
@@ -211,6 +213,82 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
                 }
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+
+
+def read_mesh(path: str | Path) -> Mesh | None:
+    """
+    Return the mesh in a binary PLY file, or None if the file has no faces.
+
+    Parameters
+    ----------
+    path : str or Path
+        A PLY file whose first element is the vertices and whose second one is the faces, triangles
+        with the property vertex_indices (or vertex_index) only.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, a text file with faces, or has other faces.
+
+    """
+    from surfel_mapper.tsdf.mesh import Mesh
+
+    try:
+        with open(path, 'rb') as file:
+            layout, count = read_faces_header(path, file)
+            if layout is None or not count:
+                return None
+            number, vertex, is_text, _ = read_header(path, file)
+            if is_text:
+                raise FileFormatError(f'{path}: faces as text, expected a binary PLY')
+            file_size = os.fstat(file.fileno()).st_size
+            needed = number * vertex.itemsize + count * layout.itemsize
+            if needed > file_size - file.tell():
+                raise FileFormatError(
+                    f'{path}: {file_size - file.tell()} bytes after the header, expected {needed} '
+                    f'for {number} vertices and {count} triangles'
+                )
+            Budget(path, file_size, FileFormatError).take(2 * needed, f'{count} triangles')
+            columns = np.frombuffer(file.read(number * vertex.itemsize), vertex)
+            faces = np.frombuffer(file.read(count * layout.itemsize), layout)
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
+    corners = faces['corners'].astype(np.int32)
+    if (faces['count'] != 3).any() or (corners < 0).any() or (corners >= number).any():
+        raise FileFormatError(f'{path}: faces with other than 3 of the {number} vertices')
+    names = vertex.names or ()
+    if not {'x', 'y', 'z'} <= set(names):
+        raise FileFormatError(f'{path}: vertices without x, y, z')
+    colours = [columns[name] for name in RGB if name in names]
+    is_coloured = len(colours) == 3 and all(each.dtype == np.uint8 for each in colours)
+    return Mesh(
+        vertices=np.stack([columns[name].astype(np.float64) for name in 'xyz'], axis=1),
+        triangles=corners,
+        colors=np.stack(colours, axis=1) if is_coloured else np.empty((0, 3), np.uint8),
+        labels=columns['label'].astype(np.int32) if 'label' in names else np.empty(0, np.int32),
+    )
+
+
+def read_faces_header(path: str | Path, file: BinaryIO) -> tuple[np.dtype[Any] | None, int]:
+    """Return layout and number of the faces, None if there are none; the file is at its begin."""
+    header, found, _ = file.read(MAX_HEADER_BYTES).partition(b'end_header')
+    file.seek(0)
+    lines = [line.split() for line in header.decode('ascii', 'replace').splitlines()]
+    at = next((i for i, line in enumerate(lines) if line[:2] == ['element', 'face']), None)
+    if not found or at is None:
+        return None, 0
+    try:
+        order = next(ORDERS[line[1]] for line in lines if line[:1] == ['format'])
+        (_, _, count), (_, kind, of_count, of_corner, name), *others = lines[at:]
+        layout = np.dtype(
+            [('count', order + TYPES[of_count]), ('corners', order + TYPES[of_corner], (3,))]
+        )
+        number = int(count)
+    except (ValueError, KeyError, StopIteration) as error:
+        raise FileFormatError(f'{path}: faces that are no list of vertices') from error
+    if kind != 'list' or 'property' in [line[0] for line in others if line] or number < 0:
+        raise FileFormatError(f'{path}: faces with properties beside {name}, expected that only')
+    return layout, number
 
 
 def check_size(

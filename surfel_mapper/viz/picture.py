@@ -9,8 +9,6 @@ from above. Surfels that face away from the viewer are left out, because they wo
 the others: from above the ceiling of a hall, from the side its near wall. The rest is painted from
 far to near.
 
-Normals vary little along a surface, so that floors, walls and cars are plain areas. Planarity, the
-other choice, depends on how the voxels of the lattice cut a wall, and gives stripes.
 Frames, colours and axes are one module because each is of no use without the others.
 
 A few distant surfels would make all others tiny, so the picture leaves out half a percent of the
@@ -30,6 +28,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.viz.discs import ramp, shaded, sides_m, SPREAD
 from surfel_mapper.viz.kernels.painting import paint_discs
 
 if TYPE_CHECKING:
@@ -185,12 +184,6 @@ class Frame:
 COLOURINGS = ('normal', 'planarity')
 """Colours of surfels: shaded by normal and light, or planarity by a colour map."""
 
-LIGHT = np.array([-0.40, -0.55, 0.73])
-"""Direction to the light, about of unit length: from above, the south and the west."""
-
-AMBIENT, TINT = 0.30, 0.45
-"""Share of the light that comes from all sides, and of the colour that depends on the normal."""
-
 
 def colours_of(surfels: Surfels, colouring: str) -> Array:
     """
@@ -202,24 +195,12 @@ def colours_of(surfels: Surfels, colouring: str) -> Array:
         If there is no such colouring.
 
     """
-    if colouring == 'planarity':
-        from matplotlib import colormaps
-
-        return np.asarray(colormaps['viridis'](surfels.planarity)[:, :3], np.float64)
-    if colouring != 'normal':
+    if colouring not in COLOURINGS:
         raise ConfigError(f'colouring {colouring!r}, expected one of {", ".join(COLOURINGS)}')
-    base = (1.0 - TINT) * 0.88 + TINT * (0.5 + 0.5 * surfels.normal)
-    lit = 0.5 + 0.5 * surfels.normal @ LIGHT  # also what faces away is not black
-    return np.asarray(np.clip(base * (AMBIENT + (1.0 - AMBIENT) * lit)[:, None], 0.0, 1.0))
+    return shaded(surfels.normal) if colouring == 'normal' else ramp(surfels.planarity)
 
 
 X, Y, Z = 0, 1, 2
-
-SPREAD = 1.45
-"""
-Diameter of a disc relative to the side of the square with the same variance: just enough that the
-discs of neighbouring voxels full of points leave no gaps.
-"""
 
 BEYOND = 0.5
 """Surfels left out at either end of an axis, per cent."""
@@ -315,13 +296,6 @@ def limits(surfels: Surfels) -> tuple[Array, Array]:
     longest = (high - low).max() + float(np.median(sides_m(surfels)))
     margin = np.maximum(0.02 * longest, 0.5 * (FLATTEST * longest - (high - low)))
     return low - margin, high + margin
-
-
-def sides_m(surfels: Surfels) -> Array:
-    """Return the side of the square with the variance of each surfel in its plane, (K,) m."""
-    # along either side of a square the variance is a twelfth of the side squared
-    sides: Array = np.sqrt(6.0 * surfels.eigenvalues[:, 1:].sum(axis=1))
-    return sides
 
 
 def views(extent: Array) -> tuple[View, View]:

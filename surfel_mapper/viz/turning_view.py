@@ -20,8 +20,9 @@ import numpy.typing as npt
 
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.discs import sides_m, SPREAD
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, mesh_data
-from surfel_mapper.viz.picture import limits, sides_m, SPREAD
+from surfel_mapper.viz.picture import limits
 
 Array = npt.NDArray[np.float64]
 

@@ -1,14 +1,11 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Viewer: shows a replay in rerun, in a window or as an .rrd file.
+Viewer: shows the map of a mapper in rerun while it grows.
 
 Every scan logs the sensor with its points, the changed surfels, and the positions of the scans in
 the window. The whole map is logged when a quarter of it has changed since the last time, so a
 recording holds each surfel about five times instead of once a scan.
-
-Positions in rerun are float32, so all is shown in the frame of the map; where that has an origin
-in the fixed frame, the entity ``map`` states it as ``origin_m``, three float64.
 """
 
 from __future__ import annotations
@@ -19,13 +16,12 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
+from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
-from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.mesh import vertex_normals
-from surfel_mapper.viz.picture import sides_m, SPREAD
+from surfel_mapper.viz.discs import Colouring, Discs
+from surfel_mapper.viz.scene import ORANGE, RED, Scene
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -38,25 +34,19 @@ MAX_POINTS = 20_000
 
 POINT_RADIUS_M = 0.02
 
-PORT = 9876
-"""Port of the window, that of rerun; one that is open there already is used."""
-
-LOOPBACK = '127.0.0.1'
-"""Address on which the window listens; rerun's own default is every interface."""
-
-RED, ORANGE = (219, 41, 33), (240, 150, 40)
-
 
 class Viewer:
     """
-    Shows a replay in rerun; a context manager.
+    Shows a mapper at work; a context manager.
 
     Parameters
     ----------
     mapper : Mapper
-        The mapper of the replay.
-    path : str or Path, optional
-        The .rrd file to write; by default a window opens.
+        The mapper of the replay or node.
+    scene : Scene, str or Path, optional
+        Where it is shown; a path is an .rrd file to write; by default a window opens.
+    colouring : str
+        Colours of the surfels, one of discs.COLOURINGS.
 
     Raises
     ------
@@ -67,21 +57,17 @@ class Viewer:
 
     """
 
-    def __init__(self, mapper: Mapper, path: str | Path | None = None) -> None:
+    def __init__(
+        self, mapper: Mapper, scene: Scene | str | Path | None = None, colouring: str = 'normal'
+    ) -> None:
         self._mapper = mapper
-        self._rerun = import_rerun()
+        self._colouring = colouring
         self._positions: list[npt.NDArray[np.float64]] = []
         self._logged_voxels = self._removed = 0
-        self._stream: Any = self._rerun.RecordingStream('surfel_mapper')
-        if path is None:
-            import rerun_bindings  # spawn of rerun itself takes no address
-
-            rerun_bindings.spawn(port=PORT, extra_args=['--bind', LOOPBACK])
-            self._stream.connect_grpc(f'rerun+http://{LOOPBACK}:{PORT}/proxy')
-        else:
-            check_writable(Path(path))
-            self._stream.save(str(path))
-        self._stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        self._ages = Ages()
+        if scene is None:
+            scene = Scene.to_window()
+        self._scene = scene if isinstance(scene, Scene) else Scene.to_file(scene)
 
     def __enter__(self) -> Viewer:
         """Return the viewer, which closes at the end of the block."""
@@ -89,36 +75,33 @@ class Viewer:
 
     def __exit__(self, kind: object, *_: object) -> None:
         """Log the final map and close."""
-        if kind is None and self._positions:
+        if kind is None:
+            self.finish()
+        self._scene.__exit__()
+
+    def finish(self) -> None:
+        """Log the whole map once more."""
+        if self._positions:
             self._log_map()
-        self._stream.flush()
-        self._stream.disconnect()
+        self._scene.flush()
 
     def add(self, update: Update) -> None:
         """Log a scan and its changes of the map."""
-        rerun, pose = self._rerun, update.T_map_sensor
-        origin_m = self._mapper.map.origin_m
-        if not self._positions and origin_m.any():
-            self._stream.log('map', rerun.AnyValues(origin_m=origin_m), static=True)
+        scene, pose = self._scene, update.T_map_sensor
+        if not self._positions:
+            scene.set_origin(self._mapper.map.origin_m)
         self._positions.append(pose[:3, 3])
-        self._stream.set_time('stamp', timestamp=np.datetime64(update.stamp_ns, 'ns'))
-        self._stream.log(
-            'map/sensor', rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3])
-        )
-        self._stream.log(
-            'map/sensor/scan',
-            rerun.Points3D(picked(update.scan.points), radii=POINT_RADIUS_M),
-        )
-        self._stream.log('map/trajectory', rerun.LineStrips3D([self._way()], colors=[RED]))
+        scene.set_stamp(update.stamp_ns)
+        scene.pose('map/sensor', pose)
+        scene.points('map/sensor/scan', picked(update.scan.points), POINT_RADIUS_M)
+        scene.lines('map/trajectory', [self._way()], [RED])
         window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
-        self._stream.log(
-            'map/window', rerun.Points3D(window.reshape(-1, 3), radii=0.15, colors=[ORANGE])
-        )
-        self._log_surfels('map/changed', update.changed)
+        scene.points('map/window', window.reshape(-1, 3), 0.15, ORANGE)
         self._removed += len(update.removed_voxel_index)
         num_voxels = self._mapper.map.num_voxels
         if abs(num_voxels - self._logged_voxels) + self._removed > NEW * num_voxels:
             self._log_map()
+        scene.discs('map/changed', self._discs(update.changed))
 
     def _way(self) -> npt.NDArray[np.float64]:
         """Return the trajectory of the sensor, at most a thousand positions and the last."""
@@ -127,85 +110,46 @@ class Viewer:
 
     def _log_map(self) -> None:
         """Log all surfels and the active layers."""
-        mapper = self._mapper
-        self._log_surfels('map/surfels', mapper.map.surfels(mapper.config.map.min_points))
+        mapper, scene = self._mapper, self._scene
+        discs = self._discs(mapper.map.surfels(mapper.config.map.min_points))
+        scene.colouring = Colouring.over(self._colouring, [discs])
+        scene.discs('map/surfels', discs)
         self._logged_voxels, self._removed = mapper.map.num_voxels, 0
         drawings = [drawing for layer in mapper.layers.values() for drawing in layer.drawings()]
         for group in {drawing.name.partition('/')[0] for drawing in drawings}:
-            self._stream.log(f'map/{group}', self._rerun.Clear(recursive=True))
+            scene.clear(f'map/{group}')
         for drawing in drawings:
             self._log_drawing(f'map/{drawing.name}', drawing)
 
     def _log_drawing(self, name: str, drawing: Drawing) -> None:
         """Log the shapes of a layer."""
-        rerun = self._rerun
         if isinstance(drawing, MeshDrawing):
-            self._log_mesh(name, drawing.mesh)
+            self._scene.mesh(name, drawing.mesh)
         elif isinstance(drawing, RingsDrawing):
-            lines = rerun.LineStrips3D(
-                [np.concatenate([ring, ring[:1]]) for ring in drawing.rings],
-                colors=drawing.colors,
-                labels=list(drawing.labels),
-                show_labels=False,
-            )
-            self._stream.log(name, lines)
+            lines = [np.concatenate([ring, ring[:1]]) for ring in drawing.rings]
+            self._scene.lines(name, lines, drawing.colors, drawing.labels)
         else:
-            ellipsoids = rerun.Ellipsoids3D(
-                centers=drawing.centers,
-                half_sizes=drawing.half_sizes_m,
-                quaternions=quaternions(drawing.R_map_axes),
-                colors=[drawing.color] * len(drawing.centers),
-                fill_mode='solid',
-            )
-            self._stream.log(name, ellipsoids)
+            turns = quaternions(drawing.R_map_axes)
+            sizes = drawing.half_sizes_m
+            self._scene.ellipsoids(name, drawing.centers, sizes, turns, drawing.color)
 
-    def _log_mesh(self, name: str, mesh: Mesh) -> None:
-        """Log a mesh, in its colours if it has any."""
-        if len(mesh):
-            self._stream.log(
-                name,
-                self._rerun.Mesh3D(
-                    vertex_positions=mesh.vertices.astype(np.float32),
-                    triangle_indices=mesh.triangles.astype(np.uint32),
-                    vertex_normals=vertex_normals(mesh),
-                    vertex_colors=mesh.colors if len(mesh.colors) else None,
-                ),
-            )
+    def _discs(self, surfels: Surfels) -> Discs:
+        """Return surfels as discs; with their ages if these are shown."""
+        values = {}
+        if self._colouring == 'age':
+            scans = list(self._mapper.window)
+            stamps = self._ages.last_seen_ns(surfels.voxel_index, scans)
+            newest_ns = max((scan.stamp_ns for scan in scans), default=0)
+            values['age'] = ages_s(stamps, newest_ns)
+        return Discs.of(surfels, values)
 
-    def _log_surfels(self, name: str, surfels: Surfels) -> None:
-        """Log surfels as points of the size of their discs, coloured by planarity."""
-        from matplotlib import colormaps
 
-        valid = surfels.select(np.isfinite(surfels.planarity))
-        colours = np.rint(colormaps['viridis'](valid.planarity)[:, :3] * 255.0).astype(np.uint8)
-        points = self._rerun.Points3D(
-            valid.position, radii=0.5 * SPREAD * sides_m(valid), colors=colours
-        )
-        self._stream.log(name, points)
+def ages_s(last_seen_ns: npt.NDArray[np.int64], newest_ns: int) -> npt.NDArray[np.float64]:
+    """Return the ages of surfels at a stamp, s; nan for those that no scan has seen."""
+    return np.where(last_seen_ns < 0, np.nan, (newest_ns - last_seen_ns) / 1e9)
 
 
 def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """Return the finite points, subsampled to at most MAX_POINTS."""
     finite = points[np.isfinite(points).all(axis=1)]
     return np.ascontiguousarray(finite[:: max(-(-len(finite) // MAX_POINTS), 1)])
-
-
-def check_writable(path: Path) -> None:
-    """Raise FileFormatError for a file that cannot be written; rerun would only log it."""
-    try:
-        with open(path, 'wb'):
-            pass
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error
-
-
-def import_rerun() -> Any:
-    """Return the module rerun, or raise DependencyError with the command to install it."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise DependencyError(
-            f'rerun cannot be loaded ({error}). It shows replays; install it with '
-            "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
-        ) from error
-    return rerun

@@ -93,12 +93,22 @@ def pixels(page):
 
 def picture_when(page, is_so):
     """Return the picture once is_so(picture) holds, or the last one after WAIT_S."""
+
+    def settled():
+        settle(page)
+        return pixels(page)
+
+    return picture_until(is_so, settled)
+
+
+def picture_until(is_so, draw):
+    """Return draw() once is_so(picture) holds, or the last one after WAIT_S."""
     end = time.monotonic() + WAIT_S
     while True:
-        settle(page)
-        image = pixels(page)
+        image = draw()
         if is_so(image) or time.monotonic() > end:
             return image
+        time.sleep(0.05)
 
 
 def num_coloured(image):

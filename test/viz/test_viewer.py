@@ -19,7 +19,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
-from surfel_mapper.viz import viewer as viewer_module
+from surfel_mapper.viz import scene
 from surfel_mapper.viz.viewer import MAX_POINTS, picked, Viewer
 from test.bags.recorded import drive, write_rosbag2
 from test.layers.test_distance_field import insert, mapper_with
@@ -107,7 +107,7 @@ def test_the_window_listens_on_loopback_only(tmp_path, monkeypatch):
     window.write_text(WINDOW.format(pid=pid, rerun=program))
     window.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')
-    monkeypatch.setattr(viewer_module, 'PORT', port)
+    monkeypatch.setattr(scene, 'PORT', port)
 
     with Viewer(Mapper()):
         listening = addresses(port)

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+``surfel-mapper view``: maps, clouds, meshes, trajectories and bags in the viewer rerun.
+
+Opens a window where there is a display, else a page for a browser. Either listens on loopback
+only. A bag or folder of scans is mapped while it is shown, and nothing is written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+import sys
+from typing import TYPE_CHECKING
+
+from surfel_mapper.cli._arguments import positive_int, UsageError
+from surfel_mapper.cli._progress import progress
+
+if TYPE_CHECKING:
+    from surfel_mapper.viz.scene import Scene
+
+SUMMARY = 'Show maps, clouds, meshes, models, trajectories and bags.'
+
+EXAMPLE = 'surfel-mapper view street_surfels/ --color height'
+
+COLOURS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age', 'label')
+
+DISPLAYS = ('DISPLAY', 'WAYLAND_DISPLAY')
+"""Variables of the environment that name a display."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    add = parser.add_argument
+    add(
+        'what',
+        type=Path,
+        nargs='+',
+        metavar='WHAT',
+        help='output of a replay or merge; map: .npz, .parquet, .ply, .pcd, tiles; cloud, mesh '
+        '(.ply, .obj, .stl, .glb), trajectory (.tum, .csv); or one bag or folder of scans',
+    )
+    add('--color', choices=COLOURS, default='normal', help='of the surfels (normal)')
+    add(
+        '--at',
+        type=float,
+        nargs=3,
+        metavar=('X', 'Y', 'Z'),
+        help='place to look at, m in the fixed frame; maps are finest there (end of the '
+        'trajectory, or middle of the map)',
+    )
+    add(
+        '--discs',
+        type=positive_int,
+        default=250_000,
+        metavar='N',
+        help='most discs; far parts of larger maps are shown as coarser maps (250000)',
+    )
+    add('--min-points', type=positive_int, default=5, metavar='N', help='of a surfel (5)')
+    add('--config', type=Path, metavar='FILE', help='settings for a bag; with its window')
+    where = parser.add_mutually_exclusive_group()
+    where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
+    where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
+    add('--port', type=positive_int, default=0, metavar='N', help='of the page (a free one)')
+
+
+def run(args: argparse.Namespace) -> int:
+    """Open a scene, show everything, and wait if there is a page to serve."""
+    from surfel_mapper.viz.contents import contents, is_shown
+    from surfel_mapper.viz.scene import import_rerun
+
+    import_rerun()
+    many = len(args.what) > 1
+    recordings = [path for path in args.what if path.exists() and not is_shown(path)]
+    if recordings and many:
+        raise UsageError(f'{recordings[0]}: a recording is shown alone')
+    if recordings:
+        with opened(args) as scene:
+            announce(scene)
+            show_recording(recordings[0], args, scene)
+            finish(scene)
+        return 0
+    found = [
+        each
+        for path in args.what
+        for each in contents(path, (path.resolve().name if path.is_dir() else '') if many else '')
+    ]
+    with opened(args) as scene:
+        from surfel_mapper.viz.show import show
+
+        about = show(
+            scene,
+            found,
+            colouring=args.color,
+            place=args.at,
+            most_discs=args.discs,
+            min_points=args.min_points,
+        )
+        for name, sentence in about.items():
+            print(f'{name}: {sentence}')
+        announce(scene)
+        finish(scene)
+    return 0
+
+
+def opened(args: argparse.Namespace) -> Scene:
+    """Open the scene that the arguments ask for."""
+    from surfel_mapper.viz.scene import Scene
+
+    if args.rrd is not None:
+        return Scene.to_file(args.rrd)
+    has_display = sys.platform != 'linux' or any(map(os.environ.get, DISPLAYS))
+    return Scene.to_window() if has_display and not args.browser else Scene.to_browser(args.port)
+
+
+def announce(scene: Scene) -> None:
+    """Print the address of the page, if there is one, and open it."""
+    if scene.address:
+        import webbrowser
+
+        print(f'{scene.address}\nCtrl-C ends', flush=True)
+        webbrowser.open(scene.address)
+
+
+def finish(scene: Scene) -> None:
+    """Serve the page until it ends or Ctrl-C."""
+    try:
+        scene.wait()
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+
+
+def show_recording(path: Path, args: argparse.Namespace, scene: Scene) -> None:
+    """Map a bag or a folder of scans while it is shown."""
+    from surfel_mapper.config import load_config
+    from surfel_mapper.offline.recording import open_recording
+    from surfel_mapper.offline.replay import started_mapper
+    from surfel_mapper.offline.request import Request
+    from surfel_mapper.viz.viewer import Viewer
+
+    with open_recording(Request(path=path), load_config(args.config)) as recording:
+        mapper = started_mapper(recording.config)
+        viewer = Viewer(mapper, scene, args.color)
+        with progress('view', 'scan') as report:
+            for number, update in enumerate(recording.replay(mapper), start=1):
+                viewer.add(update)
+                report(number, recording.num_scans)
+        viewer.finish()
+        counted = mapper.summary()
+    print(f'{counted["scans"]["mapped"]} scans, {counted["surfels"]:,} surfels of the window')

@@ -1,0 +1,261 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Contents: what files and directories hold that can be shown, in the coordinates of the fixed frame.
+
+Exact maps (npz, Parquet, tiles) can be shown at every level of detail. Surfels in PLY and PCD have
+lost their moments, so they are shown as they are; discs without a stated size get that of the gaps
+between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import map_state, model_files, parquet, ply
+from surfel_mapper.files.parquet_tiles import tiles_in
+from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
+from surfel_mapper.files.trajectory import read_trajectory, Trajectory
+from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.discs import Discs, RGB
+
+Array = npt.NDArray[np.float64]
+
+EXACT = ('.npz', '.parquet')
+
+ASSETS = ('.glb', '.gltf', '.stl')
+"""Files of triangles that rerun reads itself."""
+
+TRAJECTORIES = ('.tum', '.csv', '.txt', '.kitti')
+
+IN_DIRECTORY = ('map.parquet', 'map.npz', 'map.ply', 'map.pcd')
+"""Files of a replay that hold its map, the exact ones first; one of them is shown."""
+
+BESIDE = ('mesh.ply', 'models.obj', 'trajectory.tum')
+"""Further files of a replay that are shown."""
+
+NORMALS = (('nx', 'ny', 'nz'), ('normal_x', 'normal_y', 'normal_z'))
+
+COORDINATES = {*'xyz', *(name for names in NORMALS for name in names)}
+
+NEIGHBOURS = 20_000
+"""Number of points whose nearest neighbours decide the size of discs without one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExactMap:
+    """
+    A map with its moments.
+
+    Attributes
+    ----------
+    name : str
+        Path in the viewer, below ``map``.
+    moments : ScanMoments
+    columns : tuple of str
+    origin_m : (3,) float64, m
+    scans : list of WindowedScan
+        Those of its window, for ages.
+
+    """
+
+    name: str
+    moments: ScanMoments
+    columns: tuple[str, ...]
+    origin_m: Array
+    scans: list[WindowedScan] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, name: str, surfel_map: SurfelMap, scans: list[WindowedScan]) -> ExactMap:
+        """Return a map to be shown."""
+        moments, origin_m = surfel_map.moments(), surfel_map.origin_m
+        return cls(name, moments, surfel_map.columns, origin_m, scans)
+
+    def middle(self) -> Array:
+        """Return the median of the voxels in the fixed frame, (3,) m."""
+        index = unpack_keys(self.moments.key[:: max(len(self.moments) // 100_000, 1)])
+        middle = (np.median(index, axis=0) + 0.5) * self.moments.voxel_size_m
+        return np.asarray(middle + self.origin_m, np.float64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cloud:
+    """Surfels or points without moments in the fixed frame; discs if they have normals."""
+
+    name: str
+    position: Array
+    discs: Discs | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Surface:
+    """A mesh in the fixed frame."""
+
+    name: str
+    mesh: Mesh
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Asset:
+    """A file that rerun reads itself."""
+
+    name: str
+    path: Path
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Way:
+    """Poses in the fixed frame."""
+
+    name: str
+    trajectory: Trajectory
+
+
+Content = ExactMap | Cloud | Surface | Asset | Way
+
+
+def is_shown(path: Path) -> bool:
+    """Return whether ``contents`` reads a path; others are bags or folders of scans."""
+    if path.is_dir():
+        named = any((path / name).is_file() for name in (*IN_DIRECTORY, *BESIDE))
+        return named or any(tiles_in(place) for place in (path / 'map', path))
+    return path.suffix in (*EXACT, *ASSETS, *TRAJECTORIES, *CLOUDS, '.obj')
+
+
+def contents(path: Path, name: str = '') -> Iterator[Content]:
+    """
+    Yield what a file or an output directory holds.
+
+    Parameters
+    ----------
+    path : Path
+        A map (.npz, .parquet, .ply, .pcd, dataset of tiles), a cloud (.ply, .pcd, .bin, .las), a
+        mesh (.ply, .obj, .stl, .glb), a trajectory (.tum, .csv, KITTI), or the output of a replay
+        or merge with any of them.
+    name : str
+        Path in the viewer for a file, below ``map``; that of the file without.
+
+    Raises
+    ------
+    FileFormatError
+        If it cannot be read, or holds nothing that can be shown.
+
+    """
+    if path.is_dir():
+        yield from in_directory(path, name)
+        return
+    if not path.exists():
+        raise FileFormatError(f'{path}: no such file or directory')
+    name = name or path.stem
+    if path.suffix == '.npz':
+        surfel_map, scans = map_state.load_map(path)
+        yield ExactMap.of(name, surfel_map, scans)
+    elif path.suffix == '.parquet':
+        yield ExactMap.of(name, parquet.read_map(path), [])
+    elif path.suffix == '.obj':
+        yield Surface(name, model_files.read_obj(path))
+    elif path.suffix in ASSETS:
+        yield Asset(name, path)
+    elif path.suffix in TRAJECTORIES:
+        yield Way(name, read_trajectory(path))
+    elif path.suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
+        yield Surface(name, mesh)
+    elif path.suffix in CLOUDS:
+        yield cloud(path, name)
+    else:
+        raise FileFormatError(
+            f'{path}: expected a bag, a folder, or a file ending in '
+            f'{", ".join(dict.fromkeys([*EXACT, *CLOUDS, ".obj", *ASSETS, *TRAJECTORIES]))}'
+        )
+
+
+def in_directory(path: Path, name: str) -> Iterator[Content]:
+    """Yield the map in a directory and the meshes, models and trajectories beside it."""
+    prefix = f'{name}/' if name else ''
+    places = [path / each for each in IN_DIRECTORY if (path / each).is_file()][:1]
+    tiled = next((place for place in (path / 'map', path) if tiles_in(place)), None)
+    if tiled is not None:
+        yield tiles(tiled, f'{prefix}surfels')
+    else:
+        for place in places:
+            yield from contents(place, f'{prefix}surfels')
+    for each in BESIDE:
+        if (path / each).is_file():
+            yield from contents(path / each, f'{prefix}{Path(each).stem}')
+    for place in sorted(path.glob('apart_*.npz')):
+        yield from contents(place, f'{prefix}{place.stem}')
+
+
+def tiles(directory: Path, name: str) -> ExactMap:
+    """Return the map in a dataset of tiles."""
+    found = tiles_in(directory)
+    whole: SurfelMap | None = None
+    parts = []
+    for place in found.values():
+        surfel_map = parquet.read_map(place)
+        if whole is None:
+            whole = SurfelMap(
+                surfel_map.voxel_size_m,
+                columns=surfel_map.columns,
+                level=surfel_map.level,
+                origin_m=surfel_map.origin_m,
+            )
+        parts.append(surfel_map)
+    assert whole is not None, 'a dataset has tiles'
+    for part in parts:
+        whole.merge(part)
+    return ExactMap.of(name, whole, [])
+
+
+def cloud(path: Path, name: str) -> Cloud:
+    """Return the surfels or points of a file, in the fixed frame."""
+    points, columns = read_scan(path)
+    position = points.astype(np.float64)
+    values = {each: column for each, column in columns.items() if each not in COORDINATES}
+    names = next((names for names in NORMALS if set(names) <= set(columns)), None)
+    is_finite = np.isfinite(position).all(axis=1)
+    if names is None:
+        return Cloud(name, position[is_finite], None)
+    normal = np.stack([columns[each].astype(np.float64) for each in names], axis=1)
+    length = np.sqrt((normal * normal).sum(axis=1))
+    is_known = is_finite & (length > 0.0)
+    normal = normal[is_known] / length[is_known, None]
+    position = position[is_known]
+    radius_m = np.full(len(position), 0.75 * spacing_m(position))
+    shown = {each: value[is_known] for each, value in unpacked(values).items()}
+    return Cloud(name, position, Discs(position, normal, radius_m, shown))
+
+
+def unpacked(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:
+    """Return the columns of numbers, and a colour as red, green and blue."""
+    found = {each: values for each, values in columns.items() if values.ndim == 1}
+    colour = columns.get('rgb')
+    if colour is not None and colour.ndim == 1:
+        del found['rgb']
+        bits = colour.view(np.uint32) if colour.dtype == np.float32 else colour.astype(np.uint32)
+        colour = np.stack([bits >> shift & 255 for shift in (16, 8, 0)], axis=1).astype(np.uint8)
+    if colour is not None:
+        found.update(zip(RGB, colour.T, strict=True))
+    return found
+
+
+def spacing_m(position: Array) -> float:
+    """Return the median distance of points to their nearest neighbour, m; 0.05 for one point."""
+    from scipy.spatial import cKDTree
+
+    if len(position) < 2:
+        return 0.05
+    asked = position[:: max(len(position) // NEIGHBOURS, 1)]
+    distance, _ = cKDTree(position).query(asked, k=2)
+    return max(float(np.median(distance[:, 1])), 1e-3)

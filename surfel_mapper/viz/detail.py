@@ -1,0 +1,158 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Levels of detail of a map: near tiles as they are, far ones as the exact coarser map.
+
+A tile is a square column of voxels. Each is drawn at one level, that is, by the surfels that
+``SurfelMap.coarsen(level)`` has in it, computed from the moments and so exact; no surfel is left
+out at random. The level grows by one whenever the distance to the place looked at doubles, which
+keeps the size on the screen, and the distance at which it begins is the largest for which all
+discs together stay within a limit.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.kernels import layout
+from surfel_mapper.mapping.moments import coarse_moments, ScanMoments, unpack_keys
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.surfels import Surfels
+
+Array = npt.NDArray[np.float64]
+
+LEVELS = 5
+"""Coarser levels; a voxel of the last is 32 times larger."""
+
+MOST_LEVEL = layout.INDEX_BITS - 1
+"""The coarsest level of a map."""
+
+MOST_TILES = 256
+"""Limit of the tiles, each of which is an entity of the viewer."""
+
+STEPS = 60
+"""Distances tried for the begin of the first coarser level, between a tile and the whole map."""
+
+
+class Level(NamedTuple):
+    """Moments of a level, and rows of its surfels by tile: those of tile t begin at starts[t]."""
+
+    moments: ScanMoments
+    rows: npt.NDArray[np.int64]
+    starts: npt.NDArray[np.int64]
+
+
+class DetailedMap:
+    """
+    A map in tiles that can be drawn at several levels.
+
+    Parameters
+    ----------
+    moments : ScanMoments
+        Those of a map, as ``SurfelMap.moments`` returns them. A map of 5 million surfels is drawn
+        without its hash table, which takes longer to fill than all else.
+    columns : tuple of str
+        Columns of the map.
+    min_points : int
+        Voxels with fewer points are no surfels.
+
+    Attributes
+    ----------
+    tiles : (T, 2) int64
+        Voxel indices in i and j of the tiles, shifted right by ``bits``.
+    edge_m : float
+        Edge of a tile.
+    counts : (L, T) int64
+        Number of surfels of each tile at each level.
+
+    """
+
+    def __init__(self, moments: ScanMoments, columns: tuple[str, ...], min_points: int) -> None:
+        found = [moments]
+        while len(found) <= LEVELS and found[-1].level < MOST_LEVEL and len(found[-1]):
+            found.append(coarse_moments(found[-1], 1))
+        self._columns = columns
+        rows = [np.flatnonzero(each.count >= min_points) for each in found]
+        places = [
+            unpack_keys(each.key[row])[:, :2].astype(np.int64)
+            for each, row in zip(found, rows, strict=True)
+        ]
+        self.bits, self.tiles = tiles_of(places[-1], len(found) - 1)
+        self.edge_m = moments.voxel_size_m * 2.0**self.bits
+        self.levels = [
+            self._sorted(each, row, place >> (self.bits - level))
+            for level, (each, row, place) in enumerate(zip(found, rows, places, strict=True))
+        ]
+        self.counts = np.array([np.diff(level.starts) for level in self.levels])
+
+    def __len__(self) -> int:
+        """Return the number of tiles."""
+        return len(self.tiles)
+
+    def _sorted(
+        self, moments: ScanMoments, rows: npt.NDArray[np.int64], tile: npt.NDArray[np.int64]
+    ) -> Level:
+        # the coarser voxel of a surfel has as many points, so its tile is among the tiles
+        number = np.searchsorted(packed(self.tiles), packed(tile)).astype(np.uint16)
+        order = np.argsort(number, kind='stable')
+        starts = np.searchsorted(number[order], np.arange(len(self.tiles) + 1))
+        return Level(moments, rows[order], starts)
+
+    def choose(self, place: npt.ArrayLike, at_most: int) -> npt.NDArray[np.int64]:
+        """
+        Return the level at which each tile is drawn, (T,).
+
+        Parameters
+        ----------
+        place : (3,) float, m
+            The place looked at, in the frame of the map.
+        at_most : int
+            Limit of the number of discs; exceeded only if the coarsest level of all tiles does.
+
+        """
+        distance = self._distances(np.asarray(place, np.float64))
+        last = len(self.levels) - 1
+        tiles = np.arange(len(self.tiles))
+        if self.counts[0].sum() <= at_most:
+            return np.zeros(len(tiles), np.int64)
+        chosen = np.full(len(tiles), last)
+        for least in range(last, -1, -1):  # level at the place itself
+            for begin_m in np.geomspace(0.25 * self.edge_m, distance.max() + self.edge_m, STEPS):
+                farther = np.log2(np.maximum(distance / begin_m, 0.5)) + 1.0
+                level = np.clip(np.floor(farther).astype(np.int64) + least, least, last)
+                if self.counts[level, tiles].sum() > at_most:
+                    break
+                chosen = level
+        return chosen
+
+    def surfels(self, tile: int, level: int) -> Surfels:
+        """Return the surfels of a tile at a level."""
+        moments, rows, starts = self.levels[level]
+        part = moments.select(rows[starts[tile] : starts[tile + 1]])
+        surfel_map = SurfelMap(part.voxel_size_m, columns=self._columns, level=part.level)
+        surfel_map.insert(part)
+        return surfel_map.surfels()
+
+    def _distances(self, place: Array) -> Array:
+        """Return the horizontal distance of each tile from a place, (T,) m; 0 inside."""
+        low = self.tiles * self.edge_m
+        away = np.maximum(np.maximum(low - place[:2], place[:2] - low - self.edge_m), 0.0)
+        return np.asarray(np.sqrt((away * away).sum(axis=1)))
+
+
+def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArray[np.int64]]:
+    """Return the bits of a tile and the sorted tiles that hold some columns of a level, (T, 2)."""
+    bits = level
+    while True:
+        found = np.unique(columns >> (bits - level), axis=0)
+        if len(found) <= MOST_TILES:
+            return bits, found
+        bits += 1
+
+
+def packed(tile: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """Return tiles (K, 2) as one number each, which sorts as they do."""
+    return np.asarray((tile[:, 0] << 32) + tile[:, 1], np.int64)

@@ -1,0 +1,345 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Scene: discs, meshes, lines and poses in rerun, in a window, a browser or an .rrd file.
+
+A disc is a hexagon of a mesh, which rerun shades and draws fast, with a small point at its middle
+that can be picked and has the values of the surfel. Rerun draws in float32, so positions are given
+in the frame of the map; where that has an origin in the fixed frame, the entity ``map`` states it
+as ``origin_m``, and discs that are picked have the coordinates of the fixed frame, as
+``fixed_x_m`` and so on.
+
+Servers listen on loopback only: what is shown is not protected by a password.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+import shutil
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.errors import DependencyError, FileFormatError, SurfelMapperError
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.discs import Colouring, CORNERS, Discs
+from surfel_mapper.viz.mesh import vertex_normals
+
+Array = npt.NDArray[np.float64]
+
+PORT = 9876
+"""Port of the window, that of rerun; one that is open there already is used."""
+
+LOOPBACK = '127.0.0.1'
+"""Address on which the window listens; rerun's own default is every interface."""
+
+PICKED = 0.25
+"""Radius of the point that is picked, relative to that of its disc."""
+
+START_S = 20.0
+"""Longest wait for a server to listen, s."""
+
+NORMAL = ('normal_x', 'normal_y', 'normal_z')
+
+FIXED = ('fixed_x_m', 'fixed_y_m', 'fixed_z_m')
+"""Names of the coordinates in the fixed frame, shown for a disc that is picked."""
+
+RED, ORANGE = (219, 41, 33), (240, 150, 40)
+
+
+class Scene:
+    """
+    What is shown in rerun; a context manager.
+
+    Parameters
+    ----------
+    stream : rerun.RecordingStream
+        As ``to_window``, ``to_browser`` and ``to_file`` open it.
+    address : str, optional
+        Address of the page in a browser.
+    server : subprocess.Popen, optional
+        The server of the page, which ends with the scene.
+
+    """
+
+    def __init__(
+        self, stream: Any, address: str = '', server: subprocess.Popen[bytes] | None = None
+    ) -> None:
+        self.address = address
+        self.colouring = Colouring()
+        self.origin_m = np.zeros(3)
+        self._rerun = import_rerun()
+        self._stream = stream
+        self._server = server
+        stream.log('map', self._rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    @classmethod
+    def to_file(cls, path: str | Path) -> Scene:
+        """Write to an .rrd file; raises FileFormatError if that is not possible."""
+        rerun = import_rerun()
+        check_writable(Path(path))
+        stream = rerun.RecordingStream('surfel_mapper')
+        stream.save(str(path))
+        return cls(stream)
+
+    @classmethod
+    def to_window(cls, port: int | None = None) -> Scene:
+        """Open a window, or use the one that is open at the port, by default that of rerun."""
+        rerun = import_rerun()
+        import rerun_bindings  # spawn of rerun itself takes no address
+
+        port = port or PORT
+        stream = rerun.RecordingStream('surfel_mapper')
+        rerun_bindings.spawn(port=port, extra_args=['--bind', LOOPBACK])
+        stream.connect_grpc(f'rerun+http://{LOOPBACK}:{port}/proxy')
+        return cls(stream)
+
+    @classmethod
+    def to_browser(cls, port: int = 0) -> Scene:
+        """
+        Serve a page for a browser, on loopback only, until the scene is closed.
+
+        Parameters
+        ----------
+        port : int
+            Port of the page; 0: a free one.
+
+        Raises
+        ------
+        DependencyError
+            If rerun is not installed.
+        SurfelMapperError
+            If the server does not start.
+
+        """
+        rerun = import_rerun()
+        data_port = free_port()
+        port = port or free_port()
+        command = [
+            *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
+            *('--port', str(data_port), '--web-viewer-port', str(port)),
+            *('--server-memory-limit', '75%'),
+        ]
+        server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        try:
+            for each in (data_port, port):
+                wait_for(each, server)
+        except SurfelMapperError:
+            server.terminate()
+            raise
+        stream = rerun.RecordingStream('surfel_mapper')
+        stream.connect_grpc(f'rerun+http://{LOOPBACK}:{data_port}/proxy')
+        source = f'rerun%2Bhttp%3A%2F%2F{LOOPBACK}%3A{data_port}%2Fproxy'
+        return cls(stream, f'http://{LOOPBACK}:{port}/?url={source}', server)
+
+    def __enter__(self) -> Scene:
+        """Return the scene, which closes at the end of the block."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Send what is left and close; the page in a browser ends."""
+        with suppress(Exception):  # a window that was closed is no error
+            self.flush()
+            self._stream.disconnect()
+        if self._server is not None:
+            self._server.terminate()
+            self._server.wait()
+
+    def wait(self) -> None:
+        """Return when the server of the page ends; at once if there is none."""
+        if self._server is not None:
+            self._server.wait()
+
+    def flush(self) -> None:
+        """Send everything logged so far."""
+        self._stream.flush()
+
+    def set_stamp(self, stamp_ns: int) -> None:
+        """Put what is logged from now on at a time of the time line ``stamp``."""
+        self._stream.set_time('stamp', timestamp=np.datetime64(stamp_ns, 'ns'))
+
+    def set_origin(self, origin_m: npt.ArrayLike) -> None:
+        """State the place of the frame of the map in the fixed frame, (3,) m."""
+        self.origin_m = np.asarray(origin_m, np.float64)
+        if self.origin_m.any():
+            about = self._rerun.AnyValues(origin_m=self.origin_m)
+            self._stream.log('map', about, static=True)
+
+    def look(self, low: Array, high: Array, place: Array) -> None:
+        """Look at a place from obliquely above, as far away as a box, (3,) m each, needs."""
+        import rerun.blueprint as blueprint
+
+        size = float(np.linalg.norm(high[:2] - low[:2]))
+        across = 1 if high[0] - low[0] > high[1] - low[1] else 0
+        back = np.array([0.0, 0.0, 0.55])
+        back[across] = -0.75
+        eye = place + back * max(size, 2.0) * 0.6
+        controls = blueprint.EyeControls3D(position=eye, look_target=place, eye_up=[0, 0, 1])
+        name = 'map'
+        if self.origin_m.any():
+            name = 'map, m from ' + ' '.join(f'{value:.10g}' for value in self.origin_m)
+        view = blueprint.Spatial3DView(origin='/map', name=name, eye_controls=controls)
+        self._stream.send_blueprint(
+            blueprint.Blueprint(view, blueprint.TimePanel(state='collapsed')),
+            make_active=True,
+            make_default=True,
+        )
+
+    def discs(self, path: str, discs: Discs, *, static: bool = False) -> None:
+        """Show discs in place of those that the path has had; none clears it."""
+        if not len(discs):
+            self.clear(path, static=static)
+            return
+        rerun, colours = self._rerun, self.colouring.of(discs)
+        corners, triangles = discs.triangles()
+        mesh = rerun.Mesh3D(
+            vertex_positions=corners,
+            triangle_indices=triangles,
+            vertex_colors=np.repeat(colours, CORNERS, axis=0),
+        )
+        self._stream.log(f'{path}/discs', mesh, static=static)
+        values = dict(discs.values)
+        values.update(zip(NORMAL, discs.normal.T.astype(np.float32), strict=True))
+        if self.origin_m.any():
+            values.update(zip(FIXED, (discs.position + self.origin_m).T, strict=True))
+        points = rerun.Points3D(discs.position, radii=PICKED * discs.radius_m, colors=colours)
+        self._stream.log(path, points, rerun.AnyValues(**values), static=static)
+
+    def clear(self, path: str, *, static: bool = False) -> None:
+        """Show nothing at a path and below."""
+        self._stream.log(path, self._rerun.Clear(recursive=True), static=static)
+
+    def mesh(self, path: str, mesh: Mesh, *, static: bool = False) -> None:
+        """Show a mesh, in its colours if it has any."""
+        if not len(mesh):
+            self.clear(path, static=static)
+            return
+        shown = self._rerun.Mesh3D(
+            vertex_positions=mesh.vertices.astype(np.float32),
+            triangle_indices=mesh.triangles.astype(np.uint32),
+            vertex_normals=vertex_normals(mesh),
+            vertex_colors=mesh.colors if len(mesh.colors) else None,
+        )
+        self._stream.log(path, shown, static=static)
+
+    def asset(self, path: str, file: Path) -> None:
+        """Show a file of triangles that rerun reads itself."""
+        self._stream.log(path, self._rerun.Asset3D(path=file), static=True)
+
+    def points(
+        self,
+        path: str,
+        points: Array,
+        radius_m: float,
+        colour: Sequence[int] | None = None,
+        *,
+        static: bool = False,
+    ) -> None:
+        """Show points (N, 3), m."""
+        colours = None if colour is None else [tuple(colour)]
+        shown = self._rerun.Points3D(points, radii=radius_m, colors=colours)
+        self._stream.log(path, shown, static=static)
+
+    def lines(
+        self,
+        path: str,
+        lines: Sequence[Array],
+        colours: Any,
+        labels: Sequence[str] | None = None,
+        *,
+        static: bool = False,
+    ) -> None:
+        """Show lines, (M, 3) m each, with labels that are shown when they are picked."""
+        shown = self._rerun.LineStrips3D(
+            lines, colors=colours, labels=labels and list(labels), show_labels=False
+        )
+        self._stream.log(path, shown, static=static)
+
+    def ellipsoids(
+        self, path: str, centers: Array, half_sizes_m: Array, turns: Array, color: Any
+    ) -> None:
+        """Show ellipsoids with half axes (K, 3), m, turned by quaternions (K, 4), x y z w."""
+        shown = self._rerun.Ellipsoids3D(
+            centers=centers,
+            half_sizes=half_sizes_m,
+            quaternions=turns,
+            colors=[color] * len(centers),
+            fill_mode='solid',
+        )
+        self._stream.log(path, shown)
+
+    def pose(self, path: str, T_map_sensor: Array) -> None:
+        """Place what is below a path by a pose."""
+        placed = self._rerun.Transform3D(
+            translation=T_map_sensor[:3, 3], mat3x3=T_map_sensor[:3, :3]
+        )
+        self._stream.log(path, placed)
+
+    def poses(self, path: str, stamp_ns: npt.NDArray[np.int64], xyz: Array, turns: Array) -> None:
+        """Move a path along poses on the time line: positions (S, 3), quaternions (S, 4)."""
+        rerun = self._rerun
+        times = rerun.TimeColumn('stamp', timestamp=stamp_ns.astype('datetime64[ns]'))
+        columns = rerun.Transform3D.columns(translation=xyz, quaternion=turns)
+        self._stream.send_columns(path, indexes=[times], columns=columns)
+
+    def values(self, path: str, values: Mapping[str, Any]) -> None:
+        """Attach values to a path, shown when it is selected."""
+        self._stream.log(path, self._rerun.AnyValues(**values), static=True)
+
+
+def check_writable(path: Path) -> None:
+    """Raise FileFormatError for a file that cannot be written; rerun would only log it."""
+    try:
+        with open(path, 'wb'):
+            pass
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error
+
+
+def import_rerun() -> Any:
+    """Return the module rerun, or raise DependencyError with the command to install it."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise DependencyError(
+            f'rerun cannot be loaded ({error}). It shows maps and replays; install it with '
+            "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
+        ) from error
+    return rerun
+
+
+def rerun_program() -> str:
+    """Return the path of the program rerun, beside this Python or on the PATH."""
+    found = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
+    if found is None:
+        raise DependencyError(
+            'the program rerun, which the package rerun-sdk installs, is neither beside '
+            f'{sys.executable} nor on the PATH'
+        )
+    return found
+
+
+def free_port() -> int:
+    """Return a port that no program listens at."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
+    """Wait until a server listens at a port; raise SurfelMapperError if it does not."""
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and server.poll() is None:
+        with socket.socket() as probe:
+            if probe.connect_ex((LOOPBACK, port)) == 0:
+                return
+        time.sleep(0.05)
+    state = 'ended' if server.poll() is not None else f'did not listen within {START_S:g} s'
+    raise SurfelMapperError(f'the server of rerun at {LOOPBACK}:{port} {state}; is the port free?')

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""``surfel-mapper view --browser`` in a real browser: the map is drawn, on loopback only."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+import io
+import os
+from pathlib import Path
+import re
+import signal
+import subprocess
+import sys
+
+import numpy as np
+from PIL import Image
+import pytest
+
+from test.viz.test_report_browser import BROWSER, browser, picture_until, WAIT_S
+from test.viz.test_show import ground_map
+from test.viz.test_viewer import addresses
+
+pytestmark = [
+    pytest.mark.skipif(BROWSER is None, reason='no browser on the PATH'),
+    pytest.mark.skipif(
+        not all(map(find_spec, ('playwright', 'rerun'))),
+        reason='playwright or rerun is not installed',
+    ),
+]
+
+__all__ = ['browser']  # a fixture
+
+
+@pytest.fixture
+def served(tmp_path):
+    """Serve a map until the end of the test; yield the address of the page."""
+    ground_map().save(tmp_path / 'map.npz')
+    command = [sys.executable, '-m', 'surfel_mapper.cli.main', 'view', str(tmp_path / 'map.npz')]
+    environment = {**os.environ, 'BROWSER': 'true'}
+    with subprocess.Popen(
+        [*command, '--browser'], stdout=subprocess.PIPE, text=True, env=environment
+    ) as view:
+        found = (re.match(r'(http://127\.0\.0\.1:\d+/\S*)', line) for line in view.stdout)
+        yield next(filter(None, found))[1]
+        view.send_signal(signal.SIGINT)
+        view.stdout.read()
+        assert view.wait(WAIT_S) == 0
+
+
+def drawn(page):
+    """Return the picture of the map, right of the panels and above the time line."""
+    shot = Image.open(io.BytesIO(page.screenshot())).convert('RGB')
+    return np.asarray(shot.crop((220, 70, 900, 660))) / np.float32(255.0)
+
+
+def test_a_map_is_drawn_in_a_browser(browser, served):
+    page = browser.new_page(viewport={'width': 900, 'height': 700})
+    page.set_default_timeout(1000 * WAIT_S)
+    page.goto(f'{served}&renderer=webgl')
+
+    def is_drawn(image):  # level ground is bluish; grid and text are grey
+        colour = image[np.ptp(image, axis=2) > 0.05]
+        return len(colour) > 20_000 and (colour.argmax(axis=1) == 2).mean() > 0.9
+
+    assert is_drawn(picture_until(is_drawn, lambda: drawn(page)))
+    before = drawn(page)
+    page.mouse.move(500, 400)
+    page.mouse.wheel(0, -400)
+    nearer = picture_until(lambda image: np.abs(image - before).mean() > 0.01, lambda: drawn(page))
+    assert np.abs(nearer - before).mean() > 0.01
+    page.close()
+
+
+@pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='sockets are not shown')
+def test_the_page_is_served_on_loopback_only(served):
+    ports = {int(port) for port in re.findall(r'(?::|%3A)(\d+)', served)}
+    assert len(ports) == 2
+    for port in ports:
+        assert addresses(port) == {'127.0.0.1'}
