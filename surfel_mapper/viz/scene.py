@@ -74,7 +74,7 @@ class Scene:
     ) -> None:
         self.address = address
         self.colouring = Colouring()
-        self.origin_m = np.zeros(3)
+        self.origin_m: Array = np.zeros(3)
         self._rerun = import_rerun()
         self._stream = stream
         self._server = server
