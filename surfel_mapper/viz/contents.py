@@ -28,7 +28,7 @@ from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import Discs, RGB
+from surfel_mapper.viz.discs import DrawnDiscs, RGB
 
 Array = npt.NDArray[np.float64]
 
@@ -95,11 +95,11 @@ class Cloud:
 
     name: str
     position: Array
-    discs: Discs | None
+    discs: DrawnDiscs | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Surface:
+class ShownMesh:
     """A mesh in the fixed frame."""
 
     name: str
@@ -122,7 +122,7 @@ class Way:
     trajectory: Trajectory
 
 
-Content = ExactMap | Cloud | Surface | Asset | Way
+Content = ExactMap | Cloud | ShownMesh | Asset | Way
 
 
 def is_shown(path: Path) -> bool:
@@ -164,13 +164,13 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     elif path.suffix == '.parquet':
         yield ExactMap.of(name, parquet.read_map(path), [])
     elif path.suffix == '.obj':
-        yield Surface(name, model_files.read_obj(path))
+        yield ShownMesh(name, model_files.read_obj(path))
     elif path.suffix in ASSETS:
         yield Asset(name, path)
     elif path.suffix in TRAJECTORIES:
         yield Way(name, read_trajectory(path))
     elif path.suffix == '.ply' and (mesh := ply.read_mesh(path)) is not None:
-        yield Surface(name, mesh)
+        yield ShownMesh(name, mesh)
     elif path.suffix in CLOUDS:
         yield cloud(path, name)
     else:
@@ -234,7 +234,7 @@ def cloud(path: Path, name: str) -> Cloud:
     position = position[is_known]
     radius_m = np.full(len(position), 0.75 * spacing_m(position))
     shown = {each: value[is_known] for each, value in unpacked(values).items()}
-    return Cloud(name, position, Discs(position, normal, radius_m, shown))
+    return Cloud(name, position, DrawnDiscs(position, normal, radius_m, shown))
 
 
 def unpacked(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

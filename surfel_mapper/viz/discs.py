@@ -65,9 +65,9 @@ PALETTE = np.array(
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Discs:
+class DrawnDiscs:
     """
-    Discs to be drawn.
+    DrawnDiscs to be drawn.
 
     Attributes
     ----------
@@ -86,7 +86,9 @@ class Discs:
     values: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, surfels: Surfels, values: Mapping[str, npt.NDArray[Any]] | None = None) -> Discs:
+    def of(
+        cls, surfels: Surfels, values: Mapping[str, npt.NDArray[Any]] | None = None
+    ) -> DrawnDiscs:
         """Return the discs of surfels that have a normal, with further values (K,) of each."""
         is_known = np.isfinite(surfels.planarity)
         all_values = {
@@ -107,10 +109,10 @@ class Discs:
         """Return the number of discs."""
         return len(self.position)
 
-    def select(self, rows: Any) -> Discs:
+    def select(self, rows: Any) -> DrawnDiscs:
         """Return selected discs: by a slice, a mask (K,) bool or row indices."""
         values = {name: value[rows] for name, value in self.values.items()}
-        return Discs(self.position[rows], self.normal[rows], self.radius_m[rows], values)
+        return DrawnDiscs(self.position[rows], self.normal[rows], self.radius_m[rows], values)
 
     def triangles(self) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.uint32]]:
         """Return corners (6 K, 3), m, and the numbers of those of each triangle (4 K, 3)."""
@@ -146,7 +148,7 @@ class Colouring:
     high: float = 1.0
 
     @classmethod
-    def over(cls, kind: str, parts: Sequence[Discs]) -> Colouring:
+    def over(cls, kind: str, parts: Sequence[DrawnDiscs]) -> Colouring:
         """
         Return a colouring whose ends fit the values of some discs.
 
@@ -175,7 +177,7 @@ class Colouring:
         low, high = np.percentile(values, [BEYOND, 100.0 - BEYOND])
         return cls(kind, float(low), float(max(high, low + 1e-9)))
 
-    def of(self, discs: Discs) -> npt.NDArray[np.uint8]:
+    def of(self, discs: DrawnDiscs) -> npt.NDArray[np.uint8]:
         """Return the colours of discs, (K, 3)."""
         if self.kind == 'normal':
             return as_bytes(shaded(discs.normal))
@@ -190,12 +192,12 @@ class Colouring:
         return as_bytes(ramp(values))
 
 
-def has_value(discs: Discs, kind: str) -> bool:
+def has_value(discs: DrawnDiscs, kind: str) -> bool:
     """Return whether discs have the value of a colouring."""
     return kind in ('normal', 'height') or (RGB[0] if kind == 'rgb' else kind) in discs.values
 
 
-def value_of(discs: Discs, kind: str) -> Array:
+def value_of(discs: DrawnDiscs, kind: str) -> Array:
     """Return the values of a colouring, (K,)."""
     return np.asarray(discs.position[:, 2] if kind == 'height' else discs.values[kind], np.float64)
 

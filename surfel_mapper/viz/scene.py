@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError, SurfelMapperError
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.discs import Colouring, CORNERS, Discs
+from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
 from surfel_mapper.viz.mesh import vertex_normals
 
 Array = npt.NDArray[np.float64]
@@ -56,7 +56,7 @@ RED, ORANGE = (219, 41, 33), (240, 150, 40)
 
 class Scene:
     """
-    What is shown in rerun; a context manager.
+    Entities shown in rerun; a context manager.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ class Scene:
             make_default=True,
         )
 
-    def discs(self, path: str, discs: Discs, *, static: bool = False) -> None:
+    def discs(self, path: str, discs: DrawnDiscs, *, static: bool = False) -> None:
         """Show discs in place of those that the path has had; none clears it."""
         if not len(discs):
             self.clear(path, static=static)

@@ -18,9 +18,9 @@ import numpy.typing as npt
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.contents import Asset, Cloud, Content, ExactMap, Surface, Way
+from surfel_mapper.viz.contents import Asset, Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
-from surfel_mapper.viz.discs import Colouring, Discs
+from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
 from surfel_mapper.viz.viewer import ages_s
 
@@ -91,7 +91,7 @@ def show(
     for each in clouds:
         about[each.name] = show_cloud(scene, each)
     for other in contents:
-        if isinstance(other, Surface):
+        if isinstance(other, ShownMesh):
             scene.mesh(f'map/{other.name}', shifted_mesh(other.mesh, origin_m), static=True)
             about[other.name] = f'{len(other.mesh):,} triangles'
         elif isinstance(other, Asset):
@@ -106,7 +106,7 @@ def show(
 class Tiles:
     """The discs of a map by tile, and a sentence about them."""
 
-    def __init__(self, name: str, discs: dict[str, Discs], about: str) -> None:
+    def __init__(self, name: str, discs: dict[str, DrawnDiscs], about: str) -> None:
         self.name, self.discs, self.about = name, discs, about
 
 
@@ -123,7 +123,7 @@ def detailed(
         discs = with_age(surfels, shown, int(level[tile]))
         name = f'tile_{i}_{j}'.replace('-', 'm')
         values = {**discs.values, 'level': np.full(len(discs), level[tile])}
-        found[name] = Discs(discs.position + shift, discs.normal, discs.radius_m, values)
+        found[name] = DrawnDiscs(discs.position + shift, discs.normal, discs.radius_m, values)
     drawn = sum(map(len, found.values()))
     total = int(whole.counts[0].sum())
     about = f'{total:,} surfels in voxels of {shown.moments.voxel_size_m:g} m'
@@ -132,13 +132,13 @@ def detailed(
     return Tiles(shown.name, found, about)
 
 
-def with_age(surfels: Surfels, shown: ExactMap, level: int) -> Discs:
+def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
     """Return surfels as discs, with their ages if the map has the scans of its window."""
     if not shown.scans or level:
-        return Discs.of(surfels)
+        return DrawnDiscs.of(surfels)
     newest_ns = max(scan.stamp_ns for scan in shown.scans)
     seen_ns = Ages().last_seen_ns(surfels.voxel_index, shown.scans)
-    return Discs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
+    return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
 def show_cloud(scene: Scene, cloud: Cloud) -> str:
@@ -184,7 +184,7 @@ def place_of(contents: Sequence[Content]) -> Array:
         if isinstance(each, ExactMap) and len(each.moments):
             return each.middle()
         points = each.position if isinstance(each, Cloud) else None
-        points = each.mesh.vertices if isinstance(each, Surface) else points
+        points = each.mesh.vertices if isinstance(each, ShownMesh) else points
         if points is not None and len(points):
             return np.asarray(np.median(points, axis=0), np.float64)
     return np.zeros(3)
@@ -204,7 +204,7 @@ def shifted_cloud(cloud: Cloud, origin_m: Array) -> Cloud:
     discs = cloud.discs
     if discs is not None:
         position = discs.position - origin_m
-        discs = Discs(position, discs.normal, discs.radius_m, discs.values)
+        discs = DrawnDiscs(position, discs.normal, discs.radius_m, discs.values)
     return Cloud(cloud.name, cloud.position - origin_m, discs)
 
 

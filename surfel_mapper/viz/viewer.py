@@ -20,7 +20,7 @@ from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
-from surfel_mapper.viz.discs import Colouring, Discs
+from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
 
 if TYPE_CHECKING:
@@ -133,7 +133,7 @@ class Viewer:
             sizes = drawing.half_sizes_m
             self._scene.ellipsoids(name, drawing.centers, sizes, turns, drawing.color)
 
-    def _discs(self, surfels: Surfels) -> Discs:
+    def _discs(self, surfels: Surfels) -> DrawnDiscs:
         """Return surfels as discs; with their ages if these are shown."""
         values = {}
         if self._colouring == 'age':
@@ -141,7 +141,7 @@ class Viewer:
             stamps = self._ages.last_seen_ns(surfels.voxel_index, scans)
             newest_ns = max((scan.stamp_ns for scan in scans), default=0)
             values['age'] = ages_s(stamps, newest_ns)
-        return Discs.of(surfels, values)
+        return DrawnDiscs.of(surfels, values)
 
 
 def ages_s(last_seen_ns: npt.NDArray[np.int64], newest_ns: int) -> npt.NDArray[np.float64]:

@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.viz.discs import Colouring, COLOURINGS, CORNERS, Discs, PALETTE
+from surfel_mapper.viz.discs import Colouring, COLOURINGS, CORNERS, DrawnDiscs, PALETTE
 
 VIRIDIS_ENDS = [[68, 1, 84], [253, 231, 37]]
 """First and last colour of the map, as matplotlib documents them (#440154, #fde725)."""
@@ -18,7 +18,7 @@ VIRIDIS_ENDS = [[68, 1, 84], [253, 231, 37]]
 def discs(**values):
     position = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 9.0], [0.0, 0.0, 3.5]])
     normal = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.6, 0.0, 0.8]])
-    return Discs(position, normal, np.array([0.5, 1.0, 2.0]), values)
+    return DrawnDiscs(position, normal, np.array([0.5, 1.0, 2.0]), values)
 
 
 def test_corners_lie_on_a_circle_across_the_normal():
@@ -41,7 +41,7 @@ def test_surfels_without_a_normal_have_no_disc():
     surfel_map = SurfelMap(0.5)
     rng = np.random.default_rng(0)
     surfel_map.add(np.concatenate([[[9.1, 9.1, 9.1]], rng.uniform(0.0, 0.4, (20, 3))]))
-    found = Discs.of(surfel_map.surfels(), {'age': np.array([1.0, 2.0])})
+    found = DrawnDiscs.of(surfel_map.surfels(), {'age': np.array([1.0, 2.0])})
 
     assert len(found) == 1
     assert set(found.values) == {'planarity', 'curvature', 'num_points', 'age'}
@@ -54,7 +54,7 @@ def test_a_full_square_is_covered_by_a_disc_of_its_size():
     surfel_map.add(
         np.stack([*map(np.ravel, np.meshgrid(side, side)), np.full(10_000, 0.5)], axis=1)
     )
-    found = Discs.of(surfel_map.surfels())
+    found = DrawnDiscs.of(surfel_map.surfels())
     # between the circle within the square and the one around it
     assert 0.5 < found.radius_m[0] < np.sqrt(0.5) + 0.03
 
@@ -74,7 +74,7 @@ def test_ends_of_a_colour_map_leave_out_outliers():
 
 def many(**values):
     number = len(next(iter(values.values())))
-    return Discs(
+    return DrawnDiscs(
         np.zeros((number, 3)), np.tile([0.0, 0.0, 1.0], (number, 1)), np.ones(number), values
     )
 
