@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 import os
 from pathlib import Path
 import stat
@@ -161,6 +162,7 @@ def stated_limit() -> int:
     return int(text or 0)
 
 
+@cache
 def upper_bound() -> int:
     """Return three quarters of the memory of the machine, bytes; 3 GiB if that is unknown."""
     try:

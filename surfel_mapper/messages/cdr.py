@@ -17,6 +17,7 @@ millisecond as the bytes of two arrays. The tests compare both directions with r
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 import struct
 from typing import Any
 
@@ -51,6 +52,23 @@ class Header:
     frame_id: str
 
 
+@cache
+def layout_of(order: str, codes: str, phase: int, is_packed: bool) -> struct.Struct:
+    """
+    Return the layout of some numbers, format characters of struct.
+
+    They follow each other packed, or each at a multiple of its size; phase is the offset of the
+    first from such a multiple, modulo 8.
+    """
+    layout, at = order, phase
+    for code in codes:
+        size = struct.calcsize(order + code)
+        padding = 0 if is_packed else -at % size
+        layout += f'{padding}x{code}'
+        at += padding + size
+    return struct.Struct(layout)
+
+
 class MessageReader:
     """Reads the members of a serialised message one after the other."""
 
@@ -74,17 +92,15 @@ class MessageReader:
 
     def number(self, code: str) -> int:
         """Return the next integer; the code is a format character of struct."""
-        layout = self._order + code
-        size = struct.calcsize(layout)
-        if not self.is_ros1:
-            self._at += -(self._at - self._start) % size
-        (value,) = struct.unpack_from(layout, self._raw, self._at)
-        self._at += size
-        return int(value)
+        return self.numbers(code)[0]
 
     def numbers(self, codes: str) -> tuple[int, ...]:
         """Return the next integers, one for each format character of struct."""
-        return tuple([self.number(code) for code in codes])
+        phase = (self._at - self._start) % FLOAT64_BYTES
+        layout = layout_of(self._order, codes, phase, self.is_ros1)
+        values = layout.unpack_from(self._raw, self._at)
+        self._at += layout.size
+        return values
 
     def floats(self, number: int) -> tuple[float, ...]:
         """Return the next ``number`` float64."""

@@ -7,9 +7,9 @@ A message is read by the names of its attributes, so one decoder serves rclpy an
 not imported. Sizes and fields are checked before a byte is read, with Python integers, which do
 not overflow. Columns are strided, read-only views into the message, so unused ones cost nothing.
 
-Coordinates are gathered into one array in Fortran order, as the kernels of the map need them:
-0.2 ms for 131072 points, aligned or not, of 22 to 48 bytes. As an (N, 3) view, whose inner loop is
-three numbers long, they take 1.0 ms.
+Coordinates are gathered into one array in Fortran order, as the kernels of the map need them, in
+one pass over the bytes: 0.2 to 0.4 ms for 4 MiB in the layouts of common drivers. Three strided
+copies take 1.7 times as long.
 
 ``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
 
@@ -39,6 +39,7 @@ from surfel_mapper.messages.cdr import (
     read_header,
     write_header,
 )
+from surfel_mapper.messages.kernels.coordinates import gather_coordinates
 from surfel_mapper.scan import Scan
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
@@ -290,13 +291,25 @@ def column(points: Points, field: Field, budget: Budget) -> npt.NDArray[Any]:
 def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray[Any]:
     """Return three fields as a new (N, 3) array in Fortran order and native byte order."""
     views = [points.view(f.offset, points.order + DTYPES[f.datatype]) for f in xyz]
+    kinds = {values.dtype for values in views}
     dtype = np.result_type(*views).newbyteorder('=')
     num_points = math.prod(points.shape)
     budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
     packed: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
-    for axis, values in enumerate(views):
+    if len(kinds) == 1 and dtype in kinds:
+        x, y, z = map(np.atleast_2d, views)
+        gather_coordinates(x, y, z, packed.T)
+        return packed
+    for axis, values in enumerate(views):  # other byte orders, or float32 beside float64
         packed[:, axis].reshape(points.shape)[...] = values
     return packed
+
+
+def warm_up() -> None:
+    """Compile the kernel that decodes clouds of float32."""
+    point = np.zeros((1, 3), np.float32)
+    cloud = from_columns(dict(zip('xyz', point.T, strict=True)))
+    to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id='')))
 
 
 def from_columns(columns: Mapping[str, npt.NDArray[Any]]) -> CloudBytes:

@@ -17,6 +17,7 @@ from rclpy.node import Node
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.memory import lasting_objects, rare_collections
+from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
 from surfel_mapper.ros.inputs import Inputs
@@ -76,7 +77,7 @@ class Session:
         log.info('compiling kernels: a moment, the first time a quarter of a minute')
         before, later = self.mapper.warm_up_steps()
         with rare_collections():
-            for step in before:
+            for step in (warm_up_decoding, *before):
                 step()
         self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *later]
         self._compiler = threading.Thread(target=self._compile, name='compiling', daemon=True)

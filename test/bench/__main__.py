@@ -21,6 +21,7 @@ from test.bench.report import Row, table
 BENCHES = (
     'mapping',
     'real',
+    'decode',
     'threads',
     'scaling',
     'start',

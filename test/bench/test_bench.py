@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
-from test.bench import accuracy, filters, real
+from test.bench import accuracy, decode, filters, real
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -72,6 +72,23 @@ def test_the_voxel_grid_is_timed_and_others_beside_it(options, monkeypatch):
         'not measured: no small_gicp here',
         'not measured: no Open3D here',
     ]
+
+
+def test_the_layouts_of_drivers_are_decoded_and_compared_with_numpy(options, monkeypatch):
+    monkeypatch.setattr(decode, 'SIZE', 1 << 16)
+    monkeypatch.setattr(decode, 'REPEATS', 2)
+    rows = bench.run(['decode'], options)
+    assert [row['driver'] for row in rows] == [*decode.LAYOUTS]
+    assert all(row['points'] * row['B_point'] <= 1 << 16 for row in rows)
+
+
+def test_normals_and_outliers_are_timed_beside_those_of_peers(options, monkeypatch):
+    points = np.random.default_rng(3).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
+    monkeypatch.setattr(filters, 'run_peer', lambda *_: '{"normals 10": [1.0, 3.0, 2.0]}')
+    rows = list(filters.searches('cube', points, replace(options, peers=True)))
+    names = ['normals 10', 'small_gicp normals 10', 'Open3D normals 10']
+    assert [row['filter'] for row in rows] == [*names, 'normals 30', 'outliers 20']
+    assert rows[1]['x_ours'] == pytest.approx(2.0 / rows[0]['median_ms'])
 
 
 def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_path):
