@@ -57,10 +57,11 @@ NEAR_M, PATH_M = 5.0, 300.0
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for us and each peer."""
+    """Return a row for us and each peer; each is printed as soon as it is known."""
     drive = recorded(options)
     with one_core():
         rows = [ours(drive)]
+        print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
         for peer in LOOP_PEERS if options.peers else ():
             try:
                 python = environment(peer, options.cache)
@@ -71,6 +72,7 @@ def run(options: Options) -> list[Row]:
             seconds = sum(figures['cpu_ms']) / 1e3 + figures['finish_s']
             row = errors(poses, drive.poses)
             rows.append({'who': peer.name, **row, 'cpu_s': seconds, 'peak_mb': figures['peak_mb']})
+            print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     return [{'scans': len(drive.paths), 'path_m': path_m(drive.poses), **row} for row in rows]
 
 
