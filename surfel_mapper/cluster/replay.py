@@ -4,7 +4,8 @@
 Replay of several bags, or with several processes: one map of them all, in tiles.
 
 The map is a Parquet dataset, ``map/tile_i=*/tile_j=*/surfels.parquet``; picture and report show
-a sample of its surfels. All bags have to be in one fixed frame.
+a sample of its surfels. All bags have to be in one fixed frame; those without poses are brought
+into that of the first (common_frame.py).
 """
 
 from __future__ import annotations
@@ -17,11 +18,14 @@ from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cluster.executors import never, open_executor, start_forkserver
 from surfel_mapper.config import AUTO
-from surfel_mapper.errors import BagError, ConfigError
+from surfel_mapper.errors import BagError, ConfigError, MapError
 from surfel_mapper.offline.request import Request
 
 if TYPE_CHECKING:
+    from surfel_mapper.cluster.common_frame import CommonFrame
+    from surfel_mapper.cluster.executors import Executor
     from surfel_mapper.cluster.map_reduce import MapReduceResult
+    from surfel_mapper.cluster.tiles import OnDone
     from surfel_mapper.config import Config
 
 
@@ -105,19 +109,27 @@ def replay_bags(
     from surfel_mapper.cluster.map_reduce import map_bags
     from surfel_mapper.cluster.shards import cut, shard_length_s
 
-    lengths_s, cuts = surveyed(requests, config)
-    recorded_s, done_s = sum(lengths_s), 0.0
+    found = surveyed(requests, config)
+    is_registered = check_one_kind(found)
+    # a recording that is registered is read twice
+    recorded_s, done_s = sum(each.recorded_s for each in found), 0.0
+    total_s = (1 + is_registered) * recorded_s
 
     def on_done(kind: str, amount: float) -> None:
         nonlocal done_s
         if kind == 'map' or recorded_s == 0.0:  # merging takes little of the time
             done_s += amount
-            progress(round(done_s), round(recorded_s))
+            progress(round(done_s), round(total_s))
 
     with open_executor(workers, scheduler) as executor:
         num_workers = executor.num_workers
+        jobs = [(request, config) for request in requests]
+        frame = None
+        if is_registered:
+            frame = registered(found, config, output, executor, on_done, stopped)
+            jobs = [(each.request, each.config) for each in frame.placed]
         shard_s = shard_length_s(recorded_s, num_workers)
-        shards = [shard for request in requests for shard in cut(request, config, shard_s)]
+        shards = [shard for request, settings in jobs for shard in cut(request, settings, shard_s)]
         mapped = map_bags(shards, executor, output, on_done, stopped)
         num_workers = executor.num_workers
     summary = {
@@ -126,9 +138,10 @@ def replay_bags(
         'recorded_s': recorded_s,
         'replay_s': time.perf_counter() - began,
         'interrupted': mapped.interrupted,
-        'cut': cuts,
+        'cut': [cut for each in found for cut in each.cuts],
         **mapped.counts(),
         **mapped.map.summary(),
+        **({} if frame is None else frame.summary(mapped.counts()['scans'])),
         'workers': num_workers,
         **shares_of_work(mapped),
         'settings': config.to_mapping(),
@@ -155,27 +168,69 @@ def shares_of_work(mapped: MapReduceResult) -> dict[str, Any]:
     }
 
 
-def surveyed(requests: Sequence[Request], config: Config) -> tuple[list[float], list[str]]:
-    """Return the duration of each recording, s, and the files that end too early."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Surveyed:
+    """What is known of a recording before it is mapped."""
+
+    request: Request
+    recorded_s: float
+    cuts: list[str]
+    poses_from: str
+
+
+def surveyed(requests: Sequence[Request], config: Config) -> list[Surveyed]:
+    """Return duration, s, source of poses, and files that end too early, of each recording."""
     from surfel_mapper.offline.recording import open_recording
 
-    lengths_s: list[float] = []
-    cuts: list[str] = []
+    found = []
     for request in requests:
         with open_recording(request, config) as recording:
-            found = recording.describe()
-            if (
-                len(requests) > 1
-                and found['poses_from'] == 'registration'
-                and found['poses_reason']
-            ):
-                raise BagError(
-                    f'{request.path}: {found["poses_reason"]}; several recordings that are '
-                    'registered have no common frame, replay them one by one'
+            found.append(
+                Surveyed(
+                    request=request,
+                    recorded_s=recording.recorded_s,
+                    cuts=list(recording.cuts),
+                    poses_from=str(recording.describe()['poses_from']),
                 )
-            lengths_s.append(recording.recorded_s)
-            cuts += recording.cuts
-    return lengths_s, cuts
+            )
+    return found
+
+
+def check_one_kind(found: Sequence[Surveyed]) -> bool:
+    """Return whether the recordings have to be registered; raise BagError if only some have."""
+    without = [each for each in found if each.poses_from == 'registration']
+    others = [each for each in found if each.poses_from != 'registration']
+    if without and others:
+        raise BagError(
+            f'{without[0].request.path} has no poses, but {others[0].request.path} has, from '
+            f'{others[0].poses_from}; expected all or none, or --poses-from registration for all'
+        )
+    return bool(without)
+
+
+def registered(
+    found: Sequence[Surveyed],
+    config: Config,
+    output: Path,
+    executor: Executor,
+    on_done: OnDone,
+    stopped: Callable[[], bool],
+) -> CommonFrame:
+    """Register each recording alone, and place them on each other."""
+    from surfel_mapper.cluster.common_frame import in_one_frame, register
+    from surfel_mapper.cluster.shards import absolute
+
+    tasks = [
+        (absolute(each.request), config, output.absolute() / f'registered_{number}')
+        for number, each in enumerate(found, start=1)
+    ]
+    done = {}
+    for number, result in executor.run(register, tasks, stopped):
+        done[number] = result
+        on_done('map', found[number].recorded_s)
+    if len(done) < len(tasks):
+        raise MapError('stopped before all recordings were registered')
+    return in_one_frame([done[number] for number in range(len(tasks))])
 
 
 def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResult) -> list[Path]:

@@ -123,14 +123,27 @@ class ScanTrajectory:
     """
 
     def __init__(self, mapper: Mapper) -> None:
-        self._map = mapper.map
+        self._mapper, self._map = mapper, mapper.map
         self.stamps_ns: list[int] = []
         self.poses: list[npt.NDArray[np.float64]] = []
+        self._T_sensor_body: list[npt.NDArray[np.float64]] = []
 
     def add(self, update: Update) -> None:
         """Append the pose of a mapped scan."""
         self.stamps_ns.append(update.stamp_ns)
         self.poses.append(update.T_map_sensor)
+        if update.T_fixed_body is not None:
+            from surfel_mapper.geometry import compose, inverse
+
+            T_map_body = compose(self._mapper.T_map_fixed, update.T_fixed_body)
+            self._T_sensor_body.append(compose(inverse(update.T_map_sensor), T_map_body))
+
+    @property
+    def of_body(self) -> npt.NDArray[np.float64]:
+        """The poses of the frame that registration tracks, T_map_body, (S, 4, 4)."""
+        import numpy as np
+
+        return self.matrices @ np.array(self._T_sensor_body).reshape(-1, 4, 4)
 
     def follow_alignment(self, mapper: Mapper) -> None:
         """Replace the poses of scans that loops or the alignment of the window have moved."""

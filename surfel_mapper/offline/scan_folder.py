@@ -5,9 +5,9 @@ Scans in files, one file each, through the pipeline: a folder of them, or a sing
 
 With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
-registered. The time of scan i is that of pose i, if there are as many poses as scans; else the
-time in the name of its file; else scans follow each other at 10 Hz. Folders of data sets have
-their own layout, times and poses (datasets.py).
+registered. The time of a scan is that in the name of its file; else scans follow each other at
+10 Hz. With poses of other times, the time of scan i is that of pose i, if there are as many poses
+as scans. Folders of data sets have their own layout, times and poses (datasets.py).
 """
 
 from __future__ import annotations
@@ -154,9 +154,12 @@ class ScanFolder:
         number = len(self.files)
         if self.dataset is not None and (self.poses is None or self.poses.has_stamps):
             return self.dataset.stamps_ns
+        own = times_in_names(self.files) or [PERIOD_NS * at for at in range(number)]
         if self.poses is None:
-            return times_in_names(self.files) or [PERIOD_NS * at for at in range(number)]
+            return own
         stamps = self.poses.trajectory.stamp_ns
+        if stamps is not None and 2 * len(set(own).intersection(stamps.tolist())) > len(stamps):
+            return own  # poses of these scans by registration, without those that it dropped
         if len(self.poses.trajectory) == number:
             return [PERIOD_NS * at for at in range(number)] if stamps is None else stamps.tolist()
         if stamps is None:

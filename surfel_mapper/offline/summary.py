@@ -82,10 +82,11 @@ def apart_text(summary: Mapping[str, Any]) -> str:
     parts = tracking.get('apart', [])
     if not parts:
         return ''
-    num_scans = summary['scans']['dropped'].get('apart', 0)
+    counted = summary['scans']['dropped'].get('apart', 0)
+    num_scans = max(counted, sum(part['scans'] for part in parts))
     spans = ', '.join(
-        f'apart_{number} ({part["scans"]} scans from {part["first_s"]:.3f} to '
-        f'{part["last_s"]:.3f} s: {part["reason"]})'
+        f'{part.get("map", f"apart_{number}")} ({part["scans"]} scans from '
+        f'{part["first_s"]:.3f} to {part["last_s"]:.3f} s: {part["reason"]})'
         for number, part in enumerate(parts, start=1)
     )
     return (

@@ -214,9 +214,3 @@ def test_las_and_laz_files_are_scans(tmp_path, capsys):
     (tmp_path / 'bad.laz').write_bytes(b'LASF' + bytes(500))
     assert main(['replay', str(tmp_path / 'bad.laz'), '--output', str(tmp_path / 'out')]) == 1
     assert not Path(tmp_path / 'out').exists()
-
-
-def test_several_recordings_without_poses_are_refused(tmp_path, capsys):
-    folders = [str(write_scans(tmp_path / name)) for name in 'ab']
-    assert main(['replay', *folders, '--output', str(tmp_path / 'out')]) == 1
-    assert 'have no common frame, replay them one by one' in capsys.readouterr().err
