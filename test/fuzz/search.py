@@ -35,6 +35,8 @@ def main(name: str, corpus: str, seconds: str) -> None:
     ):
         from test.fuzz.harnesses import HARNESSES
     logging.disable(logging.CRITICAL)
+    harness = HARNESSES[name]
+    harness.one_input(harness.corpus()[0])  # kernels that compile are no hang
     arguments = [
         sys.argv[0],
         corpus,
@@ -44,7 +46,7 @@ def main(name: str, corpus: str, seconds: str) -> None:
         '-max_len=65536',
         f'-artifact_prefix={tempfile.gettempdir()}/{name}-',
     ]
-    atheris.Setup(arguments, HARNESSES[name].one_input)
+    atheris.Setup(arguments, harness.one_input)
     atheris.Fuzz()
 
 
