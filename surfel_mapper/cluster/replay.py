@@ -170,7 +170,7 @@ def shares_of_work(mapped: MapReduceResult) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Surveyed:
-    """What is known of a recording before it is mapped."""
+    """Source of poses, duration and cut files of a recording that is not mapped yet."""
 
     request: Request
     recorded_s: float
