@@ -155,8 +155,8 @@ def fit_points(
         label,
         group,
         [patch for patch, _ in patches],
-        config.voxel_size_m,
-        config.min_surface_points,
+        config,
+        view,
     )
     laps.append(perf_counter())
     return fit_owners(thinned, voxels, found, config, view)
@@ -185,6 +185,7 @@ def fit_owners(
         starts=starts - first,
         normals=found.normals * np.where(towards < 0.0, -1.0, 1.0)[:, None],
         thickness=thickness(middle, config, view),
+        curved=found.curved,
     )
     patches = fit_patches(points, config, view) if number else []
     order = [k for k, p in enumerate(patches) if p is not None and not isinstance(p, Surface)]

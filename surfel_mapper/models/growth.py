@@ -6,13 +6,13 @@ From patches of clusters to patches of points: noise, growth, facets, merging.
 Recursive bisection finds large patches from one point a voxel, but leaves voxels at edges, on
 small faces and at boundaries to Gaussians: at 3 cm three quarters of the objects on a table.
 Growth uses all points of each voxel. Patches grow over touching voxels, facets are grown from the
-points that are left, coplanar neighbours are merged, and every point goes to the patch that it
+points that are left, patches of one surface are joined, and every point goes to the patch that it
 lies on.
 
 The tolerance of a patch follows from the distances of its own points, so it needs no model of the
 sensor; thresholds of the bisection use the noise that is estimated from blocks of voxels.
 
-One module of 350 lines: growth, facets and merging share the table of patches and its noise.
+One module of 390 lines: growth, facets and noise share the table of points by voxel.
 
 Source: Besl and Jain 1988 (region growing from seeds); the rest is our own.
 """
@@ -25,19 +25,24 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.config import ModelsConfig
+from surfel_mapper.models.joining import join_patches, Pieces
 from surfel_mapper.models.kernels.growth import (
     assign_points,
     classify_free,
-    count_contacts,
     find_facets,
     grow_patches,
     sample_distances,
     SLOTS,
 )
+from surfel_mapper.models.kernels.joining import rename_owners, sort_owners
 from surfel_mapper.models.kernels.voxel_points import (
     block_noise,
     find_core,
+    LEAST_COSINE,
+    merge_owners,
     neighbour_rows,
+    neighbour_table,
     owner_means,
 )
 from surfel_mapper.models.multi_model import Plane, Surface
@@ -61,11 +66,17 @@ BLOCKS, BLOCK_POINTS = 120, 100
 NOISE_BINS, NOISE_QUANTILE = 4, 0.3
 """Bins of range; the quantile is below the median, as edges add to the noise of a block."""
 
+LEAST_ALONE, CLIPPED_VOXELS = 0.25, 0.1
+"""Share of the voxels with enough points for an estimate of their own, and the most they tell."""
+
 CLIPPING = 2.0
 """Correction of sigma by this times its square in voxels, for 5 to 15 mm at 3 cm within 10 %."""
 
 TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 """Tolerance of a patch: sigmas of its points and a share of a voxel, up to half a voxel."""
+
+NOISE_SIGMAS = 2.5
+"""Tolerance by the noise of the sensor at least: noise beyond a voxel is cut into layers."""
 
 SAMPLES = 20_000
 """Points for the tolerances of all patches, about."""
@@ -81,9 +92,6 @@ FACET_VOXELS, FACET_POINTS, FACET_WIDTH_VOXELS = 3, 30, 0.8
 
 MOST_FACETS = 4096
 
-MERGE_ANGLE_DEG, MERGE_GROWTH = 6.0, 1.25
-"""Coplanar patches differ by less, and merging them increases the residual by less."""
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VoxelPoints:
@@ -97,15 +105,15 @@ class VoxelPoints:
         Row of each in the cloud.
     starts : (V + 1,) int64
         First point of each voxel, and P.
-    lattice : tuple
-        Keys (V,) int64 of the voxels, bits to y and z, first neighbours (V, 9) int64.
+    adjacent : tuple
+        Neighbours of voxels: first (V + 1,) int64, and rows (A,) int32.
 
     """
 
     points: npt.NDArray[np.floating]
     rows: npt.NDArray[np.int32]
     starts: Indices
-    lattice: tuple[Indices, int, int, Indices]
+    adjacent: tuple[Indices, npt.NDArray[np.int32]]
 
     @classmethod
     def of(
@@ -119,21 +127,16 @@ class VoxelPoints:
         """Find the neighbours; bits (3,) of x, y and z in the keys."""
         first, to_y, to_z = np.empty((len(keys), 9), np.int64), int(bits[0]), int(bits[:2].sum())
         neighbour_rows(keys, to_y, to_z, first)
-        return cls(points, rows, starts, (keys, to_y, to_z, first))
+        ends, near = np.empty(len(keys) + 1, np.int64), np.empty(26 * len(keys), np.int32)
+        neighbour_table(keys, to_y, to_z, first, ends, near)
+        return cls(points, rows, starts, (ends, near))
 
     def core(self) -> npt.NDArray[np.bool_]:
         """Return which voxels are not outliers, (V,) bool."""
         core = np.ones(len(self.starts) - 1, np.bool_)
         if len(core):
-            find_core(self.starts, *self.lattice, CORE_SHARE, CORE_POINTS, core)
+            find_core(self.starts, self.adjacent, CORE_SHARE, CORE_POINTS, core)
         return core if 1.0 - core.mean() > MOST_SPARSE else np.ones_like(core)
-
-    def by_owner(self, owner: Owners) -> tuple[Array, Owners]:
-        """Return the means (M, 3) of the points by voxel and owner, sorted by owner, and those."""
-        owners, means = np.empty(len(owner), np.int32), np.empty((len(owner), 3))
-        num = owner_means(self.points, self.starts, owner, owners, means)
-        order = np.argsort(owners[:num], kind='stable')
-        return means[order], owners[order]
 
 
 def estimate_noise(
@@ -142,13 +145,21 @@ def estimate_noise(
     """
     Return the noise of the points as n0, m, and n2, 1/m: sigma is n0 + n2 range^2.
 
-    A block of three voxels clips noise of more than a third of a voxel; see CLIPPING.
+    Single voxels clip noise of more than a tenth of a voxel, blocks of three that of more than a
+    third (see CLIPPING), but these contain edges and corners, which are no noise.
     """
     rows = np.flatnonzero(core)
     seeds = rows[:: max(len(rows) // BLOCKS, 1)]
+    range_sq = ((means[seeds] - view) ** 2).sum(axis=1)
+    state = voxels.points, voxels.starts, voxels.adjacent
     sigma: Array = np.empty(len(seeds))
-    block_noise(voxels.points, voxels.starts, *voxels.lattice, seeds, BLOCK_POINTS, sigma)
-    range_sq, sigma = ((means[seeds] - view) ** 2).sum(axis=1)[sigma >= 0.0], sigma[sigma >= 0.0]
+    for alone in (True, False):
+        block_noise(*state, seeds, alone, BLOCK_POINTS, view, sigma)
+        known = sigma >= 0.0
+        enough = known.sum() >= max(LEAST_ALONE * len(seeds), 1.0)
+        if alone and enough and np.median(sigma[known]) < CLIPPED_VOXELS * size_m:
+            break
+    range_sq, sigma = range_sq[known], sigma[known]
     if not len(sigma):
         return 0.0, 0.0
     bins = NOISE_BINS if len(sigma) >= 10 * NOISE_BINS else 1
@@ -187,7 +198,9 @@ class Grown:
     owners : (M,) int32
         Their owners.
     normals : (K, 3) float64
-        Normals of the patches, of either sign.
+        Normals of the patches; of a curved one the mean.
+    curved : (K,) bool
+        Whether a patch is a curved surface.
 
     """
 
@@ -195,6 +208,7 @@ class Grown:
     means: Array
     owners: Owners
     normals: Array
+    curved: npt.NDArray[np.bool_]
 
 
 def grow(
@@ -203,11 +217,11 @@ def grow(
     label: Owners,
     group: Owners,
     patches: list[Plane],
-    size_m: float,
-    least_points: int,
+    config: ModelsConfig,
+    view: Array,
 ) -> Grown:
     """
-    Grow patches and facets, and merge those that are coplanar.
+    Grow patches and facets, and join those that lie on one plane or smooth surface.
 
     Parameters
     ----------
@@ -221,15 +235,21 @@ def grow(
         Group of each voxel, for points on no patch.
     patches : list of Plane
         Planes and surfaces.
-    size_m : float
-        Edge of the voxels, m.
-    least_points : int
-        Points of a facet.
+    config : ModelsConfig
+        Settings, with the noise.
+    view : (3,) float64, m
+        Position of the sensor.
 
     """
+    size_m, noise = config.voxel_size_m, (config.noise_m, config.noise_per_range_sq)
     tangent = tangents(means, label, patches)
-    tolerance = tolerances(voxels, label, tangent, len(patches), size_m)
-    median_m = float(np.median(tolerance)) if len(tolerance) else 0.1 * size_m
+    sigma = noise_across(patches, noise, view)
+    tolerance = tolerances(voxels, label, tangent, sigma, size_m)
+    if len(tolerance):
+        median_m = float(np.median(tolerance))
+    else:
+        range_sq = float(np.median(((means - view) ** 2).sum(axis=1)))
+        median_m = 3.0 * (noise[0] + noise[1] * range_sq) + 0.1 * size_m
     owner = np.repeat(label, np.diff(voxels.starts))
     free = free_surfels(voxels, owner, size_m, median_m)
     extend_patches(voxels, label, (tangent, tolerance), free, owner)
@@ -237,27 +257,47 @@ def grow(
     rules = (
         median_m,
         FACET_VOXELS,
-        max(FACET_POINTS, least_points),
+        max(FACET_POINTS, config.min_surface_points),
         math.cos(math.radians(FACET_ANGLE_DEG)),
         FACET_WIDTH_VOXELS * size_m,
     )
     num = add_facets(voxels, patches, free, rules, owner)
-    contacts = np.zeros((num, num), np.int32)
-    count_contacts(voxels.starts, voxels.lattice, owner, contacts)
-    curved = [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
-    contacts[curved], contacts[:, curved] = 0, 0
-    is_free = owner < 0
-    owner[is_free] = np.repeat(-1 - group, np.diff(voxels.starts))[is_free]
-    pair_means, owners = voxels.by_owner(owner)
-    on_patch = owners >= 0
-    moments = owner_moments(pair_means[on_patch], owners[on_patch], num)
-    root = coplanar(moments, contacts, median_m)
-    names, index = np.unique(root, return_inverse=True)
-    new: Owners = index.astype(np.int32)
-    owner, owners = renamed(owner, new), renamed(owners, new)
-    order = np.argsort(owners, kind='stable')
-    normals = np.array([plane_of(moments[root == k].sum(axis=0))[0] for k in names])
-    return Grown(owner, pair_means[order], owners[order], normals.reshape(-1, 3))
+    table = owner_table(voxels, owner)
+    out = sorted_table(table, 0, num)
+    pieces = Pieces(*out, adjacent=voxels.adjacent, first=table[3], owners=table[0])
+    index, normals, curved = join_patches(pieces, view, noise, size_m)
+    rename_owners(voxels.starts, group, index, owner)
+    rename_owners(table[3], group, index, table[0])
+    held = merge_owners(*table)
+    owners, first = table[0][:held], table[3]
+    low = min(int(owners.min(initial=0)), 0)
+    starts, _, points, _ = sorted_table((owners, *table[1:3], first), low, len(normals) - low)
+    names = np.repeat(np.arange(low, len(normals), dtype=np.int32), np.diff(starts))
+    return Grown(owner, points, names, normals, curved)
+
+
+OwnerTable = tuple[Owners, Array, Array, Indices]
+"""Owners (M,), means (M, 3) and counts (M,) by voxel and owner; first row (V + 1,) of a voxel."""
+
+
+def owner_table(voxels: VoxelPoints, owner: Owners) -> OwnerTable:
+    """Average the points of each voxel that have the same owner."""
+    owners, means = np.empty(len(owner), np.int32), np.empty((len(owner), 3))
+    counts, first = np.empty(len(owner)), np.empty(len(voxels.starts), np.int64)
+    num = owner_means(voxels.points, voxels.starts, owner, owners, means, counts, first)
+    return owners[:num], means[:num], counts[:num], first
+
+
+def sorted_table(
+    table: OwnerTable, least: int, number: int
+) -> tuple[Indices, npt.NDArray[np.int32], Array, Array]:
+    """Return starts (number + 1,), voxels, means and counts by owner, from owner least on."""
+    owners, means, counts, first = table
+    held = int((owners >= least).sum())
+    starts = np.empty(number + 1, np.int64)
+    out = starts, np.empty(held, np.int32), np.empty((held, 3)), np.empty(held)
+    sort_owners(first, owners, means, counts, least, out)
+    return out
 
 
 def extend_patches(
@@ -272,7 +312,7 @@ def extend_patches(
     planes = np.empty((len(label), SLOTS, 4))
     state = voxels.points, voxels.starts
     flat = free[1], free[3], math.cos(math.radians(GROWTH_ANGLE_DEG))
-    grow_patches(*state, voxels.lattice, label, *shape, flat, candidate, planes)
+    grow_patches(*state, voxels.adjacent, label, *shape, flat, candidate, planes)
     assign_points(*state, label, *shape, candidate, planes, owner)
 
 
@@ -287,15 +327,8 @@ def add_facets(
     found = np.empty((len(patches) + MOST_FACETS, 4))
     for k, patch in enumerate(patches):
         found[k] = (*patch.normal, patch.offset_m)
-    state = voxels.points, voxels.starts, voxels.lattice
+    state = voxels.points, voxels.starts, voxels.adjacent
     return int(find_facets(*state, free, rules, owner, found, len(patches)))
-
-
-def renamed(owner: Owners, index: Owners) -> Owners:
-    """Return owners with patch k renamed to index[k]."""
-    result: Owners = owner.copy()
-    result[owner >= 0] = index[owner[owner >= 0]]
-    return result
 
 
 def tangents(means: Array, label: Owners, patches: list[Plane]) -> Array:
@@ -314,10 +347,21 @@ def tangents(means: Array, label: Owners, patches: list[Plane]) -> Array:
     return tangent
 
 
+def noise_across(patches: list[Plane], noise: tuple[float, float], view: Array) -> Array:
+    """Return sigma (K,) across each patch, m, of noise n0 + n2 range^2 along the ray."""
+    rays = np.array([patch.mean for patch in patches]).reshape(-1, 3) - view
+    normals = np.array([patch.normal for patch in patches]).reshape(-1, 3)
+    range_sq = np.maximum(np.einsum('ij,ij->i', rays, rays), 1e-24)
+    cosine = np.abs(np.einsum('ij,ij->i', rays, normals)) / np.sqrt(range_sq)
+    result: Array = (noise[0] + noise[1] * range_sq) * np.maximum(cosine, LEAST_COSINE)
+    return result
+
+
 def tolerances(
-    voxels: VoxelPoints, label: Owners, tangent: Array, number: int, size_m: float
+    voxels: VoxelPoints, label: Owners, tangent: Array, noise: Array, size_m: float
 ) -> Array:
-    """Return the distance (K,) up to which a point lies on each patch, m."""
+    """Return the distance (K,) up to which a point lies on each patch, m; noise (K,) across it."""
+    number = len(noise)
     held = int(np.diff(voxels.starts)[label >= 0].sum())
     who, distance = np.empty(held, np.int32), np.empty(held)
     stride = 1 + held // SAMPLES
@@ -328,8 +372,9 @@ def tolerances(
         1.4826 * float(np.median(part)) if len(part) else 0.0
         for part in np.split(distance[order], ends)
     ][:number]
-    limit = TOLERANCE_SIGMAS * np.array(sigma) + TOLERANCE_VOXELS * size_m
-    result: Array = np.minimum(limit, MOST_TOLERANCE_VOXELS * size_m)
+    own = TOLERANCE_SIGMAS * np.array(sigma) + TOLERANCE_VOXELS * size_m
+    most = np.maximum(MOST_TOLERANCE_VOXELS * size_m, TOLERANCE_SIGMAS * noise)
+    result: Array = np.minimum(np.maximum(own, NOISE_SIGMAS * noise), most)
     return result
 
 
@@ -343,41 +388,3 @@ def free_surfels(
     thickness = min(FLAT_VOXELS * size_m, 8.0 / TOLERANCE_SIGMAS * tolerance_m)
     classify_free(voxels.points, voxels.starts, owner, thickness, count, flat, mean, normal)
     return count, flat, mean, normal
-
-
-def coplanar(moments: Array, contacts: npt.NDArray[np.int32], tolerance_m: float) -> Indices:
-    """Return for each patch the one that it is merged with, (K,), from pairs in contact."""
-    root = np.arange(len(moments))
-    limit = math.cos(math.radians(MERGE_ANGLE_DEG))
-    pairs = np.argwhere(np.triu(contacts) > 0)
-    pairs = pairs[np.argsort(-moments[pairs, 0].min(axis=1), kind='stable')]
-    frames, moments = [plane_of(row) for row in moments], moments.copy()
-    for i, j in pairs.tolist():
-        a, b = int(root[i]), int(root[j])
-        if a == b or abs(frames[a][0] @ frames[b][0]) < limit:
-            continue
-        together = moments[a] + moments[b]
-        plane = plane_of(together)
-        apart = max(frames[a][1], frames[b][1], tolerance_m / TOLERANCE_SIGMAS)
-        if plane[1] < MERGE_GROWTH * apart:
-            keep, gone = (a, b) if moments[a, 0] >= moments[b, 0] else (b, a)
-            root[root == gone] = keep
-            moments[keep], frames[keep] = together, plane
-    return root
-
-
-def owner_moments(means: Array, owners: Owners, number: int) -> Array:
-    """Return 1, x, y, z, xx, xy, xz, yy, yz, zz of the means of each patch, (K, 10)."""
-    xyz = means - means[0] if len(means) else means  # squares about a distant origin lose digits
-    terms = [np.ones(len(xyz)), *xyz.T]
-    terms += [xyz[:, i] * xyz[:, j] for i in range(3) for j in range(i, 3)]
-    return np.stack([np.bincount(owners, term, number) for term in terms], axis=1)
-
-
-def plane_of(moments: Array) -> tuple[Array, float]:
-    """Return normal and root mean square distance of the plane of moments (10,)."""
-    number = max(float(moments[0]), 1.0)
-    mean = moments[1:4] / number
-    scatter = moments[[4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(3, 3) / number - np.outer(mean, mean)
-    values, vectors = np.linalg.eigh(scatter)
-    return vectors[:, 0], math.sqrt(max(float(values[0]), 0.0))

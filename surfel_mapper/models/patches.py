@@ -33,8 +33,11 @@ SURFACE_PITCH_VOXELS = 3.0
 MARGIN_VOXELS = 0.5
 """Distance between a cut and the points."""
 
-FAR_VOXELS, FAR_SHARE = 1.5, 0.05
-"""A surface is multi-valued if a larger share of its points is farther than FAR_VOXELS."""
+FAR_VOXELS, FAR_THICKNESS, FAR_SHARE = 1.5, 0.35, 0.05
+"""
+A surface is multi-valued if a larger share of its points is farther, in voxels and in thicknesses
+of a plane, which follow the noise.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,6 +54,8 @@ class PatchPoints:
         Mean normals.
     thickness : (K,) float64, m
         Largest thickness, 6 sigma, of a plane.
+    curved : (K,) bool, optional
+        Which are surfaces; if omitted, thickness decides.
 
     """
 
@@ -58,6 +63,7 @@ class PatchPoints:
     starts: Indices
     normals: Array
     thickness: Array
+    curved: npt.NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +103,10 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     a = config.voxel_size_m
     means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
     covariances, curved = np.empty((number, 3, 3)), np.empty(number, np.bool_)
-    rules = (groups.thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
+    thickness = groups.thickness
+    if groups.curved is not None:
+        thickness = np.where(groups.curved, 0.0, np.inf)
+    rules = (thickness, SURFACE_PITCH_VOXELS * a, not by_paper, not by_paper)
     describe_patches(
         groups.points,
         groups.starts,
@@ -125,7 +134,8 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
             rms_m=rms_across(covariances[k], frames[k, 2], len(points)),
             grid=cells.grid(k),
         )
-        found.append(surface_of(plane, cells, points, config) if curved[k] else plane)
+        far_m = max(FAR_VOXELS * a, FAR_THICKNESS * float(groups.thickness[k]))
+        found.append(surface_of(plane, cells, points, config, far_m) if curved[k] else plane)
     return found
 
 
@@ -166,7 +176,9 @@ def cells_of(
     return cells
 
 
-def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) -> Surface | None:
+def surface_of(
+    plane: Plane, cells: Cells, points: Array, config: ModelsConfig, far_m: float
+) -> Surface | None:
     """Return the surface of (n, 3) points in a frame; None if it is multi-valued."""
     sums = cells.sums[cells.of(plane.id)]
     used = sums[:, 3] > 0.0
@@ -177,7 +189,7 @@ def surface_of(plane: Plane, cells: Cells, points: Array, config: ModelsConfig) 
     start = initial_field(grid.pitch_m, grid.origin, heights, grid.filled, config.degree)
     spline = fitted(start, means[used], sums[used, 3], config)
     error = points[:, 2] - spline.heights(points[:, :2])
-    if np.mean(np.abs(error) > FAR_VOXELS * config.voxel_size_m) > FAR_SHARE:
+    if np.mean(np.abs(error) > far_m) > FAR_SHARE:
         return None
     return Surface(
         id=plane.id,

@@ -28,7 +28,7 @@ def test_a_cloud_becomes_models_and_a_picture(tmp_path, capsys):
     arguments = [str(tmp_path / 'room.ply'), '--output', str(tmp_path / 'out'), *place]
     assert main(['extract', *arguments, '--json']) == 0
     found = json.loads(capsys.readouterr().out)
-    assert found['planes'] >= 6
+    assert found['planes'] >= 5
     assert found['surfaces'] >= 2
     assert found['coverage'] > 0.94
     assert all((tmp_path / 'out' / name).stat().st_size > 0 for name in FILES)

@@ -42,6 +42,7 @@ REFERENCES = {
     'models/kernels/charts.py': 'models/kernels/test_charts.py',
     'models/kernels/frames.py': 'models/test_segmentation.py',
     'models/kernels/gaussian_mixture.py': 'models/kernels/test_bisection.py',
+    'models/kernels/joining.py': 'models/kernels/test_joining.py',
     'models/kernels/grid.py': 'models/test_grid.py',
     'models/kernels/growth.py': 'models/kernels/test_growth.py',
     'models/kernels/outlines.py': 'models/test_outlines.py',

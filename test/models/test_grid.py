@@ -13,7 +13,7 @@ from surfel_mapper.models.kernels.grid import fill_cells, find_covered, find_cov
 from test.kernels.modes import compiled, interpreted
 from test.models.scenes import A, room, sheet, VIEW
 
-PITCH = 4 * A
+PITCH = 3 * A
 
 
 def shape(inside, size=2.0):

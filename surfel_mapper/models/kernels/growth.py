@@ -9,10 +9,10 @@ Then each point takes the nearest of the candidates of its voxel, so a voxel at 
 between its faces. Facets too small for recursive bisection are grown from the densest flat voxels
 of the free points that are left.
 
-Voxels, points, starts, keys, to_y, to_z and first are those of voxel_points.py. A plane is four
+Points, starts and adjacent (the neighbours) are those of voxel_points.py. A plane is four
 numbers: unit normal and offset, with distance normal . p + offset.
 
-One module of 380 lines: both kinds of growth share the test of a point against a patch.
+One module of 360 lines: both kinds of growth share the test of a point against a patch.
 
 Source: Besl and Jain 1988 (region growing from seeds).
 """
@@ -23,7 +23,6 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.symmetric3 import eigen_frame
-from surfel_mapper.models.kernels.voxel_points import neighbours_of
 
 SLOTS = 4
 """Candidates of a voxel, at most: three faces meet in a corner."""
@@ -69,11 +68,12 @@ def sample_distances(points, starts, label, tangent, stride, patch, distance):
     for v in range(len(label)):
         if label[v] < 0:
             continue
-        for i in range(starts[v], starts[v + 1]):
-            if skip == 0:
-                patch[num], distance[num] = label[v], plane_distance(points, i, tangent[v])
-                num += 1
-            skip = (skip + 1) % stride
+        i, end = starts[v] + skip, starts[v + 1]
+        while i < end:
+            patch[num], distance[num] = label[v], plane_distance(points, i, tangent[v])
+            num += 1
+            i += stride
+        skip = i - end
     return num
 
 
@@ -138,12 +138,12 @@ def eigen_moments(sums, scatter, value, axes):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def grow_patches(
-    points, starts, voxels, label, tangent, tolerance, free, candidate, candidate_plane
+    points, starts, adjacent, label, tangent, tolerance, free, candidate, candidate_plane
 ):
     """
     Find the candidates of voxels by growing all patches together, breadth first.
 
-    voxels           keys (V,) int64, to_y, to_z, first (V, 9) int64
+    adjacent         starts and rows of neighbour_table
     label            (V,) int32, patch of each voxel, -1 for none
     tangent          (V, 4) float64, plane of the patch there
     tolerance        (K,) float64, m, of each patch
@@ -152,10 +152,10 @@ def grow_patches(
     candidate        (V, SLOTS) int32, all -1; out
     candidate_plane  (V, SLOTS, 4) float64, out
     """
-    keys, to_y, to_z, first = voxels
+    first, rows = adjacent
     flat, normal, least_cosine = free
     queue = np.empty((len(label) * (SLOTS + 1), 2), np.int32)
-    near, plane, head, tail = np.empty(26, np.int64), np.empty(4), 0, 0
+    plane, head, tail = np.empty(4), 0, 0
     for v in range(len(label)):
         if label[v] >= 0:
             queue[tail, 0], queue[tail, 1] = v, -1
@@ -165,8 +165,8 @@ def grow_patches(
         head += 1
         patch = label[u] if slot < 0 else candidate[u, slot]
         plane[:] = tangent[u] if slot < 0 else candidate_plane[u, slot]
-        for k in range(neighbours_of(u, keys, to_y, to_z, first, near)):
-            v = near[k]
+        for k in range(first[u], first[u + 1]):
+            v = rows[k]
             place = -1 if label[v] == patch else slot_of(candidate[v], patch)
             if place < 0:
                 continue
@@ -226,11 +226,11 @@ def assign_points(points, starts, label, tangent, tolerance, candidate, candidat
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def find_facets(points, starts, voxels, free, rules, owner, planes, num_planes):
+def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes):
     """
     Grow facets from flat voxels of free points, the densest first; return the number of planes.
 
-    voxels      of grow_patches
+    adjacent    of grow_patches
     free        count (V,), flat (V,), mean (V, 3), normal (V, 3) of classify_free; count and flat
                 are consumed
     rules       tolerance m; least voxels; least points; least cosine of the normals of a flat
@@ -258,7 +258,7 @@ def find_facets(points, starts, voxels, free, rules, owner, planes, num_planes):
             size = grow_facet(
                 points,
                 starts,
-                voxels,
+                adjacent,
                 free,
                 rules,
                 owner,
@@ -306,22 +306,22 @@ def set_plane(normal, point, plane):
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def grow_facet(
-    points, starts, voxels, free, rules, owner, seed, adapts, plane, sums, visited, region, mark
+    points, starts, adjacent, free, rules, owner, seed, adapts, plane, sums, visited, region, mark
 ):
     """
     Grow one facet from a voxel; return the number of its voxels.
 
-    voxels ... owner  of find_facets
+    adjacent ... owner  of find_facets
     adapts            whether the plane is refitted whenever the points have doubled
     plane             (4,) float64, in place
     sums              (10,) float64, out: moments of the points, about the mean of the seed
     visited           (V,) int32: mark for voxels that were tested
     region            (V,) int64, out
     """
-    keys, to_y, to_z, first = voxels
+    first, rows = adjacent
     count, flat, mean, normal = free
     tolerance, _, _, least_cosine, _ = rules
-    near, centre = np.empty(26, np.int64), np.empty(3)
+    centre = np.empty(3)
     scatter, value, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
     sums[:] = 0.0
     region[0], visited[seed] = seed, mark
@@ -341,8 +341,8 @@ def grow_facet(
                 for j in range(3):
                     centre[j] = mean[seed, j] + sums[1 + j] / sums[0]
                 set_plane(axes[0], centre, plane)
-        for k in range(neighbours_of(u, keys, to_y, to_z, first, near)):
-            v = near[k]
+        for k in range(first[u], first[u + 1]):
+            v = rows[k]
             if visited[v] == mark or count[v] == 0:
                 continue
             visited[v] = mark
@@ -355,25 +355,3 @@ def grow_facet(
                 region[size] = v
                 size += 1
     return size
-
-
-@njit(cache=True, nogil=True)
-def count_contacts(starts, voxels, owner, contacts):
-    """
-    Count the pairs of neighbouring voxels whose first points belong to two patches.
-
-    voxels    of grow_patches
-    owner     (P,) int32
-    contacts  (K, K) int32, zeros; out, symmetric
-    """
-    keys, to_y, to_z, first = voxels
-    near = np.empty(26, np.int64)
-    for u in range(len(keys)):
-        one = owner[starts[u]]
-        if one < 0:
-            continue
-        for k in range(neighbours_of(u, keys, to_y, to_z, first, near)):
-            other = owner[starts[near[k]]]
-            if other >= 0 and other != one:
-                contacts[one, other] += 1
-                contacts[other, one] += 1

@@ -1,0 +1,288 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Which patches touch, and how well planes, quadrics and quartics fit their points.
+
+Points are the means by voxel and owner; those of patch k are rows starts[k] to starts[k + 1] - 1.
+"""
+
+import math
+
+from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.symmetric3 import eigen_frame
+
+TERMS = np.array([3, 6, 15])
+"""Coefficients of a plane, a quadric and a quartic height field."""
+
+RIDGE = 1e-10
+"""Added to the normal equations of coordinates in [-1, 1], for points in one line."""
+
+
+@njit(cache=True, nogil=True)
+def sort_owners(first, owners, means, counts, least, out):
+    """
+    Sort the means by owner, stably.
+
+    first, owners, means, counts  (V + 1,) int64, (M,) int32, (M, 3), (M,) float64
+    least                         least owner; those below are left out
+    out                           starts (owners + 1,) int64, then voxel, means and counts sorted
+    """
+    starts, to_voxel, to_mean, to_count = out
+    starts[:] = 0
+    for owner in owners:
+        if owner >= least:
+            starts[owner - least + 1] += 1
+    for k in range(len(starts) - 1):
+        starts[k + 1] += starts[k]
+    place = starts[:-1].copy()
+    for v in range(len(first) - 1):
+        for i in range(first[v], first[v + 1]):
+            if owners[i] < least:
+                continue
+            row = place[owners[i] - least]
+            place[owners[i] - least] += 1
+            to_voxel[row], to_count[row] = v, counts[i]
+            for j in range(3):
+                to_mean[row, j] = means[i, j]
+
+
+@njit(cache=True, nogil=True)
+def touching_patches(starts, voxel, adjacent, first, owners, pairs):
+    """
+    Count the voxels of each patch that touch another one; return how many pairs there are.
+
+    starts    (K + 1,) int64, voxel (P,) int32: voxels of each patch
+    adjacent  starts and rows of neighbour_table
+    first     (V + 1,) int64, owners (M,) int32: owners of the points of each voxel
+    pairs     (R, 3) int64, out: patch, other patch, voxels of the patch that contain points of the
+            other one or are neighbours of such voxels; rows beyond R are counted only
+    """
+    low, rows = adjacent
+    number, num = len(starts) - 1, 0
+    marked, count = np.full(number, -1, np.int64), np.zeros(number, np.int64)
+    found = np.empty(number, np.int64)
+    for k in range(number):
+        num_found = 0
+        for i in range(starts[k], starts[k + 1]):
+            own = voxel[i]
+            for n in range(low[own] - 1, low[own + 1]):
+                v = rows[n] if n >= low[own] else own
+                for m in range(first[v], first[v + 1]):
+                    other = owners[m]
+                    if other < 0 or other == k or marked[other] == i:
+                        continue
+                    marked[other] = i
+                    if count[other] == 0:
+                        found[num_found] = other
+                        num_found += 1
+                    count[other] += 1
+        for n in range(num_found):
+            if num < len(pairs):
+                pairs[num, 0], pairs[num, 1], pairs[num, 2] = k, found[n], count[found[n]]
+            count[found[n]] = 0
+            num += 1
+    return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def height_errors(points, weights, rows, normal, errors):
+    """
+    Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.
+
+    points   (N, 3), weights (N,) float64
+    rows     (n,) int64, of the points that are used
+    normal   (3,) float64, of the plane
+    errors   (3,) float64, out: weighted mean squares of the residuals, m^2
+
+    The Cholesky factor of the largest system contains those of the others, so one pass is enough.
+    The turn is that of the normals of the quadric, for a strip of constant curvature the angle
+    between its ends.
+    """
+    number = len(rows)
+    local, share = np.empty((number, 3)), np.empty(number)
+    scale = local_points(points, weights, rows, normal, local, share)
+    quadric, terms = np.empty(TERMS[1]), np.empty(TERMS[2])
+    solve_heights(local, share, quadric)
+    turn = turn_of(local, quadric, share)
+    left = solve_heights(local, share, terms)
+    done = 0
+    for d in range(3):
+        for p in range(done, TERMS[d]):
+            left -= terms[p] * terms[p]
+        done = TERMS[d]
+        errors[d] = max(left, 0.0) * scale * scale
+    return turn
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def local_points(points, weights, rows, normal, local, share):
+    """
+    Compute points over a plane, in [-1, 1]; return the factor to m.
+
+    local  (n, 3) float64, out
+    share  (n,) float64, out: weights, sum 1
+    """
+    mean, x_axis, y_axis = np.zeros(3), np.empty(3), np.empty(3)
+    tangential_axes(normal, x_axis, y_axis)
+    total, scale = 0.0, 1e-12
+    for i in rows:
+        total += weights[i]
+        for j in range(3):
+            mean[j] += weights[i] * points[i, j]
+    for n in range(len(rows)):
+        i = rows[n]
+        share[n] = weights[i] / total
+        u = points[i, 0] - mean[0] / total
+        v = points[i, 1] - mean[1] / total
+        w = points[i, 2] - mean[2] / total
+        local[n, 0] = u * x_axis[0] + v * x_axis[1] + w * x_axis[2]
+        local[n, 1] = u * y_axis[0] + v * y_axis[1] + w * y_axis[2]
+        local[n, 2] = u * normal[0] + v * normal[1] + w * normal[2]
+        scale = max(scale, abs(local[n, 0]), abs(local[n, 1]))
+    local /= scale
+    return scale
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def solve_heights(local, share, reduced):
+    """
+    Fit a height field by least squares; return the weighted mean square of the heights.
+
+    reduced  (T,) float64, out: right side of the triangular system; its squares are the parts of
+             the mean square that the terms explain, one after the other. With six terms, the
+             coefficients instead.
+    """
+    size = len(reduced)
+    matrix, basis = np.zeros((size, size)), np.empty(TERMS[2])
+    reduced[:] = 0.0
+    squares = 0.0
+    for n in range(len(local)):
+        monomials(local[n, 0], local[n, 1], basis)
+        z = local[n, 2]
+        squares += share[n] * z * z
+        for p in range(size):
+            part = share[n] * basis[p]
+            reduced[p] += part * z
+            for q in range(p + 1):
+                matrix[p, q] += part * basis[q]
+    for p in range(size):
+        matrix[p, p] += RIDGE
+        for q in range(p + 1):
+            value = matrix[p, q]
+            for m in range(q):
+                value -= matrix[p, m] * matrix[q, m]
+            matrix[p, q] = math.sqrt(max(value, RIDGE)) if p == q else value / matrix[q, q]
+        for m in range(p):
+            reduced[p] -= matrix[p, m] * reduced[m]
+        reduced[p] /= matrix[p, p]
+    if size == TERMS[1]:
+        for p in range(size - 1, -1, -1):
+            for m in range(p + 1, size):
+                reduced[p] -= matrix[m, p] * reduced[m]
+            reduced[p] /= matrix[p, p]
+    return squares
+
+
+@njit(cache=True, nogil=True)
+def monomials(x, y, basis):
+    """Compute the monomials of x and y (15,) by degree."""
+    basis[0], basis[1], basis[2] = 1.0, x, y
+    basis[3], basis[4], basis[5] = x * x, x * y, y * y
+    for p in range(3):
+        basis[6 + p] = x * basis[3 + p]
+    basis[9] = y * basis[5]
+    for p in range(4):
+        basis[10 + p] = x * basis[6 + p]
+    basis[14] = y * basis[9]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def turn_of(local, terms, share):
+    """
+    Return sqrt(12) times the root mean square angle of a quadric's normals to their mean.
+
+    local  (n, 3) float64; terms (6,) float64, of the quadric
+    share  (n,) float64, in place: multiplied by the squared cosine of the slope, so that heights
+           weigh as much as distances from the surface
+    """
+    number = len(local)
+    normals, mean = np.empty((number, 3)), np.zeros(3)
+    for n in range(number):
+        x, y = local[n, 0], local[n, 1]
+        normals[n, 0] = -(terms[1] + 2.0 * terms[3] * x + terms[4] * y)
+        normals[n, 1] = -(terms[2] + terms[4] * x + 2.0 * terms[5] * y)
+        length = math.sqrt(1.0 + normals[n, 0] ** 2 + normals[n, 1] ** 2)
+        normals[n, 0] /= length
+        normals[n, 1] /= length
+        normals[n, 2] = 1.0 / length
+        share[n] /= length * length
+        for j in range(3):
+            mean[j] += normals[n, j] / number
+    squares = 0.0
+    for n in range(number):
+        for j in range(3):
+            squares += (normals[n, j] - mean[j]) ** 2 / number
+    return math.sqrt(12.0 * squares)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def tangential_axes(normal, x_axis, y_axis):
+    """Compute unit vectors orthogonal to a unit normal and to each other."""
+    least = 0
+    for j in range(1, 3):
+        if abs(normal[j]) < abs(normal[least]):
+            least = j
+    length = math.sqrt(1.0 - normal[least] ** 2)
+    for j in range(3):
+        x_axis[j] = ((1.0 if j == least else 0.0) - normal[least] * normal[j]) / length
+    for j in range(3):
+        a, b = (j + 1) % 3, (j + 2) % 3
+        y_axis[j] = normal[a] * x_axis[b] - normal[b] * x_axis[a]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def plane_frames(points, weights, starts, means, normals, values):
+    """
+    Compute weighted mean (K, 3), normal (K, 3) and eigenvalues (K, 3) of every patch; 0 if empty.
+
+    points, weights, starts  see above
+    """
+    scatter, value, axes = np.empty((3, 3)), np.empty(3), np.empty((3, 3))
+    for k in range(len(starts) - 1):
+        total, mean = 0.0, np.zeros(3)
+        means[k], normals[k], values[k] = 0.0, 0.0, 0.0
+        if starts[k] == starts[k + 1]:
+            continue
+        for i in range(starts[k], starts[k + 1]):
+            total += weights[i]
+            for j in range(3):
+                mean[j] += weights[i] * points[i, j]
+        for j in range(3):
+            means[k, j] = mean[j] / total
+        scatter[:] = 0.0
+        for i in range(starts[k], starts[k + 1]):
+            for a in range(3):
+                for b in range(a + 1):
+                    scatter[a, b] += (
+                        weights[i] * (points[i, a] - means[k, a]) * (points[i, b] - means[k, b])
+                    )
+        for a in range(3):
+            for b in range(a + 1):
+                scatter[a, b] /= total
+                scatter[b, a] = scatter[a, b]
+        eigen_frame(scatter, value, axes)
+        normals[k], values[k] = axes[0], value
+
+
+@njit(cache=True, nogil=True)
+def rename_owners(starts, group, index, owner):
+    """
+    Rename patch k to index[k] (K,) in owners (P,) int32; free ones become -1 - their group (V,).
+
+    starts  (V + 1,) int64, first owner of each voxel
+    """
+    for v in range(len(starts) - 1):
+        for i in range(starts[v], starts[v + 1]):
+            owner[i] = index[owner[i]] if owner[i] >= 0 else -1 - group[v]
