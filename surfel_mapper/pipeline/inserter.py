@@ -166,16 +166,17 @@ class Inserter:
         return [partial(self.preparation.warm_up, config), *before, self.layers.warm_up], later
 
     def reduces_ahead(self, config: Config) -> bool:
-        """Return whether another thread reduces a scan while the one before is inserted."""
+        """Return whether another thread prepares a scan while the one before is inserted."""
         return (
             self._reduction.has_thread
             and config.map.mode != 'frozen'
-            and self.preparation.is_trivial(config)
+            and self.preparation.runs_ahead()
         )
 
     def begin(self, scan: Scan, pose: Transform, config: Config) -> None:
-        """Begin to reduce the scan that is inserted next, in another thread."""
-        self._reduction.begin(scan, self.aligner.to_map(pose), config)
+        """Begin to prepare and reduce the scan that is inserted next, in another thread."""
+        place = self.aligner.to_map(pose)
+        self._reduction.begin(scan, place, config, self.preparation.ahead)
 
     def insert(
         self,
@@ -196,11 +197,13 @@ class Inserter:
         config : Config
             All settings.
         following : Scan and pose, optional
-            The next scan, which another thread begins to reduce; only if ``reduces_ahead``.
+            The next scan, which another thread begins to prepare; only if ``reduces_ahead``.
 
         """
         laps = Laps()
-        found = self.preparation.prepare(scan, self.aligner.to_map(pose), config, laps)
+        place = self.aligner.to_map(pose)
+        begun = self._reduction.begun(scan, place, config)
+        found = self.preparation.prepare(scan, place, config, laps, begun)
         if not found and len(laps.milliseconds) > 1:
             self._drops.counters.add_times(laps.milliseconds)
         for prepared in found:

@@ -8,6 +8,7 @@ A scan that the motion gate, the filters or the registration leave out is counte
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import astuple, replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.local_map import LocalMap
-from surfel_mapper.pipeline.prepared import Prepared
+from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -81,15 +82,31 @@ class Preparation:
         self._drops = drops
         self.chain = Chain.load(config.filters) if config.filters else Chain()
 
-    def is_trivial(self, config: Config) -> bool:
-        """Return whether scans are mapped as they came, at the poses that came."""
-        return not (
-            self.chain.filters
-            or config.deskew.enabled
-            or self._needs_free_rays
-            or self._images is not None
-            or self._poses.registered is not None
+    def runs_ahead(self) -> bool:
+        """Return whether a scan can be prepared before the one before it is mapped."""
+        return (
+            all(each.is_repeatable for each in self.chain.filters)
+            and not self._needs_free_rays
+            and self._images is None
+            and self._poses.registered is None
         )
+
+    def ahead(self, scan: Scan, pose: Transform) -> Callable[[], FilteredScan]:
+        """
+        Look up the poses that a scan needs; return the function that deskews and filters it.
+
+        The function reads nothing that the mapping changes, so another thread may call it.
+        """
+        deskewing = None if scan.times is None else self._poses.deskewing(scan, scan.times)
+        chain = self.chain
+        T_base_sensor = self._poses.of_base(scan) if chain.filters else None
+
+        def prepare() -> FilteredScan:
+            return filtered_scan(
+                scan if deskewing is None else deskewing(), pose, chain, T_base_sensor
+            )
+
+        return prepare
 
     def load_filters(self, path: str) -> None:
         """
@@ -114,7 +131,14 @@ class Preparation:
         if self._poses.registered is not None:
             self._poses.registered.warm_up()
 
-    def prepare(self, scan: Scan, pose: Transform, config: Config, laps: Laps) -> list[Prepared]:
+    def prepare(
+        self,
+        scan: Scan,
+        pose: Transform,
+        config: Config,
+        laps: Laps,
+        begun: Callable[[], FilteredScan] | None = None,
+    ) -> list[Prepared]:
         """
         Deskew, filter and register a scan; return the scans that can be mapped now.
 
@@ -131,27 +155,25 @@ class Preparation:
             All settings.
         laps : Laps
             Takes the time of each stage.
+        begun : callable, optional
+            Returns what another thread has done by ``ahead``, and raises its errors.
 
         """
         if self._poses.registered is None and self._is_gated(pose, config.window):
             return []
         times = scan.times
-        if times is not None:
-            scan = self._poses.deskewed(scan, times)
-            laps.end('deskew')
-        if self._needs_free_rays and scan.free is None:
-            scan = replace(scan, free=free_directions(scan))
-        if self._images is not None:
-            scan = self._with_images(scan, self._images)
-        if self._needs_free_rays or self._images is not None:
-            laps.end('images')
-        filtered: Scan | None = scan
-        if self.chain.filters:
-            filtered = self._filter(scan, pose)
-            laps.end('filter')
-        if filtered is None:
+        try:
+            found = self._filtered(scan, pose, laps) if begun is None else begun()
+        except FilterError as error:
+            self._drops.scan(scan, 'filter', str(error))
             return []
-        prepared = Prepared(scan, filtered, pose)
+        if self.chain.filters:
+            laps.end('filter')
+        elif begun is not None and times is not None:
+            laps.end('deskew')
+        if not self._count_filtered(found):
+            return []
+        prepared = Prepared(found.scan, found.filtered, pose)
         if self._poses.registered is None:
             return [prepared]
         registered = self._register(self._poses.registered, prepared, times)
@@ -159,6 +181,32 @@ class Preparation:
         if len(registered) > 1:  # those that have waited: the gate would compare them with one
             return registered
         return [p for p in registered if not self._is_gated(p.T_map_sensor, config.window)]
+
+    def _filtered(self, scan: Scan, pose: Transform, laps: Laps) -> FilteredScan:
+        """Return a scan deskewed, joined with images, and filtered; raise FilterError."""
+        if scan.times is not None:
+            scan = self._poses.deskewing(scan, scan.times)()
+            laps.end('deskew')
+        if self._needs_free_rays and scan.free is None:
+            scan = replace(scan, free=free_directions(scan))
+        if self._images is not None:
+            scan = self._with_images(scan, self._images)
+        if self._needs_free_rays or self._images is not None:
+            laps.end('images')
+        T_base_sensor = self._poses.of_base(scan) if self.chain.filters else None
+        return filtered_scan(scan, pose, self.chain, T_base_sensor)
+
+    def _count_filtered(self, found: FilteredScan) -> bool:
+        """Count what the filters did; return whether points are left."""
+        scan, filtered = found.scan, found.filtered
+        for step in found.steps:
+            self._drops.counters.add_filter(*astuple(step))
+        if not found.steps:
+            return True
+        self._drops.counters.points_left_out['filtered'] += len(scan) - len(filtered)
+        if not len(filtered):
+            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
+        return len(filtered) > 0
 
     def _register(
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None
@@ -210,23 +258,25 @@ class Preparation:
         self._drops.counters.gated += 1
         return True
 
-    def _filter(self, scan: Scan, pose: Transform) -> Scan | None:
-        """Return a scan after the filters; None if no point is left, or a filter cannot work."""
-        T_base_sensor = self._poses.of_base(scan)  # None is refused by the filters that need it
-        try:
-            filtered, steps = self.chain.run(
-                replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose)
-            )
-        except FilterError as error:
-            self._drops.scan(scan, 'filter', str(error))
-            return None
-        for step in steps:
-            self._drops.counters.add_filter(*astuple(step))
-        self._drops.counters.points_left_out['filtered'] += len(scan) - len(filtered)
-        if not len(filtered):
-            self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
-            return None
-        return filtered
+
+def filtered_scan(
+    scan: Scan, pose: Transform, chain: Chain, T_base_sensor: Transform | None
+) -> FilteredScan:
+    """
+    Return a deskewed scan filtered.
+
+    Filters that need the pose on the robot refuse None.
+
+    Raises
+    ------
+    FilterError
+        If a filter cannot work.
+
+    """
+    if not chain.filters:
+        return FilteredScan(scan, scan)
+    filtered, steps = chain.run(replace(scan, T_base_sensor=T_base_sensor, T_map_sensor=pose))
+    return FilteredScan(scan, filtered, steps)
 
 
 def stands_still(T_map_last: Transform, T_map_sensor: Transform, gate: WindowConfig) -> bool:

@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Prepared: a scan that is ready for the map.
+Prepared: a scan that is ready for the map; FilteredScan: one whose place is not settled yet.
 
-Alone because preparation, registration and insertion hand it on.
+Alone because preparation, registration, reduction and insertion hand them on.
 """
 
 from __future__ import annotations
@@ -11,8 +11,30 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from surfel_mapper.alignment.registration import RegistrationResult
+from surfel_mapper.filters.chain import Step
 from surfel_mapper.geometry import Transform
 from surfel_mapper.scan import Scan
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FilteredScan:
+    """
+    A scan before and after the filters.
+
+    Attributes
+    ----------
+    scan : Scan
+        Deskewed, before the filters.
+    filtered : Scan
+        After the filters; the same if there are none.
+    steps : tuple of Step
+        What each filter did.
+
+    """
+
+    scan: Scan
+    filtered: Scan
+    steps: tuple[Step, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

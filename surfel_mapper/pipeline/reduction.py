@@ -3,9 +3,9 @@
 """
 Reduction of scans to the exact moments that enter the map and the window, and that leave it.
 
-With ``map.threads`` another thread reduces the next scan while the map takes the one before it.
-Reduction reads nothing of the map, so the order changes no bit. A reduction that was begun is
-used only for the same scan at the same pose; otherwise it is done again.
+With ``map.threads`` another thread deskews, filters and reduces the next scan while the map takes
+the one before it. None of these reads anything of the map, so the order changes no bit. Work that
+was begun is used only for the same scan at the same pose; otherwise it is done again.
 """
 
 from __future__ import annotations
@@ -26,19 +26,27 @@ from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import NARROW_COUNT, within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
 
 Step = Callable[[], object]
 
 
+class Ahead(NamedTuple):
+    """Result of the other thread: the points of a scan, and their moments or the error."""
+
+    points: FilteredScan
+    windowed: WindowedScan | Exception
+
+
 class Begun(NamedTuple):
-    """A scan that another thread reduces, and the arguments of the reduction."""
+    """A scan that another thread prepares and reduces, and the arguments of both."""
 
     scan: Scan
     T_map_sensor: Transform
     config: Config
-    result: Future[WindowedScan]
+    result: Future[Ahead]
 
     def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
         """Return whether a scan is this one, at the same pose and with the same settings."""
@@ -70,18 +78,43 @@ class Reduction:
         self.has_thread = self._pool is not None
         self._begun: Begun | None = None
 
-    def begin(self, scan: Scan, T_map_sensor: Transform, config: Config) -> None:
-        """Begin to reduce a scan in the other thread, unless that was begun before."""
+    def begin(
+        self,
+        scan: Scan,
+        T_map_sensor: Transform,
+        config: Config,
+        prepare: Callable[[Scan, Transform], Callable[[], FilteredScan]],
+    ) -> None:
+        """
+        Begin to prepare and reduce a scan in the other thread, unless that was begun before.
+
+        ``prepare`` is called here, and what it returns in the other thread.
+        """
         if self._pool is None:
             return
         if self._begun is not None and self._begun.is_of(scan, T_map_sensor, config):
             return
-        result = self._pool.submit(reduced, scan, T_map_sensor, self._map, config)
+        work = prepare(scan, T_map_sensor)
+        result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
         self._begun = Begun(scan, T_map_sensor, config, result)
+
+    def begun(
+        self, scan: Scan, T_map_sensor: Transform, config: Config
+    ) -> Callable[[], FilteredScan] | None:
+        """
+        Return a function that waits for the points of a scan that was begun, or None.
+
+        Work that was begun for another scan, pose or settings is forgotten.
+        """
+        begun = self._begun
+        if begun is None or not begun.is_of(scan, T_map_sensor, config):
+            self._begun = None
+            return None
+        return lambda: begun.result.result().points
 
     def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
         """
-        Return a scan as its moments at a pose; see ``reduced``.
+        Return a prepared scan as its moments at a pose; see ``reduced``.
 
         Raises
         ------
@@ -90,9 +123,27 @@ class Reduction:
 
         """
         begun, self._begun = self._begun, None
-        if begun is not None and begun.is_of(scan, T_map_sensor, config):
-            return begun.result.result()
+        if begun is not None:
+            ahead = begun.result.result()
+            if ahead.points.filtered is scan:
+                if isinstance(ahead.windowed, Exception):
+                    raise ahead.windowed
+                return ahead.windowed
         return reduced(scan, T_map_sensor, self._map, config)
+
+
+def run_ahead(
+    work: Callable[[], FilteredScan],
+    T_map_sensor: Transform,
+    surfel_map: SurfelMap,
+    config: Config,
+) -> Ahead:
+    """Prepare and reduce a scan; errors of reduction wait until its moments are asked for."""
+    points = work()
+    try:
+        return Ahead(points, reduced(points.filtered, T_map_sensor, surfel_map, config))
+    except Exception as error:
+        return Ahead(points, error)
 
 
 def reduced(

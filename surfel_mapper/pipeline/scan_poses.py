@@ -10,6 +10,7 @@ lookups need only the tree of frames.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 import math
 from typing import Any
@@ -22,7 +23,7 @@ from surfel_mapper.pipeline.map_origin import MapOrigin
 from surfel_mapper.pipeline.registered_poses import RegisteredPoses
 from surfel_mapper.poses import MAX_EDGES, MAX_TRANSFORMS, TransformBuffer
 from surfel_mapper.scan import PointTimes, Scan
-from surfel_mapper.sensors.deskew import deskewed
+from surfel_mapper.sensors.deskew import deskewing
 
 MAX_EARLY = 100
 """Number of poses of the fixed frame itself that wait until ``map.origin: auto`` is known."""
@@ -145,12 +146,12 @@ class ScanPoses:
             self._at(scan.frame_id, scan.times.last_ns)
         return pose
 
-    def deskewed(self, scan: Scan, times: PointTimes) -> Scan:
-        """Return a scan with all points in the sensor frame at its stamp."""
+    def deskewing(self, scan: Scan, times: PointTimes) -> Callable[[], Scan]:
+        """Look up the poses within a sweep; return the function that deskews the scan."""
         fixed, sensor = self._config.frames.fixed, scan.frame_id
         stamps = self.transforms.stamps(fixed, sensor, times.first_ns, times.last_ns)
         min_range_m = self._config.input.min_range_m
-        return deskewed(scan, partial(self._at, sensor), stamps, min_range_m)
+        return deskewing(scan, partial(self._at, sensor), stamps, min_range_m)
 
     def of_base(self, scan: Scan) -> Transform | None:
         """Return T_base_sensor at the stamp of a scan; None if unknown."""

@@ -123,23 +123,39 @@ def deskewed(
         The points in the same order, (N, 3) float64, all at the stamp.
 
     """
+    return deskewing(scan, pose_at, stamps_ns, min_range_m)()
+
+
+def deskewing(
+    scan: Scan,
+    pose_at: Callable[[int], Transform],
+    stamps_ns: Iterable[int] = (),
+    min_range_m: float = 0.0,
+) -> Callable[[], Scan]:
+    """Look up all poses that ``deskewed`` needs; return the rest of it, for another thread."""
     times = scan.times
     assert times is not None, 'point_times comes before'
     stamps = [s for s in stamps_ns if times.first_ns < s < times.last_ns]
     ends = sorted({times.first_ns, *stamps, times.last_ns})
     knots, poses = _track(ends, pose_at)
     to_stamp = inverse(pose_at(scan.stamp_ns))
-    moved = np.empty((len(scan), 3), order='F')
-    move_points(
-        np.require(scan.points, None, ['F', 'A', 'W']),
-        times.offsets,
-        np.array(knots) - scan.stamp_ns,
-        np.ascontiguousarray([compose(to_stamp, pose)[:3] for pose in poses]),
-        np.array([*map(_turn, poses, poses[1:]), np.zeros(3)]),
-        min_range_m * min_range_m,
-        moved,
-    )
-    return replace(scan, points=moved, times=None)
+    transforms = np.ascontiguousarray([compose(to_stamp, pose)[:3] for pose in poses])
+    turns = np.array([*map(_turn, poses, poses[1:]), np.zeros(3)])
+
+    def move() -> Scan:
+        moved = np.empty((len(scan), 3), order='F')
+        move_points(
+            np.require(scan.points, None, ['F', 'A', 'W']).T,
+            times.offsets,
+            np.array(knots) - scan.stamp_ns,
+            transforms,
+            turns,
+            min_range_m * min_range_m,
+            moved.T,
+        )
+        return replace(scan, points=moved, times=None)
+
+    return move
 
 
 def warm_up() -> None:

@@ -33,6 +33,9 @@ LENGTH_M = 600.0
 
 NOISE_M = 0.02
 
+SWEEP_S = 0.05
+"""Time from the first to the last point of a message, s."""
+
 
 class Street:
     """
@@ -78,10 +81,15 @@ class Street:
             self.points(number)
 
     def message(self, number: int) -> RawCloud:
-        """Return a scan as a PointCloud2; columns other than x y z are zero and unread."""
+        """
+        Return a scan as a PointCloud2.
+
+        Intensity and ring are zero and unread; times run to 0 within SWEEP_S, for deskewing.
+        """
         points = self.points(number)
         zeros = np.zeros(len(points), np.float32)
-        columns = {'intensity': zeros, 'ring': zeros, 'time': zeros}
+        times = np.linspace(-SWEEP_S, 0.0, len(points), dtype=np.float32)
+        columns = {'intensity': zeros, 'ring': zeros, 'time': times}
         stamp_ns = self.simulation.stamp_ns(number)
         scan = Scan(points=points, stamp_ns=stamp_ns, frame_id=SENSOR, columns=columns)
         cloud = cloud_bytes(scan, self.simulation.lidar.beams)

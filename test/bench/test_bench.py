@@ -129,7 +129,7 @@ def test_every_bench_of_times_gives_rows_of_figures(options, name, capsys):
 def test_two_threads_are_compared_with_one_on_the_same_scans(options):
     rows = bench.run(['threads'], options)
     assert [(row['voxel_m'], row['way']) for row in rows] == [
-        (size_m, way) for size_m in (0.5, 0.2) for way in ('calls', 'Mapper')
+        (size_m, way) for size_m in (0.5, 0.2) for way in ('calls', 'Mapper', 'prepared')
     ]
     for row in rows:
         assert row['turns'] == (options.untimed + SCANS) // SCANS - options.untimed // SCANS

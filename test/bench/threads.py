@@ -5,15 +5,20 @@ Two threads against one on the same scans, from decode to normals.
 
 ``calls``: one thread decodes and reduces the next scan while the other inserts this one and
 derives its normals. ``Mapper``: the pipeline with ``map.threads`` 2 and more scans waiting, as in
-a replay or a node with a backlog. The two take turns, twenty scans at a time, and every other
-turn in the opposite order; ``ratio`` is the median of the ratios of the turns. The maps are
+a replay or a node with a backlog; ``prepared`` is the same with deskewing and a chain of filters,
+which the other thread does too. Two threads and one take turns, twenty scans at a time, and every
+other turn in the opposite order; ``ratio`` is the median of the ratios of the turns. The maps are
 compared at the end.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+import json
+from pathlib import Path
+import tempfile
 from time import perf_counter
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -27,7 +32,7 @@ from surfel_mapper.threads import pool
 from test.bench.options import Options
 from test.bench.ours import Ours
 from test.bench.report import Row
-from test.bench.street import Street
+from test.bench.street import Street, SWEEP_S
 
 TURN = 20
 
@@ -71,17 +76,20 @@ class ByMapper:
 
     name = 'Mapper'
 
+    chain: ClassVar[list[Mapping[str, Any]]] = []
+
     def __init__(self, street: Street, voxel_size_m: float, window: int, threads: int) -> None:
-        settings = {'voxel_size_m': voxel_size_m, 'min_points': 1, 'threads': threads}
-        self._mapper = Mapper(
-            Config.from_mapping(
-                {
-                    'map': settings,
-                    'window': {'max_scans': window},
-                    'pose': {'source': 'odometry'},
-                }
-            )
-        )
+        settings: dict[str, Any] = {
+            'map': {'voxel_size_m': voxel_size_m, 'min_points': 1, 'threads': threads},
+            'window': {'max_scans': window},
+            'pose': {'source': 'odometry'},
+            'deskew': {'enabled': bool(self.chain)},
+        }
+        with tempfile.TemporaryDirectory() as scratch:
+            path = Path(scratch) / 'chain.yaml'
+            path.write_text(json.dumps(self.chain), encoding='utf-8')
+            filters = str(path) if self.chain else ''
+            self._mapper = Mapper(Config.from_mapping({**settings, 'filters': filters}))
         self.map = self._mapper.map
         self._drive = street.simulation.drive
         mount = self._drive.base_to_sensor
@@ -92,11 +100,23 @@ class ByMapper:
         num = 0
         for left, (_, message) in enumerate(turn, 1 - len(turn)):
             scan = to_scan(message)
-            self._mapper.add_pose(ODOM, BASE, scan.stamp_ns, *self._drive.pose(scan.stamp_ns))
+            for stamp_ns in (scan.stamp_ns - round(SWEEP_S * 1.2e9), scan.stamp_ns):
+                self._mapper.add_pose(ODOM, BASE, stamp_ns, *self._drive.pose(stamp_ns))
             self._mapper.add_scan(scan)
             num += sum(1 for _ in self._mapper.insert_ready(more_follows=left < 0))
         if num != len(turn):
             raise RuntimeError(f'{num} of {len(turn)} scans mapped')
+
+
+class Prepared(ByMapper):
+    """The pipeline with deskewing and filters."""
+
+    name = 'prepared'
+
+    chain: ClassVar[list[Mapping[str, Any]]] = [
+        {'range_limit': {'min_m': 1.0, 'max_m': 80.0}},
+        {'body_box': {'x_min_m': -1.5, 'x_max_m': 1.5, 'y_min_m': -1.0, 'y_max_m': 1.0}},
+    ]
 
 
 def run(options: Options) -> list[Row]:
@@ -106,7 +126,7 @@ def run(options: Options) -> list[Row]:
     return [
         compared(street, options, size_m, way)
         for size_m in options.voxel_sizes_m
-        for way in (ByCalls, ByMapper)
+        for way in (ByCalls, ByMapper, Prepared)
     ]
 
 

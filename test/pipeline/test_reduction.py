@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Two threads: the next scan is reduced while one is inserted, and nothing is different for it.
+Two threads: the next scan is prepared while one is inserted, and nothing is different for it.
 
 A mapper with one thread gets the same input and has to do the same, update by update, whatever
 comes between two scans.
@@ -9,12 +9,15 @@ comes between two scans.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from surfel_mapper.config import Config
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.prepared import FilteredScan
 from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.regions import Ball
 from surfel_mapper.scan import Scan
@@ -45,8 +48,12 @@ def add(mapper, number):
     points = (corner - (x + 3.0, 3.0, 3.0)).astype(np.float32)
     at = rng.normal(scale=0.05, size=3)
     at[0] += x
+    before = (at[0] - 0.05, *at[1:])  # where the sweep begins
+    mapper.add_pose('odom', 'base_link', number * S - S // 5, before, LEVEL)
     mapper.add_pose('odom', 'base_link', number * S, at, LEVEL)
-    mapper.add_scan(Scan(points=points, stamp_ns=number * S, frame_id='lidar'))
+    times = np.linspace(-0.1, 0.0, len(points), dtype=np.float32)
+    columns = {'time': times}
+    mapper.add_scan(Scan(points=points, stamp_ns=number * S, frame_id='lidar', columns=columns))
 
 
 def drive(mapper, first, last):
@@ -71,12 +78,41 @@ def same(found, expected):
 def without_times(mapper):
     summary = mapper.summary()
     timed = ('milliseconds', 'milliseconds_p99', 'stage_s')
+    for step in summary.get('filters', {}).values():
+        del step['milliseconds']
     return {name: value for name, value in summary.items() if name not in timed}
 
 
+CHAIN = """
+- range_limit: {max_m: 4.0}
+- fix_step_sampling: {start_step: 2}
+- statistical_outliers
+- body_box: {x_min_m: -1.0, x_max_m: 3.5, y_min_m: -9.0, y_max_m: 9.0, z_min_m: -9.0}
+- surface_normal: {num_neighbours: 6}
+"""
+
+
+@pytest.fixture
+def settings_of(tmp_path):
+    """Return the settings of a way to prepare scans, by its name."""
+    path = tmp_path / 'chain.yaml'
+    path.write_text(CHAIN)
+    ways = {
+        'as they came': {},
+        'filtered': {'filters': str(path)},
+        'deskewed': {'deskew.enabled': True},
+        'both': {'filters': str(path), 'deskew.enabled': True},
+    }
+    return ways.__getitem__
+
+
+WAYS = pytest.mark.parametrize('way', ['as they came', 'filtered', 'deskewed', 'both'])
+
+
+@WAYS
 @pytest.mark.parametrize('threads', [2, 3])
-def test_every_update_is_that_of_one_thread(threads):
-    one, several = mapper_with(1), mapper_with(threads)
+def test_every_update_is_that_of_one_thread(threads, way, settings_of):
+    one, several = mapper_with(1, **settings_of(way)), mapper_with(threads, **settings_of(way))
     expected, found = drive(one, 1, 12), drive(several, 1, 12)
     assert len(expected) == 11
     assert len(found) == 10  # the newest is kept
@@ -94,6 +130,15 @@ def test_scans_that_wait_together_are_mapped_together():
     assert two.map == one.map
 
 
+def filter_more(mapper):
+    """Double the points that the filters drop; without effect on mappers without filters."""
+    if mapper.config.filters:
+        path = Path(mapper.config.filters).with_name('more.yaml')
+        path.write_text(CHAIN.replace('start_step: 2', 'start_step: 4'))
+        changed = {**mapper.config.to_mapping(), 'filters': str(path)}
+        mapper.reconfigure(Config.from_mapping(changed))
+
+
 def shorten(mapper):
     mapper.reconfigure(Config.from_mapping({**mapper.config.to_mapping(), 'window.max_scans': 2}))
 
@@ -108,9 +153,12 @@ def carve(mapper):
     mapper.clear_region(Ball(np.zeros(3), 2.0))
 
 
-@pytest.mark.parametrize('between', [shorten, gate, carve], ids=lambda act: act.__name__)
-def test_changes_between_two_scans_hold_for_the_scan_that_waits(between):
-    one, two = mapper_with(1), mapper_with(2)
+@WAYS
+@pytest.mark.parametrize(
+    'between', [shorten, gate, carve, filter_more], ids=lambda act: act.__name__
+)
+def test_changes_between_two_scans_hold_for_the_scan_that_waits(between, way, settings_of):
+    one, two = (mapper_with(threads, **settings_of(way)) for threads in (1, 2))
     expected, found = drive(one, 1, 6), drive(two, 1, 7)  # two keeps the sixth
     assert [update.stamp_ns for update in found] == [update.stamp_ns for update in expected]
     for mapper in (one, two):
@@ -120,8 +168,9 @@ def test_changes_between_two_scans_hold_for_the_scan_that_waits(between):
     assert two.map == one.map
 
 
-def test_a_scan_that_was_kept_goes_where_alignment_has_moved_the_map():
-    one, two = mapper_with(1), mapper_with(2)
+@WAYS
+def test_a_scan_that_was_kept_goes_where_alignment_has_moved_the_map(way, settings_of):
+    one, two = (mapper_with(threads, **settings_of(way)) for threads in (1, 2))
     drive(one, 1, 6)
     drive(two, 1, 7)
     for mapper in (one, two):
@@ -130,6 +179,23 @@ def test_a_scan_that_was_kept_goes_where_alignment_has_moved_the_map():
     add(one, 6)
     same(list(two.insert_ready()), list(one.insert_ready()))
     assert two.map == one.map
+
+
+def test_a_scan_that_a_filter_refuses_is_dropped_and_the_next_comes(tmp_path):
+    path = tmp_path / 'chain.yaml'
+    path.write_text('- label_mask: {labels: [1]}')
+    mapper = mapper_with(2, filters=str(path))
+    assert drive(mapper, 1, 4) == []
+    assert list(mapper.insert_ready()) == []
+    assert mapper.counters.dropped['filter'] == 3
+
+
+def test_filters_that_count_their_scans_are_not_applied_ahead(tmp_path):
+    path = tmp_path / 'chain.yaml'
+    path.write_text('- fix_step_sampling: {start_step: 2, end_step: 8, step_factor: 2.0}')
+    one, two = (mapper_with(threads, filters=str(path)) for threads in (1, 2))
+    same(drive(two, 1, 6), drive(one, 1, 6))
+    assert without_times(two) == without_times(one)
 
 
 def test_clearing_drops_and_counts_the_scan_that_was_kept():
@@ -174,7 +240,8 @@ def test_a_reduction_is_used_for_the_same_scan_at_the_same_pose_only():
     scan = Scan(points=points, stamp_ns=1, frame_id='lidar')
     moved = np.eye(4)
     moved[0, 3] = 0.25
-    ahead.begin(scan, np.eye(4), config)
+    ahead.begin(scan, np.eye(4), config, lambda scan, _: lambda: FilteredScan(scan, scan))
+    assert ahead.begun(scan, moved, config) is None
     there = ahead.reduce(scan, moved, config)
     expected = SurfelMap(0.5).reduce(points, moved, origin=moved[:3, 3], min_range_m=0.1)
     np.testing.assert_array_equal(there.moments.key, expected.key)

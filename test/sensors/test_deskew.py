@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation, Slerp
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import CloudFormatError, ConfigError
@@ -190,13 +191,36 @@ def test_the_kernel_turns_and_shifts_between_knots(call):
     poses[1] = [[c, -s, 0, 2.0], [s, c, 0, 0], [0, 0, 1, 0]]
     turns = np.array([[0, 0, np.sin(angle / 2)], [0, 0, 0]])
     points = np.tile(np.float32([10.0, 0.0, 1.0]), (4, 1))
-    moved = np.empty((4, 3))
-    call(move_points, points, np.array([-5, 0, 25, 130]), knots, poses, turns, 0.0, moved)
+    moved = np.empty((3, 4))
+    call(move_points, points.T, np.array([-5, 0, 25, 130]), knots, poses, turns, 0.0, moved)
     part = np.array([0.0, 0.0, 0.25, 1.0])
     expected = np.stack(
         [10 * np.cos(part * angle) + 2 * part, 10 * np.sin(part * angle), np.ones(4)], axis=1
     )
-    np.testing.assert_allclose(moved, expected, atol=1e-14)
+    np.testing.assert_allclose(moved.T, expected, atol=1e-14)
+
+
+@both
+@pytest.mark.parametrize('in_order', [True, False])
+def test_the_kernel_moves_runs_and_single_points_as_scipy_does(call, in_order):
+    rng = np.random.default_rng(4)
+    knots = np.array([-90, -50, -20, 0]) * MS
+    attitudes = Rotation.from_rotvec(np.cumsum(rng.normal(0.0, 0.002, (4, 3)), axis=0))
+    shifts = rng.normal(size=(4, 3))
+    poses = np.concatenate([attitudes.as_matrix(), shifts[:, :, None]], axis=2)
+    turns = np.zeros((4, 3))
+    turns[:3] = (attitudes[:-1].inv() * attitudes[1:]).as_quat()[:, :3]
+    offsets = rng.integers(-99 * MS, 9 * MS, 2500)
+    offsets = np.sort(offsets) if in_order else offsets
+    points = rng.normal(scale=20.0, size=(3, 2500))
+    points[:, ::7], points[:, 3] = 0.0, np.nan
+    moved = np.empty((3, 2500))
+    call(move_points, points, offsets, knots, poses, turns, 4.0, moved)
+    within = np.clip(offsets, knots[0], knots[-1])
+    expected = Slerp(knots, attitudes)(within).apply(points.T)
+    expected += np.stack([np.interp(within, knots, shift) for shift in shifts.T], axis=1)
+    expected[np.linalg.norm(points, axis=0) < 2.0] = 0.0
+    np.testing.assert_allclose(moved.T, expected, atol=1e-12)
 
 
 SETTINGS = {'pose.source': 'odometry', 'frames.fixed': 'odom', 'map.min_points': 5}

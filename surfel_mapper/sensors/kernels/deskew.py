@@ -13,48 +13,95 @@ import math
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.grouping import CHUNK
+
 
 @njit(cache=True, nogil=True)
 def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
     """
     Move points to the pose of the scan.
 
-    points        (N, 3) float32 or float64, m, sensor frame at the time of each
+    points        (3, N) float32 or float64, m, sensor frame at the time of each
     offsets       (N,) int64, ns after the stamp; outside of the knots the nearest one holds
     knots         (K,) int64, ns after the stamp, ascending, one at least
     poses         (K, 3, 4) float64, take points at the knot to the sensor frame at the stamp
     turns         (K, 3) float64, vector part of the unit quaternion that turns knot to next
     min_range_sq  float64, m^2
-    moved         (N, 3) float64, out
+    moved         (3, N) float64, out
 
     A point nearer to the sensor than the range (drivers write 0 0 0 for a ray without a return)
     is put into the origin, still too near; if it were moved, it could become an obstacle.
+
+    Points that follow each other mostly lie between the same two knots: such a run is moved with
+    vector instructions, in a quarter of the time of one point after the other.
     """
     last = len(knots) - 1
-    at = -1
-    start = end = knots[0]
-    per_ns = qx = qy = qz = drop = 0.0
-    pose = following = poses[0]
-    for i in range(len(points)):
-        x, y, z = np.float64(points[i, 0]), np.float64(points[i, 1]), np.float64(points[i, 2])
-        range_sq = (x * x + y * y) + z * z
-        if range_sq == 0.0 or range_sq < min_range_sq:
-            moved[i, 0] = moved[i, 1] = moved[i, 2] = 0.0
-            continue
-        offset = min(max(offsets[i], knots[0]), knots[last])
-        if at < 0 or offset < start or offset > end:
-            at = max(at, 0)
-            while at > 0 and offset < knots[at]:
-                at -= 1
-            while at < last - 1 and offset > knots[at + 1]:
-                at += 1
+    at = 0
+    is_placed = False
+    near, within = np.empty(CHUNK, np.bool_), np.empty(CHUNK, np.int64)
+    all_x, all_y, all_z = points[0], points[1], points[2]
+    out_x, out_y, out_z = moved[0], moved[1], moved[2]
+    for first in range(0, len(all_x), CHUNK):
+        num = min(CHUNK, len(all_x) - first)
+        for i in range(num):
+            row = np.uint64(first + i)
+            x, y, z = np.float64(all_x[row]), np.float64(all_y[row]), np.float64(all_z[row])
+            range_sq = (x * x + y * y) + z * z
+            near[i] = (range_sq == 0.0) | (range_sq < min_range_sq)
+            within[i] = min(max(offsets[first + i], knots[0]), knots[last])
+        begin = 0
+        while begin < num:
             start, end = knots[at], knots[min(at + 1, last)]
-            per_ns = 1.0 / max(end - start, 1)
-            pose, following = poses[at], poses[min(at + 1, last)]
-            qx, qy, qz = turns[at, 0], turns[at, 1], turns[at, 2]
-            sine_sq = (qx * qx + qy * qy) + qz * qz
-            drop = -sine_sq / (1.0 + math.sqrt(1.0 - sine_sq))
-        alpha = (offset - start) * per_ns
+            offset = within[begin]
+            if not near[begin] and (not is_placed or offset < start or offset > end):
+                is_placed = True
+                while at > 0 and offset < knots[at]:
+                    at -= 1
+                while at < last - 1 and offset > knots[at + 1]:
+                    at += 1
+                start, end = knots[at], knots[min(at + 1, last)]
+            stop = begin + 1
+            while stop < num and (near[stop] or (is_placed and start <= within[stop] <= end)):
+                stop += 1
+            run = slice(first + begin, first + stop)
+            pair = poses[at], poses[min(at + 1, last)]
+            move_run(
+                (all_x[run], all_y[run], all_z[run]),
+                within[begin:stop],
+                near[begin:stop],
+                start,
+                end,
+                pair,
+                turns[at],
+                (out_x[run], out_y[run], out_z[run]),
+            )
+            begin = stop
+
+
+@njit(cache=True, nogil=True)
+def move_run(points, offsets, near, start, end, pair, turn, moved):
+    """
+    Move the points of a run, all between the same two knots.
+
+    points      x, y, z (R,) each, m
+    offsets     (R,) int64, ns after the stamp, from start to end
+    near        (R,) bool, points to put into the origin
+    start, end  int64, the knots, ns after the stamp
+    pair        (3, 4) float64 each, the poses at both
+    turn        (3,) float64, vector part of the quaternion between them
+    moved       x, y, z (R,) float64 each, out
+    """
+    (a00, a01, a02, a03), (a10, a11, a12, a13), (a20, a21, a22, a23) = rows_of(pair[0])
+    dx, dy, dz = pair[1][0, 3] - a03, pair[1][1, 3] - a13, pair[1][2, 3] - a23
+    qx, qy, qz = turn[0], turn[1], turn[2]
+    per_ns = 1.0 / max(end - start, 1)
+    sine_sq = (qx * qx + qy * qy) + qz * qz
+    drop = -sine_sq / (1.0 + math.sqrt(1.0 - sine_sq))
+    px, py, pz = points
+    mx, my, mz = moved
+    for i in range(np.uint64(len(px))):
+        x, y, z = np.float64(px[i]), np.float64(py[i]), np.float64(pz[i])
+        alpha = (offsets[i] - start) * per_ns
         weight = slerp_weight(alpha, drop)
         vx, vy, vz = weight * qx, weight * qy, weight * qz
         w = math.sqrt(1.0 - ((vx * vx + vy * vy) + vz * vz))
@@ -64,9 +111,19 @@ def move_points(points, offsets, knots, poses, turns, min_range_sq, moved):
             (y + w * cy) + (vz * cx - vx * cz),
             (z + w * cz) + (vx * cy - vy * cx),
         )
-        for axis in range(3):
-            t = pose[axis, 3] + alpha * (following[axis, 3] - pose[axis, 3])
-            moved[i, axis] = ((pose[axis, 0] * x + pose[axis, 1] * y) + pose[axis, 2] * z) + t
+        mx[i] = 0.0 if near[i] else ((a00 * x + a01 * y) + a02 * z) + (a03 + alpha * dx)
+        my[i] = 0.0 if near[i] else ((a10 * x + a11 * y) + a12 * z) + (a13 + alpha * dy)
+        mz[i] = 0.0 if near[i] else ((a20 * x + a21 * y) + a22 * z) + (a23 + alpha * dz)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def rows_of(pose):
+    """Return the rows of a (3, 4) matrix as tuples."""
+    return (
+        (pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]),
+        (pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]),
+        (pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]),
+    )
 
 
 @njit(cache=True, nogil=True, inline='always')
