@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-``surfel-mapper view``: maps, clouds, meshes, trajectories and bags in the viewer rerun.
+``surfel-mapper view``: maps, clouds, meshes, trajectories, bags and nodes in the viewer rerun.
 
 Opens a window where there is a display, else a page for a browser. Either listens on loopback
 only. A bag or folder of scans is mapped while it is shown, and nothing is written.
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add(
         'what',
         type=Path,
-        nargs='+',
+        nargs='*',
         metavar='WHAT',
         help='output of a replay or merge; map: .npz, .parquet, .ply, .pcd, tiles; cloud, mesh '
         '(.ply, .obj, .stl, .glb), trajectory (.tum, .csv); or one bag or folder of scans',
@@ -60,6 +60,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add('--min-points', type=positive_int, default=5, metavar='N', help='of a surfel (5)')
     add('--config', type=Path, metavar='FILE', help='settings for a bag; with its window')
+    add(
+        '--live',
+        nargs='?',
+        const='/surfel_mapper',
+        metavar='NODE',
+        help='show a running node instead, by its topics (/surfel_mapper)',
+    )
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
     where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
@@ -67,11 +74,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
+    """Show everything; Ctrl-C and SIGTERM end a page, and leave no server behind."""
+    from surfel_mapper.ros.main_thread import Signals
+
+    with Signals():
+        return shown(args)
+
+
+def shown(args: argparse.Namespace) -> int:
     """Open a scene, show everything, and wait if there is a page to serve."""
     from surfel_mapper.viz.contents import contents, is_shown
     from surfel_mapper.viz.scene import import_rerun
 
+    if bool(args.what) == (args.live is not None):
+        raise UsageError('expected WHAT to show, or --live')
     import_rerun()
+    if args.live is not None:
+        show_live(args)
+        return 0
     many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
     if recordings and many:
@@ -128,6 +148,20 @@ def finish(scene: Scene) -> None:
     """Serve the page until it ends or Ctrl-C."""
     try:
         scene.wait()
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+
+
+def show_live(args: argparse.Namespace) -> None:
+    """Show a running node until Ctrl-C, or until the page ends."""
+    from surfel_mapper.cli._ros import loading_ros
+
+    try:
+        with loading_ros(), opened(args) as scene:
+            from surfel_mapper.ros.node_view import show_node
+
+            announce(scene)
+            show_node(scene, args.live, args.color, args.ros_args, scene.has_ended)
     except KeyboardInterrupt:
         print(file=sys.stderr)
 

@@ -54,6 +54,7 @@ from surfel_mapper.config.stages import (
     OutputConfig,
     PoseConfig,
     PublishConfig,
+    ViewerConfig,
     WindowConfig,
 )
 from surfel_mapper.config.yaml_files import parse_yaml, read_yaml
@@ -84,6 +85,7 @@ __all__ = [
     'Settings',
     'Stage',
     'TsdfConfig',
+    'ViewerConfig',
     'WEIGHT_MODES',
     'WindowConfig',
     'allowed',

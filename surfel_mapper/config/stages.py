@@ -29,6 +29,8 @@ MAX_ORIGIN_M = 1e9
 
 MARKER_COLORS = ('planarity', 'normal', 'age')
 
+VIEWER_COLORS = ('normal', 'height', 'planarity', 'intensity', 'rgb', 'age')
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MapConfig(Stage):
@@ -335,6 +337,21 @@ class PublishConfig(Stage):
     diagnostics_rate_hz: float = setting(
         1.0, 'Rate of /diagnostics, Hz; 0: never.', low=0.0, high=100.0
     )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ViewerConfig(Stage):
+    """The page on which a node shows its map in a browser; needs rerun."""
+
+    enabled: bool = setting(
+        False,
+        'Serve the page at http://127.0.0.1:PORT, for this machine only; see docs/report.md.',
+    )
+    port: int = setting(
+        9090, 'Port of the page; the data are on the next one.', low=1024, high=65534
+    )
+    rate_hz: float = setting(2.0, 'At most this many scans are shown, Hz.', low=0.1, high=100.0)
+    color: str = setting('normal', 'Colour of the surfels.', choices=VIEWER_COLORS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

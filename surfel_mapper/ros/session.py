@@ -11,6 +11,7 @@ from contextlib import suppress
 from functools import partial
 import threading
 import time
+from typing import TYPE_CHECKING
 
 from rclpy.node import Node
 
@@ -28,6 +29,9 @@ from surfel_mapper.ros.outputs import Outputs
 from surfel_mapper.ros.outputs import warm_up as warm_up_outputs
 from surfel_mapper.ros.pose_outputs import registration_outputs
 from surfel_mapper.ros.services import Services
+
+if TYPE_CHECKING:
+    from surfel_mapper.ros.live_viewer import LiveViewer
 
 LATEST = 200
 """Scans whose latencies are kept for the percentiles: 10 s at 20 Hz."""
@@ -89,6 +93,7 @@ class Session:
         self.latencies_s: deque[float] = deque(maxlen=LATEST)
         self._changing = threading.Lock()  # transitions and settings come from two threads
         self._is_active = False
+        self._viewer = self._opened_viewer()
         self.thread.start(self._on_update)
 
     def activate(self) -> None:
@@ -127,6 +132,8 @@ class Session:
         if self._compiler.ident is not None:
             self._compiler.join()
         self.thread.stop()
+        if self._viewer is not None:
+            self._viewer.close()
         log = self._node.get_logger()
         with self.mapper.guarded('the end of the input'):
             self.mapper.finish()
@@ -139,6 +146,16 @@ class Session:
             except (SurfelMapperError, OSError) as error:
                 log.error(f'the map could not be saved: {error}')
         log.info(report(self.mapper))
+
+    def _opened_viewer(self) -> LiveViewer | None:
+        """Return the page of the map, if it is wanted; rerun is loaded only then."""
+        if not self.config.viewer.enabled:
+            return None
+        from surfel_mapper.ros.live_viewer import LiveViewer
+
+        viewer = LiveViewer(self.mapper)
+        self._node.get_logger().info(f'the map is shown at {viewer.address}')
+        return viewer
 
     def _compile(self) -> None:
         """Compile the kernels that the first scans do not need; run in a thread of its own."""
@@ -163,6 +180,8 @@ class Session:
                 f'{len(update.changed)} surfels'
             )
         self.outputs.publish_update(update)
+        if self._viewer is not None:
+            self._viewer.add(update)
         if self.registration is not None:
             self.registration.publish(update)
         with self.mapper.guarded('a checkpoint'):

@@ -222,19 +222,40 @@ def cloud(path: Path, name: str) -> Cloud:
     """Return the surfels or points of a file, in the fixed frame."""
     points, columns = read_scan(path)
     position = points.astype(np.float64)
-    values = {each: column for each, column in columns.items() if each not in COORDINATES}
-    names = next((names for names in NORMALS if set(names) <= set(columns)), None)
-    is_finite = np.isfinite(position).all(axis=1)
-    if names is None:
-        return Cloud(name, position[is_finite], None)
+    if normal_names(columns) is None:
+        return Cloud(name, position[np.isfinite(position).all(axis=1)], None)
+    discs = discs_of(position, columns)
+    return Cloud(name, discs.position, discs)
+
+
+def normal_names(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, ...] | None:
+    """Return the names of the columns of normals, if there are any."""
+    return next((names for names in NORMALS if set(names) <= set(columns)), None)
+
+
+def discs_of(position: Array, columns: Mapping[str, npt.NDArray[Any]]) -> DrawnDiscs:
+    """
+    Return the discs of surfels of a file or topic, which lack a size.
+
+    Parameters
+    ----------
+    position : (N, 3) float64, m
+        Positions, in any frame.
+    columns : mapping of str to (N,) array
+        With normals; rows without one are left out. The others become values.
+
+    """
+    names = normal_names(columns)
+    assert names is not None, 'the caller has found normals'
     normal = np.stack([columns[each].astype(np.float64) for each in names], axis=1)
     length = np.sqrt((normal * normal).sum(axis=1))
-    is_known = is_finite & (length > 0.0)
+    is_known = np.isfinite(position).all(axis=1) & (length > 0.0)
     normal = normal[is_known] / length[is_known, None]
     position = position[is_known]
     radius_m = np.full(len(position), 0.75 * spacing_m(position))
+    values = {each: column for each, column in columns.items() if each not in COORDINATES}
     shown = {each: value[is_known] for each, value in unpacked(values).items()}
-    return Cloud(name, position, DrawnDiscs(position, normal, radius_m, shown))
+    return DrawnDiscs(position, normal, radius_m, shown)
 
 
 def unpacked(columns: Mapping[str, npt.NDArray[Any]]) -> dict[str, npt.NDArray[Any]]:

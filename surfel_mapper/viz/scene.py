@@ -16,8 +16,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+import os
 from pathlib import Path
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -109,7 +111,7 @@ class Scene:
         Parameters
         ----------
         port : int
-            Port of the page; 0: a free one.
+            Port of the page, and one less than that of its data; 0: free ones.
 
         Raises
         ------
@@ -120,19 +122,24 @@ class Scene:
 
         """
         rerun = import_rerun()
-        data_port = free_port()
+        data_port = port + 1 if port else free_port()
         port = port or free_port()
         command = [
             *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
             *('--port', str(data_port), '--web-viewer-port', str(port)),
             *('--server-memory-limit', '75%'),
         ]
-        server = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        server = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
         try:
             for each in (data_port, port):
                 wait_for(each, server)
-        except SurfelMapperError:
-            server.terminate()
+        except BaseException:
+            end_group(server)
             raise
         stream = rerun.RecordingStream('surfel_mapper')
         stream.connect_grpc(f'rerun+http://{LOOPBACK}:{data_port}/proxy')
@@ -149,13 +156,16 @@ class Scene:
             self.flush()
             self._stream.disconnect()
         if self._server is not None:
-            self._server.terminate()
-            self._server.wait()
+            end_group(self._server)
 
     def wait(self) -> None:
         """Return when the server of the page ends; at once if there is none."""
         if self._server is not None:
             self._server.wait()
+
+    def has_ended(self) -> bool:
+        """Return whether the server of the page has ended."""
+        return self._server is not None and self._server.poll() is not None
 
     def flush(self) -> None:
         """Send everything logged so far."""
@@ -324,6 +334,13 @@ def rerun_program() -> str:
             f'{sys.executable} nor on the PATH'
         )
     return found
+
+
+def end_group(server: subprocess.Popen[bytes]) -> None:
+    """End a server and its children: the program rerun starts another one and waits for it."""
+    with suppress(ProcessLookupError):
+        os.killpg(server.pid, signal.SIGTERM)
+    server.wait()
 
 
 def free_port() -> int:

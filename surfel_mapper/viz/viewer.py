@@ -10,6 +10,7 @@ recording holds each surfel about five times instead of once a scan.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
@@ -33,6 +34,38 @@ MAX_POINTS = 20_000
 """Limit of the points logged of a scan; larger scans are subsampled."""
 
 POINT_RADIUS_M = 0.02
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class Snapshot:
+    """
+    Copies of what is shown of a scan, in the frame of the map.
+
+    Attributes
+    ----------
+    stamp_ns : int
+    T_map_sensor : (4, 4) float64
+    points : (N, 3) float
+        Of the scan, in the frame of the sensor.
+    way, window : (S, 3), (W, 3) float64, m
+        Positions of the sensor so far, and of the scans in the window.
+    changed, surfels : DrawnDiscs
+        Surfels that the scan changed; all surfels, or None.
+    drawings : list of Drawing
+        Those of the layers, with all surfels.
+    origin_m : (3,) float64, m
+
+    """
+
+    stamp_ns: int
+    T_map_sensor: npt.NDArray[np.float64]
+    points: npt.NDArray[Any]
+    way: npt.NDArray[np.float64]
+    window: npt.NDArray[np.float64]
+    changed: DrawnDiscs
+    surfels: DrawnDiscs | None
+    drawings: list[Drawing]
+    origin_m: npt.NDArray[np.float64]
 
 
 class Viewer:
@@ -63,7 +96,9 @@ class Viewer:
         self._mapper = mapper
         self._colouring = colouring
         self._positions: list[npt.NDArray[np.float64]] = []
-        self._logged_voxels = self._removed = 0
+        self._shown_voxels = self._removed = 0
+        self._last: Update | None = None
+        self._is_placed = False
         self._ages = Ages()
         if scene is None:
             scene = Scene.to_window()
@@ -80,46 +115,69 @@ class Viewer:
         self._scene.__exit__()
 
     def finish(self) -> None:
-        """Log the whole map once more."""
-        if self._positions:
-            self._log_map()
+        """Show the whole map once more."""
+        if self._last is not None:
+            self.show(self.snapshot(self._last, whole=True))
         self._scene.flush()
 
     def add(self, update: Update) -> None:
-        """Log a scan and its changes of the map."""
-        scene, pose = self._scene, update.T_map_sensor
-        if not self._positions:
-            scene.set_origin(self._mapper.map.origin_m)
-        self._positions.append(pose[:3, 3])
-        scene.set_stamp(update.stamp_ns)
-        scene.pose('map/sensor', pose)
-        scene.points('map/sensor/scan', picked(update.scan.points), POINT_RADIUS_M)
-        scene.lines('map/trajectory', [self._way()], [RED])
-        window = np.array([scan.T_map_sensor[:3, 3] for scan in self._mapper.window])
-        scene.points('map/window', window.reshape(-1, 3), 0.15, ORANGE)
+        """Show a scan and its changes of the map."""
+        self.note(update)
+        self.show(self.snapshot(update))
+
+    def note(self, update: Update) -> None:
+        """Count a scan that may not be shown."""
+        self._positions.append(update.T_map_sensor[:3, 3])
         self._removed += len(update.removed_voxel_index)
-        num_voxels = self._mapper.map.num_voxels
-        if abs(num_voxels - self._logged_voxels) + self._removed > NEW * num_voxels:
-            self._log_map()
-        scene.discs('map/changed', self._discs(update.changed))
+        self._last = update
+
+    def snapshot(self, update: Update, *, whole: bool = False) -> Snapshot:
+        """Copy what is shown of a scan, in the thread of the mapper; all surfels if due."""
+        mapper = self._mapper
+        num_voxels = mapper.map.num_voxels
+        change = abs(num_voxels - self._shown_voxels) + self._removed
+        surfels, drawings = None, []
+        if whole or change > NEW * num_voxels:
+            self._shown_voxels, self._removed = num_voxels, 0
+            surfels = self._discs(mapper.map.surfels(mapper.config.map.min_points))
+            drawings = [each for layer in mapper.layers.values() for each in layer.drawings()]
+        window = np.array([scan.T_map_sensor[:3, 3] for scan in mapper.window])
+        return Snapshot(
+            stamp_ns=update.stamp_ns,
+            T_map_sensor=update.T_map_sensor,
+            points=picked(update.scan.points),
+            way=self._way(),
+            window=window.reshape(-1, 3),
+            changed=self._discs(update.changed),
+            surfels=surfels,
+            drawings=drawings,
+            origin_m=mapper.map.origin_m,
+        )
+
+    def show(self, shot: Snapshot) -> None:
+        """Show a snapshot; any one thread may."""
+        scene = self._scene
+        if not self._is_placed:
+            self._is_placed = True
+            scene.set_origin(shot.origin_m)
+        scene.set_stamp(shot.stamp_ns)
+        scene.pose('map/sensor', shot.T_map_sensor)
+        scene.points('map/sensor/scan', shot.points, POINT_RADIUS_M)
+        scene.lines('map/trajectory', [shot.way], [RED])
+        scene.points('map/window', shot.window, 0.15, ORANGE)
+        if shot.surfels is not None:
+            scene.colouring = Colouring.over(self._colouring, [shot.surfels])
+            scene.discs('map/surfels', shot.surfels)
+            for group in {drawing.name.partition('/')[0] for drawing in shot.drawings}:
+                scene.clear(f'map/{group}')
+            for drawing in shot.drawings:
+                self._log_drawing(f'map/{drawing.name}', drawing)
+        scene.discs('map/changed', shot.changed)
 
     def _way(self) -> npt.NDArray[np.float64]:
         """Return the trajectory of the sensor, at most a thousand positions and the last."""
         step = max(len(self._positions) // 1000, 1)
         return np.array([*self._positions[::step], self._positions[-1]])
-
-    def _log_map(self) -> None:
-        """Log all surfels and the active layers."""
-        mapper, scene = self._mapper, self._scene
-        discs = self._discs(mapper.map.surfels(mapper.config.map.min_points))
-        scene.colouring = Colouring.over(self._colouring, [discs])
-        scene.discs('map/surfels', discs)
-        self._logged_voxels, self._removed = mapper.map.num_voxels, 0
-        drawings = [drawing for layer in mapper.layers.values() for drawing in layer.drawings()]
-        for group in {drawing.name.partition('/')[0] for drawing in drawings}:
-            scene.clear(f'map/{group}')
-        for drawing in drawings:
-            self._log_drawing(f'map/{drawing.name}', drawing)
 
     def _log_drawing(self, name: str, drawing: Drawing) -> None:
         """Log the shapes of a layer."""

@@ -42,10 +42,17 @@ def served(tmp_path):
         [*command, '--browser'], stdout=subprocess.PIPE, text=True, env=environment
     ) as view:
         found = (re.match(r'(http://127\.0\.0\.1:\d+/\S*)', line) for line in view.stdout)
-        yield next(filter(None, found))[1]
-        view.send_signal(signal.SIGINT)
+        address = next(filter(None, found))[1]
+        yield address
+        view.send_signal(signal.SIGTERM)
         view.stdout.read()
         assert view.wait(WAIT_S) == 0
+    assert not any(map(addresses, ports_of(address)))
+
+
+def ports_of(address):
+    """Return the ports of a page and of its data."""
+    return {int(port) for port in re.findall(r'(?::|%3A)(\d+)', address)}
 
 
 def drawn(page):
@@ -74,7 +81,6 @@ def test_a_map_is_drawn_in_a_browser(browser, served):
 
 @pytest.mark.skipif(not Path('/proc/net/tcp').exists(), reason='sockets are not shown')
 def test_the_page_is_served_on_loopback_only(served):
-    ports = {int(port) for port in re.findall(r'(?::|%3A)(\d+)', served)}
-    assert len(ports) == 2
-    for port in ports:
+    assert len(ports_of(served)) == 2
+    for port in ports_of(served):
         assert addresses(port) == {'127.0.0.1'}

@@ -5,7 +5,6 @@
 from importlib.util import find_spec
 import os
 from pathlib import Path
-import shutil
 import signal
 import socket
 import subprocess
@@ -101,9 +100,8 @@ def test_the_window_listens_on_loopback_only(tmp_path, monkeypatch):
     with socket.socket() as probe:
         probe.bind(('127.0.0.1', 0))
         port = probe.getsockname()[1]
-    installed = Path(sys.executable).with_name('rerun')
     window, pid = tmp_path / 'rerun', tmp_path / 'pid'
-    program = shutil.which(installed) or shutil.which('rerun')
+    program = Path(find_spec('rerun_cli').origin).with_name('rerun')  # rerun itself only starts it
     window.write_text(WINDOW.format(pid=pid, rerun=program))
     window.chmod(0o755)
     monkeypatch.setenv('PATH', f'{tmp_path}{os.pathsep}{os.environ["PATH"]}')

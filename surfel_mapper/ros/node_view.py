@@ -1,0 +1,160 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+A view of a running node by its topics, for ``surfel-mapper view --live``.
+
+Shows ``~/normals`` (latched, so at once), ``~/changed``, ``~/mesh`` and ``~/planes``, from any
+machine that receives them. The topics lack the moments, so there is one level of detail; the size
+of discs is found from the gaps between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+import logging
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.ros.base_node import LATCHED
+from surfel_mapper.ros.context import context
+from surfel_mapper.tsdf.mesh import Mesh
+from surfel_mapper.viz.contents import discs_of
+from surfel_mapper.viz.discs import Colouring, DrawnDiscs
+from surfel_mapper.viz.scene import Scene
+
+SILENT_S = 10.0
+"""Time without surfels after which a warning says what was heard, s."""
+
+log = logging.getLogger(__name__)
+
+
+class NodeView:
+    """
+    Topics of a node in a scene.
+
+    Parameters
+    ----------
+    node : rclpy Node
+        The node that subscribes.
+    name : str
+        Full name of the node to be shown.
+    scene : Scene
+        Where it is shown.
+    colouring : str
+        One of discs.COLOURINGS.
+
+    """
+
+    def __init__(self, node: Any, name: str, scene: Scene, colouring: str) -> None:
+        self._scene, self._colouring = scene, colouring
+        self.num_shown = 0
+        changes = QoSProfile(depth=10)
+        node.create_subscription(PointCloud2, f'{name}/normals', self._on_normals, LATCHED)
+        node.create_subscription(PointCloud2, f'{name}/changed', self._on_changed, changes)
+        node.create_subscription(Marker, f'{name}/mesh', self._on_mesh, LATCHED)
+        node.create_subscription(MarkerArray, f'{name}/planes', self._on_planes, LATCHED)
+
+    def _on_normals(self, msg: PointCloud2) -> None:
+        """Show all surfels."""
+        discs = self._discs(msg)
+        self._scene.colouring = Colouring.over(self._colouring, [discs])
+        self._scene.discs('map/surfels', discs)
+        self.num_shown += 1
+
+    def _on_changed(self, msg: PointCloud2) -> None:
+        """Show the surfels that the last scan changed."""
+        self._scene.discs('map/changed', self._discs(msg))
+
+    def _discs(self, msg: PointCloud2) -> DrawnDiscs:
+        """Return the surfels of a cloud, and go to its stamp."""
+        scan = to_scan(msg)
+        self._scene.set_stamp(scan.stamp_ns)
+        return discs_of(scan.points.astype(np.float64), scan.columns)
+
+    def _on_mesh(self, msg: Marker) -> None:
+        """Show the mesh of the distance field."""
+        self._scene.mesh('map/mesh', marker_mesh(msg))
+
+    def _on_planes(self, msg: MarkerArray) -> None:
+        """Show planes and surfaces, in place of the ones before."""
+        self._scene.clear('map/models')
+        for marker in msg.markers:
+            path = f'map/models/{marker.ns}_{marker.id}'
+            if marker.action != Marker.ADD:
+                continue
+            if marker.type == Marker.TRIANGLE_LIST:
+                self._scene.mesh(path, marker_mesh(marker))
+            elif marker.type == Marker.LINE_LIST:
+                lines = list(places_of(marker).reshape(-1, 2, 3))
+                self._scene.lines(path, lines, colours_of(marker)[::2])
+
+
+def show_node(
+    scene: Scene,
+    name: str,
+    colouring: str,
+    ros_args: Sequence[str],
+    stopped: Callable[[], bool],
+) -> int:
+    """Show a node until ``stopped`` returns True; return the number of maps shown."""
+    with context(ros_args):
+        node = rclpy.create_node('surfel_mapper_view')
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        view = NodeView(node, name, scene, colouring)
+        warn_s = time.monotonic() + SILENT_S
+        try:
+            while not stopped():
+                executor.spin_once(0.1)
+                if not view.num_shown and time.monotonic() > warn_s:
+                    warn_s = float('inf')
+                    log.warning(silence(node, name))
+        finally:
+            executor.shutdown()
+            node.destroy_node()
+    return view.num_shown
+
+
+def silence(node: Any, name: str) -> str:
+    """Return why nothing is shown."""
+    topic = f'{name}/normals'
+    if node.count_publishers(topic):
+        return f'{topic}: no map yet; the node waits for its input, see /diagnostics'
+    kind = 'sensor_msgs/msg/PointCloud2'
+    found = [each for each, kinds in node.get_topic_names_and_types() if kind in kinds]
+    maps = [each.removesuffix('/normals') for each in found if each.endswith('/normals')]
+    others = ', '.join(each for each in maps if each != name) or 'none'
+    return f'{topic}: nothing publishes it; nodes that publish such a map: {others}'
+
+
+def places_of(marker: Marker) -> npt.NDArray[np.float64]:
+    """Return the points of a marker, (N, 3) m."""
+    return np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3)
+
+
+def colours_of(marker: Marker) -> npt.NDArray[np.uint8]:
+    """Return the colours of the points of a marker, (N, 3)."""
+    each = [(c.r, c.g, c.b) for c in marker.colors] or [
+        (marker.color.r, marker.color.g, marker.color.b)
+    ] * len(marker.points)
+    return np.rint(255.0 * np.array(each).reshape(-1, 3)).astype(np.uint8)
+
+
+def marker_mesh(marker: Marker) -> Mesh:
+    """Return the triangles of a marker."""
+    places = places_of(marker)
+    number = len(places) // 3
+    return Mesh(
+        vertices=places,
+        triangles=np.arange(3 * number, dtype=np.int32).reshape(-1, 3),
+        colors=colours_of(marker),
+    )
