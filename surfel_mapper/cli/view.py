@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
 def shown(args: argparse.Namespace) -> int:
     """Open a scene, show everything, and wait if there is a page to serve."""
     from surfel_mapper.viz.contents import contents, is_shown
-    from surfel_mapper.viz.scene import import_rerun
+    from surfel_mapper.viz.server import import_rerun
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')

@@ -291,7 +291,7 @@ def check_outputs(directory: Path, options: ReplayOptions) -> None:
         if path is not None:
             check_writable(path)
     if options.view or options.rrd is not None:
-        from surfel_mapper.viz.scene import import_rerun
+        from surfel_mapper.viz.server import import_rerun
 
         import_rerun()
     if options.truth is not None:

@@ -16,37 +16,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-import os
 from pathlib import Path
-import shutil
-import signal
-import socket
 import subprocess
-import sys
-import time
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import DependencyError, FileFormatError, SurfelMapperError
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
 from surfel_mapper.viz.mesh import vertex_normals
+from surfel_mapper.viz.server import (
+    end_group,
+    free_port,
+    import_rerun,
+    LOOPBACK,
+    started_server,
+)
 
 Array = npt.NDArray[np.float64]
 
 PORT = 9876
 """Port of the window, that of rerun; one that is open there already is used."""
 
-LOOPBACK = '127.0.0.1'
-"""Address on which the window listens; rerun's own default is every interface."""
-
 PICKED = 0.25
 """Radius of the point that is picked, relative to that of its disc."""
-
-START_S = 20.0
-"""Longest wait for a server to listen, s."""
 
 NORMAL = ('normal_x', 'normal_y', 'normal_z')
 
@@ -124,23 +119,7 @@ class Scene:
         rerun = import_rerun()
         data_port = port + 1 if port else free_port()
         port = port or free_port()
-        command = [
-            *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
-            *('--port', str(data_port), '--web-viewer-port', str(port)),
-            *('--server-memory-limit', '75%'),
-        ]
-        server = subprocess.Popen(
-            command,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        try:
-            for each in (data_port, port):
-                wait_for(each, server)
-        except BaseException:
-            end_group(server)
-            raise
+        server = started_server(port, data_port)
         stream = rerun.RecordingStream('surfel_mapper')
         stream.connect_grpc(f'rerun+http://{LOOPBACK}:{data_port}/proxy')
         source = f'rerun%2Bhttp%3A%2F%2F{LOOPBACK}%3A{data_port}%2Fproxy'
@@ -311,52 +290,3 @@ def check_writable(path: Path) -> None:
             pass
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error
-
-
-def import_rerun() -> Any:
-    """Return the module rerun, or raise DependencyError with the command to install it."""
-    try:
-        import rerun
-    except ImportError as error:
-        raise DependencyError(
-            f'rerun cannot be loaded ({error}). It shows maps and replays; install it with '
-            "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
-        ) from error
-    return rerun
-
-
-def rerun_program() -> str:
-    """Return the path of the program rerun, beside this Python or on the PATH."""
-    found = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
-    if found is None:
-        raise DependencyError(
-            'the program rerun, which the package rerun-sdk installs, is neither beside '
-            f'{sys.executable} nor on the PATH'
-        )
-    return found
-
-
-def end_group(server: subprocess.Popen[bytes]) -> None:
-    """End a server and its children: the program rerun starts another one and waits for it."""
-    with suppress(ProcessLookupError):
-        os.killpg(server.pid, signal.SIGTERM)
-    server.wait()
-
-
-def free_port() -> int:
-    """Return a port that no program listens at."""
-    with socket.socket() as probe:
-        probe.bind((LOOPBACK, 0))
-        return int(probe.getsockname()[1])
-
-
-def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
-    """Wait until a server listens at a port; raise SurfelMapperError if it does not."""
-    end = time.monotonic() + START_S
-    while time.monotonic() < end and server.poll() is None:
-        with socket.socket() as probe:
-            if probe.connect_ex((LOOPBACK, port)) == 0:
-                return
-        time.sleep(0.05)
-    state = 'ended' if server.poll() is not None else f'did not listen within {START_S:g} s'
-    raise SurfelMapperError(f'the server of rerun at {LOOPBACK}:{port} {state}; is the port free?')

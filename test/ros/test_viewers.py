@@ -22,7 +22,7 @@ from rerun import chunk as reader
 from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.scene import free_port
+from surfel_mapper.viz.server import free_port
 from test.ros.driving import arguments, drive, mapped, send
 from test.ros.live import LATCHED, NODE, TIMEOUT_S
 

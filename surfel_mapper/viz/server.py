@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The package and the program rerun: where they are, and starting and ending its servers."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+import os
+from pathlib import Path
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from typing import Any
+
+from surfel_mapper.errors import DependencyError, SurfelMapperError
+
+LOOPBACK = '127.0.0.1'
+"""Address on which servers listen; rerun's own default is every interface."""
+
+START_S = 20.0
+"""Longest wait for a server to listen, s."""
+
+
+def started_server(port: int, data_port: int) -> subprocess.Popen[bytes]:
+    """Return a server of a page and of its data, as soon as both ports are open."""
+    command = [
+        *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
+        *('--port', str(data_port), '--web-viewer-port', str(port)),
+        *('--server-memory-limit', '75%'),
+    ]
+    server = subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True
+    )
+    try:
+        for each in (data_port, port):
+            wait_for(each, server)
+    except BaseException:
+        end_group(server)
+        raise
+    return server
+
+
+def import_rerun() -> Any:
+    """Return the module rerun, or raise DependencyError with the command to install it."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise DependencyError(
+            f'rerun cannot be loaded ({error}). It shows maps and replays; install it with '
+            "`pip install 'surfel_mapper[viewer]'` or `pip install rerun-sdk`"
+        ) from error
+    return rerun
+
+
+def rerun_program() -> str:
+    """Return the path of the program rerun, beside this Python or on the PATH."""
+    found = shutil.which('rerun', path=str(Path(sys.executable).parent)) or shutil.which('rerun')
+    if found is None:
+        raise DependencyError(
+            'the program rerun, which the package rerun-sdk installs, is neither beside '
+            f'{sys.executable} nor on the PATH'
+        )
+    return found
+
+
+def end_group(server: subprocess.Popen[bytes]) -> None:
+    """End a server and its children: the program rerun starts another one and waits for it."""
+    with suppress(ProcessLookupError):
+        os.killpg(server.pid, signal.SIGTERM)
+    server.wait()
+
+
+def free_port() -> int:
+    """Return a port that no program listens at."""
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        return int(probe.getsockname()[1])
+
+
+def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
+    """Wait until a server listens at a port; raise SurfelMapperError if it does not."""
+    end = time.monotonic() + START_S
+    while time.monotonic() < end and server.poll() is None:
+        with socket.socket() as probe:
+            if probe.connect_ex((LOOPBACK, port)) == 0:
+                return
+        time.sleep(0.05)
+    state = 'ended' if server.poll() is not None else f'did not listen within {START_S:g} s'
+    raise SurfelMapperError(f'the server of rerun at {LOOPBACK}:{port} {state}; is the port free?')
