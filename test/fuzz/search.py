@@ -36,7 +36,8 @@ def main(name: str, corpus: str, seconds: str) -> None:
         from test.fuzz.harnesses import HARNESSES
     logging.disable(logging.CRITICAL)
     harness = HARNESSES[name]
-    harness.one_input(harness.corpus()[0])  # kernels that compile are no hang
+    for seed in harness.corpus():
+        harness.one_input(seed)  # kernels that compile are no hang
     arguments = [
         sys.argv[0],
         corpus,
