@@ -10,6 +10,7 @@ the same bits for any number of threads. See tsdf/kernels/integration.py for the
 
 from __future__ import annotations
 
+from dataclasses import replace
 import logging
 import math
 import os
@@ -31,6 +32,7 @@ from surfel_mapper.tsdf.kernels.integration import (
     OBSERVED,
     SOLID,
 )
+from surfel_mapper.tsdf.kernels.point_fusion import sum_surfaces
 from surfel_mapper.tsdf.measurements import (
     checked_pose,
     Integrated,
@@ -57,6 +59,13 @@ A block that was free in SETTLED measurements in a row is fused in one of RECHEC
 
 With a lidar of 10 Hz a block between the beams is complete after a second or two; of the blocks of
 a street that a scan carves, 40 % are skipped, of a hall with voxels of 0.1 m 65 %.
+"""
+
+THIN_VOXELS = 1.25
+"""
+Objects narrower than this, seen by a lidar, are fused by their points too.
+
+Of poles of 1, 0.5 and 0.25 voxels the mesh without it goes through 94, 45 and 20 % of the points.
 """
 
 NO_COLOR = np.empty((0, 0, 3), np.uint8)
@@ -136,16 +145,19 @@ class Integrator:
         self._warn_of_radius(image.sensor)
         if self.blocks.config.distance == 'to_plane' and image.cosine is None:
             image = image.with_cosines(self.blocks.config.voxel_size_m)
-        index, near = self._selection.blocks(image, T)
-        blocks = self.blocks
+        image = self._labelled(image)
+        thin = self._thin_points(image, T)
+        selected = self._selection.blocks(image, T, thin)
+        index, blocks = selected.index, self.blocks
         before = blocks.num_blocks
         rows = blocks.place(index) if allocate_blocks else blocks.find(index)
         there = rows >= 0
         try:
-            skipped = there & ~near & self._free_for_long(rows)
+            skipped = there & ~selected.near & self._free_for_long(rows)
             blocks.head[rows[skipped], STAMP] = stamp_ns
             fused = there & ~skipped
-            found, num_lost = self._fuse(image, T, stamp_ns, index[fused], rows[fused])
+            sums = self._thin_sums(thin, selected.thin, image, T)
+            found, num_lost = self._fuse(image, T, stamp_ns, index[fused], rows[fused], sums)
             observed = found[:, OBSERVED]
             changed = observed > 0
             updated = rows[fused][changed]
@@ -164,8 +176,44 @@ class Integrator:
             num_labels_lost=num_lost,
         )
 
+    def _thin_points(self, image: RangeImage, T_map_sensor: Float64) -> Float64:
+        """Return the points of objects thinner than THIN_VOXELS, map frame, in voxels, (P, 3)."""
+        size_m, sensor = self.blocks.config.voxel_size_m, image.sensor
+        thin = image.thin(size_m, THIN_VOXELS * size_m)
+        range_m = image.range_m[:, : sensor.columns][thin].astype(np.float64)
+        local = sensor.directions[thin] * range_m[:, None]
+        found: Float64 = (local @ T_map_sensor[:3, :3].T + T_map_sensor[:3, 3]) / size_m
+        return found
+
+    def _thin_sums(
+        self, points: Float64, index: Int64, image: RangeImage, T_map_sensor: Float64
+    ) -> tuple[Int64, Float32]:
+        """
+        Return the sums of thin objects, and the place in them of each row, -1 for none.
+
+        The sums are of the voxels about the points only: those farther from the surface, and what
+        is beside it, the image shows.
+        """
+        config, blocks = self.blocks.config, self.blocks
+        rows = blocks.find(index)
+        slots = np.full(len(blocks.head), -1, np.int64)
+        slots[rows[rows >= 0]] = np.flatnonzero(rows >= 0)
+        sums = np.zeros((len(index), blocks.voxels_per_block, 3), np.float32)
+        if len(points):
+            content = config.voxel_size_m, config.voxels_per_side.bit_length() - 1
+            weights = image_settings(config, image), POWERS[config.weight_mode]
+            origin = T_map_sensor[:3, 3] / config.voxel_size_m
+            sum_surfaces(points, origin, True, *content, *weights, blocks.lookup, slots, sums)
+        return slots, sums
+
     def _fuse(
-        self, image: RangeImage, T_map_sensor: Float64, stamp_ns: int, index: Int64, rows: Int64
+        self,
+        image: RangeImage,
+        T_map_sensor: Float64,
+        stamp_ns: int,
+        index: Int64,
+        rows: Int64,
+        thin: tuple[Int64, Float32],
     ) -> tuple[Int64, int]:
         """Fuse an image into blocks; return figures of each, and the number of lost labels."""
         config, sensor = self.blocks.config, image.sensor
@@ -174,19 +222,22 @@ class Integrator:
         corners = ((corner - T_map_sensor[:3, 3]) @ R_sensor_map.T).astype(np.float32)
         offsets = (R_sensor_map @ self._voxels).astype(np.float32)
         found = np.empty((len(rows), NUM_FOUND), np.int64)
-        rates = self.blocks.forgetting_rates(rows, stamp_ns)
+        slots, sums = thin
+        each = rows, corners, self.blocks.forgetting_rates(rows, stamp_ns), slots[rows]
         common = (
+            offsets,
             self.blocks.field,
             (*sensor.projection, sensor.row_gaps_rad),
             self._images(image),
+            sums,
             image_settings(config, image),
             (INTERPOLATIONS.index(config.interpolation), POWERS[config.weight_mode]),
             self._channels(stamp_ns),
         )
 
         def fuse(part: slice) -> int:
-            where = rows[part], corners[part], rates[part], offsets
-            return int(integrate_blocks(*where, *common, found[part]))
+            where = tuple(values[part] for values in each)
+            return int(integrate_blocks(where, *common, found[part]))
 
         helpers = pool(self._threads)
         parts = split(len(rows), self._threads)
@@ -222,14 +273,19 @@ class Integrator:
                 needed_m,
             )
 
+    def _labelled(self, image: RangeImage) -> RangeImage:
+        """Return an image with labels after label_map; those that leave no surface are masked."""
+        if image.label is None:
+            return image
+        label, mask = remapped(image.label, self.blocks.config), image.mask
+        if len(self._masked_labels):
+            masked = np.isin(label, self._masked_labels).astype(np.uint8)
+            mask = masked if mask is None else masked | mask
+        return replace(image, label=label, mask=mask)
+
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
         """Return ranges, cosines, colours, labels and mask; missing ones have no rows."""
         mask, label = image.mask, image.label
-        if label is not None:
-            label = remapped(label, self.blocks.config)
-        if len(self._masked_labels) and label is not None:
-            masked = np.isin(label, self._masked_labels).astype(np.uint8)
-            mask = masked if mask is None else masked | mask
         rows, (left, right) = kernels.BORDER
         edges = [rows, (left, right - image.sensor.wraps)]
         return (

@@ -24,7 +24,7 @@ from surfel_mapper.config import SEMANTICS
 from surfel_mapper.errors import CloudFormatError, MapLimitError
 from surfel_mapper.tsdf.blocks import BlockMap, Int64
 from surfel_mapper.tsdf.kernels import point_fusion as kernels
-from surfel_mapper.tsdf.kernels.block_marks import count_marks, list_marks, mark_rays
+from surfel_mapper.tsdf.kernels.block_marks import mark_rays
 from surfel_mapper.tsdf.kernels.integration import INSIDE, MOVED, NUM_FOUND, OBSERVED, SOLID
 from surfel_mapper.tsdf.measurements import (
     checked_pose,
@@ -33,7 +33,7 @@ from surfel_mapper.tsdf.measurements import (
     remapped,
     settings,
 )
-from surfel_mapper.tsdf.selection import MAX_SIDE, NO_COSINE
+from surfel_mapper.tsdf.selection import listed, MAX_SIDE, NO_COSINE
 
 Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
@@ -167,7 +167,7 @@ class PointIntegrator:
             settings(self.blocks.config),
             POWERS[config.weight_mode],
         )
-        kernels.sum_surfaces(surfaces, origin, *content, blocks.lookup, slots, sums)
+        kernels.sum_surfaces(surfaces, origin, False, *content, blocks.lookup, slots, sums)
         if config.carve:
             kernels.sum_free(places, origin, *content, blocks.lookup, slots, sums)
         found = np.empty((len(rows), NUM_FOUND), np.int64)
@@ -212,9 +212,7 @@ class PointIntegrator:
         limits = config.min_range_m / config.voxel_size_m, config.max_range_m / config.voxel_size_m
         origin = T_map_sensor[:3, 3] / config.voxel_size_m
         kernels.mark_corners(surfaces, origin, low, side, self._bits, limits, marks)
-        index = np.empty((count_marks(marks), 3), np.int64)
-        list_marks(marks, side, low, index)
-        return index
+        return listed(marks, low, side)
 
     def _fuse_channels(
         self,

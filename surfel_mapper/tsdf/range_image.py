@@ -17,7 +17,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.tsdf.kernels import range_image as kernels
-from surfel_mapper.tsdf.sensors import CameraModel, Sensor
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel, Sensor
 
 Float32 = npt.NDArray[np.float32]
 
@@ -122,6 +122,24 @@ class RangeImage:
             cosine,
         )
         return replace(self, cosine=cosine)
+
+    def thin(self, step_m: float, widest_m: float) -> npt.NDArray[np.bool_]:
+        """
+        Return which pixels of a lidar are on objects narrower than widest_m, (rows, columns).
+
+        These are the runs of pixels of a row, up to step_m apart from one to the next, between
+        farther or unknown ones. Masked pixels do not count, nor do those of cameras, whose ranges
+        are wrong at edges.
+        """
+        sensor = self.sensor
+        found = np.zeros((sensor.rows, sensor.columns), bool)
+        if isinstance(sensor, LidarModel):
+            level = np.cos(sensor.elevations_rad) * sensor.pitch_rad[1]
+            farthest = np.float32(sensor.max_range_m)
+            kernels.find_thin(self.range_m, level, step_m, widest_m, farthest, found)
+        if self.mask is not None:
+            found &= self.mask[:, : sensor.columns] == 0
+        return found
 
     def _fitted(
         self, name: str, image: npt.NDArray[Any], channels: tuple[int, ...]

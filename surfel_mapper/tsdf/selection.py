@@ -10,6 +10,8 @@ rays only pass, which need no fusion if they are free already, are found here to
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 
@@ -21,7 +23,9 @@ from surfel_mapper.tsdf.kernels.block_marks import (
     look_up_marks,
     mark_rays,
 )
+from surfel_mapper.tsdf.kernels.point_fusion import mark_corners
 from surfel_mapper.tsdf.range_image import LEAST_COSINE, RangeImage
+from surfel_mapper.tsdf.sensors import Ranging
 
 Int64 = npt.NDArray[np.int64]
 Float64 = npt.NDArray[np.float64]
@@ -30,10 +34,36 @@ Flags = npt.NDArray[np.bool_]
 NO_COSINE = np.empty((0, 0), np.float32)
 
 MAX_SIDE = 2048
-"""Largest side of the cube about the sensor, blocks: 1 GiB of bits, twice that if carving."""
+"""Largest side of the cube about the sensor, blocks: 1 GiB of bits in each row of marks."""
+
+TOUCHED, NEAR, ABOUT = range(3)
+"""Rows of marks: blocks that rays touch, those in the band, those about thin objects."""
+
+NO_BLOCKS: Int64 = np.empty((0, 3), np.int64)
 
 SPACING_VOXELS = 0.7
 """Largest spacing of the rays walked through the band, voxels; the smallest is half of it."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Selected:
+    """
+    Blocks that a range image updates.
+
+    Attributes
+    ----------
+    index : (K, 3) int64
+        The blocks, ascending.
+    near : (K,) bool
+        False for blocks that rays only pass through; True for all if nothing is carved.
+    thin : (L, 3) int64
+        Those of the blocks that hold voxels about points of thin objects.
+
+    """
+
+    index: Int64
+    near: Flags
+    thin: Int64
 
 
 class BlockSelection:
@@ -49,18 +79,22 @@ class BlockSelection:
 
     def __init__(self, config: TsdfConfig) -> None:
         self._config = config
-        self._marks = np.zeros((2, 0), np.int64)
+        self._marks = np.zeros((3, 0), np.int64)
 
-    def blocks(self, image: RangeImage, T_map_sensor: Float64) -> tuple[Int64, Flags]:
+    def blocks(
+        self, image: RangeImage, T_map_sensor: Float64, thin: Float64 | None = None
+    ) -> Selected:
         """
-        Return the blocks that a range image updates, and those near its surface.
+        Return the blocks that a range image updates.
 
-        Returns
-        -------
-        index : (K, 3) int64
-            The blocks, ascending.
-        near : (K,) bool
-            False for blocks that rays only pass through; True for all if nothing is carved.
+        Parameters
+        ----------
+        image : RangeImage
+            The measurement.
+        T_map_sensor : (4, 4) float64
+            Pose of the sensor in the map frame.
+        thin : (P, 3) float64, optional
+            Points of thin objects, map frame, in voxels; the voxels about them are updated too.
 
         Raises
         ------
@@ -71,7 +105,7 @@ class BlockSelection:
         config = self._config
         half = half_side(config, image)
         if half == 0:
-            return np.empty((0, 3), np.int64), np.empty(0, bool)
+            return Selected(index=NO_BLOCKS, near=np.empty(0, bool), thin=NO_BLOCKS)
         side = 2 * half + 1
         if side > MAX_SIDE:
             raise MapLimitError(
@@ -79,37 +113,54 @@ class BlockSelection:
                 f'{config.block_size_m:g} m, expected at most {MAX_SIDE // 2}; use larger '
                 'voxels or a smaller max_range_m'
             )
-        if config.allocation == 'frustum' and not config.carve:
-            index = in_view(config, image, T_map_sensor, half)
-            return index, np.ones(len(index), bool)
-        marks, near, low = self._marked(image, T_map_sensor, half)
-        index = np.empty((count_marks(marks), 3), np.int64)
-        list_marks(marks, side, low, index)
-        if config.allocation == 'frustum':
-            index = in_view(config, image, T_map_sensor, half)
-        is_near = np.ones(len(index), bool)
-        if config.carve:
-            look_up_marks(near, side, low, index, is_near)
-        return index, is_near
-
-    def _marked(
-        self, image: RangeImage, T_map_sensor: Float64, half: int
-    ) -> tuple[Int64, Int64, Int64]:
-        """Return the marks of blocks that rays touch, of those in the band, and the corner."""
-        config, side = self._config, 2 * half + 1
-        num_words = side**3 // 64 + 1
-        if self._marks.shape[1] < num_words:
-            self._marks = np.zeros((1 + config.carve, num_words), np.int64)
-        marks, near = self._marks[0, :num_words], self._marks[1:].ravel()[:num_words]
-        near[:] = 0
         pose = T_map_sensor[:3] / config.block_size_m
         low = np.floor(pose[:, 3]).astype(np.int64) - half
-        pose[:, 3] -= low
+        marks = self._marked(image, pose, low, side)
+        around = NO_BLOCKS
+        if thin is not None and len(thin):
+            around = self._about(thin, image.sensor, T_map_sensor, low, side)
+        index = listed(marks[TOUCHED], low, side)
+        if config.allocation == 'frustum':
+            index = in_view(config, image, T_map_sensor, half)
+        near = np.ones(len(index), bool)
+        if config.carve:
+            look_up_marks(marks[NEAR], side, low, index, near)
+        return Selected(index=index, near=near, thin=around)
+
+    def _marked(self, image: RangeImage, pose: Float64, low: Int64, side: int) -> Int64:
+        """Return the marks of blocks that rays touch, and of those in the band, (3, words)."""
+        config, num_words = self._config, side**3 // 64 + 1
+        if self._marks.shape[1] < num_words:
+            self._marks = np.zeros((3, num_words), np.int64)
+        marks = self._marks[:, :num_words]
+        marks[NEAR] = 0
+        local = np.column_stack([pose[:, :3], pose[:, 3] - low])
         cosine = NO_COSINE if image.cosine is None else image.cosine
-        directions = image.sensor.directions
-        limits = reach(config, image)
-        mark_rays(image.range_m, cosine, directions, pose, limits, side, marks, near)
-        return marks, near, low
+        near = marks[NEAR] if config.carve else marks[NEAR, :0]
+        directions, limits = image.sensor.directions, reach(config, image)
+        mark_rays(image.range_m, cosine, directions, local, limits, side, marks[TOUCHED], near)
+        return marks
+
+    def _about(
+        self, thin: Float64, sensor: Ranging, T_map_sensor: Float64, low: Int64, side: int
+    ) -> Int64:
+        """Mark the blocks of the voxels about points, as touched and near; return them."""
+        config = self._config
+        marks = self._marks[:, : side**3 // 64 + 1]
+        bits = config.voxels_per_side.bit_length() - 1
+        origin = T_map_sensor[:3, 3] / config.voxel_size_m
+        limits = sensor.min_range_m / config.voxel_size_m, sensor.max_range_m / config.voxel_size_m
+        mark_corners(thin, origin, low, side, bits, limits, marks[ABOUT])
+        marks[TOUCHED] |= marks[ABOUT]
+        marks[NEAR] |= marks[ABOUT]
+        return listed(marks[ABOUT], low, side)
+
+
+def listed(marks: Int64, low: Int64, side: int) -> Int64:
+    """Return the marked blocks, (K, 3) int64, ascending, and clear the marks."""
+    index = np.empty((count_marks(marks), 3), np.int64)
+    list_marks(marks, side, low, index)
+    return index
 
 
 def reach_behind_m(config: TsdfConfig, image: RangeImage) -> float:

@@ -58,12 +58,8 @@ def mesh_error(
     if not len(triangles):
         raise RuntimeError('the mesh is empty')
     corners = np.asarray(vertices, np.float64)[triangles]
-    samples, chosen = spread_over(corners, voxel_size_m / 3.0)
-    off = distance(samples)
-    _, nearest = cKDTree(samples).query(truth, min(NEAREST, len(samples)))
-    near = corners[chosen[nearest.reshape(len(truth), -1)]]
-    missing = np.min([to_triangles(truth, near[:, n]) for n in range(near.shape[1])], axis=0)
-    missing = np.minimum(missing, 4.0 * voxel_size_m)
+    off = distance(spread_over(corners, voxel_size_m / 3.0)[0])
+    missing = np.minimum(distances_to_mesh(truth, corners, voxel_size_m), 4.0 * voxel_size_m)
     precision = float((off <= voxel_size_m).mean())
     recall = float((missing <= voxel_size_m).mean())
     return {
@@ -71,6 +67,17 @@ def mesh_error(
         'complete_mm': float(missing.mean()) * 1e3,
         'f_score': 2.0 * precision * recall / max(precision + recall, 1e-9),
     }
+
+
+def distances_to_mesh(points: FloatArray, corners: FloatArray, voxel_size_m: float) -> FloatArray:
+    """Return the distance of (N, 3) points from the nearest of (T, 3, 3) triangles, (N,) m."""
+    samples, chosen = spread_over(corners, voxel_size_m / 3.0)
+    _, nearest = cKDTree(samples).query(points, min(NEAREST, len(samples)))
+    near = corners[chosen[nearest.reshape(len(points), -1)]]
+    found: FloatArray = np.min(
+        [to_triangles(points, near[:, n]) for n in range(near.shape[1])], axis=0
+    )
+    return found
 
 
 def spread_over(corners: FloatArray, spacing_m: float) -> tuple[FloatArray, npt.NDArray[np.int64]]:

@@ -9,6 +9,9 @@ camera that turns in a room at 4 cm and 1 cm with 4 voxels, and with colours; on
 input is points or depths in the frame of the sensor; VDBFusion gets points in the map frame.
 Errors of meshes are distances from the equations of street and room; a mesh that is empty or less
 than half complete fails.
+
+Rows ``layer`` are the time of a scan in the layer of a mapper, its check of the sensor included.
+Then follow clouds of other kinds, see any_cloud.py.
 """
 
 from __future__ import annotations
@@ -22,7 +25,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import TsdfConfig
+from surfel_mapper.config import Config, TsdfConfig
+from surfel_mapper.pipeline import Mapper
+from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
@@ -30,6 +35,7 @@ from surfel_mapper.tsdf.mesh import Mesher
 from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.bench import room
+from test.bench.any_cloud import cloud_rows
 from test.bench.machine import one_core
 from test.bench.mesh_error import mesh_error
 from test.bench.options import Options
@@ -107,6 +113,27 @@ def run(options: Options) -> list[Row]:
             rows += case_rows(case, options)
     with one_core():
         rows += esdf_rows(street_cases(options, scans)[1])
+        rows += layer_rows(street_cases(options, scans)[1])
+    return rows + cloud_rows(options)
+
+
+def layer_rows(case: Case) -> list[Row]:
+    """Return rows of the whole layer, with its defaults and as in the preset of a lidar."""
+    rows: list[Row] = []
+    outdoors = {'voxel_size_m': 0.2, 'truncation_m': 0.6, 'min_range_m': 1.5, 'max_range_m': 60.0}
+    settings = {'defaults': {}, 'preset': {**case.ours, **outdoors, 'max_radius_m': 80.0}}
+    for name, ours in settings.items():
+        mapping = {f'layers.tsdf.{key}': value for key, value in ours.items()}
+        mapping |= {'layers.tsdf.enabled': True, 'layers.tsdf.threads': 1}
+        layer, found = Mapper(Config.from_mapping(mapping)).tsdf, []
+        for number, (path, pose) in enumerate(zip(case.files, case.poses, strict=True)):
+            scan = Scan(points=np.load(path), stamp_ns=number * 10**8, frame_id='lidar')
+            busy = process_time()
+            layer.insert(scan, pose)
+            found.append((process_time() - busy) * 1e3)
+        late = found[len(found) // 3 :]
+        figures = {'cpu_ms': float(np.median(late)), 'least_ms': min(late), 'scans': len(late)}
+        rows.append({'case': f'layer, {name}', 'who': 'surfel_mapper', **figures})
     return rows
 
 

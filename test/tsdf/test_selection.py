@@ -46,15 +46,16 @@ def test_the_view_holds_every_block_with_a_voxel_observed(sensor):
     config = TsdfConfig(**SIZES, allocation='frustum')
     for _ in range(20):
         T, image = random_pose(rng), random_image(sensor, rng)
-        chosen = {*map(tuple, BlockSelection(config).blocks(image, T)[0])}
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T).index)}
         one = Integrator(BlockMap(config))
         index = everywhere(T, 5.4, config.block_size_m)
         rows = one.blocks.place(index)
-        found, _ = one._fuse(image, T, 0, index, rows)
+        none = np.full(len(one.blocks.head), -1), np.zeros((0, 64, 3), np.float32)
+        found, _ = one._fuse(image, T, 0, index, rows, none)
         observed = found[:, OBSERVED]
         assert (observed > 0).sum() > 100
         assert {*map(tuple, index[observed > 0])} <= chosen
-        touched, _ = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T)
+        touched = BlockSelection(TsdfConfig(**SIZES)).blocks(image, T).index
         assert {*map(tuple, touched)} <= chosen
 
 
@@ -83,7 +84,7 @@ def test_rays_touch_every_block_of_their_band(sensor, extra_m):
     for _ in range(5):
         # So far away pixels are more than half a voxel apart, and none is passed over.
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
-        chosen = {*map(tuple, BlockSelection(config).blocks(image, T)[0])}
+        chosen = {*map(tuple, BlockSelection(config).blocks(image, T).index)}
         range_m = image.range_m[:, : sensor.columns]
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
@@ -120,7 +121,7 @@ def test_carving_reaches_all_but_corners_of_blocks_along_the_rays():
     range_m = np.repeat(np.repeat(rng.uniform(2.0, 19.0, (8, 32)), 8, 0), 32, 1)
     image, T = image_of(sensor, range_m), random_pose(rng)
     config = TsdfConfig(voxel_size_m=0.1, truncation_m=0.3)
-    chosen, _ = BlockSelection(config).blocks(image, T)
+    chosen = BlockSelection(config).blocks(image, T).index
     keys = {*map(tuple, chosen)}
     rays = sensor.directions.astype(float) @ T[:3, :3].T
     size, deep, missed = config.block_size_m, 0, 0
@@ -140,8 +141,8 @@ def test_without_a_measurement_there_is_no_block():
     for allocation in ('band', 'frustum'):
         image = image_of(SENSORS['lidar'], np.full((16, 90), np.nan))
         config = TsdfConfig(**SIZES, allocation=allocation)
-        index, near = BlockSelection(config).blocks(image, np.eye(4))
-        assert (index.shape, near.shape) == ((0, 3), (0,))
+        found = BlockSelection(config).blocks(image, np.eye(4))
+        assert (found.index.shape, found.near.shape, found.thin.shape) == ((0, 3), (0,), (0, 3))
 
 
 @pytest.mark.parametrize('sensor', SENSORS)
@@ -152,7 +153,8 @@ def test_blocks_near_the_surface_are_those_of_the_band(sensor, allocation):
     selection = BlockSelection(config)  # its marks are used again
     for _ in range(5):
         T, image = random_pose(rng), random_image(sensor, rng, nearest_m=2.5)
-        index, near = selection.blocks(image, T)
+        selected = selection.blocks(image, T)
+        index, near = selected.index, selected.near
         range_m = image.range_m[:, : sensor.columns]
         rays = sensor.directions.astype(float) @ T[:3, :3].T
         sampled = set()
@@ -167,8 +169,7 @@ def test_blocks_near_the_surface_are_those_of_the_band(sensor, allocation):
 
 def test_clearing_pixels_have_no_blocks_near_a_surface():
     image = image_of(SENSORS['camera'], np.full((36, 48), np.inf))
-    index, near = BlockSelection(TsdfConfig(**SIZES, carve=True)).blocks(image, np.eye(4))
-    assert len(index) > 100
-    assert not near.any()
-    index, near = BlockSelection(TsdfConfig(**SIZES, carve=False)).blocks(image, np.eye(4))
-    assert near.all()
+    found = BlockSelection(TsdfConfig(**SIZES, carve=True)).blocks(image, np.eye(4))
+    assert len(found.index) > 100
+    assert not found.near.any()
+    assert BlockSelection(TsdfConfig(**SIZES, carve=False)).blocks(image, np.eye(4)).near.all()

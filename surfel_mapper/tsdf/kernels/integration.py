@@ -15,6 +15,9 @@ negative behind it, and the weight, 0 for voxels never observed.
 A measurement that contradicts a voxel (it differs by half a voxel or more: a wall is gone, or an
 object has come) counts at least the share ``rate``, however heavy the voxel is; colours and
 labels always count that share. 0 never forgets.
+
+Objects thinner than a voxel are lost between voxel centres if only voxels are projected. The
+voxels about their points take distances that were summed point by point (point_fusion.py).
 """
 
 from numba import njit
@@ -72,19 +75,20 @@ JUMP = np.int32(2**31 - 1)
 
 @njit(cache=True, nogil=True, error_model='numpy')
 def integrate_blocks(
-    rows, corners, rates, offsets, field, sensor, images, settings, modes, channels, found
+    blocks, offsets, field, sensor, images, sums, settings, modes, channels, found
 ):
     """
     Fuse a range image into blocks; return the number of labels without a slot.
 
-    rows      (K,) int64, row of each block
-    corners   (K, 3) float32 m, centre of the first voxel of each block, in the sensor's frame
-    rates     (K,) float32, least share of contradicting measurements, in [0, 1)
+    blocks    (rows, corners, rates, slots) of K blocks: (K,) int64, their rows; (K, 3) float32 m,
+              centres of their first voxels in the sensor's frame; (K,) float32, least shares of
+              contradicting measurements, in [0, 1); (K,) int64, places in sums, -1 for none
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations, gaps), see kernels/projection.py and row_gaps
     images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
               subtract, fuse_color, vote_labels, apply_mask; missing images have no rows
+    sums      (S, N, 3) float32, distances of thin objects, see kernels/point_fusion.py
     settings  (NUM_SETTINGS,) float32
     modes     (interpolation, power): weights fall by depth^-(2 power)
     channels  (color, votes, stamps, semantics, extra_labels, skip_extra, stamp): rows of all
@@ -93,15 +97,16 @@ def integrate_blocks(
     found     (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
-    scratch = np.empty((14, num_voxels), np.float32)
+    scratch = np.empty((15, num_voxels), np.float32)
     x, y, z, distance = scratch[0], scratch[1], scratch[2], scratch[3]
     u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
-    pixels, value, fused = scratch[8:12], scratch[12], scratch[13]
+    pixels, value, fused, merged = scratch[8:12], scratch[12], scratch[13], scratch[14]
     place = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
     kind, parameters, elevations, gaps = sensor
     image, cosine, color_image, label_image, mask = images
     color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
+    rows, corners, rates, slots = blocks
     tau, most, overflow = settings[TAU], settings[MAX_WEIGHT], 0
     for b in range(len(rows)):
         row, rate = rows[b], rates[b]
@@ -126,11 +131,15 @@ def integrate_blocks(
             vote_labels(label_image, tau, u, v, mixed, signed, label)
             if len(extra_labels) > 0:
                 count -= keep_labels(extra_labels, tau, label, signed)
+        merged[:] = signed
+        if slots[b] >= 0:
+            replace_summed(sums[slots[b]], tau, signed, merged)
+            count = count_observed(merged)
         found[b, OBSERVED] = count
         if count == 0:
             found[b, MOVED] = 0
             continue
-        weigh(distance if kind > 0 else z, signed, settings, modes[1], weight)
+        weigh(distance if kind > 0 else z, merged, settings, modes[1], weight)
         if label_image.shape[0] > 0 and semantics != NONE:
             caps = most, rate
             overflow += fuse_labels(
@@ -143,7 +152,7 @@ def integrate_blocks(
         if stamps.shape[0] > 0:
             fuse_stamps(stamp, weight, field[row, 1], stamps[row])
         mean, total = field[row, 0], field[row, 1]
-        fuse(signed, weight, settings[CONTRADICTS], rate, mean, total, fused)
+        fuse(merged, weight, settings[CONTRADICTS], rate, mean, total, fused)
         found[b, MOVED] = largest_step(mean, fused, total, weight, settings[LEAST])
         replace(fused, weight, most, mean, total)
         found[b, SOLID], found[b, INSIDE] = count_solid(mean, total, tau)
@@ -176,6 +185,22 @@ def count_observed(signed):
     for n in range(len(signed)):
         count += np.int32(signed[n] > SKIP)
     return np.int64(count)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def replace_summed(sums, tau, signed, merged):
+    """
+    Replace the distances of the voxels that have sums, in a block.
+
+    sums    (N, 3) float32, see kernels/point_fusion.py
+    signed  (N,) float32 m, of the image; voxels that it did not observe become free of colours
+            and labels: tau
+    merged  (N,) float32 m, in and out
+    """
+    for n in range(len(signed)):
+        if sums[n, 2] > _ZERO:
+            merged[n] = sums[n, 0] / sums[n, 1]
+            signed[n] = max(signed[n], tau) if signed[n] == SKIP else signed[n]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -42,6 +42,9 @@ from surfel_mapper.tsdf.kernels.queries import find_voxel
 CORE = 1.0
 """Samples up to this far from the surface observe the eight voxels about them, voxels."""
 
+ASIDE = 0.87
+"""Voxels about thin objects are observed up to this far from the ray: half a diagonal."""
+
 STEP = 0.5
 """Distance of these samples, voxels."""
 
@@ -123,12 +126,13 @@ def weight_at(depth_m, signed_m, settings, power):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, sums):
+def sum_surfaces(points, origin, core_only, voxel_m, bits, settings, power, lookup, slots, sums):
     """
     Sum the measurements within the truncation of each point.
 
     points    (N, 3) float64, map frame; those out of range or not finite are skipped
     origin    (3,) float64, the sensor
+    core_only whether only voxels about the surface are observed, not all up to the truncation
     voxel_m   float64, edge of a voxel, m
     settings  (NUM_SETTINGS,) float32, see kernels/lookup.py
     power     weights fall by depth^-(2 power)
@@ -157,6 +161,8 @@ def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, 
         used += 1
         x, y, z = x / measured, y / measured, z / measured
         start, end = max(measured - tau, near), measured + behind
+        if core_only:
+            start = end = measured
         along[0], along[1], along[2] = x, y, z
         for _ in range(begin_walk(origin, along, start, end, places, steps, reached, spacing)):
             i, j, k = places[0], places[1], places[2]
@@ -190,6 +196,11 @@ def sum_surfaces(points, origin, voxel_m, bits, settings, power, lookup, slots, 
                 signed = first - (x * a + y * b + z * c)
                 if abs(signed) > tau:
                     continue
+                if core_only:
+                    ahead = measured - signed
+                    away = (u + a) ** 2 + (v + b) ** 2 + (w + c) ** 2 - ahead * ahead
+                    if away > ASIDE * ASIDE:
+                        continue
                 voxel = number + a + (b << bits) + (c << 2 * bits)
                 if not within:
                     row, voxel = find_voxel(i + a, j + b, k + c, bits, recent, head, table, depth)

@@ -214,3 +214,51 @@ def slope(first, middle, second, gap_m):
         return 0
     bend = abs(1.0 / first + 1.0 / second - 2.0 / middle)
     return side if bend <= STRAIGHT * abs(1.0 / first - 1.0 / second) else 0
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def find_thin(image, level, step_m, widest_m, max_range, thin):
+    """
+    Flag the pixels of objects that are narrower than a width: runs along a row with more behind.
+
+    image      (rows, columns or one more) float32 m; one more for a full circle
+    level      (rows,) float64 rad, angle between neighbouring columns of each row
+    step_m     pixels of a run differ by at most this from one to the next
+    widest_m   width of an object that is flagged, at most
+    max_range  float32 m, of the sensor
+    thin       (rows, columns) bool, in: False; out
+
+    Both neighbours of the run must be farther or unknown. Runs at the ends of a row count only if
+    it is a full circle.
+    """
+    rows, columns = np.int64(thin.shape[0]), np.int64(thin.shape[1])
+    around = image.shape[1] > columns
+    for row in range(rows):
+        first = 0
+        if around:
+            while first < columns and joined(image, row, first, columns, step_m, max_range):
+                first += 1
+        start, end = first, first + columns if around else columns
+        for column in range(start + 1, end + 1):
+            if column < end and joined(image, row, column, columns, step_m, max_range):
+                continue
+            begin, last = first % columns, (column - 1) % columns
+            width = (column - first) * level[row] * image[row, begin]
+            if 0.0 < width <= widest_m and image[row, begin] <= max_range:
+                left, right = image[row, (begin - 1) % columns], image[row, column % columns]
+                is_inside = around or (first > 0 and column < columns)
+                behind = (left <= 0.0 or left > image[row, begin]) and (
+                    right <= 0.0 or right > image[row, last]
+                )
+                if is_inside and behind:
+                    for inside in range(first, column):
+                        thin[row, inside % columns] = True
+            first = column
+
+
+@njit(cache=True, nogil=True, error_model='numpy', inline='always')
+def joined(image, row, column, columns, step_m, max_range):
+    """Return whether a pixel and the one before it in its row are of one run."""
+    before, here = image[row, (column - 1) % columns], image[row, column % columns]
+    known = before > 0.0 and here > 0.0 and max(before, here) <= max_range
+    return known and abs(here - before) <= step_m

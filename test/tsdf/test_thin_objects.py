@@ -1,0 +1,105 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Objects thinner than a voxel stay in the mesh of a lidar's range images."""
+
+import numpy as np
+import pytest
+
+from surfel_mapper.tsdf.mesh import Mesher
+from surfel_mapper.tsdf.sensors import LidarModel
+from test.bench.mesh_error import distances_to_mesh
+from test.tsdf.scenes import image_of, integrator, SMALL
+
+LIDAR = LidarModel(rows=32, columns=1024, vertical_fov_deg=30.0, max_range_m=40.0)
+VOXEL_M = 0.2
+SIZES = dict(voxel_size_m=VOXEL_M, truncation_m=0.6, max_range_m=40.0, threads=1)
+BEYOND_M = 20.0
+
+
+def ranges(at, radius_m, start=(0.0, 0.0)):
+    """Return the ranges of vertical poles before a round wall, and which pixels are on a pole."""
+    level = np.hypot(LIDAR.directions[..., 0], LIDAR.directions[..., 1]).astype(float)
+    x, y = (LIDAR.directions[..., axis] / level for axis in (0, 1))
+    nearest = np.full(level.shape, BEYOND_M)
+    for place in np.asarray(at, float) - start:
+        along = x * place[0] + y * place[1]
+        aside_sq = place @ place - along**2
+        depth = along - np.sqrt(np.maximum(radius_m**2 - aside_sq, 0.0))
+        nearest = np.where((aside_sq < radius_m**2) & (along > 0.0), depth, nearest)
+    return nearest / level, nearest < BEYOND_M
+
+
+POLES = [(4.0, 0.1), (-5.0, 0.0), (0.3, 6.0), (3.0, -7.0), (-6.0, -6.0)]
+"""The second is where the last column neighbours the first."""
+
+
+@pytest.mark.parametrize('carve', [False, True])
+@pytest.mark.parametrize('radius_m', [0.03, 0.05, 0.1])
+def test_the_mesh_goes_through_the_points_of_thin_poles(radius_m, carve):
+    one, points = integrator(**SIZES, carve=carve), []
+    for number in range(6):
+        T = np.eye(4)
+        T[0, 3] = 0.2 * number
+        range_m, on_pole = ranges(POLES, radius_m, T[:2, 3])
+        one.integrate(image_of(LIDAR, range_m), T, number * 10**8)
+        found = LIDAR.directions[on_pole] * range_m[on_pole, None] + T[:3, 3]
+        points.append(found)
+    points = np.concatenate(points).astype(float)
+    for place in POLES:  # every pole was seen
+        assert (np.hypot(*(points[:, :2] - place).T) < 2 * radius_m).sum() > 50
+    mesher = Mesher(one.blocks)
+    mesher.update()
+    mesh = mesher.mesh()
+    far = distances_to_mesh(points, mesh.vertices.astype(float)[mesh.triangles], VOXEL_M)
+    assert (far <= 1.5 * VOXEL_M).mean() >= 0.95
+
+
+def test_only_narrow_runs_before_farther_ones_are_thin():
+    range_m = np.full((LIDAR.rows, LIDAR.columns), 10.0)
+    step = 10.0 * 2.0 * np.pi / LIDAR.columns  # 6 cm between columns at 10 m
+    range_m[:, 100:103] = 5.0  # 9 cm wide at 5 m
+    range_m[:, 200:240] = 5.0  # 1.2 m
+    range_m[:, 300:303] = 15.0  # a gap
+    range_m[:, 400:403], range_m[:, 403:460] = 5.0, 4.0  # beside something nearer
+    range_m[:, 500:503], range_m[:, 503:] = 5.0, np.nan
+    range_m[:, [0, 1, -1]] = 5.0  # across the seam
+    thin = image_of(LIDAR, range_m).thin(0.2, 3.5 * step / 2.0)
+    columns = np.flatnonzero(thin.all(axis=0))
+    assert columns.tolist() == [0, 1, 100, 101, 102, 500, 501, 502, LIDAR.columns - 1]
+    assert thin.any(axis=0).sum() == len(columns)
+
+
+def test_masked_pixels_and_cameras_have_no_thin_objects():
+    range_m, on_pole = ranges(POLES, 0.05)
+    image = image_of(LIDAR, range_m)
+    assert image.thin(0.2, 0.25).sum() > 100
+    assert not image.with_images(mask=on_pole).thin(0.2, 0.25).any()
+    depth = np.full((SMALL.rows, SMALL.columns), 3.0)
+    depth[:, 40] = 1.0
+    assert not image_of(SMALL, depth).thin(0.2, 0.25).any()
+
+
+def test_thin_objects_of_dynamic_labels_leave_no_surface():
+    range_m, on_pole = ranges(POLES, 0.05)
+    solid = {}
+    for dynamic in ([], [7.0]):
+        one = integrator(**SIZES, dynamic_labels=dynamic)
+        image = image_of(LIDAR, range_m).with_images(label=np.where(on_pole, 7, -1))
+        one.integrate(image, np.eye(4))
+        row = one.blocks.find(np.floor(np.array([4.0, 0.1, 0.0]) / 1.6).astype(int))
+        known = one.blocks.weight[row] > 0.0
+        solid[len(dynamic)] = (known & (one.blocks.distance[row] < 0.3)).sum()
+    assert solid[0] > 20
+    assert solid[1] == 0
+
+
+def test_voxels_about_thin_objects_take_no_colour_of_the_background():
+    one = integrator(**SIZES, color=True)
+    range_m, on_pole = ranges(POLES, 0.03)
+    color = np.where(on_pole[..., None], (255, 0, 0), (0, 0, 255)).astype(np.uint8)
+    one.integrate(image_of(LIDAR, range_m).with_images(color=color), np.eye(4))
+    row = one.blocks.find(np.floor(np.array([4.0, 0.1, 0.0]) / 1.6).astype(int))
+    colored = one.blocks.color[row][3] > 0
+    assert (np.abs(one.blocks.distance[row]) < 0.3).sum() > 20
+    assert colored.any()
+    assert not one.blocks.color[row][2, colored].any()
