@@ -67,3 +67,23 @@ def test_a_topic_that_is_not_in_the_bag_is_refused(tmp_path):
     settings = {**COLORED, 'layers.tsdf.color_topic': 'nothing'}
     with pytest.raises(BagError, match='no topic /nothing; Image topics: /camera/'):
         replayed(recorded(tmp_path), settings)
+
+
+@pytest.mark.parametrize('number', [3, 80])
+def test_images_without_camera_info_beside_a_lidar_cost_no_scan(tmp_path, number):
+    entries, rng = Entries(), np.random.default_rng(3)
+    across = rng.uniform(-2.0, 2.0, (4000, 2))
+    wall = np.column_stack([np.full(4000, 4.0), across]).astype(np.float32)
+    for scan in range(number):
+        entries.cloud('/lidar', START_NS + scan * PERIOD_NS, wall)
+        color_image(entries, scan, late_ns=-1000)
+    entries.sort(key=lambda entry: entry[2])
+    settings = {**COLORED, 'input.kind': 'cloud', 'input.topics': ['/lidar']}
+    mapper, _ = replayed(write_rosbag2(tmp_path / 'bag', entries), settings)
+    assert mapper.counters.mapped == number
+    assert mapper.tsdf.summary()['scans'] == number
+    mesh = mapper.tsdf.mesh()
+    assert len(mesh) > 100
+    assert not mesh.colors.any()
+    ignored = mapper.counters.messages_ignored.get('bad_image', 0)
+    assert (ignored > 0) == (number > 64), mapper.counters.messages_ignored
