@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
-from test.bench import accuracy, decode, filters, real
+from test.bench import accuracy, decode, filters, real, scaling
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -46,6 +46,8 @@ def options(tmp_path_factory):
         window=WINDOW,
         windows=(2, 5),
         map_voxels=(100, 20_000),
+        real_windows=(1, 2),
+        real_map_voxels=(100, 20_000),
         beams=8,
         columns=64,
         cache=tmp_path_factory.mktemp('cache'),
@@ -166,11 +168,22 @@ def test_the_stages_of_mapping_are_all_there(options):
     ]
 
 
-def test_the_windows_and_maps_compared_are_as_long_and_large_as_asked(options):
+def test_the_windows_and_maps_compared_are_as_long_and_large_as_asked(options, monkeypatch):
+    monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
     rows = [row for row in bench.run(['scaling'], options) if row['voxel_m'] == 0.5]
     assert [row['window'] for row in rows] == [2, 5, WINDOW, WINDOW]
     small, large = (row['voxels'] for row in rows if row['varied'] == 'map')
     assert large - small == 20_000 - 100
+
+
+def test_windows_and_maps_of_a_real_scan_are_compared(options, monkeypatch):
+    points = np.random.default_rng(3).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
+    scans = [('another', points[:9]), (scaling.REAL, np.asfortranarray(points))]
+    monkeypatch.setattr(scaling, 'real_scans', lambda: scans)
+    rows = scaling.real_rows(options, 0.5)
+    assert [row['window'] for row in rows] == [1, 2, scaling.REAL_WINDOW, scaling.REAL_WINDOW]
+    assert rows[3]['voxels'] - rows[2]['voxels'] == 20_000 - 100
+    assert rows[0]['ratio'] == rows[2]['ratio'] == 1.0
 
 
 def test_scans_are_simulated_once_and_kept(options):
