@@ -4,8 +4,8 @@
 Add the moments of a scan to a map, subtract them again, and sum them into coarser voxels.
 
 All are integer sums by voxel, so that a subtraction undoes an addition to the bit, in any order.
-Rows of the slab are visited in the order of the scan; the hash bucket and the row of later voxels
-are prefetched, which hides most of the cache misses.
+Rows of the slab are visited in the order of the scan; the hash bucket, the count of its segment
+and the row of later voxels are prefetched, which hides most of the cache misses.
 
 A voxel of level L consists of 2^L finer voxels an axis and keeps their lattice unit. A point at q
 about the centre of its fine voxel lies at q + d about the coarse centre, d an integer vector: the
@@ -15,7 +15,7 @@ Moments come from files, messages and callers too. Sums beyond the range of a vo
 the integers of the map or give negative eigenvalues later, far from the cause; so moments that no
 points can have are found before they are added, in 20 us for 10,000 voxels.
 
-One module of 355 lines: all work on the moments of a scan and the rows of the same voxels.
+One module of 375 lines: all work on the moments of a scan and the rows of the same voxels.
 """
 
 from numba import njit
@@ -36,6 +36,7 @@ from surfel_mapper.kernels.hashing import (
     POINTS,
     remove_entry,
     ROWS_USED,
+    SEGMENT,
     VOXELS,
 )
 from surfel_mapper.kernels.layout import (
@@ -70,7 +71,7 @@ SLACK = 1.0 + 1e-9
 
 
 @njit(cache=True, nogil=True, inline='always')
-def look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely):
+def look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely):
     """
     Find the likely rows of num voxels from start on, and prefetch them.
 
@@ -82,7 +83,9 @@ def look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely):
     for i in range(num):
         hashed = hash_key(keys[start + i])
         hashes[i] = hashed
-        prefetch(buckets, first_bucket(hashed, directory, depth))
+        bucket = first_bucket(hashed, directory, depth)
+        prefetch(buckets, bucket)
+        prefetch(held, bucket // SEGMENT)
     for i in range(num):
         row = likely_row(hashes[i], directory, buckets, depth)
         likely[i] = row
@@ -99,13 +102,13 @@ def find_rows(keys, rows, table, state, found):
     keys   (K,) int64
     found  (K,) int32, out: row, -1 if not found
     """
-    directory, buckets, _, _ = table
+    directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
     hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
     for start in range(0, len(keys), BLOCK):
         num = min(BLOCK, len(keys) - start)
-        look_up(keys, start, num, flat, directory, buckets, depth, hashes, likely)
+        look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely)
         for i in range(num):
             row = likely[i]
             if row >= 0 and rows[row, KEY] != keys[start + i]:
@@ -135,7 +138,7 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
     done = start
     while done < len(keys):
         num = min(BLOCK, len(keys) - done)
-        look_up(keys, done, num, flat, directory, buckets, depth, hashes, likely)
+        look_up(keys, done, num, flat, directory, buckets, held, depth, hashes, likely)
         for i in range(num):
             place = done + i
             key = keys[place]
@@ -237,7 +240,9 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
     for i in range(num_emptied):
         if i + AHEAD < num_emptied:
             ahead = emptied[i + AHEAD]
-            prefetch(buckets, first_bucket(hash_key(keys[ahead]), directory, depth))
+            bucket = first_bucket(hash_key(keys[ahead]), directory, depth)
+            prefetch(buckets, bucket)
+            prefetch(num_held, bucket // SEGMENT)
             prefetch(flat, np.int64(found[ahead]) * ROW)
         place = emptied[i]
         row = np.int64(found[place])
