@@ -29,7 +29,17 @@ from surfel_mapper.errors import ModelError
 from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.growth import estimate_noise, grow, Grown, VoxelPoints
+from surfel_mapper.models.growth import (
+    add_facets,
+    estimate_noise,
+    grow,
+    Grown,
+    grown,
+    owner_table,
+    pieces_of,
+    VoxelPoints,
+)
+from surfel_mapper.models.joining import join_patches
 from surfel_mapper.models.kernels.voxel_means import (
     average_runs,
     CHUNK,
@@ -57,6 +67,9 @@ Indices = npt.NDArray[np.int64]
 
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
+
+COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0), 0.12
+"""Coarser voxels for sparse points, and the share of points on no patch from which they help."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
@@ -158,8 +171,39 @@ def fit_points(
         config,
         view,
     )
+    found = grow_sparse(thinned, voxels, found, config, view)
     laps.append(perf_counter())
     return fit_owners(thinned, voxels, found, config, view)
+
+
+def grow_sparse(
+    thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
+) -> Grown:
+    """Find facets in coarser voxels if many points are on no patch, and join across gaps."""
+    finest, noise = config.voxel_size_m, (config.noise_m, config.noise_per_range_sq)
+    owner, normals, curved = found.owner, found.normals, found.curved
+    of_row = np.empty(thinned.num_points, np.int32)
+    for factor in COARSER:
+        if not len(owner) or np.count_nonzero(owner < 0) < SPARSE_SHARE * len(owner):
+            break
+        size_m = factor * finest
+        coarse = thin(thinned.points, size_m).by_voxel()
+        of_row[voxels.rows] = owner
+        before = of_row[coarse.rows]
+        after = np.maximum(before, -1)
+        num = add_facets(coarse, after, len(normals), (size_m, found.tolerance_m), config)
+        table = owner_table(coarse, after)
+        index, normals, bent = join_patches(pieces_of(coarse, table, num), view, noise, finest)
+        # coarse voxels resolve less: what was curved stays so, unless a larger plane takes it
+        was = np.append(curved, np.zeros(num - len(curved), np.bool_))
+        points = np.bincount(after[after >= 0], minlength=num)
+        total = np.bincount(index, points, len(normals))
+        curved = bent | (2.0 * np.bincount(index, points * was, len(normals)) > total)
+        of_row[coarse.rows] = np.where(after < 0, before, np.append(index, 0)[after])
+        owner = of_row[voxels.rows]
+    if owner is found.owner:
+        return found
+    return grown(owner, owner_table(voxels, owner), normals, curved, found.tolerance_m)
 
 
 def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:

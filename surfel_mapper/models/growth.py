@@ -51,6 +51,9 @@ Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
 Owners = npt.NDArray[np.int32]
 
+OwnerTable = tuple[Owners, Array, Array, Indices]
+"""Owners (M,), means (M, 3) and counts (M,) by voxel and owner; first row (V + 1,) of a voxel."""
+
 FreeSurfels = tuple[Indices, npt.NDArray[np.bool_], Array, Array]
 """Number, flatness, mean and normal of the free points of every voxel, (V, ...) each."""
 
@@ -201,6 +204,8 @@ class Grown:
         Normals of the patches; of a curved one the mean.
     curved : (K,) bool
         Whether a patch is a curved surface.
+    tolerance_m : float
+        Distance up to which a point lies on a facet.
 
     """
 
@@ -209,6 +214,7 @@ class Grown:
     owners: Owners
     normals: Array
     curved: npt.NDArray[np.bool_]
+    tolerance_m: float
 
 
 def grow(
@@ -253,31 +259,34 @@ def grow(
     owner = np.repeat(label, np.diff(voxels.starts))
     free = free_surfels(voxels, owner, size_m, median_m)
     extend_patches(voxels, label, (tangent, tolerance), free, owner)
-    free = free_surfels(voxels, owner, size_m, median_m)
-    rules = (
-        median_m,
-        FACET_VOXELS,
-        max(FACET_POINTS, config.min_surface_points),
-        math.cos(math.radians(FACET_ANGLE_DEG)),
-        FACET_WIDTH_VOXELS * size_m,
-    )
-    num = add_facets(voxels, patches, free, rules, owner)
+    num = add_facets(voxels, owner, len(patches), (size_m, median_m), config)
     table = owner_table(voxels, owner)
-    out = sorted_table(table, 0, num)
-    pieces = Pieces(*out, adjacent=voxels.adjacent, first=table[3], owners=table[0])
-    index, normals, curved = join_patches(pieces, view, noise, size_m)
+    index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
     rename_owners(voxels.starts, group, index, owner)
     rename_owners(table[3], group, index, table[0])
+    return grown(owner, table, normals, curved, median_m)
+
+
+def grown(
+    owner: Owners,
+    table: OwnerTable,
+    normals: Array,
+    curved: npt.NDArray[np.bool_],
+    tolerance_m: float,
+) -> Grown:
+    """Return the points by patch; the table is consumed."""
     held = merge_owners(*table)
     owners, first = table[0][:held], table[3]
     low = min(int(owners.min(initial=0)), 0)
     starts, _, points, _ = sorted_table((owners, *table[1:3], first), low, len(normals) - low)
     names = np.repeat(np.arange(low, len(normals), dtype=np.int32), np.diff(starts))
-    return Grown(owner, points, names, normals, curved)
+    return Grown(owner, points, names, normals, curved, tolerance_m)
 
 
-OwnerTable = tuple[Owners, Array, Array, Indices]
-"""Owners (M,), means (M, 3) and counts (M,) by voxel and owner; first row (V + 1,) of a voxel."""
+def pieces_of(voxels: VoxelPoints, table: OwnerTable, number: int) -> Pieces:
+    """Return the means of the points of each patch."""
+    out = sorted_table(table, 0, number)
+    return Pieces(*out, adjacent=voxels.adjacent, first=table[3], owners=table[0])
 
 
 def owner_table(voxels: VoxelPoints, owner: Owners) -> OwnerTable:
@@ -318,17 +327,28 @@ def extend_patches(
 
 def add_facets(
     voxels: VoxelPoints,
-    patches: list[Plane],
-    free: FreeSurfels,
-    rules: tuple[float, ...],
     owner: Owners,
+    number: int,
+    sizes: tuple[float, float],
+    config: ModelsConfig,
 ) -> int:
-    """Grow facets from free points and write the owners; return the number of all patches."""
-    found = np.empty((len(patches) + MOST_FACETS, 4))
-    for k, patch in enumerate(patches):
-        found[k] = (*patch.normal, patch.offset_m)
+    """
+    Grow facets from free points and write the owners; return the number of all patches.
+
+    sizes: edge of the voxels and tolerance, m
+    """
+    size_m, tolerance_m = sizes
+    free = free_surfels(voxels, owner, size_m, tolerance_m)
+    rules = (
+        tolerance_m,
+        FACET_VOXELS,
+        max(FACET_POINTS, config.min_surface_points),
+        math.cos(math.radians(FACET_ANGLE_DEG)),
+        FACET_WIDTH_VOXELS * size_m,
+    )
+    planes = np.empty((number + MOST_FACETS, 4))
     state = voxels.points, voxels.starts, voxels.adjacent
-    return int(find_facets(*state, free, rules, owner, found, len(patches)))
+    return int(find_facets(*state, free, rules, owner, planes, number))
 
 
 def tangents(means: Array, label: Owners, patches: list[Plane]) -> Array:

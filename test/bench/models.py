@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.models import evaluate, fit, MultiModel
-from test.bench import live_models, tabletop
+from test.bench import live_models, scan_planes, tabletop
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.peers import OPEN3D, PeerSpec
@@ -49,7 +49,7 @@ PEER_RUNS = 3
 
 
 def run(options: Options) -> list[Row]:
-    """Return rows of rooms, of labelled frames of a table, and of live models."""
+    """Return rows of rooms, labelled frames of a table, scans of lidars, and live models."""
     rows: list[Row] = []
     runs = max(min(options.scans, 40), 5)
     for name, noise in (('room', 0.0), ('room, Kinect noise', KINECT)):
@@ -58,7 +58,7 @@ def run(options: Options) -> list[Row]:
             rows += [case(name, points, size_m, noise, runs) for size_m in SIZES_M]
             if options.peers:
                 rows += [peer(name, points, size_m, options.cache) for size_m in (0.01, 0.0)]
-    return [*rows, *tabletop.run(options), *live_models.run()]
+    return [*rows, *tabletop.run(options), *scan_planes.run(options), *live_models.run()]
 
 
 def case(

@@ -6,8 +6,12 @@ Planes of labelled Kinect frames of objects on a table (OSD), by voxel size.
 Means over the frames of: ``table``, the share of the flat table points in one plane; ``free``, the
 share of object points in no patch; ``impure``, the share of points in patches whose label is not
 that of most points of their patch; ``pieces``, the patches that are mostly table; ``patches``;
-``residual_mm``, the root mean square distance of the points from their planes; CPU time. The flat
-table points are those within 1 cm of the plane that most table points lie on.
+``residual_mm``, the root mean square distance of the points from their planes; ``boundary_mm``,
+the mean distance between the boundaries of objects and of their patches in the image; CPU time.
+The flat table points are those within 1 cm of the plane that most table points lie on.
+
+Four frames with their patches at 2 cm, beside those of Open3D with ``--peers``, are written to
+tabletop.png in the cache.
 
 The frames are those of the folder osd in SURFEL_MAPPER_TEST_DATA; without it there are no rows.
 Open3D's planar patches and its RANSAC planes (up to twelve, one after the other) are labelled by
@@ -17,6 +21,7 @@ the points within a voxel of their boxes, and within 1 cm of their planes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+import contextlib
 import json
 import os
 from pathlib import Path
@@ -25,6 +30,9 @@ from time import thread_time
 
 import numpy as np
 import numpy.typing as npt
+from PIL import Image
+from scipy.ndimage import binary_erosion
+from scipy.spatial import cKDTree
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.files.pcd import read_points
@@ -47,6 +55,8 @@ TABLE = 1
 """Label of the table; objects have higher ones, 0 is unlabelled."""
 
 NEAR_M = 0.01
+SHAPE = 480, 640
+PICTURE_SIZE_M, PICTURE_FRAMES = 0.02, 4
 RUNS = 4
 
 
@@ -64,7 +74,26 @@ def run(options: Options) -> list[Row]:
             rows.append(mean_row('surfel_mapper', size_m, found))
         if options.peers:
             rows += peer_rows(frames, options.cache)
+        picture(frames[:PICTURE_FRAMES], options)
     return rows
+
+
+def picture(
+    frames: Sequence[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]], options: Options
+) -> None:
+    """Write the patches of frames to tabletop.png in the cache."""
+    rows: list[tuple[npt.NDArray[np.integer], ...]] = []
+    for points, _ in frames:
+        model = fit(points, ModelsConfig(voxel_size_m=PICTURE_SIZE_M))
+        own = np.where(model.labels < len(model.patches), model.labels, -1)
+        others: tuple[npt.NDArray[np.integer], ...] = ()
+        if options.peers:
+            with contextlib.suppress(PeerError):  # told in the rows
+                method = 'planar patches'
+                others = (open3d_labels(points, method, PICTURE_SIZE_M, options.cache)[0],)
+        rows.append((own, *others))
+    options.cache.mkdir(parents=True, exist_ok=True)
+    write_picture(options.cache / 'tabletop.png', rows)
 
 
 def frame(file: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:
@@ -86,7 +115,8 @@ def ours(
     number = len(model.patches)
     patch = np.where(model.labels < number, model.labels, -1)
     planes = np.arange(number) < len(model.planes)
-    return {**figures(points, labels, patch, planes), 'cpu_ms': min(times)}
+    found = {**figures(points, labels, patch, planes), 'cpu_ms': min(times)}
+    return {**found, 'boundary_mm': boundary_error_mm(points, labels, patch)}
 
 
 def figures(
@@ -131,6 +161,61 @@ def figures(
         'patches': float(len(used)),
         'residual_mm': 1e3 * float(np.sqrt(squares / max(total, 1))),
     }
+
+
+def boundary_error_mm(
+    points: npt.NDArray[np.float32],
+    labels: npt.NDArray[np.int64],
+    patch: npt.NDArray[np.integer],
+) -> float:
+    """
+    Return the mean distance between boundaries of objects and of their patches, both ways.
+
+    An object's patches are those with most points on it; one without patches is left out.
+
+    Parameters
+    ----------
+    points, labels, patch : (N, 3), (N,), (N,)
+        An organised frame, of SHAPE; patch is -1 for none.
+
+    """
+    votes = np.zeros((int(patch.max(initial=-1)) + 1, int(labels.max()) + 1), np.int64)
+    known = (patch >= 0) & (labels > 0)
+    np.add.at(votes, (patch[known], labels[known]), 1)
+    object_of = np.append(votes.argmax(axis=1), 0)[patch]
+    total, number = 0.0, 0
+    for label in np.unique(labels[labels > TABLE]):
+        trees = []
+        for mask in (labels == label, (object_of == label) & (patch >= 0)):
+            image = mask.reshape(SHAPE)
+            rim = (image & ~binary_erosion(image)).reshape(-1)
+            trees.append(points[rim & np.isfinite(points).all(axis=1)])
+        if min(map(len, trees)) > 0:
+            for one, other in (trees, trees[::-1]):
+                distance = cKDTree(other).query(one)[0]
+                total, number = total + float(distance.sum()), number + len(distance)
+    return 1e3 * total / max(number, 1)
+
+
+def write_picture(file: Path, frames: Sequence[tuple[npt.NDArray[np.integer], ...]]) -> None:
+    """Write patches of frames (labels of one or two methods, (N,) each), a colour each, as PNG."""
+    rng = np.random.default_rng(1)
+    colours = np.concatenate([rng.integers(60, 256, (4096, 3)), [[0, 0, 0]]]).astype(np.uint8)
+    colours[0] = 200
+    rows = [
+        np.concatenate([colours[by_size(patch)].reshape(*SHAPE, 3) for patch in methods], axis=1)
+        for methods in frames
+    ]
+    Image.fromarray(np.concatenate(rows)[::2, ::2]).save(file)
+
+
+def by_size(patch: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """Renumber patches by their points, so that a table has the same colour in all pictures."""
+    counts = np.bincount(patch[patch >= 0], minlength=1)
+    rank = np.empty(len(counts) + 1, np.int64)
+    rank[np.argsort(-counts, kind='stable')] = np.arange(len(counts))
+    rank[-1] = -1
+    return rank[patch]
 
 
 def table_plane(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
@@ -179,6 +264,16 @@ def peer(
     cache: Path,
 ) -> dict[str, float]:
     """Return the figures of one frame."""
+    patch, duration = open3d_labels(points, method, size_m, cache)
+    planes = np.ones(int(patch.max(initial=-1)) + 1, np.bool_)
+    found = {**figures(points, labels, patch, planes), 'cpu_ms': duration}
+    return {**found, 'boundary_mm': boundary_error_mm(points, labels, patch)}
+
+
+def open3d_labels(
+    points: npt.NDArray[np.float32], method: str, size_m: float, cache: Path
+) -> tuple[npt.NDArray[np.int32], float]:
+    """Return the index of Open3D's patch of each point, -1 for none, and its milliseconds."""
     python = environment(OPEN3D_TABLETOP, cache)
     with tempfile.TemporaryDirectory() as scratch:
         source, result = Path(scratch) / 'points.npy', Path(scratch) / 'patch.npy'
@@ -186,6 +281,4 @@ def peer(
         arguments = ('-m', OPEN3D_TABLETOP.module, str(source), str(result), method, str(size_m))
         one_thread = {**os.environ, 'OMP_NUM_THREADS': '1'}
         said = output([str(python), *arguments], cwd=ROOT, env=one_thread)
-        patch = np.load(result)
-    planes = np.ones(int(patch.max(initial=-1)) + 1, np.bool_)
-    return {**figures(points, labels, patch, planes), 'cpu_ms': json.loads(said.splitlines()[-1])}
+        return np.load(result), float(json.loads(said.splitlines()[-1]))

@@ -214,6 +214,24 @@ def test_a_bent_sheet_is_one_surface_and_a_roof_two_planes():
         assert np.bincount(model.labels).max() > 0.49 * len(x)
 
 
+def test_rings_of_a_lidar_on_a_floor_are_one_plane():
+    rng = np.random.default_rng(10)
+    below = np.radians(np.arange(3.0, 40.0, 1.3))  # 29 beams, gaps of 0.1 to 12 m
+    angle = np.radians(np.arange(0.0, 360.0, 0.2))
+    reach = np.repeat(1.8 / np.tan(below), len(angle))
+    angle = np.tile(angle, len(below))
+    floor = np.column_stack(
+        [reach * np.cos(angle), reach * np.sin(angle), np.full(len(angle), -1.8)]
+    )
+    floor *= (
+        1.0 + 0.01 * rng.standard_normal((len(floor), 1)) / np.linalg.norm(floor, axis=1)[:, None]
+    )
+    model = fit(floor[reach < 15.0], ModelsConfig(voxel_size_m=0.3))
+    counts = np.bincount(model.labels)
+    assert counts.max() > 0.9 * counts.sum()
+    assert abs(model.patches[int(counts.argmax())].normal[2]) == pytest.approx(1.0, abs=1e-4)
+
+
 def test_an_organised_cloud_has_labels_for_all_its_points():
     cloud = np.full((40, 50, 3), np.nan, np.float32)
     cloud[5:, :, :] = sheet(1.0, 0.7, 0.02)[: 35 * 50].reshape(35, 50, 3)

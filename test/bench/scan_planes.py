@@ -1,0 +1,92 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Planes of real single scans of lidars, beside Open3D's planar patches, by voxel size.
+
+For each scan: ``covered``, the share of its points in patches; ``residual_mm``, the root mean
+square distance of these points from the planes through the points of their patch; ``patches``; CPU
+time.
+The scans are those of the folder scans in SURFEL_MAPPER_TEST_DATA; without it there are no rows.
+Open3D's patches contain the points within a voxel of their boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+import os
+from pathlib import Path
+from time import thread_time
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import ModelsConfig
+from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.models import fit
+from test.bench.machine import one_core
+from test.bench.options import Options
+from test.bench.peers.run import PeerError
+from test.bench.report import Row
+from test.bench.tabletop import open3d_labels, OPEN3D_TABLETOP
+
+SIZES_M = (0.2, 0.3, 0.5)
+SUFFIXES = ('.pcd', '.ply', '.bin')
+METHOD = 'planar patches'
+
+
+def run(options: Options) -> list[Row]:
+    """Return rows for every scan and voxel size, ours and those of Open3D."""
+    rows: list[Row] = []
+    for name, points in real_scans():
+        for size_m in SIZES_M:
+            row: Row = {'cloud': name, 'voxel_m': size_m, 'points': len(points)}
+            with one_core():
+                rows.append({**row, 'who': 'surfel_mapper', **ours(points, size_m)})
+            if options.peers:
+                rows.append({**row, **peer(points, size_m, options.cache)})
+    return rows
+
+
+def real_scans() -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
+    """Yield name and points (N, 3), m, of every scan; those at the sensor are no returns."""
+    data = os.environ.get('SURFEL_MAPPER_TEST_DATA')
+    for file in sorted((Path(data) / 'data' / 'scans').iterdir()) if data else []:
+        if file.suffix in SUFFIXES:
+            points = np.asarray(read_scan(file)[0], np.float32).reshape(-1, 3)
+            held = np.isfinite(points).all(axis=1) & points.any(axis=1)
+            yield file.stem, points[held]
+
+
+def ours(points: npt.NDArray[np.float32], size_m: float) -> dict[str, float]:
+    """Return the figures of one scan."""
+    config = ModelsConfig(voxel_size_m=size_m)
+    fit(points, config)  # compiles
+    start = thread_time()
+    model = fit(points, config)
+    duration = (thread_time() - start) * 1e3
+    patch = np.where(model.labels < len(model.patches), model.labels, -1)
+    return {**figures(points, patch), 'cpu_ms': duration}
+
+
+def figures(points: npt.NDArray[np.floating], patch: npt.NDArray[np.integer]) -> dict[str, float]:
+    """Return coverage and residual of points (N, 3) with the index of their patch, -1 for none."""
+    squares, held = 0.0, patch >= 0
+    for k in np.unique(patch[held]):
+        own = points[patch == k].astype(np.float64)
+        if len(own) > 3:
+            squares += float(np.linalg.eigvalsh(np.cov(own.T, bias=True))[0]) * len(own)
+    return {
+        'covered': float(held.mean()),
+        'residual_mm': 1e3 * float(np.sqrt(squares / max(held.sum(), 1))),
+        'patches': float(len(np.unique(patch[held]))),
+    }
+
+
+def peer(points: npt.NDArray[np.float32], size_m: float, cache: Path) -> Row:
+    """Return the figures of Open3D for one scan."""
+    try:
+        patch, duration = open3d_labels(points, METHOD, size_m, cache)
+    except PeerError as error:
+        return {'who': f'{OPEN3D_TABLETOP.name} {METHOD}, not measured: {error}'}
+    name = f'{OPEN3D_TABLETOP.name} {METHOD}'
+    return {'who': name, **figures(points, patch), 'cpu_ms': duration}
