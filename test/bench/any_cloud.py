@@ -124,7 +124,7 @@ def peer_rows(case: Case, options: Options) -> list[Row]:
         np.save(files[-1], scan.points[in_range(scan.points)])
     settings = {'voxel_size_m': VOXEL_M, 'truncation_m': TRUNCATION_M, 'carve': False}
     try:
-        _, mesh = run_tsdf(VDBFUSION, options.cache, files, np.array(case.poses), settings)
+        _, mesh, _ = run_tsdf(VDBFUSION, options.cache, files, np.array(case.poses), settings)
     except PeerError as error:
         return [{'case': case.name, 'who': f'{VDBFUSION.name}, not measured: {error}'}]
     found = {'share': share(case, *mesh), 'triangles': len(mesh[1])}

@@ -56,9 +56,9 @@ def run_tsdf(
     scans: Sequence[Path],
     poses: npt.NDArray[np.float64],
     settings: dict[str, Any],
-) -> tuple[npt.NDArray[np.float64], Mesh]:
+) -> tuple[npt.NDArray[np.float64], Mesh, float]:
     """
-    Return the times of every scan, (S, 2) ms of the clock and of the processor, and the mesh.
+    Return the times of every scan, (S, 2) ms of clock and processor, the mesh, and its time, ms.
 
     Raises
     ------
@@ -82,4 +82,5 @@ def run_tsdf(
         command = [str(python), '-m', 'test.bench.peers.tsdf_driver']
         said = output(command, input=json.dumps(job), cwd=ROOT, env=one_thread)
         mesh = np.load(files['mesh.npz'])
-        return np.array(json.loads(said.splitlines()[-1])), (mesh['vertices'], mesh['triangles'])
+        times = np.array(json.loads(said.splitlines()[-1]))
+        return times, (mesh['vertices'], mesh['triangles']), float(mesh['mesh_ms'])
