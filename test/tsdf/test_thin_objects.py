@@ -103,3 +103,30 @@ def test_voxels_about_thin_objects_take_no_colour_of_the_background():
     assert (np.abs(one.blocks.distance[row]) < 0.3).sum() > 20
     assert colored.any()
     assert not one.blocks.color[row][2, colored].any()
+
+
+@pytest.mark.parametrize('pixel', [(16, 100), (3, 700), (30, 0)])
+def test_voxels_about_a_thin_point_have_their_distance_along_its_ray(pixel):
+    range_m = np.full((LIDAR.rows, LIDAR.columns), BEYOND_M)
+    range_m[pixel] = 7.3
+    one = integrator(**SIZES, carve=True)
+    T = np.eye(4)
+    T[:3, 3] = (31.37, -12.21, 1.83)
+    one.integrate(image_of(LIDAR, range_m), T)
+    ray = LIDAR.directions[pixel].astype(float)
+    expected = {}
+    for step in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        sample = T[:3, 3] / VOXEL_M + (7.3 / VOXEL_M + step) * ray
+        for corner in np.ndindex(2, 2, 2):
+            voxel = np.floor(sample - 0.5).astype(int) + corner
+            offset = (voxel + 0.5) * VOXEL_M - T[:3, 3]
+            along = offset @ ray
+            if np.linalg.norm(offset - along * ray) <= 0.87 * VOXEL_M:
+                expected[tuple(voxel)] = 7.3 - along
+    assert len(expected) > 6
+    for voxel, signed in expected.items():
+        row = one.blocks.find(np.array(voxel) >> 3)
+        x, y, z = np.array(voxel) & 7
+        number = x + 8 * (y + 8 * z)
+        assert one.blocks.weight[row, number] > 0.0
+        assert one.blocks.distance[row, number] == pytest.approx(signed, abs=2e-5)
