@@ -159,8 +159,8 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
         raise FileFormatError(f'{path}: no such file or directory')
     name = name or path.stem
     if path.suffix == '.npz':
-        surfel_map, scans = map_state.load_map(path)
-        yield ExactMap.of(name, surfel_map, scans)
+        moments, empty, scans = map_state.load_moments(path)
+        yield ExactMap(name, moments, empty.columns, empty.origin_m, scans)
     elif path.suffix == '.parquet':
         yield ExactMap.of(name, parquet.read_map(path), [])
     elif path.suffix == '.obj':

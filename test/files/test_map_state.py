@@ -9,7 +9,7 @@ import pytest
 
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.files.map_state import load_map, load_moments, save_map
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
@@ -66,6 +66,29 @@ def test_a_loaded_map_continues_like_the_saved_one(tmp_path):
 
     assert len(resumed) == len(window) == 3
     assert loaded == surfel_map
+
+
+def test_moments_are_read_without_their_map(tmp_path):
+    surfel_map, window = driven()
+    surfel_map.origin_m = (512.0, 0.0, 8.0)
+    save_map(tmp_path / 'map.npz', surfel_map, window)
+
+    moments, empty, scans = load_moments(tmp_path / 'map.npz')
+
+    assert (empty.num_voxels, empty.origin_m.tolist()) == (0, [512.0, 0.0, 8.0])
+    empty.insert(moments)
+    assert empty.digest() == surfel_map.digest()
+    assert [scan.stamp_ns for scan in scans] == [scan.stamp_ns for scan in window]
+
+
+@pytest.mark.parametrize('name', ['duplicate', 'count', 'shape', 'type', 'missing', 'pose'])
+def test_impossible_moments_are_refused(tmp_path, name):
+    save_map(tmp_path / 'map.npz', *driven())
+    arrays, attributes = load_state(tmp_path / 'map.npz')
+    globals()[f'damage_{name}'](arrays, attributes)
+    save_state(tmp_path / 'map.npz', arrays, attributes)
+    with pytest.raises(FileFormatError, match='damaged'):
+        load_moments(tmp_path / 'map.npz')
 
 
 def test_an_empty_map_comes_back(tmp_path):
