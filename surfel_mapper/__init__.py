@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from surfel_mapper.offline.replay import replay
     from surfel_mapper.pipeline import Mapper
     from surfel_mapper.scan import Scan
+    from surfel_mapper.viz.inline import show
 
 __version__ = '0.1.0'
 
@@ -49,6 +50,7 @@ __all__ = [
     'estimate_normals',
     'load_config',
     'replay',
+    'show',
 ]
 
 _HOMES = {
@@ -67,6 +69,7 @@ _HOMES = {
     'estimate_normals': 'filters.normals',
     'load_config': 'config',
     'replay': 'offline.replay',
+    'show': 'viz.inline',
 }
 """The module that each public name comes from."""
 

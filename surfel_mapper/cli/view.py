@@ -108,9 +108,9 @@ def shown(args: argparse.Namespace) -> int:
         for each in contents(path, (path.resolve().name if path.is_dir() else '') if many else '')
     ]
     with opened(args) as scene:
-        from surfel_mapper.viz.show import show
+        from surfel_mapper.viz.show import show_contents
 
-        about = show(
+        about = show_contents(
             scene,
             found,
             colouring=args.color,

@@ -236,9 +236,11 @@ def write_files(
     """
     from surfel_mapper.files.atomic import write_json
     from surfel_mapper.files.trajectory import TRAJECTORY
+    from surfel_mapper.viz.detail import drawn_surfels
     from surfel_mapper.viz.drawings import draw_points, page_meshes, section_html
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
+    from surfel_mapper.viz.turning_view import most_shown
 
     meshes, sections = {}, []
     for layer in mapper.layers.values():
@@ -260,7 +262,9 @@ def write_files(
     )
     origin_m = mapper.map.origin_m
     draw_map(surfels, picture, title, trajectory=trajectory.positions, origin_m=origin_m)
-    write_report(page, title, summary, surfels, history, picture, meshes, sections)
+    place = trajectory.positions[-1] if trajectory.stamps_ns else (0.0, 0.0, 0.0)
+    in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, place, most_shown(meshes))
+    write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
     write_json(figures, summary)
     maps = [output / FORMATS[name] for name in formats]
     return [*maps, output / TRAJECTORY, picture, page, figures]

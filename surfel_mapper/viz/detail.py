@@ -20,7 +20,7 @@ import numpy.typing as npt
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.moments import coarse_moments, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.mapping.surfels import concatenated, Surfels
 
 Array = npt.NDArray[np.float64]
 
@@ -141,6 +141,32 @@ class DetailedMap:
         low = self.tiles * self.edge_m
         away = np.maximum(np.maximum(low - place[:2], place[:2] - low - self.edge_m), 0.0)
         return np.asarray(np.sqrt((away * away).sum(axis=1)))
+
+
+def drawn_surfels(
+    surfel_map: SurfelMap, min_points: int, place: npt.ArrayLike, at_most: int
+) -> Surfels:
+    """
+    Return the surfels of a map by which it is drawn, of several levels if there are many.
+
+    Parameters
+    ----------
+    surfel_map : SurfelMap
+        The map.
+    min_points : int
+        Voxels with fewer points are no surfels.
+    place : (3,) float, m
+        The place around which the map has its full detail, in the frame of the map.
+    at_most : int
+        Limit of their number.
+
+    """
+    surfels = surfel_map.surfels(min_points)
+    if len(surfels) <= at_most:
+        return surfels
+    found = DetailedMap(surfel_map.moments(), surfel_map.columns, min_points)
+    level = found.choose(place, at_most)
+    return concatenated([found.surfels(tile, int(level[tile])) for tile in range(len(found))])
 
 
 def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArray[np.int64]]:

@@ -5,7 +5,7 @@ Meshes for pages and viewers: vertex normals and simplification.
 
 A mesh is simplified by merging the vertices in each cell of a grid (Rossignac and Borrel 1993), in
 one pass of array operations for any topology. Triangles with merged corners vanish. Edges are
-rounded by a cell, a pixel or two for 100,000 triangles on a page.
+rounded by a cell, a few pixels for 24,000 triangles on a page.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import numpy.typing as npt
 from surfel_mapper.geometry import face_normals
 from surfel_mapper.tsdf.mesh import Mesh
 
-MAX_TRIANGLES = 150_000
-"""Limit on a page: with 75,000 vertices of 16 bytes and 12 bytes a triangle, 4 MB of text."""
+MAX_TRIANGLES = 24_000
+"""Limit on a page: with 12,000 vertices of 16 bytes and 12 bytes a triangle, 0.6 MB of text."""
 
 VERTEX = np.dtype([('place', '<u2', 3), ('', '<u2'), ('color', 'u1', 4), ('normal', 'i1', 4)])
 """Vertex format of page/view.js; the fourth components of colour and normal are unused."""

@@ -51,6 +51,7 @@ def write_report(
     picture: str | Path | None = None,
     layers: Mapping[str, Mesh] | None = None,
     sections: Sequence[str] = (),
+    drawn: Surfels | None = None,
 ) -> None:
     """
     Write a report, whole or not at all.
@@ -74,6 +75,8 @@ def write_report(
         Meshes that can be shown in place of the surfels, by name.
     sections : sequence of str
         Further sections as HTML, below the map.
+    drawn : Surfels, optional
+        The surfels of the 3D view, as ``drawn_surfels`` of detail.py returns them for a large map.
 
     Raises
     ------
@@ -83,10 +86,11 @@ def write_report(
     """
     history = history or History()
     valid = surfels.select(np.isfinite(surfels.planarity))
+    shown = valid if drawn is None else drawn.select(np.isfinite(drawn.planarity))
     parts = [
         f'<h1>{escape(title)}</h1><p class="about">{escape(about(summary))}</p>',
         figures(summary, history),
-        turning_view(valid, history.trajectory, summary, picture, layers or {}),
+        turning_view(shown, history.trajectory, summary, picture, layers or {}),
         *sections,
         plots(valid, summary, history),
         pose_errors_table(summary.get('pose_errors')),

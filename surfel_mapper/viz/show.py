@@ -36,7 +36,7 @@ ROUND_M = 1000.0
 """The origin of contents without one is a multiple of this."""
 
 
-def show(
+def show_contents(
     scene: Scene,
     contents: Sequence[Content],
     *,

@@ -3,14 +3,15 @@
 """
 The interactive 3D view of report.html: its elements and the data for page/view.js.
 
-The data is JSON without the character <, so it cannot begin a tag. A surfel takes 12 bytes: 1.6 MB
-of text for the limit of 100,000; each mesh takes up to 4 MB more.
+The data is JSON without the character <, so it cannot begin a tag. A surfel takes 12 bytes, 1.3 MB
+of text for the limit, which keeps the page below 2 MB; with meshes fewer surfels are shown.
 """
 
 from __future__ import annotations
 
 import base64
 from collections.abc import Mapping
+import io
 import json
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,8 @@ from surfel_mapper.viz.picture import limits
 
 Array = npt.NDArray[np.float64]
 
-MAX_SHOWN = 100_000
-"""Limit of the surfels shown; larger maps are subsampled with a fixed seed."""
+MAX_SHOWN, BESIDE_MESHES = 80_000, 45_000
+"""Limits of the surfels shown, alone and if there are meshes; see ``detail.drawn_surfels``."""
 
 SURFEL = np.dtype(
     [('place', '<u2', 3), ('radius', 'u1'), ('planarity', 'u1'), ('normal', 'i1', 3), ('', 'u1')]
@@ -42,16 +43,29 @@ def turning_view(
     picture: str | Path | None,
     layers: Mapping[str, Mesh],
 ) -> str:
-    """Return the 3D view with its data; layers can be shown in the place of the surfels."""
+    """
+    Return the 3D view with its data; layers can be shown in the place of the surfels.
+
+    ``surfels`` are those drawn, of several levels for a large map; if they are more than the limit
+    a selection with a fixed seed is shown.
+    """
     layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
-    note = 'Drag to turn, with shift to move, wheel to zoom.'
+    note = (
+        'Drag or arrows turn, with shift they move; wheel, + and - zoom, 0 resets, F is full '
+        'screen. A click shows the values of a surfel.'
+    )
     mixed = np.random.default_rng(0).permutation(
         len(shown)
     )  # while the view moves, only the first are drawn
-    shown = shown.select(mixed[:MAX_SHOWN])
-    if len(mixed) > MAX_SHOWN:
-        note += f' {MAX_SHOWN:,} of {summary["surfels"]:,} surfels are shown.'
+    shown = shown.select(mixed[: most_shown(layers)])
+    if len(shown) < len(mixed):
+        note += f' {len(shown):,} of {summary["surfels"]:,} surfels are shown.'
+    elif len(surfels) < summary['surfels']:
+        note += (
+            f' The {summary["surfels"]:,} surfels are shown by {len(shown):,}: parts far from the '
+            'end of the trajectory by larger voxels of the same points.'
+        )
     choice = ''
     if layers:
         kinds = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
@@ -59,24 +73,46 @@ def turning_view(
     for name, mesh in layers.items():
         if len(mesh) > MAX_TRIANGLES:
             note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
-    height_m = summary.get('origin_m', (0.0, 0.0, 0.0))[2]
-    data = json.dumps(view_data(shown, trajectory, layers, height_m)).replace('<', '\\u003c')
+    origin_m = np.asarray(summary.get('origin_m', (0.0, 0.0, 0.0)), np.float64)
+    data = json.dumps(view_data(shown, trajectory, layers, origin_m)).replace('<', '\\u003c')
     fallback = '<p class="none">This browser has no WebGL 2.</p>'
     if picture is not None:
-        png = base64.b64encode(Path(picture).read_bytes()).decode()
+        png = base64.b64encode(small_png(picture)).decode()
         fallback = f'<img alt="the map, drawn" src="data:image/png;base64,{png}">'
     colours = ''.join(f'<option>{n}</option>' for n in ('normal', 'planarity', 'height', 'slope'))
     return (
-        '<h2>The map</h2><div class="view"><canvas id="surfels"></canvas>'
+        '<h2>The map</h2><div class="view" id="view">'
+        '<canvas id="surfels" tabindex="0" role="img" aria-describedby="help" '
+        'aria-label="The map in three dimensions"></canvas>'
         f'<div id="picture" hidden>{fallback}</div>'
         f'<div class="tools">{choice}'
         f'<label>colour <select id="colouring">{colours}</select></label>'
         '<label><input type="checkbox" id="hide" checked> hide surfels that face away</label>'
-        '<button id="reset">reset</button></div>'
+        '<button id="reset">reset</button><button id="full">full screen</button></div>'
+        '<div class="length" aria-hidden="true">'
+        '<span id="bar"></span><span id="metres"></span></div>'
+        '<output class="values" id="values" aria-live="polite" hidden></output>'
         '<div class="scale"><span id="least">0</span><span class="ramp"></span>'
-        f'<span id="most">1</span></div></div><p class="none">{note}</p>'
+        f'<span id="most">1</span></div></div><p class="none" id="help">{note}</p>'
         f'<script type="application/json" id="map">{data}</script>'
     )
+
+
+def most_shown(layers: Mapping[str, Mesh]) -> int:
+    """Return the limit of the surfels beside these layers."""
+    return BESIDE_MESHES if any(map(len, layers.values())) else MAX_SHOWN
+
+
+def small_png(picture: str | Path) -> bytes:
+    """Return a PNG file at half of its size, for browsers that show nothing else."""
+    from matplotlib.image import imread, imsave
+
+    image = imread(picture)[..., :3]
+    height, width = (side - side % 2 for side in image.shape[:2])
+    halves = image[:height, :width].reshape(height // 2, 2, width // 2, 2, 3).mean(axis=(1, 3))
+    content = io.BytesIO()
+    imsave(content, halves, format='png')
+    return content.getvalue()
 
 
 def within_sight(surfels: Surfels) -> Surfels:
@@ -88,12 +124,12 @@ def within_sight(surfels: Surfels) -> Surfels:
 
 
 def view_data(
-    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh], height_m: float
+    surfels: Surfels, trajectory: Array, layers: Mapping[str, Mesh], origin_m: Array
 ) -> dict[str, Any]:
     """
     Return the data for page/view.js, in metres from the middle of the map.
 
-    Heights are stated with that of the map's origin added.
+    Heights and the middle are stated with the map's origin added.
     """
     from matplotlib import colormaps
 
@@ -120,7 +156,8 @@ def view_data(
         'size': [float(side) for side in size],
         'largest': largest,
         'layers': [mesh_data(mesh, low, size) for mesh in layers.values()],
-        'heights': [f'{height_m + end:.{decimals}f} m' for end in (low[2], high[2])],
+        'middle': [float(place) for place in low + 0.5 * size + origin_m],
+        'heights': [f'{origin_m[2] + end:.{decimals}f} m' for end in (low[2], high[2])],
     }
 
 

@@ -92,7 +92,7 @@ def test_the_page_holds_the_mesh_where_it_is(tmp_path):
 
 def test_a_large_mesh_makes_no_large_page(tmp_path):
     size, parsed, data = page(tmp_path, sphere(300, 20.0, (5.0, 5.0, 5.0)))
-    assert size < 8_000_000
+    assert size < 2_000_000
     assert len(base64.b64decode(data['layers'][0]['triangles'])) <= 12 * MAX_TRIANGLES
     assert 'shown' in [attributes.get('id') for _, attributes in parsed.tags]
 

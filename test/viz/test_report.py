@@ -126,7 +126,7 @@ def test_large_map_is_subsampled_and_the_page_says_so(tmp_path):
     parsed = report(tmp_path, surfels, surfels=len(surfels))
 
     assert len(shown(parsed)[1]) == MAX_SHOWN < len(surfels)
-    assert any('100,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
+    assert any('80,000 of 108,900 surfels are shown' in text for *_, text in parsed.text)
 
 
 def test_one_far_surfel_does_not_make_the_rest_tiny(tmp_path):

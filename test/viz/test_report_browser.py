@@ -7,6 +7,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 import io
 import os
+import re
 import shutil
 import time
 
@@ -33,7 +34,8 @@ SOFTWARE_GL = ('--use-angle=swiftshader', '--enable-unsafe-swiftshader')
 """WebGL without a graphics card."""
 
 HIDE = """() => {
-  for (const part of document.querySelectorAll('.tools, .scale')) part.style.visibility = 'hidden';
+  const over = document.querySelectorAll('.tools, .scale, .length');
+  for (const part of over) part.style.visibility = 'hidden';
 }"""
 """As a script's property: the policy of the page blocks further style sheets."""
 
@@ -164,6 +166,80 @@ def test_the_wheel_comes_nearer_and_colours_can_be_chosen(opened):
     page.locator('#colouring').select_option('normal', force=True)
     assert is_blue(picture_when(page, is_blue))
     assert complaints == []
+
+
+def test_a_click_shows_the_values_of_a_surfel(opened):
+    page, complaints = opened
+    box = page.locator('#surfels').bounding_box()
+    page.mouse.click(box['x'] + box['width'] / 2, box['y'] + box['height'] / 2)
+    page.locator('#values').wait_for()
+    found = dict(
+        re.match(r'(x y z|normal|planarity) (.*)', line).groups()
+        for line in page.locator('#values').inner_text().splitlines()
+    )
+    place = [float(word) for word in found['x y z'].split()[:3]]
+
+    surfels = plane(30)
+    away = np.linalg.norm(surfels.position - place, axis=1)
+    assert away.min() < 0.02
+    row = away.argmin()
+    normal = [float(word) for word in found['normal'].split()]
+    np.testing.assert_allclose(normal, surfels.normal[row], atol=0.02)
+    np.testing.assert_allclose(float(found['planarity']), surfels.planarity[row], atol=0.01)
+    page.mouse.click(box['x'] + box['width'] - 5, box['y'] + 60)  # above the horizon of the map
+    page.locator('#values').wait_for(state='hidden')
+    assert complaints == []
+
+
+def test_keys_turn_and_zoom_the_map(opened):
+    page, complaints = opened
+    page.locator('#surfels').focus()
+    page.keyboard.press('0')
+    settle(page)
+    before = pixels(page)  # with the outline of the focus
+
+    def is_moved(image):
+        return np.abs(image - before).mean() > 0.01
+
+    for key in ('ArrowLeft', '+', 'Shift+ArrowUp'):
+        for _ in range(3):
+            page.keyboard.press(key)
+        assert is_moved(picture_when(page, is_moved)), key
+        page.keyboard.press('0')
+        again = picture_when(page, lambda image: np.allclose(image, before, atol=0.03))
+        np.testing.assert_allclose(again, before, atol=0.03)
+    assert complaints == []
+
+
+def test_the_bar_has_the_length_that_it_states(opened):
+    page, _ = opened
+    metres = float(page.locator('#metres').text_content().removesuffix(' m'))
+    width = page.locator('#bar').evaluate('part => part.getBoundingClientRect().width')
+    box = page.locator('#surfels').bounding_box()
+    seen = []
+    for column in (-220, 220):  # the middle of the map is in the middle, its x to the right
+        page.mouse.click(box['x'] + box['width'] / 2 + column, box['y'] + box['height'] / 2)
+        page.locator('#values').wait_for()
+        seen.append(float(page.locator('#values').inner_text().split()[3]))
+
+    # picked are the middles of surfels of 0.5 m
+    np.testing.assert_allclose(440.0 / width * metres, seen[1] - seen[0], atol=0.6)
+    assert 24.0 < width <= 120.0
+
+
+def test_the_whole_map_is_in_view_on_a_telephone(browser, tmp_path):
+    report(tmp_path, plane(30))
+    page = browser.new_page(viewport={'width': 390, 'height': 844})
+    page.set_default_timeout(1000 * WAIT_S)
+    page.goto((tmp_path / 'report.html').as_uri())
+    image = picture_when(page, lambda image: num_coloured(image) > 2000)
+    found = np.nonzero(np.ptp(image, axis=2) > 0.1)
+    assert len(found[0]) > 2000
+    for place, end in zip(found, image.shape[:2], strict=True):
+        assert place.min() > 0
+        assert place.max() < end - 1
+    assert page.evaluate('document.documentElement.scrollWidth') <= 390
+    page.close()
 
 
 def test_a_mesh_can_be_shown_in_its_colours(browser, tmp_path):

@@ -78,7 +78,7 @@
   if (!gl) {
     document.getElementById('picture').hidden = false;
     canvas.hidden = true;
-    for (const part of document.querySelectorAll('.tools, .scale')) part.hidden = true;
+    for (const part of document.querySelectorAll('.tools, .scale, .length')) part.hidden = true;
     return;
   }
 
@@ -183,13 +183,34 @@
   const half = data.size.map((side) => side / 2);
   const radius = Math.max(Math.hypot(...half), 1);
   const across = data.size[0] >= data.size[1];
-  const narrow = Math.max(canvas.clientHeight / (canvas.clientWidth || 1e9), 1); // telephones
-  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, distance: 1.4 * radius * narrow };
+  const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, target: [0, 0, -0.15 * half[2]] };
+  const MARGIN = 0.94;
   let view, running = false, moved = false, share = 1, last = 0, rest = 0;
 
   function reset() {
-    view = { ...start, target: [0, 0, -0.15 * half[2]] };
+    let [near, far] = [0.5 * radius, 20 * radius];
+    for (let step = 0; step < 20; step++) {
+      const distance = 0.5 * (near + far);
+      view = { ...start, target: [...start.target], distance };
+      if (isWhole()) far = distance;
+      else near = distance;
+    }
+    view.distance = far;
     redraw();
+  }
+
+  // Whether all corners of the box of the map are in view, on telephones too.
+  function isWhole() {
+    const eye = eyeOf();
+    const [right, up, back] = axes();
+    const wide = MARGIN * Math.tan(0.35) * (canvas.clientWidth || 1) / (canvas.clientHeight || 1);
+    for (let corner = 0; corner < 8; corner++) {
+      const from = [0, 1, 2].map((axis) => (corner >> axis & 1 ? 1 : -1) * half[axis] - eye[axis]);
+      const ahead = -dot(back, from);
+      if (ahead <= 0 || Math.abs(dot(right, from)) > wide * ahead) return false;
+      if (Math.abs(dot(up, from)) > MARGIN * Math.tan(0.35) * ahead) return false;
+    }
+    return true;
   }
 
   function eyeOf() {
@@ -258,6 +279,57 @@
     gl.bindVertexArray(lineArrays);
     gl.uniformMatrix4fv(gl.getUniformLocation(line, 'camera'), false, matrix);
     gl.drawArrays(gl.LINE_STRIP, 0, path.length / 3);
+    showLength();
+  }
+
+  // A bar of a round length at the distance of the point that the view turns about.
+  function showLength() {
+    const metresOfPixel = 2 * Math.tan(0.35) * view.distance / (canvas.clientHeight || 1);
+    const most = 120 * metresOfPixel;
+    const power = 10 ** Math.floor(Math.log10(most));
+    const length = power * [5, 2, 1].find((digit) => digit * power <= most);
+    document.getElementById('bar').style.width = `${length / metresOfPixel}px`;
+    document.getElementById('metres').textContent =
+      length < 0.01 ? `${+(length * 1000).toPrecision(1)} mm` : `${+length.toPrecision(1)} m`;
+  }
+
+  // Values of the surfel nearest to the eye among those whose disc covers a place of the canvas.
+  const words = new DataView(surfels.buffer);
+  function pick(x, y) {
+    const eye = eyeOf();
+    const [right, up, back] = axes();
+    const scale = canvas.clientHeight / (2 * Math.tan(0.35));
+    let nearest = Infinity, found = -1;
+    for (let row = 0; row < count; row++) {
+      const at = row * BYTES;
+      const from = [0, 1, 2].map((axis) => (
+        words.getUint16(at + 2 * axis, true) / 65535 * data.size[axis] - half[axis] - eye[axis]
+      ));
+      const ahead = -dot(back, from);
+      if (ahead <= 0 || ahead >= nearest) continue;
+      const dx = canvas.clientWidth / 2 + scale * dot(right, from) / ahead - x;
+      const dy = canvas.clientHeight / 2 - scale * dot(up, from) / ahead - y;
+      const size = Math.max(surfels[at + 6] / 255 * data.largest * scale / ahead, 3);
+      if (dx * dx + dy * dy < size * size) {
+        nearest = ahead;
+        found = row;
+      }
+    }
+    return found;
+  }
+
+  function showValues(row) {
+    const values = document.getElementById('values');
+    values.hidden = row < 0;
+    if (row < 0) return;
+    const at = row * BYTES;
+    const place = [0, 1, 2].map((axis) => (
+      words.getUint16(at + 2 * axis, true) / 65535 * data.size[axis] - half[axis]
+        + data.middle[axis]
+    ).toFixed(2));
+    const normal = [0, 1, 2].map((axis) => (words.getInt8(at + 8 + axis) / 127).toFixed(2));
+    values.textContent = `x y z ${place.join(' ')} m\nnormal ${normal.join(' ')}\n`
+      + `planarity ${(surfels[at + 7] / 255).toFixed(2)}`;
   }
 
   function drawMesh(layer, matrix, eye) {
@@ -330,9 +402,41 @@
 
   // One pointer turns, or pans with a key or another button; two pan and zoom.
   const pointers = new Map();
+  let pressed = null;
   canvas.addEventListener('pointerdown', (event) => {
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, [event.clientX, event.clientY]);
+    pressed = [event.clientX, event.clientY];
+  });
+  canvas.addEventListener('click', (event) => {
+    const away = pressed ? Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) : 0;
+    if (away > 4 || layerShown()) return; // the end of a drag
+    const box = canvas.getBoundingClientRect();
+    showValues(pick(event.clientX - box.left, event.clientY - box.top));
+  });
+  const KEYS = {
+    ArrowLeft: [-30, 0], ArrowRight: [30, 0], ArrowUp: [0, -30], ArrowDown: [0, 30],
+  };
+  const full = document.getElementById('full');
+  function fullScreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else document.getElementById('view').requestFullscreen();
+  }
+  full.hidden = !document.fullscreenEnabled;
+  full.addEventListener('click', fullScreen);
+  canvas.addEventListener('keydown', (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;
+    const step = KEYS[event.key];
+    if (step) (event.shiftKey ? pan : rotate)(...step);
+    else if (event.key === '+' || event.key === '=') zoom(0.8);
+    else if (event.key === '-') zoom(1.25);
+    else if (event.key === '0') reset();
+    else if (event.key === 'f' && document.fullscreenEnabled) fullScreen();
+    else if (event.key === 'Enter') {
+      showValues(pick(canvas.clientWidth / 2, canvas.clientHeight / 2));
+    } else return;
+    event.preventDefault();
+    move();
   });
   for (const end of ['pointerup', 'pointercancel']) {
     canvas.addEventListener(end, (event) => pointers.delete(event.pointerId));
