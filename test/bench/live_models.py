@@ -6,6 +6,9 @@ Models that follow a map: an update after about 5,000 changed voxels.
 A lidar drives through the simulated street; the voxels within a radius of it change with every
 scan. Times are processor time (cpu_ms), as the machine may be shared, and clock time (median_ms).
 ``access`` is the time to read all surfels and models.
+
+Then whole real scans, not cut, again and again with 1 cm of noise, as a lidar that stands sees
+them: every voxel changes, few patches grow. Without SURFEL_MAPPER_TEST_DATA there are none.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from surfel_mapper.models.live import LiveModels
 from surfel_mapper.simulation import Lidar, Simulation, World
 from test.bench.machine import load, one_core
 from test.bench.report import Row, spread
+from test.bench.scan_planes import real_scans
 
 SCANS = 16
 WARM = 6
@@ -30,11 +34,31 @@ CASES = ((0.5, 22.0), (0.3, 12.0), (0.2, 10.0))
 """Voxel size and radius, m, by which about 5,000 voxels change a scan."""
 
 
+STANDING = ('argoverse2_2xvlp32_sweep', 'ouster_os0_128', 'velodyne_vls128_street')
+STANDING_SIZE_M, STANDING_NOISE_M = 0.5, 0.01
+"""Scans of the standing lidars, edge of the voxels, and noise."""
+
+
 def run() -> list[Row]:
-    """Return a row for every voxel size."""
+    """Return a row for every voxel size of the street and for every whole scan."""
     scans = street_scans()
     with one_core():
-        return [case(scans, size_m, radius_m) for size_m, radius_m in CASES]
+        rows = [case('street', scans, size_m, radius_m) for size_m, radius_m in CASES]
+        for name, points in real_scans():
+            if name in STANDING:
+                rows.append(case(name, repeated(points), STANDING_SIZE_M, np.inf))
+    return rows
+
+
+def repeated(
+    points: npt.NDArray[np.float32],
+) -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
+    """Return a scan SCANS times, each time with other noise, and the sensor position."""
+    rng = np.random.default_rng(1)
+    return [
+        (points + STANDING_NOISE_M * rng.standard_normal(points.shape), np.zeros(3))
+        for _ in range(SCANS)
+    ]
 
 
 def street_scans() -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
@@ -52,6 +76,7 @@ def street_scans() -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64
 
 
 def case(
+    name: str,
     scans: list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]],
     voxel_size_m: float,
     radius_m: float,
@@ -73,7 +98,7 @@ def case(
         access.append((process_time() - busy) * 1e3)
         changed.append(update.num_changed)
     row: dict[str, Any] = {
-        'cloud': 'street, live',
+        'cloud': f'{name}, live',
         'who': 'surfel_mapper',
         'voxel_m': voxel_size_m,
         **spread(times[WARM:]),
