@@ -1,7 +1,8 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-LAS and LAZ files of points, read by laspy (an extra: the formats have 30 kinds of records).
+LAS and LAZ files of points and surfels, by laspy (an extra: the formats have many kinds of
+records).
 
 On its own because it alone imports laspy. Coordinates are scaled integers, often of a map
 projection, so they are returned as float64.
@@ -9,6 +10,7 @@ projection, so they are returned as float64.
 
 from __future__ import annotations
 
+import io
 import os
 from pathlib import Path
 import struct
@@ -19,11 +21,19 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, BYTES_PER_BYTE
 from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.mapping.surfels import Surfels
 
 SUFFIXES = ('.las', '.laz')
 
 RGB = ('red', 'green', 'blue')
 
+
+RESOLUTION_M = 1e-4
+"""Unit of the coordinates that are written, m."""
+
+MAX_STEPS = 2**31 - 1
+"""Limit of a coordinate in a file, in units."""
 
 HEADER_BYTES = 375
 """Size of the header of version 1.4; that of 1.2 has 227."""
@@ -56,13 +66,7 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
         If laspy is not installed.
 
     """
-    try:
-        import laspy
-    except ImportError as error:
-        raise DependencyError(
-            f'{path}: laspy cannot be loaded ({error}). It reads LAS and LAZ; install it with '
-            "`pip install 'surfel_mapper[las]'`"
-        ) from error
+    laspy = import_laspy(path)
     try:
         check_header(path)
         las = laspy.read(str(path))
@@ -84,6 +88,74 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
         shift = 8 if max((int(v.max()) for v in values if v.size), default=0) > 255 else 0
         columns |= {n: (v >> shift).astype(np.uint8) for n, v in zip(RGB, values, strict=True)}
     return columns
+
+
+def write_surfels(
+    path: str | Path, surfels: Surfels, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)
+) -> None:
+    """
+    Write surfels as LAS 1.4, packed if the suffix is .laz, atomically.
+
+    Coordinates are multiples of 0.1 mm about a whole metre; normals, planarity, curvature and
+    num_points are extra columns, which CloudCompare and PDAL show by name. Intensity is rounded
+    to the 16 bits of the format.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    surfels : Surfels
+        In the frame of the map.
+    origin_m : (3,) float64, m
+        Added to the positions; see SurfelMap.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be written, or the surfels are farther apart than 214 km.
+    DependencyError
+        If laspy is not installed.
+
+    """
+    laspy = import_laspy(path)
+    has_colour = 'red' in surfels.channels
+    header = laspy.LasHeader(point_format=7 if has_colour else 6, version='1.4')
+    position = surfels.position + np.asarray(origin_m, np.float64)
+    header.scales = np.full(3, RESOLUTION_M)
+    header.offsets = np.floor(position.mean(axis=0)) if len(surfels) else np.zeros(3)
+    if np.abs(position - header.offsets).max(initial=0.0) / RESOLUTION_M > MAX_STEPS:
+        raise FileFormatError(f'{path}: surfels farther apart than 214 km; expected a smaller map')
+    extra = {
+        **dict(zip(('nx', 'ny', 'nz'), surfels.normal.astype(np.float32).T, strict=True)),
+        'planarity': surfels.planarity.astype(np.float32),
+        'curvature': surfels.curvature.astype(np.float32),
+        'num_points': surfels.num_points.astype(np.uint32),
+    }
+    header.add_extra_dims([laspy.ExtraBytesParams(n, v.dtype) for n, v in extra.items()])
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = position.T
+    for name, values in extra.items():
+        las[name] = values
+    if 'intensity' in surfels.channels:
+        las.intensity = np.clip(np.rint(surfels.channels['intensity']), 0, 65535)
+    for name in RGB if has_colour else ():
+        las[name] = np.rint(257.0 * surfels.channels[name]).astype(np.uint16)  # 255 is 65535
+    content = io.BytesIO()
+    las.write(content, do_compress=Path(path).suffix == '.laz')
+    with replace_file(path) as file:
+        file.write(content.getvalue())
+
+
+def import_laspy(path: str | Path) -> Any:
+    """Return the module laspy, or raise DependencyError with the command to install it."""
+    try:
+        import laspy
+    except ImportError as error:
+        raise DependencyError(
+            f'{path}: laspy cannot be loaded ({error}). It reads and writes LAS and LAZ; install '
+            "it with `pip install 'surfel_mapper[las]'`"
+        ) from error
+    return laspy
 
 
 def check_header(path: str | Path) -> None:

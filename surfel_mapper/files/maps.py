@@ -11,12 +11,12 @@ from __future__ import annotations
 from pathlib import Path
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import map_state, parquet, pcd, ply
+from surfel_mapper.files import las, map_state, parquet, pcd, ply
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 EXACT = ('.npz', '.parquet')
 
-SURFELS = ('.ply', '.pcd')
+SURFELS = ('.ply', '.pcd', *las.SUFFIXES)
 
 
 def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
@@ -27,7 +27,8 @@ def save_surfel_map(path: Path, surfel_map: SurfelMap) -> str:
         return parquet.write_map(path, surfel_map)
     if path.suffix not in SURFELS:
         raise FileFormatError(f'{path}: expected a file ending in {", ".join(EXACT + SURFELS)}')
-    write = ply.write_surfels if path.suffix == '.ply' else pcd.write_surfels
+    writers = {'.ply': ply.write_surfels, '.pcd': pcd.write_surfels}
+    write = writers.get(path.suffix, las.write_surfels)
     write(path, surfel_map.surfels(), surfel_map.origin_m)
     return surfel_map.digest()
 

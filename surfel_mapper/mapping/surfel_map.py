@@ -369,7 +369,8 @@ class SurfelMap(MomentMap):
         Parameters
         ----------
         path : str or Path
-            The suffix decides: .npz and .parquet are exact, .ply and .pcd hold the surfels.
+            The suffix decides: .npz and .parquet are exact, .ply, .pcd, .las and .laz hold the
+            surfels.
 
         Raises
         ------
