@@ -1,10 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-LAS and LAZ files of points and surfels, by laspy (an extra: the formats have many kinds of
-records).
+LAS and LAZ files of points and surfels, by laspy.
 
-On its own because it alone imports laspy. Coordinates are scaled integers, often of a map
+It is an extra, since the formats have 30 kinds of records. On its own because it alone imports laspy. Coordinates are scaled integers, often of a map
 projection, so they are returned as float64.
 """
 
