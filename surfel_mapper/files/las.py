@@ -3,8 +3,8 @@
 """
 LAS and LAZ files of points and surfels, by laspy.
 
-It is an extra, since the formats have 30 kinds of records. On its own because it alone imports laspy. Coordinates are scaled integers, often of a map
-projection, so they are returned as float64.
+That is an extra: the formats have 30 kinds of records. On its own because it alone imports laspy.
+Coordinates are scaled integers, often of a map projection, so they are returned as float64.
 """
 
 from __future__ import annotations
