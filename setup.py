@@ -68,7 +68,7 @@ ALIGN = [
 ]
 
 VIEWER = [
-    'rerun-sdk>=0.23',  # replay --view and --rrd
+    'rerun-sdk>=0.27',  # view, replay --view and --rrd; 0.27 is the first that places the eye
 ]
 
 RUNNER = [
