@@ -25,6 +25,9 @@ MODULES = {'pickle', 'cPickle', 'marshal', 'shelve', 'dill', 'cloudpickle', 'job
 
 CALLS = {'eval', 'exec', 'compile', '__import__', 'os.system', 'os.popen', 'tempfile.mktemp'}
 
+STARTS_RERUN = {'server.py': ['subprocess']}
+"""The one module that starts a program: the server of rerun, with arguments of our own."""
+
 SOURCES = sorted(PACKAGE.rglob('*.py'))
 
 
@@ -68,7 +71,7 @@ def dangers_of_call(call):
 
 def test_no_source_unpickles_evaluates_or_starts_programs():
     found = {path: dangers(path.read_text(encoding='utf-8')) for path in SOURCES}
-    assert {path.name: faults for path, faults in found.items() if faults} == {}
+    assert {path.name: faults for path, faults in found.items() if faults} == STARTS_RERUN
     assert len(found) > 100
 
 

@@ -106,9 +106,6 @@ def replay_bags(
         )
     if workers is not None and scheduler is None:
         start_forkserver()  # they load their modules while this process loads its own
-    from surfel_mapper.cluster.map_reduce import map_bags
-    from surfel_mapper.cluster.shards import cut, shard_length_s
-
     found = surveyed(requests, config)
     is_registered = check_one_kind(found)
     # a recording that is registered is read twice
@@ -122,15 +119,11 @@ def replay_bags(
             progress(round(done_s), round(total_s))
 
     with open_executor(workers, scheduler) as executor:
-        num_workers = executor.num_workers
-        jobs = [(request, config) for request in requests]
-        frame = None
+        jobs, frame = [(each.request, config) for each in found], None
         if is_registered:
             frame = registered(found, config, output, executor, on_done, stopped)
             jobs = [(each.request, each.config) for each in frame.placed]
-        shard_s = shard_length_s(recorded_s, num_workers)
-        shards = [shard for request, settings in jobs for shard in cut(request, settings, shard_s)]
-        mapped = map_bags(shards, executor, output, on_done, stopped)
+        mapped = mapped_together(jobs, recorded_s, executor, output, on_done, stopped)
         num_workers = executor.num_workers
     summary = {
         'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
@@ -149,6 +142,23 @@ def replay_bags(
     return ShelfResult(
         mapped=mapped, summary=summary, written=write_overview(output, summary, mapped)
     )
+
+
+def mapped_together(
+    jobs: Sequence[tuple[Request, Config]],
+    recorded_s: float,
+    executor: Executor,
+    output: Path,
+    on_done: OnDone,
+    stopped: Callable[[], bool],
+) -> MapReduceResult:
+    """Map recordings in one frame, each cut into shards, into one dataset of tiles."""
+    from surfel_mapper.cluster.map_reduce import map_bags
+    from surfel_mapper.cluster.shards import cut, shard_length_s
+
+    shard_s = shard_length_s(recorded_s, executor.num_workers)
+    shards = [shard for request, config in jobs for shard in cut(request, config, shard_s)]
+    return map_bags(shards, executor, output, on_done, stopped)
 
 
 def shares_of_work(mapped: MapReduceResult) -> dict[str, Any]:

@@ -39,7 +39,6 @@ from surfel_mapper.messages.cdr import (
     read_header,
     write_header,
 )
-from surfel_mapper.messages.kernels.coordinates import gather_coordinates
 from surfel_mapper.scan import Scan
 
 UINT32, FLOAT32, FLOAT64 = 6, 7, 8
@@ -297,6 +296,9 @@ def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray
     budget.take(3 * num_points * dtype.itemsize, f'coordinates of {num_points} points')
     packed: npt.NDArray[Any] = np.empty((num_points, 3), dtype, order='F')
     if len(kinds) == 1 and dtype in kinds:
+        # loads numba, for which an `info` of a bag without clouds does not wait
+        from surfel_mapper.messages.kernels.coordinates import gather_coordinates
+
         x, y, z = map(np.atleast_2d, views)
         gather_coordinates(x, y, z, packed.T)
         return packed

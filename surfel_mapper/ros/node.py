@@ -15,6 +15,7 @@ them on. Only the mapping thread accesses the map, and publishes the results.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
@@ -186,7 +187,8 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         """Destroy all publishers, subscriptions, services and timers of a session."""
         for entity, destroy in dict(self._entities()).items():
             if (entity, destroy) not in self._lasting:
-                destroy(entity)
+                with suppress(ValueError):  # a signal came while rclpy was making it
+                    destroy(entity)
 
     def _entities(self) -> Iterator[tuple[Any, Callable[[Any], Any]]]:
         """Yield all timers and endpoints of the node, each with the method that destroys it."""

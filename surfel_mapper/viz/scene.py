@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-import subprocess
 from typing import Any
 
 import numpy as np
@@ -32,6 +31,7 @@ from surfel_mapper.viz.server import (
     free_port,
     import_rerun,
     LOOPBACK,
+    Server,
     started_server,
 )
 
@@ -61,14 +61,12 @@ class Scene:
         As ``to_window``, ``to_browser`` and ``to_file`` open it.
     address : str, optional
         Address of the page in a browser.
-    server : subprocess.Popen, optional
+    server : Server, optional
         The server of the page, which ends with the scene.
 
     """
 
-    def __init__(
-        self, stream: Any, address: str = '', server: subprocess.Popen[bytes] | None = None
-    ) -> None:
+    def __init__(self, stream: Any, address: str = '', server: Server | None = None) -> None:
         self.address = address
         self.colouring = Colouring()
         self.origin_m: Array = np.zeros(3)

@@ -20,11 +20,14 @@ from surfel_mapper.errors import DependencyError, SurfelMapperError
 LOOPBACK = '127.0.0.1'
 """Address on which servers listen; rerun's own default is every interface."""
 
+Server = subprocess.Popen[bytes]
+"""A server of rerun, with a process group of its own."""
+
 START_S = 20.0
 """Longest wait for a server to listen, s."""
 
 
-def started_server(port: int, data_port: int) -> subprocess.Popen[bytes]:
+def started_server(port: int, data_port: int) -> Server:
     """Return a server of a page and of its data, as soon as both ports are open."""
     command = [
         *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
@@ -66,7 +69,7 @@ def rerun_program() -> str:
     return found
 
 
-def end_group(server: subprocess.Popen[bytes]) -> None:
+def end_group(server: Server) -> None:
     """End a server and its children: the program rerun starts another one and waits for it."""
     with suppress(ProcessLookupError):
         os.killpg(server.pid, signal.SIGTERM)
@@ -80,7 +83,7 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def wait_for(port: int, server: subprocess.Popen[bytes]) -> None:
+def wait_for(port: int, server: Server) -> None:
     """Wait until a server listens at a port; raise SurfelMapperError if it does not."""
     end = time.monotonic() + START_S
     while time.monotonic() < end and server.poll() is None:
