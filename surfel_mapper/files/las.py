@@ -13,7 +13,7 @@ import io
 import os
 from pathlib import Path
 import struct
-from typing import Any
+from typing import Any, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -21,12 +21,13 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, BYTES_PER_BYTE
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.mapping.surfels import Surfels
+
+if TYPE_CHECKING:
+    from surfel_mapper.mapping.surfels import Surfels
 
 SUFFIXES = ('.las', '.laz')
 
 RGB = ('red', 'green', 'blue')
-
 
 RESOLUTION_M = 1e-4
 """Unit of the coordinates that are written, m."""
