@@ -4,7 +4,7 @@
 Motion and information of an edge, from the pairs of points of its two scans at given poses.
 
 Edges of plain pairs (``exact_terms``, ``pcl_terms``) and of weighted pairs (``weighted_terms``)
-share one module of 400 lines because the solver takes both as EdgeTerms.
+share one module because the solver takes both as EdgeTerms.
 
 *Plain pairs.* For a pair a (of the source) and b (of the target), both in the map, let c = (a + b)
 / 2 and z = a - b. The edge asks for X = X_source - X_target, a translation t and a rotation vector

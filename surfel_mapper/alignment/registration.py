@@ -13,7 +13,7 @@ motion that the scan does not determine (a tunnel, a plain). In these the predic
 Zhang, Kaess and Singh 2016. The share of the information is compared, not its amount, which would
 need a threshold for every sensor.
 
-One module of 360 lines: the levels, the headings and the steps of one search.
+One module: the levels, the headings and the steps of one search.
 """
 
 from __future__ import annotations

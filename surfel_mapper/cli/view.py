@@ -3,7 +3,7 @@
 """
 ``surfel-mapper view``: maps, clouds, meshes, trajectories, bags and nodes in the viewer rerun.
 
-Opens a window where there is a display, else a page for a browser. Either listens on loopback
+Opens a window where there is a display, else a page for a browser. Both listen on loopback
 only. A bag or folder of scans is mapped while it is shown, and nothing is written.
 """
 

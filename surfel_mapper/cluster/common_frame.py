@@ -53,6 +53,8 @@ class Registered:
         Settings to map it at these poses.
     directory : Path
         Its map, trajectory and report.
+    first_s, last_s : float
+        Stamps of its first and last scan that was mapped, s.
     scans : dict of str
         Its counts of scans, as in summary.json.
     registration : dict of str
@@ -63,6 +65,8 @@ class Registered:
     request: Request
     config: Config
     directory: Path
+    first_s: float
+    last_s: float
     scans: dict[str, Any]
     registration: dict[str, Any]
 
@@ -97,14 +101,22 @@ class CommonFrame:
             The counts of the scans that were mapped in the common frame.
 
         """
-        parts = [part for each in self.placed for part in each.registration['apart']]
+        parts = [
+            {**part, 'map': f'{each.directory.name}/apart_{number}'}
+            for each in self.placed
+            for number, part in enumerate(each.registration['apart'], start=1)
+        ]
         dropped, received = Counter(scans['dropped']), scans['received']
         for each, reason in self.apart:
-            stamps_ns = Trajectory.load(each.directory / POSES).stamp_ns
-            part = {'scans': each.scans['mapped'], 'map': each.directory.name}
-            if stamps_ns is not None:
-                part |= {'first_s': stamps_ns[0] / 1e9, 'last_s': stamps_ns[-1] / 1e9}
-            parts.append({**part, 'reason': f'{each.request.path.name}: {reason}'})
+            parts.append(
+                {
+                    'scans': each.scans['mapped'],
+                    'first_s': each.first_s,
+                    'last_s': each.last_s,
+                    'reason': f'{each.request.path.name}: {reason}',
+                    'map': each.directory.name,
+                }
+            )
             dropped.update(each.scans['dropped'])
             dropped['apart'] += each.scans['mapped']
             received += each.scans['received']
@@ -158,6 +170,8 @@ def register(task: tuple[Request, Config, Path]) -> Registered:
         request=replace(request, poses=directory / POSES, poses_format='tum', poses_from='file'),
         config=config.replace(settings),
         directory=directory,
+        first_s=found.trajectory.stamps_ns[0] / 1e9,
+        last_s=found.trajectory.stamps_ns[-1] / 1e9,
         scans=found.summary['scans'],
         registration=found.summary['registration'],
     )
@@ -194,7 +208,7 @@ def in_one_frame(found: Sequence[Registered]) -> CommonFrame:
     placed, motions = [first], []
     waiting = [(each, '') for each in others]
     num_placed = 0
-    while waiting and num_placed < len(placed):  # what was placed may help those left
+    while waiting and num_placed < len(placed):  # a map just placed may reach the others
         num_placed, tried, waiting = len(placed), waiting, []
         for each, _ in tried:
             discs = discs_of(each)

@@ -7,7 +7,7 @@ No process holds more than one tile and the part that it adds. The digest of the
 by visiting the tiles in the order of their voxels. The tiles are written to a directory beside
 the target, which takes its name when all are done; until then an earlier map stays whole.
 
-One module of 390 lines: the work on a tile and the order of the tiles share the layout of the
+One module: the work on a tile and the order of the tiles share the layout of the
 directories.
 """
 

@@ -11,7 +11,7 @@ Defaults of the models are those of Gao and Dong 2025 except where real sensors 
 buildings break its rules; profile paper restores those. Lengths are in voxels, the unit of the
 method, so that one number suits a table and a hall.
 
-One module of more than 350 lines: a list of settings, with no other code than their checks.
+One module: a list of settings, with no other code than their checks.
 """
 
 from __future__ import annotations

@@ -10,7 +10,7 @@ on the axis about which an angle is measured has no such angle: neither test kee
 
 If several sensors feed one map, a filter with a ``sensor`` applies only to scans of that frame.
 
-One module of more than 350 lines, because the tests of a coordinate are shared.
+One module, because the tests of a coordinate are shared.
 """
 
 from __future__ import annotations

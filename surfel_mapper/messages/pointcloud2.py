@@ -12,7 +12,7 @@ one pass over the bytes. Three strided copies would read each line of the cache 
 
 ``parse_cloud`` reads a serialised message in place: its data is a view of the bytes.
 
-One module of 490 lines: reading and writing share the fields and their types.
+One module: reading and writing share the fields and their types.
 """
 
 from __future__ import annotations

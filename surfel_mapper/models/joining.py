@@ -37,7 +37,7 @@ LEAST_TOUCH = 2
 """Voxels of the smaller patch that touch the other one, at least."""
 
 LAYER_SHARE, LAYER_SIGMAS = 0.6, 3.0
-"""A patch is a layer of another one if so many of its voxels touch it, so near in noise."""
+"""Share of touching voxels, and distance in deviations of the noise, of a layer of a patch."""
 
 JOIN_ANGLE_DEG = 50.0
 """Largest angle between the normals of joined patches at their means."""

@@ -8,7 +8,7 @@ mapped, the map before everything that may fail after it; a viewer that fails en
 that maps nothing is an error, because an empty map looks like a result. Heavy modules are imported
 inside functions, so that ``surfel_mapper.replay`` loads neither rosbags nor matplotlib early.
 
-One module of 400 lines: a replay reads from top to bottom as check, start, map, write.
+One module: a replay reads from top to bottom as check, start, map, write.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ class Reduction:
         """
         Begin to prepare and reduce a scan in the other thread, unless that was begun before.
 
-        ``prepare`` is called here, and what it returns in the other thread.
+        ``prepare`` is called here, the function that it returns in the other thread.
         """
         if self._pool is None:
             return

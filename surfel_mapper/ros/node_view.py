@@ -32,7 +32,7 @@ from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import Scene
 
 SILENT_S = 10.0
-"""Time without surfels after which a warning says what was heard, s."""
+"""Time without surfels after which a warning names the topics that were found, s."""
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +48,7 @@ class NodeView:
     name : str
         Full name of the node to be shown.
     scene : Scene
-        Where it is shown.
+        The scene that shows it.
     colouring : str
         One of discs.COLOURINGS.
 

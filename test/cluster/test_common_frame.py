@@ -113,6 +113,9 @@ def test_a_recording_of_another_place_stays_apart(tmp_path, world, capsys):
     summary = json.loads((output / 'summary.json').read_text())
     assert summary['scans']['received'] == 2 * NUM_SCANS
     assert summary['scans']['mapped'] == summary['scans']['dropped']['apart'] == NUM_SCANS
+    (part,) = summary['registration']['apart']
+    assert (part['map'], part['first_s']) == ('registered_2', 0.0)
+    assert part['last_s'] == pytest.approx(0.1 * (NUM_SCANS - 1))
     assert load_map(output / 'registered_2')[0].num_voxels
 
 

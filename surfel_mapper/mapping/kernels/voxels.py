@@ -15,7 +15,7 @@ Moments come from files, messages and callers too. Sums beyond the range of a vo
 the integers of the map or give negative eigenvalues later, far from the cause; so moments that no
 points can have are found before they are added, in 20 us for 10,000 voxels.
 
-One module of 375 lines: all work on the moments of a scan and the rows of the same voxels.
+One module: all work on the moments of a scan and the rows of the same voxels.
 """
 
 from numba import njit
