@@ -39,7 +39,7 @@ from surfel_mapper.ros.base_node import BaseNode, result_of
 from surfel_mapper.ros.bond import Bond
 from surfel_mapper.ros.diagnostics import Diagnostics
 from surfel_mapper.ros.main_thread import TaskQueue
-from surfel_mapper.ros.parameters import as_declared, changed_config, declare_settings, refusal
+from surfel_mapper.ros.parameters import as_declared, declare_settings, refusal, settings_among
 from surfel_mapper.ros.session import Session
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
@@ -238,7 +238,7 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
         """Refuse values that the configuration refuses, and invalid filter files."""
         try:
-            config = changed_config(self._config, parameters)
+            config = self._config.replace(settings_among(parameters))
             if config.filters and config.filters != self._config.filters:
                 Chain.load(config.filters)
         except ConfigError as error:
@@ -246,8 +246,17 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         return SetParametersResult(successful=True)
 
     def _apply_parameters(self, parameters: list[Parameter]) -> None:
-        """Apply new settings from the next scan on."""
-        config = changed_config(self._config, parameters)
+        """
+        Apply new settings from the next scan on.
+
+        Settings come from the services alone, one at a time. The main thread declares parameters
+        of rclpy meanwhile, for example those of QoS: it must not write settings back that it has
+        read before they changed.
+        """
+        changed = settings_among(parameters)
+        if not changed:
+            return
+        config = self._config.replace(changed)
         if config != self._config:
             self._config = config
             if self._session is not None:

@@ -98,19 +98,10 @@ def descriptor(declared: Declaration) -> ParameterDescriptor:
     return found
 
 
-def changed_config(config: Config, parameters: Iterable[Parameter]) -> Config:
-    """
-    Return a configuration with some parameters changed; parameters of rclpy are ignored.
-
-    Raises
-    ------
-    ConfigError
-        If a value is refused.
-
-    """
+def settings_among(parameters: Iterable[Parameter]) -> dict[str, Any]:
+    """Return the values of those parameters that are settings; those of rclpy are none."""
     names = {declared.name for declared in declarations()}
-    changed = {p.name: p.value for p in parameters if p.name in names}
-    return config.replace(changed) if changed else config
+    return {p.name: p.value for p in parameters if p.name in names}
 
 
 def refusal(node: Node, parameters: Iterable[Parameter]) -> str:

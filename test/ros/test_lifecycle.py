@@ -158,6 +158,29 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
     assert values['window_scans'] == '2'
 
 
+def test_a_setting_that_changes_while_a_parameter_of_rclpy_is_declared_stays(peer):
+    class Slow(Parameter):
+        """Its name is known after another thread has changed a setting."""
+
+        @property
+        def name(self):
+            changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
+            assert peer.result(changed).results[0].successful
+            return super().name
+
+    with context(ARGUMENTS):
+        node = MapperNode()
+        with executing(node):
+            node._call_post_set_parameters_callback([Slow('use_sim_time', value=False)])
+            node.start()
+            peer.advertise('/odom', '/points')
+            send(peer, drive(3))
+            _, values = peer.diagnosis({'scans.mapped': 3})
+            node.end()
+        node.destroy_node()
+    assert values['window_scans'] == '2'
+
+
 @pytest.mark.parametrize('how', ['signal', 'shutdown'])
 def test_the_map_is_saved_on_shutdown_if_configured(start, peer, tmp_path, how):
     folder = tmp_path / 'maps'
