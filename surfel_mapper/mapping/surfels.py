@@ -33,6 +33,10 @@ class OneSurfel(NamedTuple):
     voxel_index: tuple[int, int, int]
 
 
+FEW = 2048
+"""Below this number of surfels threads take longer to start than they save."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Surfels:
     """
@@ -266,5 +270,5 @@ def derive(
         outputs = tuple(values[part] for values in surfels.arrays)
         derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
 
-    share(derive_part, num, threads)
+    share(derive_part, num, threads if num >= FEW else 1)
     return surfels

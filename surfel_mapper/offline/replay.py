@@ -182,6 +182,7 @@ def replay(
         history = History()
         with listeners(directory, options, mapper) as listening:
             listen: list[Callable[[Update], object]] = [partial(history.add, mapper), *listening]
+            mapper.derives = bool(listening)  # the files hold the surfels of the end
             start_s = time.perf_counter()
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
             replay_s = time.perf_counter() - start_s

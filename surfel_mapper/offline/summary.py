@@ -16,8 +16,8 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     """
     Return the summary in a few lines for people.
 
-    The times of the stages are those of the whole replay by scan received; they add up to the
-    total, but for loading and for stages in two threads at a time.
+    The times of the stages are those of the whole replay by scan received, in the thread that
+    maps; ``other`` is what is left of the total: mostly giving scans to a second thread.
     """
     from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
 
@@ -27,10 +27,10 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
     slowest = times['total']['p99'] if 'total' in times else 0.0
     share = 1e3 / max(scans['received'], 1)
-    means = {**summary['stage_s'], 'total': summary['replay_s']}
-    stages = '   '.join(
-        f'{stage} {share * means[stage]:.1f} ms' for stage in STAGES if stage in means
-    )
+    means = {stage: s for stage, s in in_order(summary['stage_s'], STAGES) if stage != 'total'}
+    means['other'] = summary['replay_s'] - sum(means.values())
+    means['total'] = summary['replay_s']
+    stages = '   '.join(f'{stage} {share * seconds:.1f} ms' for stage, seconds in means.items())
     filters = ''.join(
         f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
         f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
@@ -58,6 +58,12 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'digest {summary["digest"]}\n'
         f'{"   ".join(str(path) for path in written)}'
     )
+
+
+def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str, Any]]:
+    """Return items in the order of names; those of other names, of layers, at the end."""
+    first = [name for name in names if name in values]
+    return [(name, values[name]) for name in [*first, *(n for n in values if n not in first)]]
 
 
 def uncertain_text(summary: Mapping[str, Any]) -> str:

@@ -388,6 +388,15 @@ class Mapper:
         return move
 
     @property
+    def derives(self) -> bool:
+        """Whether ``Update.changed`` is filled; False leaves it empty and saves the time."""
+        return self._inserter.derives
+
+    @derives.setter
+    def derives(self, value: bool) -> None:
+        self._inserter.derives = value
+
+    @property
     def loops(self) -> LoopCloser | None:
         """The scans and poses that loops are closed with; None without ``loops.enabled``."""
         return self._inserter.loops

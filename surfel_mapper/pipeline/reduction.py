@@ -50,8 +50,9 @@ class Begun(NamedTuple):
 
     def is_of(self, scan: Scan, T_map_sensor: Transform, config: Config) -> bool:
         """Return whether a scan is this one, at the same pose and with the same settings."""
-        same = self.scan is scan and self.config is config
-        return same and np.array_equal(self.T_map_sensor, T_map_sensor)
+        if self.scan is not scan or self.config is not config:
+            return False
+        return self.T_map_sensor is T_map_sensor or np.array_equal(self.T_map_sensor, T_map_sensor)
 
 
 class Reduction:

@@ -33,7 +33,7 @@ class ShardMapper(Mapper):
 
     def __init__(self, config: Config | None = None) -> None:
         super().__init__(config)
-        self._inserter.derives = False  # surfels are derived when all parts are merged
+        self.derives = False  # surfels are derived when all parts are merged
 
     @property
     def passes_over(self) -> bool:

@@ -28,6 +28,8 @@ from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow, WindowedScan
 
+IDENTITY = np.eye(4)
+
 MIN_POINTS = 6
 """Surfels of fewer points of one scan are not matched."""
 
@@ -126,19 +128,19 @@ class WindowAligner:
 
     def to_map(self, T_fixed_sensor: Transform) -> Transform:
         """Return the pose in the map of a sensor whose pose in the fixed frame is given."""
-        if np.array_equal(self.T_map_fixed, np.eye(4)):
+        if np.array_equal(self.T_map_fixed, IDENTITY):
             return T_fixed_sensor  # to the bit
         return compose(self.T_map_fixed, T_fixed_sensor)
 
     def to_fixed(self, T_map_sensor: Transform) -> Transform:
         """Return the pose in the fixed frame of a sensor whose pose in the map is given."""
-        if np.array_equal(self.T_map_fixed, np.eye(4)):
+        if np.array_equal(self.T_map_fixed, IDENTITY):
             return T_map_sensor  # to the bit
         return compose(inverse(self.T_map_fixed), T_map_sensor)
 
     def correct(self, T_after_before: Transform) -> None:
         """Correct later scans as the newest one was moved in the map."""
-        if not np.array_equal(T_after_before, np.eye(4)):
+        if not np.array_equal(T_after_before, IDENTITY):
             self.T_map_fixed = compose(T_after_before, self.T_map_fixed)
 
     def is_due(self, every_scans: int) -> bool:

@@ -4,7 +4,7 @@
 History: the figures of each scan of a replay, for the plots of the report.
 
 The figures are flat arrays, about 100 bytes a scan: 4 MB an hour at 10 Hz. Counting surfels visits
-every voxel of the map, so a run of any length has between 128 and 256 counts, evenly spread.
+every voxel of the map, so a run of any length has between 32 and 64 counts, evenly spread.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy.typing as npt
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
 
-MAX_COUNTS = 256
+MAX_COUNTS = 64
 """Number of surfel counts at which every second one is dropped."""
 
 

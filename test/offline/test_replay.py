@@ -3,6 +3,7 @@
 """``surfel_mapper.replay`` writes and returns what the verb replay does."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.offline.replay import ReplayOptions, started_mapper
 from surfel_mapper.offline.request import Request
+from surfel_mapper.offline.summary import as_text
 from surfel_mapper.viz import viewer
 from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
 
@@ -214,3 +216,8 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     stages = {name: s for name, s in summary['stage_s'].items() if name != 'total'}
     assert {'read', 'decode', 'reduce', 'insert', 'normals', 'record'} <= set(stages)
     assert 0.0 < sum(stages.values()) <= summary['replay_s']
+    line = next(line for line in as_text(summary, []).splitlines() if line.startswith('read '))
+    printed = re.findall(r'(\w+) (-?[\d.]+) ms', line)
+    assert [name for name, _ in printed][-2:] == ['other', 'total']
+    *parts, total = (float(milliseconds) for _, milliseconds in printed)
+    assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding

@@ -80,6 +80,21 @@ def test_normals_of_an_update_are_those_of_the_exact_twin():
     assert compared > 100
 
 
+def test_without_deriving_updates_hold_no_surfels_and_the_map_is_the_same():
+    mappers = [mapper_with(window__max_scans=3) for _ in range(2)]
+    mappers[1].derives = False
+    for stamp_s in range(6):
+        updates = []
+        for mapper in mappers:
+            add_pose(mapper, stamp_s, x=0.4 * stamp_s)
+            updates += insert(mapper, scan_at(stamp_s))
+        assert len(updates[0].changed) > 0
+        assert len(updates[1].changed) == 0
+        removed = [set(map(tuple, each.removed_voxel_index.tolist())) for each in updates]
+        assert removed[0] == removed[1]
+    assert mappers[0].map.digest() == mappers[1].map.digest()
+
+
 def test_every_stage_is_timed():
     mapper = mapper_with(pose__source='identity')
     (update,) = insert(mapper, scan_at(1.0))
