@@ -10,8 +10,8 @@ squared distance, in voxels, to the nearest occupied voxel; row r belongs to row
     squared  (R, N) uint16, FAR beyond ``max_m``
     marks    (R, N) uint8, occupied before and now; see kernels/euclidean.py
 
-Blocks changed since the last update are compared with their former occupancy, and only blocks
-with a voxel whose distance differs are computed again. Distances stay exact, those of a transform
+Blocks changed since the last update are compared with their former occupancy, and only voxels
+whose distance may differ are computed again. Distances stay exact, those of a transform
 of the whole (scipy.ndimage.distance_transform_edt), unlike those of wavefronts.
 
 Peers: voxblox (Oleynikova et al. 2017) and FIESTA (Han et al. 2019) propagate wavefronts, nvblox
@@ -33,6 +33,12 @@ from surfel_mapper.tsdf.blocks import block_index, BlockMap, FIRST_ROWS, Int64
 from surfel_mapper.tsdf.kernels import euclidean as kernels
 from surfel_mapper.tsdf.kernels.blocks import FREE, FREE_VISITS, VERSION
 from surfel_mapper.tsdf.queries import in_voxels
+
+MANY = 128
+"""Marked voxels of a block from which it is faster to compute the whole block."""
+
+FULL = 3
+"""Blocks of a cube of eight from which it is faster to compute all of them together."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,6 +97,7 @@ class EuclideanField:
         self._blocks = blocks
         self._center: npt.NDArray[np.float64] = np.zeros(3)
         self._most = int((max_m / size_m) ** 2 * (1.0 + 1e-9))
+        self._order = places_within(self._most)
         self._bits = blocks.config.voxels_per_side.bit_length() - 1
         self._squared, self._marks = (Slab(FIRST_ROWS, voxels * k // 8) for k in (2, 1))
         self._keys: Int64 = np.full(FIRST_ROWS, -1, np.int64)
@@ -116,22 +123,18 @@ class EuclideanField:
         if center is not None:
             self._center = np.asarray(center, np.float64)
         self._grow()
-        touched = np.zeros(len(self._keys), bool)
-        self._forget(touched)
+        num_raised = np.zeros(len(self._keys), np.int64)
+        self._forget(num_raised)
         rows = self._changed()
         fresh = rows[self._keys[rows] < 0]
-        self._keys[fresh] = self._blocks.head[fresh, KEY]
-        counts = np.empty((len(rows), 3), np.int64)
-        config, field = self._blocks.config, self._blocks.field
-        occupied = np.float32(0.5 * config.voxel_size_m)
-        least = np.float32(np.finfo(np.float32).tiny)
-        kernels.mark_occupied(rows, field, least, occupied, self._mark_rows, counts)
-        self._seen[rows] = self._blocks.head[rows, VERSION]
-        self._occupied[rows] = counts[:, 2]
-        touched[fresh] = True
-        self._touch(rows[counts[:, 0] > 0], kernels.OLD, self._keys >= 0, touched)
-        self._touch(rows[counts[:, 1] > 0], kernels.NEW, self._keys >= 0, touched)
-        self._transform(np.flatnonzero(touched))
+        counts = self._mark(rows)
+        is_new = np.zeros(len(self._keys), bool)
+        is_new[fresh] = True
+        kept = (self._keys >= 0) & ~is_new
+        self._spread(rows[counts[:, 0] > 0], kernels.OLD, kept, num_raised)
+        self._search(num_raised, is_new)
+        self._transform(np.flatnonzero(is_new))
+        self._spread(rows[counts[:, 1] > 0], kernels.NEW, kept & ~is_new, num_raised)
         kernels.settle(rows[counts[:, :2].any(axis=1)], self._mark_rows)
         return int(counts[:, :2].sum())
 
@@ -216,8 +219,8 @@ class EuclideanField:
         self._keys = np.concatenate([self._keys, np.full(more, -1, np.int64)])
         self._seen, self._occupied = (np.pad(a, (0, more)) for a in (self._seen, self._occupied))
 
-    def _forget(self, touched: npt.NDArray[np.bool_]) -> None:
-        """Forget blocks that are no longer in the map; touch those that were near."""
+    def _forget(self, num_raised: Int64) -> None:
+        """Forget blocks that have left the map; mark the voxels that were nearest to theirs."""
         head = self._blocks.head
         kept = (head[:, KEY] == self._keys) & (head[:, VERSION] != FREE)
         gone = np.flatnonzero((self._keys >= 0) & ~kept)
@@ -225,7 +228,7 @@ class EuclideanField:
             return
         marks = self._mark_rows
         marks[gone] &= kernels.OLD
-        self._touch(gone, kernels.OLD, kept, touched)
+        self._spread(gone, kernels.OLD, kept, num_raised)
         marks[gone] = 0
         self._keys[gone] = -1
         self._occupied[gone] = 0
@@ -244,15 +247,24 @@ class EuclideanField:
         changed: Int64 = rows[~stays_free]
         return changed
 
-    def _touch(
-        self,
-        rows: Int64,
-        flips: np.uint8,
-        targets: npt.NDArray[np.bool_],
-        touched: npt.NDArray[np.bool_],
+    def _mark(self, rows: Int64) -> Int64:
+        """Compare occupancy with that before; return what kernels.mark_occupied counts."""
+        blocks, counts = self._blocks, np.empty((len(rows), 3), np.int64)
+        self._keys[rows] = blocks.head[rows, KEY]
+        occupied = np.float32(0.5 * blocks.config.voxel_size_m)
+        least = np.float32(np.finfo(np.float32).tiny)
+        kernels.mark_occupied(rows, blocks.field, least, occupied, self._mark_rows, counts)
+        self._seen[rows] = blocks.head[rows, VERSION]
+        self._occupied[rows] = counts[:, 2]
+        return counts
+
+    def _spread(
+        self, rows: Int64, flips: np.uint8, targets: npt.NDArray[np.bool_], num_raised: Int64
     ) -> None:
-        """Find the blocks that voxels of some blocks change; see kernels.touch."""
-        kernels.touch(
+        """Follow voxels of some blocks that became occupied or free; see kernels.spread."""
+        if not targets.any():
+            return
+        kernels.spread(
             rows,
             block_index(self._keys[rows]),
             flips,
@@ -263,18 +275,74 @@ class EuclideanField:
             self._blocks.lookup,
             self._mark_rows,
             self._squares,
-            touched,
+            num_raised,
         )
 
-    def _transform(self, rows: Int64) -> None:
-        tiles = np.unique(block_index(self._keys[rows]) // kernels.TILE, axis=0) * kernels.TILE
-        kernels.transform(
-            tiles,
-            self._most,
+    def _search(self, num_raised: Int64, is_new: npt.NDArray[np.bool_]) -> None:
+        """Find the distances of marked voxels; blocks of many are left to the transform."""
+        marked = np.flatnonzero(num_raised)
+        many = marked[num_raised[marked] > MANY]
+        is_new[many] = True
+        self._mark_rows[many] &= ~kernels.RAISED
+        few = marked[~is_new[marked]]
+        kernels.search(
+            few,
+            block_index(self._keys[few]),
+            *self._order,
             self._bits,
             self._keys,
             self._blocks.lookup,
             self._mark_rows,
-            self._occupied,
             self._squares,
         )
+
+    def _transform(self, rows: Int64) -> None:
+        """Compute blocks as a whole, by eight if most of them are asked for."""
+        index = block_index(self._keys[rows])
+        tiles, place, number = np.unique(
+            index // 2 * 2, axis=0, return_inverse=True, return_counts=True
+        )
+        for size, part in (
+            (2, tiles[number >= FULL]),
+            (1, index[number[place.reshape(-1)] < FULL]),
+        ):
+            kernels.transform(
+                part,
+                size,
+                self._most,
+                self._bits,
+                self._keys,
+                self._blocks.lookup,
+                self._mark_rows,
+                self._occupied,
+                self._squares,
+            )
+
+
+def places_within(most: int) -> tuple[npt.NDArray[np.int16], npt.NDArray[np.uint16], Int64]:
+    """
+    Return the voxels about a voxel in the order of their distance, for kernels.search.
+
+    Parameters
+    ----------
+    most : int
+        Largest squared distance, voxels.
+
+    Returns
+    -------
+    places : (P, 3) int16
+        Offsets.
+    lengths : (P,) uint16
+        Their squared lengths, ascending.
+    firsts : (most + 1,) int64
+        The first place of at least each squared length.
+
+    """
+    steps = np.arange(-math.isqrt(most), math.isqrt(most) + 1)
+    places = np.stack(np.meshgrid(steps, steps, steps, indexing='ij'), axis=-1).reshape(-1, 3)
+    squared = (places**2).sum(axis=1)
+    order = np.argsort(squared, kind='stable')
+    order = order[: np.searchsorted(squared[order], most, side='right')]
+    lengths = squared[order]
+    firsts = np.searchsorted(lengths, np.arange(most + 1)).astype(np.int64)
+    return places[order].astype(np.int16), lengths.astype(np.uint16), firsts

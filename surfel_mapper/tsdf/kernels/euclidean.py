@@ -3,17 +3,21 @@
 """
 Squared distances of voxels to the nearest occupied voxel, made again where occupancy has changed.
 
-A voxel p that becomes occupied changes the voxels of the ball about it that are nearer to p than
-their distance; one that becomes free, those whose distance was that to p. If the neighbour of p in
-a direction is occupied, all voxels on that side are nearer to the neighbour: in a wall the ball is
-a column. ``touch`` finds the blocks with such voxels, and ``transform`` makes their distances from
-the occupied voxels in reach, in one pass along each axis (Felzenszwalb and Huttenlocher 2012, with
+A voxel p that becomes occupied lowers the distances of the voxels about it that are nearer to p
+than to any other; one that becomes free raises those whose distance was that to p. If there is an
+occupied voxel k voxels from p along an axis, voxels more than k / 2 on that side are nearer to it:
+in a wall the ball about p is a column. ``lower`` writes the new distances. ``mark_raised`` marks
+the voxels whose nearest one has gone, and ``search`` finds their next: from the former distance
+on, through the places about them in the order of their distance.
+
+Blocks that are new, or have many marked voxels, are computed as a whole by ``transform`` from the
+occupied voxels in reach, in one pass along each axis (Felzenszwalb and Huttenlocher 2012, with
 a window instead of an envelope of parabolas: reaches are short, and plain loops compile to vector
 instructions).
 
 Distances are integers and exact: the result does not depend on the order of changes.
 
-One module: both halves share the marks of voxels and the look-up of blocks.
+One module: all share the marks of voxels and the look-up of blocks.
 """
 
 from numba import njit
@@ -34,8 +38,11 @@ MAX_REACH = 127
 BEYOND = np.uint16(1 << 15)
 """Squared distance while it is computed, if farther along the axis than the reach."""
 
-TILE = 2
-"""Blocks a side that are computed together: their windows overlap."""
+RAISED = np.uint8(4)
+"""The nearest occupied voxel has gone."""
+
+NEIGHBOURS = 4
+"""Voxels along an axis that are looked at for a nearer occupied one, on either side."""
 
 UNREAD = -2
 """Row of a block that was not looked up yet."""
@@ -95,31 +102,64 @@ def look_up(place, index, width, half, keys, find, cube):
 
 
 @njit(cache=True, nogil=True)
-def is_marked(x, y, z, bit, index, width, bits, keys, find, marks, cube):
-    """Return whether a voxel, counted from the block in the middle of a cube, has a mark."""
-    half, low = width // 2, (1 << bits) - 1
-    place = (x >> bits) + half + width * ((y >> bits) + half + width * ((z >> bits) + half))
-    if cube[place] == UNREAD:
-        look_up(place, index, width, width // 2, keys, find, cube)
-    number = (x & low) | (y & low) << bits | (z & low) << 2 * bits
-    return cube[place] >= 0 and marks[cube[place], number] & bit != 0
+def place_in(x, y, z, bits, width):
+    """Return the place in a cube of the block of a voxel, counted from the block in the middle."""
+    half = width // 2
+    return (x >> bits) + half + width * ((y >> bits) + half + width * ((z >> bits) + half))
 
 
 @njit(cache=True, nogil=True)
-def touch(rows, index, flips, most, targets, bits, keys, find, marks, squared, touched):
-    """
-    Find the blocks whose distances change because of voxels that became occupied, or free.
+def number_in(x, y, z, bits):
+    """Return the number of a voxel in its block."""
+    low = (1 << bits) - 1
+    return (x & low) | (y & low) << bits | (z & low) << 2 * bits
 
-    rows     (K,) int64, blocks of these voxels
-    index    (K, 3) int64, their block indices
-    flips    NEW: voxels that became occupied; OLD: voxels that became free
-    most     int64, largest squared distance, voxels
-    targets  (R,) bool, blocks to look at
-    bits     a block has 2^bits voxels a side
-    keys     (R,) int64, see look_up
-    marks    (R, N) uint8
-    squared  (R, N) uint16, distances before the changes
-    touched  (R,) bool, in and out; blocks that are touched already are not looked at
+
+@njit(cache=True, nogil=True)
+def bound(voxel, bit, reach, index, width, bits, keys, find, marks, cube, least, largest):
+    """
+    Find the box of the voxels that may be nearer to a voxel than to another one on its axes.
+
+    voxel           (3,) int64, counted from the block in the middle of a cube
+    bit             mark of the others
+    index, keys, find, cube  as in look_up
+    bits, marks     as in spread
+    least, largest  (3,) int64, out, counted as voxel
+    """
+    for axis in range(3):
+        for sign in (-1, 1):
+            nearest = reach
+            for k in range(1, min(NEIGHBOURS, reach) + 1):
+                x = voxel[0] + sign * k * (axis == 0)
+                y = voxel[1] + sign * k * (axis == 1)
+                z = voxel[2] + sign * k * (axis == 2)
+                place = place_in(x, y, z, bits, width)
+                if cube[place] == UNREAD:  # here, not in a function: calls cost 30 times the rest
+                    look_up(place, index, width, width // 2, keys, find, cube)
+                if cube[place] >= 0 and marks[cube[place], number_in(x, y, z, bits)] & bit:
+                    nearest = k // 2
+                    break
+            if sign < 0:
+                least[axis] = voxel[axis] - nearest
+            else:
+                largest[axis] = voxel[axis] + nearest
+
+
+@njit(cache=True, nogil=True)
+def spread(rows, index, flips, most, targets, bits, keys, find, marks, squared, num_raised):
+    """
+    Lower the distances about voxels that became occupied, or mark those that voxels have left.
+
+    rows        (K,) int64, blocks of these voxels
+    index       (K, 3) int64, their block indices
+    flips       NEW: voxels that became occupied; OLD: voxels that became free
+    most        int64, largest squared distance, voxels
+    targets     (R,) bool, blocks to look at
+    bits        a block has 2^bits voxels a side
+    keys        (R,) int64, see look_up
+    marks       (R, N) uint8, in and out: RAISED is set
+    squared     (R, N) uint16, in and out: lowered
+    num_raised  (R,) int64, in and out: marked voxels of each block
     """
     low, reach = (1 << bits) - 1, np.int64(np.sqrt(most))
     half = (reach + low) >> bits
@@ -127,75 +167,143 @@ def touch(rows, index, flips, most, targets, bits, keys, find, marks, squared, t
     cube = np.empty(width * width * width, np.int64)
     least, largest = np.empty(3, np.int64), np.empty(3, np.int64)
     middle, voxel = half * (1 + width * (1 + width)), np.empty(3, np.int64)
+    plane = np.empty(1 << 2 * bits, np.uint16)
     for b in range(len(rows)):
         cube[:] = UNREAD
         cube[middle] = rows[b]
         for n in range(marks.shape[1]):
             if marks[rows[b], n] & (OLD | NEW) != flips:
                 continue
-            x, y, z = n & low, n >> bits & low, n >> 2 * bits
-            near = (flips, index[b], width, bits, keys, find, marks, cube)
-            voxel[0], voxel[1], voxel[2] = x, y, z
-            least[0] = x if is_marked(x - 1, y, z, *near) else x - reach
-            largest[0] = x if is_marked(x + 1, y, z, *near) else x + reach
-            least[1] = y if is_marked(x, y - 1, z, *near) else y - reach
-            largest[1] = y if is_marked(x, y + 1, z, *near) else y + reach
-            least[2] = z if is_marked(x, y, z - 1, *near) else z - reach
-            largest[2] = z if is_marked(x, y, z + 1, *near) else z + reach
-            for k in range(least[2] >> bits, (largest[2] >> bits) + 1):
-                for j in range(least[1] >> bits, (largest[1] >> bits) + 1):
-                    for i in range(least[0] >> bits, (largest[0] >> bits) + 1):
+            voxel[0], voxel[1], voxel[2] = n & low, n >> bits & low, n >> 2 * bits
+            near = (index[b], width, bits, keys, find, marks, cube)
+            bound(voxel, flips, reach, *near, least, largest)
+            for j in range(least[1] >> bits, (largest[1] >> bits) + 1):
+                for i in range(least[0] >> bits, (largest[0] >> bits) + 1):
+                    square(voxel[0] - (i << bits), voxel[1] - (j << bits), bits, plane)
+                    for k in range(least[2] >> bits, (largest[2] >> bits) + 1):
                         place = middle + i + width * (j + width * k)
                         if cube[place] == UNREAD:
                             look_up(place, index[b], width, half, keys, find, cube)
                         row = cube[place]
-                        if row >= 0 and targets[row] and not touched[row]:
-                            bounds = (i << bits, j << bits, k << bits, low, most)
-                            touched[row] = is_hit(
-                                voxel, least, largest, bounds, bits, squared[row], flips == NEW
+                        if row < 0 or not targets[row]:
+                            continue
+                        above = (k << bits) - voxel[2]
+                        first = max(-reach - above, 0)
+                        last = min(reach - above, low) + 1
+                        if flips == NEW:
+                            lower(plane, above, first, last, most, squared[row])
+                        else:
+                            num_raised[row] += mark_raised(
+                                plane, above, first, last, squared[row], marks[row]
                             )
 
 
 @njit(cache=True, nogil=True)
-def is_hit(voxel, least, largest, bounds, bits, squared, lowers):
+def square(x, y, bits, plane):
     """
-    Return whether a voxel comes nearer to those of a block, or was the nearest to any of them.
+    Find the squared distances across z of a layer of a block.
 
-    voxel           (3,) int64, counted from its own block
-    least, largest  (3,) int64, of the box to look at, in the same way
-    bounds          x, y, z of the block's first voxel, voxels a side less 1, and most
-    squared         (N,) uint16, distances before
-    lowers          whether it comes nearer
+    x, y   int64, of the place in question, from the first voxel of the block
+    plane  (side^2,) uint16, out; at most BEYOND
     """
-    x, y, z, low, most = bounds
-    for w in range(max(least[2], z), min(largest[2], z + low) + 1):
-        for v in range(max(least[1], y), min(largest[1], y + low) + 1):
-            fixed = (w - voxel[2]) ** 2 + (v - voxel[1]) ** 2
-            if fixed > most:
-                continue
-            line = ((v - y) << bits | (w - z) << 2 * bits) - x
-            for u in range(max(least[0], x), min(largest[0], x + low) + 1):
-                length = fixed + (u - voxel[0]) ** 2
-                before = squared[line + u]
-                if length <= most and (length < before if lowers else length == before):
-                    return True
-    return False
+    for n in range(len(plane)):
+        length = ((n & ((1 << bits) - 1)) - x) ** 2 + ((n >> bits) - y) ** 2
+        plane[n] = min(length, BEYOND)
 
 
 @njit(cache=True, nogil=True)
-def transform(tiles, most, bits, keys, find, marks, occupied, squared):
+def lower(plane, above, first, last, most, squared):
     """
-    Compute the distances of all voxels in tiles of TILE^3 blocks.
+    Lower the distances of the voxels of a block to those from a voxel.
+
+    plane        (side^2,) uint16, from square
+    above        z of the first layer, from the voxel
+    first, last  layers to look at, the last not included
+    most         as in spread
+    squared      (N,) uint16, in and out
+    """
+    limit = np.uint16(most)
+    for z in range(first, last):
+        added = np.uint16((above + z) ** 2)
+        layer = squared[z * len(plane) : (z + 1) * len(plane)]
+        for n in range(len(plane)):
+            length = np.uint16(plane[n] + added)
+            layer[n] = min(layer[n], length if length <= limit else FAR)
+
+
+@njit(cache=True, nogil=True)
+def mark_raised(plane, above, first, last, squared, marks):
+    """
+    Mark the voxels of a block whose distance is that to a voxel; return the number of new marks.
+
+    marks   (N,) uint8, in and out
+    others  as in lower
+    """
+    found = 0
+    for z in range(first, last):
+        added, start, equal = np.uint16((above + z) ** 2), z * len(plane), False
+        layer = squared[start : start + len(plane)]
+        for n in range(len(plane)):
+            equal |= layer[n] == np.uint16(plane[n] + added)
+        if equal:
+            for n in range(len(plane)):
+                if layer[n] == np.uint16(plane[n] + added):
+                    found += marks[start + n] & RAISED == 0
+                    marks[start + n] |= RAISED
+    return found
+
+
+@njit(cache=True, nogil=True)
+def search(rows, index, places, lengths, firsts, bits, keys, find, marks, squared):
+    """
+    Find the distances of marked voxels, none of which is less than before.
+
+    rows     (K,) int64, blocks with marked voxels
+    index    (K, 3) int64, their block indices
+    places   (P, 3) int16, offsets of the voxels about a voxel
+    lengths  (P,) uint16, their squared distances, ascending
+    firsts   (most + 1,) int64, the first place of at least each squared distance
+    bits, keys, find  as in spread
+    marks    (R, N) uint8, in and out: RAISED is unset
+    squared  (R, N) uint16, in and out
+    """
+    low, reach = (1 << bits) - 1, np.int64(np.sqrt(len(firsts) - 1))
+    half = (reach + low) >> bits
+    width = 2 * half + 1
+    cube = np.empty(width * width * width, np.int64)
+    for b in range(len(rows)):
+        mark, distance = marks[rows[b]], squared[rows[b]]
+        cube[:] = UNREAD
+        for n in range(len(mark)):
+            if mark[n] & RAISED:
+                x, y, z = n & low, n >> bits & low, n >> 2 * bits
+                mark[n] &= ~RAISED
+                first, distance[n] = firsts[distance[n]], FAR
+                for p in range(first, len(places)):
+                    u, v, w = x + places[p, 0], y + places[p, 1], z + places[p, 2]
+                    place = place_in(u, v, w, bits, width)
+                    if cube[place] == UNREAD:
+                        look_up(place, index[b], width, half, keys, find, cube)
+                    if cube[place] >= 0 and marks[cube[place], number_in(u, v, w, bits)] & NEW:
+                        distance[n] = lengths[p]
+                        break
+
+
+@njit(cache=True, nogil=True)
+def transform(tiles, size, most, bits, keys, find, marks, occupied, squared):
+    """
+    Compute the distances of all voxels in tiles of size^3 blocks.
 
     tiles     (K, 3) int64, index of the first block of each
-    most, bits, keys, find  as in touch
+    size      1 or more: the windows of blocks that are computed together overlap
+    most, bits, keys, find  as in spread
     marks     (R, N) uint8, NEW for occupied voxels
     occupied  (R,) int64, number of occupied voxels of each block
     squared   (R, N) uint16, out; FAR if no voxel in reach is occupied
     """
-    side, reach = TILE << bits, np.int64(np.sqrt(most))
+    side, reach = size << bits, np.int64(np.sqrt(most))
     half = (reach + (1 << bits) - 1) >> bits
-    width, span = 2 * half + TILE, side + 2 * reach
+    width, span = 2 * half + size, side + 2 * reach
     cube = np.empty(width * width * width, np.int64)
     free = np.empty((span, span * span), np.uint8)
     run = np.empty(span * span, np.uint16)
@@ -205,7 +313,7 @@ def transform(tiles, most, bits, keys, find, marks, occupied, squared):
     found = np.empty(side * side * side, np.uint16)
     for b in range(len(tiles)):
         follow(tiles, b, width, half, keys, find, cube)
-        if fill(free.ravel(), cube, width, half, bits, reach, marks, occupied):
+        if fill(free.ravel(), cube, width, half, bits, reach, span, marks, occupied):
             transform_z(free, reach, side, run, along_z)
             for z in range(side):
                 slide(along_z[z], span, reach, along_y)
@@ -241,10 +349,11 @@ def write(found, most, cube, width, half, bits, squared):
     cube     (width^3,) int64, rows of the blocks about the tile and in it
     squared  (R, N) uint16, out; FAR beyond most
     """
-    low, side = (1 << bits) - 1, TILE << bits
-    for i in range(TILE):
-        for j in range(TILE):
-            for k in range(TILE):
+    size, low = width - 2 * half, (1 << bits) - 1
+    side = size << bits
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
                 row = cube[i + half + width * (j + half + width * (k + half))]
                 if row < 0:
                     continue
@@ -259,15 +368,16 @@ def write(found, most, cube, width, half, bits, squared):
 
 
 @njit(cache=True, nogil=True)
-def fill(free, cube, width, half, bits, reach, marks, occupied):
+def fill(free, cube, width, half, bits, reach, span, marks, occupied):
     """
     Copy the occupancy about a tile; return whether any voxel is occupied.
 
-    free    (W^3,) uint8, x fastest, out: 0 if occupied, else 1; W = side of the tile + 2 reach
+    free    (W^3,) uint8, x fastest, out: 0 if occupied, else 1
+    span    W, side of the tile + 2 reach
     cube    (width^3,) int64, rows of the blocks about the tile and in it
     others  as in transform
     """
-    side, span = 1 << bits, (TILE << bits) + 2 * reach
+    side = 1 << bits
     before, is_empty = half * side - reach, True
     for place in range(len(cube)):
         row = cube[place]
@@ -285,8 +395,7 @@ def fill(free, cube, width, half, bits, reach, marks, occupied):
                 line = left + span * (y + front + span * (z + bottom))
                 number = (y + (z << bits)) << bits
                 for x in range(first, last):
-                    if marks[row, number + x] & NEW:
-                        free[line + x] = 0
+                    free[line + x] = (marks[row, number + x] & NEW) == 0
     return not is_empty
 
 
@@ -343,11 +452,11 @@ def slide(values, stride, reach, found):
     for step in range(1, reach + 1):
         before, after = (reach - step) * stride, (reach + step) * stride
         added = np.uint16(step * step)
-        lower(values[before : before + number], values[after : after + number], added, found)
+        lower_line(values[before : before + number], values[after : after + number], added, found)
 
 
 @njit(cache=True, nogil=True)
-def lower(before, after, added, found):
+def lower_line(before, after, added, found):
     """Lower values (F,) uint16 to the lesser of two plus a number."""
     for n in range(len(found)):
         less = min(before[n], after[n])
