@@ -36,6 +36,30 @@ class PointTimes:
     last_ns: int
 
 
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class DepthImage:
+    """
+    A rectified depth image, for layers that need no points.
+
+    Attributes
+    ----------
+    points : (N, 3) float32
+        The points that were made of it.
+    depth : (H, W) uint16, mm, or float32, m
+        Along the optical axis; 0, negative values, nan and 65535 mm mean unknown, inf no return.
+    color : (H, W, 3) uint8, optional
+        Red, green, blue.
+    label : (H, W) int32, optional
+        -1 means unknown.
+
+    """
+
+    points: npt.NDArray[Any]
+    depth: npt.NDArray[Any]
+    color: npt.NDArray[np.uint8] | None = None
+    label: npt.NDArray[np.int32] | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scan:
     """
@@ -60,6 +84,8 @@ class Scan:
     camera : tuple of float
         For points of a depth image: width and height of the image, focal lengths and centre
         fx, fy, cx, cy, all in pixels.
+    depth : DepthImage, optional
+        The depth image that has exactly these points; None as soon as a scan has others.
     free : (K, 3) float, optional
         Unit vectors along which the sensor reports no return within its range.
     msg : sensor_msgs/PointCloud2, optional
@@ -81,6 +107,7 @@ class Scan:
     T_map_sensor: npt.NDArray[np.float64] | None = None
     times: PointTimes | None = None
     camera: tuple[float, ...] = ()
+    depth: DepthImage | None = None
     free: npt.NDArray[Any] | None = None
     msg: Any = None
 
@@ -98,6 +125,8 @@ class Scan:
             )
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
+        if self.depth is not None and self.depth.points is not points:
+            object.__setattr__(self, 'depth', None)
         if getattr(self.columns, 'num_rows', None) == len(points):
             return  # columns of filters are lazy: measuring would compute each
         for name, column in self.columns.items():

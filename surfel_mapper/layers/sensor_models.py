@@ -19,9 +19,11 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import CloudFormatError, PoseError
+from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.poses.buffer import TransformBuffer
 from surfel_mapper.scan import Scan
 from surfel_mapper.tsdf.fitting import best_fit, fit_share, fitted_lidar, LEAST_FIT
+from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 logger = logging.getLogger(__name__)
@@ -38,6 +40,12 @@ NUM_CHECKED = 4096
 
 MAX_LIDARS = 64
 """Frames whose lidars are kept; frame names may change without end."""
+
+MAX_CAMERAS = 8
+"""Cameras whose tables of rays are kept, 5 MB each at 640 x 480."""
+
+NO_DEPTH_MM = 65535
+"""Value of pixels without depth in images of mm of some cameras."""
 
 
 @dataclass(slots=True)
@@ -89,6 +97,7 @@ class SensorModels:
         self._transforms = transforms
         self.frames: dict[str, FrameModel] = {}
         self.num_refits = 0
+        self._cameras: dict[tuple[float, ...], CameraModel] = {}
         self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
 
     def of(self, scan: Scan) -> CameraModel | LidarModel | None:
@@ -103,10 +112,7 @@ class SensorModels:
         """
         config = self._config
         if scan.camera:
-            width, height, fx, fy, cx, cy = scan.camera
-            return CameraModel(
-                columns=int(width), rows=int(height), fx=fx, fy=fy, cx=cx, cy=cy, **self._ranges
-            )
+            return self._camera(scan.camera)
         if self._checked[0] is not scan:  # several layers ask for the same scan
             if scan.frame_id not in self.frames and len(self.frames) >= MAX_LIDARS:
                 del self.frames[next(iter(self.frames))]
@@ -122,6 +128,8 @@ class SensorModels:
         """
         Return the pose of the sensor in the frame of a scan, T_scan_sensor; None: its origin.
 
+        The points of a camera are always given about its centre.
+
         Raises
         ------
         PoseError
@@ -129,6 +137,8 @@ class SensorModels:
 
         """
         config = self._config
+        if scan.camera:
+            return None
         if config.sensor_center_m:
             T = np.eye(4)
             T[:3, 3] = config.sensor_center_m
@@ -151,6 +161,18 @@ class SensorModels:
             },
             'sensor_fit': {name: round(frame.share, 3) for name, frame in self.frames.items()},
         }
+
+    def _camera(self, numbers: tuple[float, ...]) -> CameraModel:
+        """Return the model of a camera, whose tables of rays are made once."""
+        if numbers not in self._cameras:
+            if len(self._cameras) >= MAX_CAMERAS:
+                del self._cameras[next(iter(self._cameras))]
+            width, height, *pinhole = numbers
+            angles = dict(zip(('fx', 'fy', 'cx', 'cy'), pinhole, strict=True))
+            self._cameras[numbers] = CameraModel(
+                columns=int(width), rows=int(height), **angles, **self._ranges
+            )
+        return self._cameras[numbers]
 
     @property
     def _ranges(self) -> dict[str, Any]:
@@ -243,6 +265,59 @@ class SensorModels:
         return fit_share(model, scan.points, self._config.voxel_size_m, num_checked=NUM_CHECKED)
 
 
+def range_image(
+    scan: Scan, sensor: CameraModel | LidarModel, *, has_color: bool, has_label: bool
+) -> RangeImage:
+    """
+    Return the range image of a scan: of its depth image if it has one, else of points and rays.
+
+    Parameters
+    ----------
+    scan : Scan
+        In the frame of its sensor.
+    sensor : CameraModel or LidarModel
+        The model of it.
+    has_color, has_label : bool
+        Whether colours and labels are taken, if the scan has any.
+
+    Raises
+    ------
+    CloudFormatError
+        If labels are out of range.
+
+    """
+    depth, columns = scan.depth, scan.columns
+    if (
+        depth is None
+        or not isinstance(sensor, CameraModel)
+        or (has_color and depth.color is None and ('rgb' in columns or 'rgba' in columns))
+        or (has_label and depth.label is None and 'label' in columns)
+    ):
+        points, channels = measured_channels(
+            scan, sensor.max_range_m, has_color=has_color, has_label=has_label
+        )
+        return from_points(sensor, points, **channels)
+    unknown = NO_DEPTH_MM if depth.depth.dtype.kind == 'u' else None
+    return from_depth(sensor, depth.depth, unknown=unknown).with_images(
+        color=depth.color if has_color else None, label=depth.label if has_label else None
+    )
+
+
+def measured_channels(
+    scan: Scan, max_range_m: float, *, has_color: bool, has_label: bool
+) -> tuple[npt.NDArray[Any], dict[str, npt.NDArray[Any] | None]]:
+    """Return points and free rays of a scan, with their colours and labels if asked for."""
+    points = measured(scan, max_range_m)
+    num_free = len(points) - len(scan)
+    colors = colors_of(scan) if has_color else None
+    labels = scan.columns.get('label') if has_label else None
+    if colors is not None:
+        colors = np.pad(colors, ((0, num_free), (0, 0)))
+    if labels is not None:
+        labels = np.pad(labels, (0, num_free), constant_values=-1)
+    return points, {'colors': colors, 'labels': labels}
+
+
 def measured(scan: Scan, max_range_m: float) -> npt.NDArray[Any]:
     """Return the points of a scan, then a point beyond the range on each ray that met nothing."""
     if scan.free is None:
@@ -255,3 +330,19 @@ def two_beams(dtype: Any) -> npt.NDArray[Any]:
     """Return simulated points of a lidar of two beams in a round room, to compile kernels with."""
     lidar = LidarModel(rows=2, columns=64, vertical_fov_deg=10.0)
     return np.asarray(3.0 * lidar.directions.reshape(-1, 3), dtype)
+
+
+def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
+    """
+    Return the colours of the points: (N, 3), or (N, 4) with a fourth value of 0 if unknown.
+
+    Alpha marks the points that have a colour, unless it is 0 everywhere, as some drivers leave it.
+    """
+    columns = scan.columns
+    if not {'rgb', 'rgba'} & columns.keys():
+        return None
+    colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
+    packed = columns['rgba'] if 'rgb' not in columns else None
+    if packed is None or packed.dtype != np.uint32 or not (packed >> 24).any():
+        return colors
+    return np.column_stack([colors, (packed >> 24).astype(np.uint8)])

@@ -26,7 +26,7 @@ from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.messages.cdr import checked_stamp_ns, frame_name
 from surfel_mapper.messages.compressed_image import base_topic, unpacked
 from surfel_mapper.messages.pointcloud2 import bytes_of
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import DepthImage, Scan
 from surfel_mapper.sensors.depth import COLOR, depth_points, free_rays, PinholeCamera, SceneImage
 
 ENCODINGS = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
@@ -151,6 +151,7 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
         stamp_ns=stamp_ns,
         frame_id=str(msg.header.frame_id),
         camera=astuple(image.camera),
+        depth=DepthImage(points=points, depth=depth),
         free=free_rays(depth, image.camera),
     )
 

@@ -12,7 +12,7 @@ already has stay.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -22,7 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.geometry import Transform
 from surfel_mapper.layers import Images
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import DepthImage, Scan
 from surfel_mapper.sensors.depth import LABEL, PinholeCamera, SceneImage
 
 MAX_IMAGES = 60
@@ -90,7 +90,7 @@ class ScanImages:
             If an image is not of the size of the depth image.
 
         """
-        columns, missing = dict(scan.columns), []
+        columns, missing, depth = dict(scan.columns), [], scan.depth
         for kind in self._images:
             if has_column(scan, kind):
                 continue
@@ -98,9 +98,15 @@ class ScanImages:
             if image is None:
                 missing.append(kind)
                 continue
+            if depth is not None:
+                check_size(image, scan)
+                depth = replace(depth, **{kind: image.pixels})
+                continue
             seen = seen_in(image, scan, place)
             if seen is not None:
                 columns[COLUMNS[kind][0]] = seen
+        if depth is not None:
+            return replace(scan, depth=depth, columns=PixelColumns(scan, depth)), missing
         return replace(scan, columns=columns), missing
 
     def _nearest(self, kind: str, stamp_ns: int) -> SceneImage | None:
@@ -127,13 +133,8 @@ def seen_in(
     image get 0, whose alpha is 0 too, or -1.
     """
     if scan.camera:
-        width, height = int(scan.camera[0]), int(scan.camera[1])
-        if image.pixels.shape[:2] != (height, width):
-            raise CloudFormatError(
-                f'{image.kind} image of {image.pixels.shape[1]} x {image.pixels.shape[0]} pixels, '
-                f'expected {width} x {height} as the depth image has'
-            )
-        camera, points = PinholeCamera(width, height, *scan.camera[2:]), scan.points
+        check_size(image, scan)
+        camera, points = camera_of(scan), scan.points
     else:
         assert image.camera is not None, 'images beside a lidar come with their camera'
         camera, T = image.camera, place(image)
@@ -141,14 +142,87 @@ def seen_in(
     pixel = pixels_of(camera, points, image.pixels.shape[:2])
     if not len(pixel) or pixel.max() < 0:
         return None
+    return pixel_values(image.kind, image.pixels, pixel)
+
+
+def pixel_values(
+    kind: str, pixels: npt.NDArray[Any], pixel: npt.NDArray[np.int32]
+) -> npt.NDArray[Any]:
+    """Return the values of an image at pixels counted row by row, as seen_in; -1: none."""
     values: npt.NDArray[Any]
-    if image.kind == LABEL:
-        values, nothing = image.pixels.ravel(), -1
-    else:
-        values, nothing = packed(image.pixels), 0
+    values, nothing = (pixels.ravel(), -1) if kind == LABEL else (packed(pixels), 0)
     seen = values[pixel]
     seen[pixel < 0] = nothing
     return seen
+
+
+def check_size(image: SceneImage, scan: Scan) -> None:
+    """Raise CloudFormatError if an image is not of the size of the depth image of a scan."""
+    width, height = int(scan.camera[0]), int(scan.camera[1])
+    if image.pixels.shape[:2] != (height, width):
+        raise CloudFormatError(
+            f'{image.kind} image of {image.pixels.shape[1]} x {image.pixels.shape[0]} pixels, '
+            f'expected {width} x {height} as the depth image has'
+        )
+
+
+def camera_of(scan: Scan) -> PinholeCamera:
+    """Return the camera of the points of a depth image."""
+    return PinholeCamera(int(scan.camera[0]), int(scan.camera[1]), *scan.camera[2:])
+
+
+class PixelColumns(Mapping[str, npt.NDArray[Any]]):
+    """
+    Columns of the points of a depth image, taken from images of its pixels when first read.
+
+    The distance field reads the images themselves, and often nothing else needs the columns.
+
+    Parameters
+    ----------
+    scan : Scan
+        Points, camera, and columns that stay as they are.
+    depth : DepthImage
+        The images.
+
+    """
+
+    __slots__ = ('_base', '_camera', '_made', '_pixel', '_points', '_sources', 'num_rows')
+
+    def __init__(self, scan: Scan, depth: DepthImage) -> None:
+        self._base, self._camera, self._points = scan.columns, camera_of(scan), scan.points
+        images = {kind: getattr(depth, kind) for kind in COLUMNS}
+        self._sources = {
+            COLUMNS[kind][0]: (kind, pixels)
+            for kind, pixels in images.items()
+            if pixels is not None and not has_column(scan, kind)
+        }
+        self._made: dict[str, npt.NDArray[Any]] = {}
+        self._pixel: npt.NDArray[np.int32] | None = None
+        self.num_rows = len(scan)
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        """Return a column, the same array every time."""
+        if name not in self._sources:
+            return self._base[name]
+        if name not in self._made:
+            if self._pixel is None:
+                size = self._camera.height, self._camera.width
+                self._pixel = pixels_of(self._camera, self._points, size)
+            self._made[name] = pixel_values(*self._sources[name], self._pixel)
+        return self._made[name]
+
+    def __contains__(self, name: object) -> bool:
+        """Return whether the column exists, without making it."""
+        return name in self._sources or name in self._base
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        yield from self._base
+        yield from self._sources
+
+    def __len__(self) -> int:
+        """Return the number of columns."""
+        return len(self._base) + len(self._sources)
 
 
 def packed(pixels: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint32]:

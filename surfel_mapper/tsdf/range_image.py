@@ -104,7 +104,7 @@ class RangeImage:
                     f'label: {found.dtype} from {found.min()} to {found.max()}, expected whole '
                     f'numbers from -1 to {MAX_LABEL}'
                 )
-            more['label'] = found.astype(np.int32)
+            more['label'] = found.astype(np.int32, copy=False)
         if mask is not None:
             more['mask'] = (self._fitted('mask', np.asarray(mask), ()) != 0).astype(np.uint8)
         return replace(self, **more)
@@ -193,10 +193,9 @@ def from_depth(
         raise CloudFormatError(f'depth scale: {scale}, expected positive and finite')
     image = np.empty((sensor.rows, sensor.columns), np.float32)
     native = np.ascontiguousarray(depth, native_type)
-    if unknown is not None:
-        native = np.where(native == unknown, 0, native).astype(native_type)
+    absent = np.nan if unknown is None else float(unknown)
     largest, used = kernels.from_depth(
-        native, np.float32(scale), sensor.ray_length, limits(sensor), image
+        native, np.float32(scale), absent, sensor.ray_length, limits(sensor), image
     )
     return RangeImage(sensor=sensor, range_m=image, largest_m=float(largest), num_used=used)
 
@@ -270,7 +269,7 @@ def from_ranges(sensor: Sensor, range_m: npt.NDArray[Any]) -> RangeImage:
     image = np.empty((sensor.rows, sensor.columns + sensor.wraps), np.float32)
     native = np.ascontiguousarray(range_m, np.float32)
     largest, used = kernels.from_depth(
-        native, np.float32(1.0), np.ones_like(native), limits(sensor), image
+        native, np.float32(1.0), np.nan, np.ones_like(native), limits(sensor), image
     )
     if sensor.wraps:
         image[:, -1] = image[:, 0]

@@ -28,6 +28,7 @@ import numpy.typing as npt
 from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
+from surfel_mapper.sensors.depth import depth_points, PinholeCamera
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
@@ -112,6 +113,7 @@ def run(options: Options) -> list[Row]:
         with one_core():
             rows += case_rows(case, options)
     with one_core():
+        rows += image_rows(room_cases(options, scans)[0])
         rows += esdf_rows(street_cases(options, scans)[1])
         rows += layer_rows(street_cases(options, scans)[1])
     return rows + cloud_rows(options)
@@ -135,6 +137,26 @@ def layer_rows(case: Case) -> list[Row]:
         figures = {'cpu_ms': float(np.median(late)), 'least_ms': min(late), 'scans': len(late)}
         rows.append({'case': f'layer, {name}', 'who': 'surfel_mapper', **figures})
     return rows
+
+
+def image_rows(case: Case) -> list[Row]:
+    """Return rows of range images of 640 x 480, from the depth image and from its points."""
+    camera, found = room.CAMERA, []
+    pinhole = PinholeCamera(
+        camera.columns, camera.rows, camera.fx, camera.fy, camera.cx, camera.cy
+    )
+    for path in case.files:
+        depth = np.load(path).astype(np.float32)
+        begin = process_time()
+        from_depth(camera, depth)
+        middle = process_time()
+        from_points(camera, depth_points(depth, pinhole))
+        found.append(((middle - begin) * 1e3, (process_time() - middle) * 1e3))
+    late = np.array(found)[WARM:]
+    return [
+        {'case': f'range image, {what}', 'who': 'surfel_mapper', 'cpu_ms': float(np.median(times))}
+        for what, times in zip(('from depth', 'from points'), late.T, strict=True)
+    ]
 
 
 def esdf_rows(case: Case) -> list[Row]:

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A real depth camera: points of further images lie on the surface of field and mesh."""
 
-from dataclasses import astuple
+from dataclasses import astuple, replace
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ import pytest
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import q_xyzw
 from surfel_mapper.pipeline import Mapper
-from surfel_mapper.scan import Scan
+from surfel_mapper.scan import DepthImage, Scan
 from surfel_mapper.sensors.depth import depth_points, PinholeCamera, SceneImage
 from surfel_mapper.tsdf.queries import FREE, sample, states
 from surfel_mapper.tsdf.range_image import from_depth
@@ -101,9 +101,8 @@ def fused(data_folder, numbers):
             )
         )
         points = depth_points(depth, camera)
-        mapper.add_scan(
-            Scan(points=points, stamp_ns=stamp_ns, frame_id='kinect', camera=astuple(camera))
-        )
+        scan = Scan(points=points, stamp_ns=stamp_ns, frame_id='kinect', camera=astuple(camera))
+        mapper.add_scan(replace(scan, depth=DepthImage(points=points, depth=depth)))
         assert len(list(mapper.insert_ready())) == 1
     return mapper.tsdf.mesh()
 

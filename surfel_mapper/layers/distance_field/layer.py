@@ -39,8 +39,12 @@ from surfel_mapper.layers.layer import (
     Publication,
     Surroundings,
 )
-from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
-from surfel_mapper.mapping.channels import quantised
+from surfel_mapper.layers.sensor_models import (
+    measured_channels,
+    range_image,
+    SensorModels,
+    two_beams,
+)
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
@@ -51,7 +55,6 @@ from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
-from surfel_mapper.tsdf.range_image import from_points
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
 SPARSE_ROWS = 24
@@ -152,15 +155,16 @@ class TsdfLayer(Layer):
             T_map_sensor = T_map_sensor @ T_scan_sensor
         sensor = self._sensor(scan)
         self.blocks.clear_updated()
+        config = self.config.tsdf
+        wanted = {'has_color': config.color, 'has_label': config.semantics != 'none'}
         if sensor is None:
-            points, channels = self._measured(scan, self.config.tsdf.max_range_m)
+            points, channels = measured_channels(scan, config.max_range_m, **wanted)
             done = self._point_integrator.integrate(
                 points, T_map_sensor, scan.stamp_ns, **channels
             )
             self._num_by_points += 1
         else:
-            points, channels = self._measured(scan, sensor.max_range_m)
-            image = from_points(sensor, points, **channels)
+            image = range_image(scan, sensor, **wanted)
             done = self._integrator.integrate(image, T_map_sensor, scan.stamp_ns)
         self._position = T_map_sensor[:3, 3].copy()
         left = self.blocks.evict(self._position, scan.stamp_ns)
@@ -349,21 +353,6 @@ class TsdfLayer(Layer):
             return None
         return sensor
 
-    def _measured(
-        self, scan: Scan, max_range_m: float
-    ) -> tuple[npt.NDArray[Any], dict[str, npt.NDArray[Any] | None]]:
-        """Return points and free rays of a scan, with colours and labels as configured."""
-        config, columns = self.config.tsdf, scan.columns
-        points = measured(scan, max_range_m)
-        num_free = len(points) - len(scan)
-        colors = colors_of(scan) if config.color else None
-        labels = columns.get('label') if config.semantics != 'none' else None
-        if colors is not None:
-            colors = np.pad(colors, ((0, num_free), (0, 0)))
-        if labels is not None:
-            labels = np.pad(labels, (0, num_free), constant_values=-1)
-        return points, {'colors': colors, 'labels': labels}
-
     def _settle(self, windowed: WindowedScan) -> list[Integrated]:
         """Fuse a scan of the window at its final pose, if it waits for that."""
         scan = self._waiting.pop(windowed.stamp_ns, None)
@@ -375,19 +364,3 @@ def centered(scan: Scan, T_scan_sensor: npt.NDArray[np.float64]) -> Scan:
     R, center = T_scan_sensor[:3, :3], T_scan_sensor[:3, 3]
     points = ((scan.points - center) @ R).astype(scan.points.dtype)
     return replace(scan, points=points, free=None if scan.free is None else scan.free @ R)
-
-
-def colors_of(scan: Scan) -> npt.NDArray[np.uint8] | None:
-    """
-    Return the colours of the points: (N, 3), or (N, 4) with a fourth value of 0 if unknown.
-
-    Alpha marks the points that have a colour, unless it is 0 everywhere, as some drivers leave it.
-    """
-    columns = scan.columns
-    if not {'rgb', 'rgba'} & columns.keys():
-        return None
-    colors = quantised(columns, ('rgb',), len(scan)).astype(np.uint8)
-    packed = columns['rgba'] if 'rgb' not in columns else None
-    if packed is None or packed.dtype != np.uint32 or not (packed >> 24).any():
-        return colors
-    return np.column_stack([colors, (packed >> 24).astype(np.uint8)])

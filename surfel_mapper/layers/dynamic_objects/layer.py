@@ -21,10 +21,9 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import inverse
 from surfel_mapper.layers.dynamic_objects.kernels.free_space import look_through, SEEN, THROUGH
 from surfel_mapper.layers.layer import InsertedScan, Layer, Surroundings
-from surfel_mapper.layers.sensor_models import measured, SensorModels, two_beams
+from surfel_mapper.layers.sensor_models import range_image, SensorModels, two_beams
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.range_image import from_points
 
 Keys = npt.NDArray[np.int64]
 
@@ -106,7 +105,7 @@ class DynamicObjectsLayer(Layer):
         sensor, voxel_size_m = self.around.sensors.of(scan), self.around.surfel_map.voxel_size_m
         if sensor is None:  # no model fits: nothing is known about any voxel
             return np.zeros(len(keys), np.int8)
-        image = from_points(sensor, measured(scan, sensor.max_range_m)).range_m
+        image = range_image(scan, sensor, has_color=False, has_label=False).range_m
         image = np.minimum(image, np.float32(sensor.max_range_m))  # unknown beyond
         T = inverse(T_map_sensor)
         centers = (unpack_keys(keys).astype(np.float64) + 0.5) * voxel_size_m

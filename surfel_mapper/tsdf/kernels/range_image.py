@@ -42,11 +42,12 @@ def range_value(range_m, limits):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def from_depth(depth, scale, ray_length, limits, image):
+def from_depth(depth, scale, unknown, ray_length, limits, image):
     """
     Turn depths into ranges; return (largest, used).
 
     depth       (rows, columns) float32, float64 or uint16; scale float32, metres of one unit
+    unknown     float64, a depth that means unknown; nan if there is none
     ray_length  (rows, columns) float32, range at depth 1
     image       (rows, columns or more) float32 m, out
 
@@ -59,6 +60,8 @@ def from_depth(depth, scale, ray_length, limits, image):
         for column in range(columns):
             measured = np.float32(depth[row, column]) * scale * ray_length[row, column]
             value = range_value(measured, limits)
+            if depth[row, column] == unknown:
+                value = np.float32(0.0)
             image[row, column] = value
             used += value > np.float32(0.0)
             largest = value if value > largest else largest
