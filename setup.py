@@ -47,6 +47,10 @@ FORMATS = [
     'python-neo-lzf>=0.3',  # scans in compressed PCD files
 ]
 
+NURBS = [
+    'rhino3dm>=8.4',  # curved surfaces as NURBS in 3dm files; MIT, wheels for 3.9 to 3.14
+]
+
 CLUSTER = [
     'dask>=2024.4',  # bags on many processes and machines
     'distributed>=2024.4',  # likewise: its scheduler and workers
@@ -82,6 +86,7 @@ TEST = [
     *FORMATS,
     *CLUSTER,
     *LAS,
+    *NURBS,
     *LOOPS,
     *ALIGN,
     *VIEWER,
@@ -146,6 +151,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
+        'nurbs': NURBS,
         'align': ALIGN,
         'loops': LOOPS,
         'viewer': VIEWER,

@@ -72,6 +72,7 @@ HOMES = {
     'rclpy': ('ros/',),
     'rerun': ('viz/',),
     'rerun_bindings': ('viz/',),
+    'rhino3dm': ('files/model_3dm',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),
     'rosidl_runtime_py': ('ros/',),

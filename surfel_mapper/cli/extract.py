@@ -26,7 +26,7 @@ EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
 
 MAPS = ('.npz', '.parquet')
 
-FORMATS = ('json', 'obj', 'parquet', 'dxf')
+FORMATS = ('json', 'obj', 'parquet', 'dxf', '3dm')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -125,7 +125,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         '--formats',
         type=formats,
         metavar='LIST',
-        help='of the map (dxf: of its models), with a comma between: '
+        help='of the map (dxf, 3dm: of its models), with a comma between: '
         f'{", ".join(FORMATS)} (ply,npz)',
     )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')

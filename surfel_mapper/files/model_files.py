@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ and DXF.
+Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ, DXF and 3dm.
 
 OBJ is for viewers, DXF for CAD; each plane and surface is an object of its own there, without
 Gaussians. DXF is that of AutoCAD 2000 and later, in metres, with outlines as closed polylines and
@@ -25,6 +25,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.model_3dm import write_3dm
 from surfel_mapper.files.parquet import import_pyarrow
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
@@ -46,7 +47,7 @@ def write_models(
     versions: Mapping[int, int] | None = None,
 ) -> list[Path]:
     """
-    Write models as ``models`` in some formats: json, obj, parquet, dxf; return the files.
+    Write models as ``models`` in some formats: json, obj, parquet, dxf, 3dm; return the files.
 
     Parameters
     ----------
@@ -55,7 +56,7 @@ def write_models(
     model : MultiModel
         The models.
     formats : sequence of str
-        Any of json, obj, parquet, dxf.
+        Any of json, obj, parquet, dxf, 3dm.
     versions : mapping of int to int, optional
         Versions of the primitives, by id; written to JSON and Parquet.
 
@@ -64,7 +65,7 @@ def write_models(
     FileFormatError
         If a file cannot be written.
     DependencyError
-        If pyarrow or ezdxf is needed and not installed.
+        If pyarrow, ezdxf or rhino3dm is needed and not installed.
 
     """
     paths = [directory / f'models.{name}' for name in formats]
@@ -75,6 +76,8 @@ def write_models(
             write_parquet(path, model, versions)
         elif name == 'obj':
             write_obj(path, model)
+        elif name == '3dm':
+            write_3dm(path, model)
         else:
             write_dxf(path, model)
     return paths

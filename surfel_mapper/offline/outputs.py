@@ -27,15 +27,16 @@ if TYPE_CHECKING:
 BAG = 'bag'
 """Format that is written while mapping: a bag of normals in the directory ``normals``."""
 
-DXF = 'dxf'
-"""Format of planes and surfaces; needs ``layers.models.enabled``."""
+OF_MODELS = ('dxf', '3dm')
+"""Formats of planes and surfaces; they need ``layers.models.enabled``."""
 
 FORMATS = {
     'ply': 'map.ply',
     'pcd': 'map.pcd',
     'parquet': 'map.parquet',
     'npz': 'map.npz',
-    DXF: 'models.dxf',
+    'dxf': 'models.dxf',
+    '3dm': 'models.3dm',
     BAG: 'normals',
 }
 """File of each format in the output directory; npz and parquet are exact, to be loaded again."""
@@ -87,7 +88,7 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
     Raises
     ------
     DependencyError
-        If pyarrow or ezdxf is needed and not installed.
+        If pyarrow, ezdxf or rhino3dm is needed and not installed.
     FileFormatError
         If a file of the output directory cannot be written.
 
@@ -96,10 +97,14 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
         from surfel_mapper.files.parquet import import_pyarrow
 
         import_pyarrow()
-    if DXF in formats:
+    if 'dxf' in formats:
         from surfel_mapper.files.model_files import import_ezdxf
 
         import_ezdxf()
+    if '3dm' in formats:
+        from surfel_mapper.files.model_3dm import import_rhino3dm
+
+        import_rhino3dm()
     from surfel_mapper.files.trajectory import TRAJECTORY
 
     names = [FORMATS[name] for name in formats if name != BAG]

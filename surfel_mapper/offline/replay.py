@@ -213,7 +213,7 @@ def replay(
 def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:
     """Return the configuration for a replay with some options, after checking their formats."""
     from surfel_mapper.config import Config, load_config
-    from surfel_mapper.offline.outputs import DXF, FORMATS
+    from surfel_mapper.offline.outputs import FORMATS, OF_MODELS
 
     if config is not None and not isinstance(config, (Config, str, Path)):
         raise ConfigError(
@@ -224,10 +224,11 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
     unknown = [name for name in options.formats if name not in FORMATS]
     if unknown:
         raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(FORMATS)}')
-    if DXF in options.formats and not settings.models.enabled:
+    of_models = [name for name in options.formats if name in OF_MODELS]
+    if of_models and not settings.models.enabled:
         raise ConfigError(
-            'formats: dxf holds planes and surfaces, expected layers.models.enabled: true in the '
-            'configuration'
+            f'formats: {of_models[0]} holds planes and surfaces, expected layers.models.enabled: '
+            'true in the configuration'
         )
     if options.align:
         settings = settings.replace({'window.keep_points': True})

@@ -126,8 +126,8 @@ class ModelsLayer(Layer):
         )
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write models.json and models.obj, and Parquet and DXF if asked for."""
-        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf') if name in formats)]
+        """Write models.json and models.obj, and Parquet, DXF and 3dm if asked for."""
+        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf', '3dm') if name in formats)]
         model = self.models.model.translated(self.around.surfel_map.origin_m)
         return write_models(directory, model, wanted, self.models.versions)
 
