@@ -27,6 +27,8 @@ STAMP := $(VENV)/.ready-$(KIND)
 DOCS_STAMP := $(VENV)/.docs-$(KIND)
 LINT := $(VENV)-lint
 LINT_STAMP := $(LINT)/.ready
+# ouster-sdk pins a rosbags that is too old for bags/: pip would complain at each installation.
+OUSTER := $(CURDIR)/$(VENV)/ouster
 
 .PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist settings clean
 
@@ -36,6 +38,7 @@ demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, com
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
 # one, and has a ROS domain of its own. TEST_PROCESSES=0 runs all in this process.
 test: $(STAMP)  ## all tests
+	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \
 		--durations=5 $(PYTEST_ARGS)
 
@@ -108,6 +111,8 @@ $(STAMP): setup.py pyproject.toml
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
+	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --upgrade \
+		--target $(OUSTER) 'ouster-sdk>=1,<2' more-itertools
 	touch $@
 
 $(LINT_STAMP): setup.py setup.cfg

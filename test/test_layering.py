@@ -66,6 +66,7 @@ HOMES = {
     'open3d': ('mapping/surfels',),
     'pandas': ('mapping/surfels',),
     'nav_msgs': ('ros/',),
+    'ouster': ('offline/ouster_pcap',),
     'numba': ('kernels/',),
     'pyarrow': ('files/parquet',),
     'rcl_interfaces': ('ros/',),

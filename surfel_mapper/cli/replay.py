@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar='BAG',
         help='rosbag2 directory, .mcap, .db3, ROS 1 .bag; directory or file of .ply, .pcd, .bin, '
-        '.las, .laz scans',
+        '.las, .laz scans; .pcap of an Ouster lidar',
     )
     add('--config', type=Path, metavar='FILE', help='YAML file of settings')
     add(

@@ -100,6 +100,15 @@ class Dataset:
     poses_path: Path | None = None
     read: Read = read_scan
 
+    @property
+    def format(self) -> str:
+        """Name of the layout, for info."""
+        return f'{self.name} data set'
+
+    def scan(self, number: int) -> tuple[npt.NDArray[Any], Columns]:
+        """Return points (N, 3), m, and columns of a scan; raises FileFormatError."""
+        return self.read(self.files[number])
+
 
 def find_dataset(path: Path) -> Dataset | None:
     """

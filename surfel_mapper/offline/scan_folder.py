@@ -7,7 +7,8 @@ With a file of poses, the scans are in frames.base, whose poses it gives; if
 frames.base_to_sensor is set, they are in a frame called sensor on it. Without poses they are
 registered. The time of a scan is that in the name of its file; else scans follow each other at
 10 Hz. With poses of other times, the time of scan i is that of pose i, if there are as many poses
-as scans. Folders of data sets have their own layout, times and poses (datasets.py).
+as scans. Folders of data sets have their own layout, times and poses (datasets.py), a capture of
+an Ouster lidar has all scans in one file (ouster_pcap.py).
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.files.trajectory import nanoseconds
+from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import find_dataset
+from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.pose_choice import choose_for_folder, is_default, pose_summary
 from surfel_mapper.offline.pose_sources import PosePath
 from surfel_mapper.offline.request import part, Request, Span
@@ -66,9 +69,10 @@ class ScanFolder:
 
     def __init__(self, request: Request, config: Config, poses: PosePath | None) -> None:
         self.path = request.path
-        self.dataset = find_dataset(self.path)
+        is_packets = self.path.suffix == ouster_pcap.SUFFIX
+        self.dataset = OusterPcap(self.path) if is_packets else find_dataset(self.path)
         if self.dataset is not None:
-            self.files, self.format = self.dataset.files, f'{self.dataset.name} data set'
+            self.files, self.format = self.dataset.files, self.dataset.format
         else:
             self.files = [self.path] if self.path.is_file() else scan_files(self.path)
         is_free = poses is None and request.poses_from is None
@@ -145,8 +149,10 @@ class ScanFolder:
         mapper.add_scan(scan)
 
     def _read(self, number: int, stamp_ns: int, frame: str) -> Scan:
-        read = read_scan if self.dataset is None else self.dataset.read
-        points, columns = read(self.files[number])
+        if self.dataset is None:
+            points, columns = read_scan(self.files[number])
+        else:
+            points, columns = self.dataset.scan(number)
         return Scan(points=points, stamp_ns=stamp_ns, frame_id=frame, columns=columns)
 
     def _stamps(self) -> list[int]:
@@ -208,7 +214,7 @@ def stem(file: Path) -> str:
 def is_scans(path: Path) -> bool:
     """Return whether a path is a file of points, or a directory of scans and not of a bag."""
     if path.is_file():
-        return path.suffix in SUFFIXES
+        return path.suffix in (*SUFFIXES, ouster_pcap.SUFFIX)
     if not path.is_dir() or (path / METADATA).exists():
         return False
     if find_dataset(path) is not None:
