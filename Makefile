@@ -5,9 +5,12 @@
 # environment sees the packages of the system and uses that ROS; elsewhere it has its own from
 # PyPI. The two do not mix, so that sourcing ROS later makes the environment anew.
 
+# Tests start hundreds of processes, which compile the package anew if they may not keep bytecode.
+unexport PYTHONDONTWRITEBYTECODE
+
 PYTHON ?= python3
 PYTEST_ARGS ?=
-TEST_PROCESSES ?= 2
+TEST_PROCESSES ?= 3
 FUZZ_SECONDS ?= 10
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
@@ -36,7 +39,8 @@ demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, com
 	$(BIN)/python examples/demo.py
 
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
-# one, and has a ROS domain of its own. TEST_PROCESSES=0 runs all in this process.
+# one, and has a ROS domain of its own. Three keep two cores busy, as tests of nodes wait for each
+# other. TEST_PROCESSES=0 runs all in this process.
 test: $(STAMP)  ## all tests
 	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \

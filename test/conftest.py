@@ -39,8 +39,18 @@ def pytest_configure() -> None:
         )
 
 
-WAITING = ('test/ros/', 'test/docs/', 'test/examples/', 'test/cluster/')
+WAITING = ('test/ros/', 'test/cluster/', 'test/viz/test_view_browser', 'test/viz/test_report_b')
 """Tests of processes, which wait for each other half of their time."""
+
+LONGEST = (
+    'test/fuzz/test_failures.py',
+    'test/fuzz/test_fuzz.py',
+    'test/docs/test_tutorials.py',
+    'test/cli/test_replay_registration.py',
+    'test/examples/test_examples.py',
+    'test/test_determinism.py',
+)
+"""Files of few tests that take 20 to 50 s each; the first forks, best while memory is small."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -54,7 +64,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         files.setdefault(item.nodeid.partition('::')[0], []).append(item)
     waiting = [name for name in files if name.startswith(WAITING)]
     others = [name for name in files if not name.startswith(WAITING)]
-    others.sort(key=lambda name: -len(files[name]))
+    others.sort(key=lambda name: (name not in LONGEST, -len(files[name])))
     pairs = zip_longest(waiting, others)
     items[:] = [item for pair in pairs for name in pair if name for item in files[name]]
 

@@ -31,7 +31,7 @@ from surfel_mapper.viz.contents import discs_of
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import Scene
 
-SILENT_S = 10.0
+SILENT_S = 5.0
 """Time without surfels after which a warning names the topics that were found, s."""
 
 log = logging.getLogger(__name__)

@@ -38,6 +38,9 @@ POINTS = 400
 
 NUM_BINS = 36
 
+LEFT, RIGHT, TOP, BOTTOM = 54, 14, 6, 36
+"""Margins around the axes of lines and histograms, px; their labels are short numbers."""
+
 FAINT, RULE, BAR = '#fe0001', '#fe0002', '#fe0003'
 """Placeholder colours of text, grid lines and bars."""
 
@@ -96,7 +99,7 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
     if not drawn:
         return NO_DATA
     top = max(highest(y[np.isfinite(y)]) for _, y in drawn.values())
-    with _axes(HEIGHT) as (figure, axes):
+    with _axes(HEIGHT, with_numbers=True) as (figure, axes):
         for number, (name, (places, values)) in enumerate(drawn.items()):
             color = LINES[number % len(LINES)]
             axes.plot(places, values, color=color, linewidth=1.6, label=_visible(name))
@@ -115,7 +118,7 @@ def histogram(values: Array, low: float, high: float, x_label: str, y_label: str
         return NO_DATA
     clipped = np.clip(finite, low, high)
     counts, edges = np.histogram(clipped, bins=NUM_BINS, range=(low, high))
-    with _axes(HEIGHT) as (figure, axes):
+    with _axes(HEIGHT, with_numbers=True) as (figure, axes):
         axes.bar(edges[:-1], counts, np.diff(edges), align='edge', color=BAR)
         axes.set(xlim=(low, high), xlabel=x_label, ylabel=y_label)
         _label_numbers(axes)
@@ -167,14 +170,23 @@ def short(value: float) -> str:
 
 
 @contextmanager
-def _axes(height: float) -> Iterator[tuple[Figure, Axes]]:
-    """Make a figure with one pair of axes in the style of the page."""
+def _axes(height: float, *, with_numbers: bool = False) -> Iterator[tuple[Figure, Axes]]:
+    """
+    Make a figure with one pair of axes in the style of the page.
+
+    Labels that are numbers have fixed margins: to measure every label takes twice the time.
+    """
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH / 72.0, height / 72.0), dpi=72, layout='constrained')
-        axes = figure.add_subplot()
+        figure = Figure(figsize=(WIDTH / 72.0, height / 72.0), dpi=72)
+        if with_numbers:
+            box = (LEFT, BOTTOM, WIDTH - LEFT - RIGHT, height - BOTTOM - TOP)
+            axes = figure.add_axes(tuple(np.divide(box, (WIDTH, height, WIDTH, height))))
+        else:
+            figure.set_layout_engine('constrained')
+            axes = figure.add_subplot()
         axes.grid(visible=True, axis='y')
         axes.set_axisbelow(True)
         yield figure, axes

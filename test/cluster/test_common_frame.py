@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 import json
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -44,13 +46,28 @@ def recorded(folder, world, first, heading=1.0):
     return np.array(found)
 
 
-def test_two_recordings_are_mapped_in_the_frame_of_the_first(tmp_path, world, capsys):
-    true = [recorded(tmp_path / name, world, at) for name, at in (('a', 0), ('b', 3))]
-    output = tmp_path / 'out'
+class Placed(NamedTuple):
+    """Two recordings, a and b, that were replayed together in two processes."""
 
-    assert main(['replay', str(tmp_path / 'a'), str(tmp_path / 'b'), '--output', str(output)]) == 0
+    folder: Path
+    output: Path
+    true: list
+    """True poses of the sensor in each."""
 
-    assert '2 recordings without poses' in capsys.readouterr().out
+    summary: dict
+
+
+@pytest.fixture(scope='module')
+def placed(tmp_path_factory, world):
+    folder = tmp_path_factory.mktemp('placed')
+    true = [recorded(folder / name, world, at) for name, at in (('a', 0), ('b', 3))]
+    requests = [Request(path=folder / name) for name in 'ab']
+    found = replay_bags(requests, Config(), folder / 'out', workers=2)
+    return Placed(folder, folder / 'out', true, found.summary)
+
+
+def test_two_recordings_are_mapped_in_the_frame_of_the_first(placed):
+    _, output, true, _ = placed
     summary = json.loads((output / 'summary.json').read_text())
     assert summary['scans']['mapped'] == 2 * NUM_SCANS
     assert summary['registration']['apart'] == []
@@ -65,25 +82,18 @@ def test_two_recordings_are_mapped_in_the_frame_of_the_first(tmp_path, world, ca
             assert rotation_angle(off) < 0.01
 
 
-def test_the_map_is_that_of_the_recordings_at_these_poses(tmp_path, world):
-    for name, at in (('a', 0), ('b', 3)):
-        recorded(tmp_path / name, world, at)
-    output = tmp_path / 'out'
-    requests = [Request(path=tmp_path / name) for name in 'ab']
-
-    found = replay_bags(requests, Config(), output, workers=2)
-
+def test_the_map_is_that_of_the_recordings_at_these_poses(placed, tmp_path):
     expected = None
     for number, name in enumerate('ab', start=1):
-        poses = output / f'registered_{number}' / 'poses.tum'
-        command = ['replay', str(tmp_path / name), '--poses', str(poses)]
+        poses = placed.output / f'registered_{number}' / 'poses.tum'
+        command = ['replay', str(placed.folder / name), '--poses', str(poses)]
         assert main([*command, '--output', str(tmp_path / f'out_{name}')]) == 0
         surfel_map = load_map(tmp_path / f'out_{name}')[0]
         if expected is None:
             expected = surfel_map
         else:
             expected.merge(surfel_map)
-    assert found.summary['digest'] == expected.digest()
+    assert placed.summary['digest'] == expected.digest()
 
 
 @pytest.mark.skipif(find_spec('kiss_matcher') is None, reason='kiss-matcher is not installed')
@@ -109,7 +119,9 @@ def test_a_recording_of_another_place_stays_apart(tmp_path, world, capsys):
 
     assert main(['replay', str(tmp_path / 'a'), str(tmp_path / 'b'), '--output', str(output)]) == 4
 
-    assert 'registered_2 (12 scans' in capsys.readouterr().err
+    printed = capsys.readouterr()
+    assert '2 recordings without poses' in printed.out
+    assert 'registered_2 (12 scans' in printed.err
     summary = json.loads((output / 'summary.json').read_text())
     assert summary['scans']['received'] == 2 * NUM_SCANS
     assert summary['scans']['mapped'] == summary['scans']['dropped']['apart'] == NUM_SCANS

@@ -14,6 +14,7 @@ import doctest
 import os
 from pathlib import Path
 import re
+import shlex
 import subprocess
 import sys
 
@@ -21,6 +22,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper import SurfelMap
+from surfel_mapper.cli.main import main
 
 ROOT = Path(__file__).parents[2]
 TUTORIALS = ROOT / 'docs' / 'tutorials'
@@ -55,8 +57,12 @@ def steps(block):
 
 
 @pytest.fixture
-def shell(tmp_path):
-    """Return a function that runs a command in a folder, with surfel-mapper and python ours."""
+def shell(tmp_path, monkeypatch, capsys):
+    """
+    Return a function that runs a command in a folder, with surfel-mapper and python ours.
+
+    A verb alone runs in this process, which has its modules and kernels loaded.
+    """
     tools = tmp_path / 'tools'
     tools.mkdir()
     for name, arguments in (('python', ''), ('surfel-mapper', ' -m surfel_mapper.cli.main')):
@@ -67,6 +73,14 @@ def shell(tmp_path):
     path = f'{tools}:{os.environ["PATH"]}'
 
     def run(command):
+        verb, *arguments = shlex.split(command)
+        if verb == 'surfel-mapper' and not set(command) & set('|&;<>$*'):
+            with monkeypatch.context() as patch:
+                patch.chdir(folder)
+                code = main(arguments)
+            printed = capsys.readouterr()
+            assert code == 0, f'{command}\n{printed.err}'
+            return stripped(printed.out)
         done = subprocess.run(
             ['bash', '-o', 'pipefail', '-c', command],
             cwd=folder,
@@ -75,9 +89,14 @@ def shell(tmp_path):
             text=True,
         )
         assert done.returncode == 0, f'{command}\n{done.stderr}'
-        return ''.join(f'{line.strip()}\n' for line in done.stdout.splitlines())
+        return stripped(done.stdout)
 
     return run
+
+
+def stripped(printed):
+    """Return lines without the spaces around them."""
+    return ''.join(f'{line.strip()}\n' for line in printed.splitlines())
 
 
 @pytest.mark.parametrize('name', pages('console'))

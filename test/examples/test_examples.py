@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Every example runs as a process of its own, and its output is true.
+Every example runs as from the command line, and its output is true.
 
 The output is compared with the command line, with another computation of the number, or with the
 content of the written file.
@@ -10,11 +10,13 @@ content of the written file.
 from __future__ import annotations
 
 import ast
+import contextlib
 from importlib.util import find_spec
 import json
 import os
 from pathlib import Path
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -33,8 +35,24 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / 'examples'
 
 
-def run(name, *arguments, folder):
-    """Run an example in a folder; return its output."""
+@pytest.fixture
+def run(capsys, monkeypatch):
+    """Return a function that runs an example in a folder and returns its output."""
+
+    def run(name, *arguments, folder):
+        with monkeypatch.context() as patch:
+            patch.chdir(folder)
+            patch.setattr(sys, 'argv', [str(EXAMPLES / name), *map(str, arguments)])
+            capsys.readouterr()
+            with contextlib.suppress(SystemExit):
+                runpy.run_path(sys.argv[0], run_name='__main__')
+        return capsys.readouterr().out
+
+    return run
+
+
+def run_process(name, *arguments, folder):
+    """Run an example in a folder as a process of its own; return its output."""
     done = subprocess.run(
         [sys.executable, EXAMPLES / name, *map(str, arguments)],
         cwd=folder,
@@ -69,13 +87,13 @@ def test_every_example_says_in_its_first_lines_how_it_is_run():
         assert f'examples/{path.name}' in doc or 'make demo' in doc
 
 
-def test_ten_lines_give_the_map_of_the_last_ten_scans(tmp_path):
+def test_ten_lines_give_the_map_of_the_last_ten_scans(tmp_path, run):
     printed = run('ten_lines.py', folder=tmp_path)
     assert re.match(r'\d{4} surfels, \d{3} of them flat and level\n', printed)
     assert printed.endswith('equal to a map of these alone: True\n')
 
 
-def test_slope_costs_are_a_map_that_nav2_reads(street, tmp_path):
+def test_slope_costs_are_a_map_that_nav2_reads(street, tmp_path, run):
     run('slope_costs.py', street / 'mapped/map.npz', 'costs', '--max-slope', 20, folder=tmp_path)
 
     place = yaml.safe_load((tmp_path / 'costs.yaml').read_text(encoding='utf-8'))
@@ -88,7 +106,7 @@ def test_slope_costs_are_a_map_that_nav2_reads(street, tmp_path):
     assert (image == 100).any()
 
 
-def test_slope_costs_have_level_ground_free_and_a_wall_blocked_where_they_are(tmp_path):
+def test_slope_costs_have_level_ground_free_and_a_wall_blocked_where_they_are(tmp_path, run):
     rng = np.random.default_rng(1)
     ground = rng.uniform([0.0, 0.0, 0.1], [10.0, 6.0, 0.12], (20000, 3))
     wall = rng.uniform([4.1, 0.0, 0.1], [4.12, 6.0, 2.0], (20000, 3))
@@ -113,13 +131,13 @@ def test_slope_costs_have_level_ground_free_and_a_wall_blocked_where_they_are(tm
     assert cost(1.25, 7.25) == 255
 
 
-def test_equal_maps_compare_as_equal(street, tmp_path):
+def test_equal_maps_compare_as_equal(street, tmp_path, run):
     map_file = street / 'mapped/map.npz'
     printed = run('compare_maps.py', map_file, map_file, folder=tmp_path)
     assert printed == f'equal to the bit: {digest_of(street / "mapped")}\n'
 
 
-def test_differences_between_two_maps_are_counted_and_written(tmp_path):
+def test_differences_between_two_maps_are_counted_and_written(tmp_path, run):
     rng = np.random.default_rng(2)
     before, after = SurfelMap(0.5), SurfelMap(0.5)
     stays, goes, comes = (rng.uniform(low, low + 0.5, (50, 3)) for low in (0.0, 2.0, 4.0))
@@ -141,7 +159,7 @@ def test_differences_between_two_maps_are_counted_and_written(tmp_path):
 def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     pytest.importorskip('distributed', reason='Dask is not installed (extra cluster)')
     arguments = ['--output', 'city', '--workers', 2, '--shard', 1]
-    printed = run('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
+    printed = run_process('dask_run.py', street / 'bag', *arguments, folder=tmp_path)
     assert printed.startswith('2 shards')
     assert f'digest {digest_of(street / "mapped")}' in printed
 
@@ -150,7 +168,7 @@ def test_a_dask_run_comes_to_the_digest_of_a_single_process(street, tmp_path):
     not (find_spec('playwright') and any(map(shutil.which, ('chromium', 'google-chrome')))),
     reason='needs Chromium and playwright',
 )
-def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_path):
+def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_path, run):
     text = run('street_picture.py', 'street.png', '4', folder=tmp_path)
     assert int(re.search(r': ([\d,]+) surfels', text)[1].replace(',', '')) > 1000
     rgb = np.asarray(Image.open(tmp_path / 'street.png').convert('RGB'), np.int64)
@@ -159,7 +177,7 @@ def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_
     assert (red > green + 30).sum() > 500  # walls along the street
 
 
-def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path):
+def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path, run):
     text = run('filter_picture.py', 'filters.png', folder=tmp_path)
     before, after, ground = map(
         int, re.search(r'(\d+) -> (\d+) points, (\d+) ground', text).groups()
@@ -168,7 +186,7 @@ def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path):
     assert (tmp_path / 'filters.png').read_bytes().startswith(b'\x89PNG')
 
 
-def test_the_distance_field_is_meshed_and_its_two_distances_agree(tmp_path):
+def test_the_distance_field_is_meshed_and_its_two_distances_agree(tmp_path, run):
     said = run('distance_field.py', 'street.ply', folder=tmp_path)
     triangles, near, by_scipy = (float(n) for n in re.findall(r'([\d.]+) (?:triangles|m)\b', said))
     assert triangles > 10_000

@@ -42,7 +42,7 @@ def drive(num_scans):
 def send(peer, messages):
     """Send clouds with their poses."""
     for points, pose in messages:
-        peer.spin_for(0.02)  # the subscription has a queue of 20
+        peer.spin_for(0.03)  # the subscription has a queue of 20
         peer.publish('/odom', pose)
         peer.publish('/points', points)
 

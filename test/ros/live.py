@@ -118,7 +118,8 @@ class Peer:
 
     def spin_for(self, seconds):
         end = time.monotonic() + seconds
-        self.spin_until(lambda: time.monotonic() > end)
+        while (left := end - time.monotonic()) > 0.0:
+            self._executor.spin_once(left)
 
     def meet(self, name=NODE):
         """

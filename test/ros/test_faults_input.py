@@ -65,7 +65,7 @@ class Stream:
         self.step()
         self.pose()
         self.scan(**options)
-        self.peer.spin_for(0.01)
+        self.peer.spin_for(0.03)
 
     def values(self):
         status = self._reports[-1].status[0]
@@ -340,7 +340,7 @@ def test_the_memory_for_frames_is_bounded(stream):
     for number in range(150):
         stream.step(PERIOD_NS // 10)
         stream.scan(num=4, frame_id=f'frame{number}')
-        stream.peer.spin_for(0.005)
+        stream.peer.spin_for(0.015)
     stream.step(2 * SECOND_NS)
     stream.pair()
     grown = stream.settle()

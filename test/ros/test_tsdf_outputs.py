@@ -213,7 +213,8 @@ def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     half = directions[:, 0] > 0.0
-    ranges = np.where(half, 30.0, RADIUS_M)[:, None]
+    level = np.abs(directions[:, 2]) < 0.1
+    ranges = np.where(half, np.where(level, 30.0, np.nan), RADIUS_M)[:, None]
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, ranges * directions))
     peer.spin_until(lambda: len(shown(meshes)) > 5)
