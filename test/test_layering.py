@@ -60,7 +60,7 @@ HOMES = {
     'llvmlite': ('kernels/',),
     'lz4': ('bags/',),
     'lzf': ('files/pcd',),
-    'PIL': ('messages/compressed_image',),
+    'PIL': ('messages/compressed_image', 'viz/turning_view'),
     'map_closures': ('alignment/recognition',),
     'matplotlib': ('viz/',),
     'open3d': ('mapping/surfels',),
