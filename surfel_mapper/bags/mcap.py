@@ -21,14 +21,25 @@ import struct
 from zlib import crc32
 
 from surfel_mapper.bags._rosbags import is_same, ros2_connection
-from surfel_mapper.bags.bag_file import FoundMessage, INDEX_COLUMNS
-from surfel_mapper.bags.chunked import CHECK_EVERY, Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.bag_file import FoundMessage, Index, INDEX_COLUMNS
+from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.runs import (
+    are_known,
+    CHECK_EVERY,
+    entries,
+    equal_heads,
+    number_at,
+    RUN,
+)
 
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX = 2, 3, 4, 5, 6, 8
 STATISTICS, DATA_END = 11, 15
 
 RECORD = struct.Struct('<BQ')
 MESSAGE_HEAD = struct.Struct('<HIQQ')
+WHOLE_HEAD = struct.Struct('<BQHIQQ')
+"""Head of a record, and of the message in it."""
+
 CHUNK_HEAD = struct.Struct('<QQQI')
 CHUNK_INDEX_HEAD = struct.Struct('<QQQQ')
 FOOTER_CONTENT = struct.Struct('<QQI')
@@ -53,9 +64,8 @@ class McapFile(ChunkedFile):
                 return
         except DAMAGE:
             pass
-        for found in (self._schemas, self._by_id, self._counts, self._chunks, self.skipped_at):
-            found.clear()
-        self.start_time, self.end_time, self.skip_reason = 2**63 - 1, 0, ''
+        self._schemas.clear()
+        self._begin_again()
         self._read_records()
 
     def _read_summary(self) -> bool:
@@ -173,19 +183,45 @@ class McapFile(ChunkedFile):
 
     def _walk(self, number: int, records: bytes | bytearray, index: array[int]) -> None:
         """Append the messages in the records of a chunk; keep or check schemas and channels."""
-        known, head, size = self._by_id, MESSAGE_HEAD.unpack_from, MESSAGE_HEAD.size
+        known, head, end = self._by_id, WHOLE_HEAD.unpack_from, len(records)
+        last_head, before, size = end - WHOLE_HEAD.size, RECORD.size, MESSAGE_HEAD.size
+        at, run, last = 0, 0, -1
         charge_at = CHECK_EVERY * INDEX_COLUMNS
-        for kind, at, length in records_in(records):
+        while at < end:
+            if at <= last_head:
+                kind, length, channel, _, record_ns, _ = head(records, at)
+            else:  # no message fits
+                kind, length = RECORD.unpack_from(records, at)
+                channel = -1
+            start = at + before
+            after = start + length
+            if after > end:
+                raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
             if kind != MESSAGE:
-                self._note(kind, bytes(records[at : at + length]))
+                self._note(kind, bytes(records[start:after]))
+                at, run = after, 0
                 continue
-            channel, _, record_ns, _ = head(records, at)
-            if channel not in known or length < size or record_ns >= MAX_NS:
+            run, last = (run + 1 if length == last else 0), length
+            if run > RUN and len(found := self._run(number, records, at, length)):
+                index.frombytes(found.tobytes())
+                after = at + len(found) * (before + length)
+            elif channel not in known or length < size or record_ns >= MAX_NS:
                 raise ValueError(f'message of channel {channel} at {record_ns} ns')
-            index.extend((record_ns, channel, number, at + size, length - size, 0))
-            if len(index) == charge_at:
-                self._charge(index)
-                charge_at += CHECK_EVERY * INDEX_COLUMNS
+            else:
+                index.extend((record_ns, channel, number, start + size, length - size, 0))
+            if len(index) >= charge_at:
+                self._charge(len(index) // INDEX_COLUMNS)
+                charge_at = len(index) + CHECK_EVERY * INDEX_COLUMNS
+            at = after
+
+    def _run(self, number: int, records: bytes | bytearray, at: int, length: int) -> Index:
+        """Return the entries of the messages of equal size from an offset on, up to another."""
+        stride, head = RECORD.size + length, WHOLE_HEAD.size
+        heads = equal_heads(records, at, stride, head)
+        channel, record_ns = number_at(heads, 9, '<u2'), number_at(heads, 15, '<u8')
+        alike = (heads[:, : RECORD.size] == heads[:1, : RECORD.size]).all(axis=1)
+        alike &= are_known(channel, self._by_id) & (record_ns >= 0)
+        return entries(record_ns, channel, number, (at + head, stride, stride - head), alike)
 
     def _note(self, kind: int, content: bytes) -> None:
         """Keep a schema or channel; raise ValueError if it differs from an earlier one."""

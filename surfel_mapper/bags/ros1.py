@@ -19,9 +19,19 @@ from array import array
 import re
 import struct
 
+import numpy as np
+
 from surfel_mapper.bags._rosbags import is_same, ros1_connection
-from surfel_mapper.bags.bag_file import FoundMessage, INDEX_COLUMNS
-from surfel_mapper.bags.chunked import CHECK_EVERY, Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.bag_file import FoundMessage, Index, INDEX_COLUMNS
+from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
+from surfel_mapper.bags.runs import (
+    are_known,
+    CHECK_EVERY,
+    entries,
+    equal_heads,
+    number_at,
+    RUN,
+)
 
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
 
@@ -32,6 +42,12 @@ MESSAGE_HEAD = struct.Struct('<9sI8s9sII')
 
 USUAL = b'\x09\0\0\0conn=', b'\x04\0\0\0op=\x02', b'\x0d\0\0\0time='
 """The constant parts of such a header."""
+
+HEAD_BYTES = 4 + MESSAGE_HEAD.size + 4
+"""Bytes of such a record before its data."""
+
+CONSTANT = slice(0, 13), slice(17, 34), slice(42, 46)
+"""Bytes of them that are equal in a run: all but connection and time."""
 
 MOST_HEADER_BYTES = 1 << 20
 """A longer header is damaged; message definitions are in the data."""
@@ -51,9 +67,7 @@ class Ros1File(ChunkedFile):
                 return
         except DAMAGE:
             pass
-        for found in (self._by_id, self._counts, self._chunks, self.skipped_at):
-            found.clear()
-        self.start_time, self.end_time, self.skip_reason = 2**63 - 1, 0, ''
+        self._begin_again()
         self._read_records()
 
     def _read_index(self) -> bool:
@@ -143,33 +157,62 @@ class Ros1File(ChunkedFile):
     def _walk(self, number: int, records: bytes | bytearray, index: array[int]) -> None:
         """Append the messages in the records of a chunk; keep or check connections."""
         at, word, head = 0, WORD.unpack_from, MESSAGE_HEAD.unpack_from
+        end, run, last = len(records), 0, -1
         charge_at = CHECK_EVERY * INDEX_COLUMNS
-        while at < len(records):
+        while at < end:
             (length,) = word(records, at)
             data = at + 8 + length
             if length > MOST_HEADER_BYTES:
                 raise ValueError(f'header of {length} bytes')
             (size,) = word(records, data - 4)
-            if data + size > len(records):
+            after = data + size
+            if after > end:
                 raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
+            run, last = (run + 1 if after - at == last else 0), after - at
             is_usual = length == MESSAGE_HEAD.size
             if is_usual:
                 conn, key, op, time, seconds, rest = head(records, at + 4)
                 is_usual = (conn, op, time) == USUAL and key in self._by_id
-            if is_usual:
-                index.extend((seconds * 10**9 + rest, key, number, data, size, 0))
+            if not is_usual:
+                self._walk_unusual(number, records, (at, data, size), index)
+            elif run > RUN:
+                found = self._run(number, records, at, after - at)
+                index.frombytes(found.tobytes())
+                after = at + len(found) * (after - at)
             else:
-                fields = header_fields(bytes(records[at + 4 : data - 4]))
-                kind = fields['op'][0]
-                if kind == CONNECTION:
-                    self._note_connection(fields, bytes(records[data : data + size]))
-                elif kind == MESSAGE:
-                    found = self._found(fields, data, size, number)
-                    index.extend((found.record_ns, found.connection, *found.place))
-            if len(index) == charge_at:
-                self._charge(index)
-                charge_at += CHECK_EVERY * INDEX_COLUMNS
-            at = data + size
+                index.extend((seconds * 10**9 + rest, key, number, data, size, 0))
+            if len(index) >= charge_at:
+                self._charge(len(index) // INDEX_COLUMNS)
+                charge_at = len(index) + CHECK_EVERY * INDEX_COLUMNS
+            at = after
+
+    def _run(self, number: int, records: bytes | bytearray, at: int, stride: int) -> Index:
+        """Return the entries of usual messages of equal size, of the one at an offset and on."""
+        heads = equal_heads(records, at, stride, HEAD_BYTES)
+        alike = np.ones(len(heads), bool)
+        for constant in CONSTANT:
+            alike &= (heads[:, constant] == heads[:1, constant]).all(axis=1)
+        keys, seconds, rest = (number_at(heads, offset, '<u4') for offset in (13, 34, 38))
+        alike &= are_known(keys, self._by_id)
+        place = (at + HEAD_BYTES, stride, stride - HEAD_BYTES)
+        return entries(seconds * 10**9 + rest, keys, number, place, alike)
+
+    def _walk_unusual(
+        self,
+        number: int,
+        records: bytes | bytearray,
+        place: tuple[int, int, int],
+        index: array[int],
+    ) -> None:
+        """Append a message with an unusual header; keep or check a connection."""
+        at, data, size = place
+        fields = header_fields(bytes(records[at + 4 : data - 4]))
+        kind = fields['op'][0]
+        if kind == CONNECTION:
+            self._note_connection(fields, bytes(records[data : data + size]))
+        elif kind == MESSAGE:
+            found = self._found(fields, data, size, number)
+            index.extend((found.record_ns, found.connection, *found.place))
 
     def _found(self, fields: Fields, start: int, size: int, number: int) -> FoundMessage:
         """Return the entry of a message."""

@@ -30,7 +30,7 @@ from surfel_mapper.filters.chain import example as example_scan
 from test.fuzz.memory import reset_peak, resident
 from test.fuzz.source import Source
 
-MOST_MESSAGES = 10_000
+MOST_MESSAGES = 5000
 """Number of messages read of a bag."""
 
 

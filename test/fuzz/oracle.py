@@ -29,8 +29,6 @@ MOST_S, MOST_S_PER_BYTE = 0.2, 100e-9
 SLOW = {
     'drive': (20.0, 'maps up to 14 scans with their poses'),
     'chain': (20.0, 'applies the filters that it reads'),
-    'mcap_structure': (3.0, 'up to 100,000 messages that pack to nothing, 4 us each'),
-    'ros1_structure': (3.0, 'likewise'),
 }
 """Readers that may take longer: factors of the time, and why."""
 
