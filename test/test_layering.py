@@ -89,6 +89,12 @@ HOMES = {
 ANYWHERE = {'numpy', 'scipy', 'tqdm', 'yaml'}
 """Foreign packages that any module above level 0 may import."""
 
+LAYER_SETTINGS = ('tsdf', 'esdf', 'models', 'dynamic', 'grid')
+"""Attributes of a configuration that hold the settings of layers."""
+
+CONFIGS = ('config', 'settings')
+"""Names of variables that hold a configuration."""
+
 MODULES = {
     path.relative_to(PACKAGE).as_posix(): path
     for path in sorted(PACKAGE.rglob('*.py'))
@@ -145,6 +151,18 @@ def faults(module: str, names: list[str]) -> list[str]:
 
 def test_modules_import_their_own_folder_and_lower_levels():
     found = [fault for name, path in MODULES.items() for fault in faults(name, imports(path))]
+    assert found == []
+
+
+def test_only_layers_and_their_parts_read_the_settings_of_layers():
+    found = [
+        f'{name}:{node.lineno}: .{node.attr}'
+        for name, path in MODULES.items()
+        if not name.startswith(('config/', 'layers/', *LAYER_SETTINGS))
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.Attribute) and node.attr in LAYER_SETTINGS
+        if getattr(node.value, 'attr', getattr(node.value, 'id', '')).strip('_') in CONFIGS
+    ]
     assert found == []
 
 

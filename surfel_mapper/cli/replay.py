@@ -32,7 +32,8 @@ from surfel_mapper.cli._arguments import (
 )
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.errors import MapError
-from surfel_mapper.offline.outputs import FORMATS, output_directory
+from surfel_mapper.layers import formats as layer_formats
+from surfel_mapper.offline.outputs import known_formats, MAP_FORMATS, output_directory
 from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text, uncertain_text
@@ -125,8 +126,8 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
         '--formats',
         type=formats,
         metavar='LIST',
-        help='of the map (dxf, 3dm: of its models), with a comma between: '
-        f'{", ".join(FORMATS)} (ply,npz)',
+        help=f'with a comma between; of the map: {", ".join(MAP_FORMATS)} (ply,npz); of layers: '
+        f'{", ".join(layer_formats())}',
     )
     add('--poses-out', type=Path, metavar='FILE', help='write the poses of the scans as TUM text')
     add(
@@ -158,9 +159,10 @@ def mount(text: str) -> tuple[str, tuple[float, ...]]:
 def formats(text: str) -> tuple[str, ...]:
     """Return the formats of a list with commas."""
     names = tuple(text.split(','))
-    unknown = [name for name in names if name not in FORMATS]
+    known = known_formats()
+    unknown = [name for name in names if name not in known]
     if unknown:
-        raise argparse.ArgumentTypeError(f'{unknown[0]!r}, expected some of {", ".join(FORMATS)}')
+        raise argparse.ArgumentTypeError(f'{unknown[0]!r}, expected some of {", ".join(known)}')
     return names
 
 

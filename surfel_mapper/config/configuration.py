@@ -141,6 +141,11 @@ class Config:
         more = {name: stage(**stages.get(name, {})) for name, stage in layer_stages().items()}
         return cls(**made, **of_no_stage, more=more)
 
+    @property
+    def image_topics(self) -> dict[str, str]:
+        """Topics of the images joined with the scans, by kind: color, label."""
+        return self.tsdf.image_topics
+
     def to_mapping(self) -> dict[str, Any]:
         """Return all settings as ``stage.name`` to value, in the order they are declared."""
         places: dict[str, Any] = {'': self}

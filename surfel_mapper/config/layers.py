@@ -289,6 +289,7 @@ class TsdfConfig(Stage):
             ),
             ('num_labels', self.semantics != 'majority' or self.num_labels > 0, 'positive'),
             *self._sensor_conditions(),
+            *self._label_and_mesh_conditions(),
         )
         for name, holds, expected in checks:
             if not holds:
@@ -327,21 +328,6 @@ class TsdfConfig(Stage):
                 ),
                 'two or more different angles between -90 and 90, one for each of sensor_rows',
             ),
-            (
-                'label_map',
-                len(self.label_map) % 2 == 0
-                and len(set(self.label_map[::2])) == len(self.label_map) / 2
-                and all(label.is_integer() for label in self.label_map)
-                and all(0 <= label <= MAX_LABEL for label in self.label_map[::2])
-                and all(-1 <= label <= MAX_LABEL for label in self.label_map[1::2]),
-                f'pairs of different labels from 0, and labels from -1, to {MAX_LABEL}',
-            ),
-            ('mesh_color', self.mesh_color != 'color' or self.color, 'another without color'),
-            (
-                'mesh_color',
-                self.mesh_color != 'label' or self.semantics != 'none',
-                'another without semantics',
-            ),
             ('sensor_center_m', len(self.sensor_center_m) in (0, 3), 'x y z or empty'),
             (
                 'sensor_center_m',
@@ -362,6 +348,26 @@ class TsdfConfig(Stage):
                 'sensor_azimuth_deg',
                 not self.sensor_azimuth_deg or bool(self.sensor_rows or self.sensor_beams_deg),
                 'empty without sensor_rows or sensor_beams_deg',
+            ),
+        )
+
+    def _label_and_mesh_conditions(self) -> tuple[tuple[str, bool, str], ...]:
+        """Return the conditions on labels and the mesh, in the same form."""
+        return (
+            (
+                'label_map',
+                len(self.label_map) % 2 == 0
+                and len(set(self.label_map[::2])) == len(self.label_map) / 2
+                and all(label.is_integer() for label in self.label_map)
+                and all(0 <= label <= MAX_LABEL for label in self.label_map[::2])
+                and all(-1 <= label <= MAX_LABEL for label in self.label_map[1::2]),
+                f'pairs of different labels from 0, and labels from -1, to {MAX_LABEL}',
+            ),
+            ('mesh_color', self.mesh_color != 'color' or self.color, 'another without color'),
+            (
+                'mesh_color',
+                self.mesh_color != 'label' or self.semantics != 'none',
+                'another without semantics',
             ),
         )
 

@@ -263,6 +263,14 @@ class Layer:
         """Return the topics of the layer; called once."""
         return ()
 
+    @classmethod
+    def check_formats(cls, formats: Sequence[str]) -> None:
+        """
+        Raise DependencyError if a package that formats need is missing; called before mapping.
+
+        Called with formats that the layer is registered with.
+        """
+
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
         """
         Write the layer into a directory that exists, each file whole or not at all.

@@ -4,18 +4,22 @@
 The registry of layers: their names, their classes, and the settings that switch them on.
 
 A class is loaded when its layer is switched on: the models take 0.1 s, which a map without them
-does not wait for. Other packages register layers by an entry point (docs/extending.md).
+does not wait for. This module loads no compiler, so that the command line can list formats. Other
+packages register layers by an entry point (docs/extending.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from importlib import import_module
+from typing import TYPE_CHECKING
 
-from surfel_mapper.config import Config
 from surfel_mapper.errors import ConfigError
-from surfel_mapper.layers.layer import Layer
+
+if TYPE_CHECKING:
+    from surfel_mapper.config import Config
+    from surfel_mapper.layers.layer import Layer
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,18 +35,23 @@ class RegisteredLayer:
         ``module:Class``.
     switch : str
         Setting that switches it on, if true and not 0; empty: it is always on.
+    formats : mapping of str to str
+        The file of each format that ``write`` makes only if the user asks for it.
 
     """
 
     name: str
     location: str
     switch: str = ''
+    formats: Mapping[str, str] = field(default_factory=dict)
 
 
 _REGISTERED: dict[str, RegisteredLayer] = {}
 
 
-def register(name: str, location: str, switch: str = '') -> None:
+def register(
+    name: str, location: str, switch: str = '', formats: Mapping[str, str] | None = None
+) -> None:
     """
     Register a layer; the order of registration is the order in which layers follow a scan.
 
@@ -52,7 +61,8 @@ def register(name: str, location: str, switch: str = '') -> None:
         If another layer has the name.
 
     """
-    found = _REGISTERED.setdefault(name, RegisteredLayer(name, location, switch))
+    layer = RegisteredLayer(name, location, switch, formats or {})
+    found = _REGISTERED.setdefault(name, layer)
     if found.location != location:
         raise ConfigError(f'layer {name!r} of {location}: {found.location} has this name already')
 
@@ -65,6 +75,11 @@ def unregister(name: str) -> None:
 def names() -> tuple[str, ...]:
     """Return the names of all registered layers, switched on or not."""
     return tuple(_REGISTERED)
+
+
+def formats() -> dict[str, RegisteredLayer]:
+    """Return the formats that users may ask for, with the layer that writes each."""
+    return {name: layer for layer in _REGISTERED.values() for name in layer.formats}
 
 
 def enabled(config: Config) -> Iterator[type[Layer]]:
@@ -80,10 +95,21 @@ def enabled(config: Config) -> Iterator[type[Layer]]:
     settings = config.to_mapping()
     for registered in _REGISTERED.values():
         if not registered.switch or settings[registered.switch]:
-            yield _load(registered)
+            yield load(registered)
 
 
-def _load(registered: RegisteredLayer) -> type[Layer]:
+def load(registered: RegisteredLayer) -> type[Layer]:
+    """
+    Return the class of a layer.
+
+    Raises
+    ------
+    ConfigError
+        If its location holds no layer of the name.
+
+    """
+    from surfel_mapper.layers.layer import Layer
+
     module, _, name = registered.location.partition(':')
     found = getattr(import_module(module), name, None)
     if not (isinstance(found, type) and issubclass(found, Layer)):
@@ -98,4 +124,9 @@ def _load(registered: RegisteredLayer) -> type[Layer]:
 register('dynamic', 'surfel_mapper.layers.dynamic_objects:DynamicObjectsLayer', 'dynamic.clear')
 register('grid', 'surfel_mapper.layers.costs:CostsLayer')
 register('tsdf', 'surfel_mapper.layers.distance_field:TsdfLayer', 'layers.tsdf.enabled')
-register('models', 'surfel_mapper.layers.models:ModelsLayer', 'layers.models.enabled')
+register(
+    'models',
+    'surfel_mapper.layers.models:ModelsLayer',
+    'layers.models.enabled',
+    {'dxf': 'models.dxf', '3dm': 'models.3dm'},
+)

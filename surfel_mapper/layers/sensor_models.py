@@ -5,11 +5,12 @@ The camera or lidar of each scan, and its measurements: points and free rays.
 
 The model of a lidar is fitted to the first scan of its frame and checked on every scan. If a scan
 does not fit, the model is fitted again, at growing intervals while no model fits. In between the
-frame has no model, and layers work without one.
+frame has no model, and layers work without one. One module: every check may end in another fit.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 import logging
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import TsdfConfig
+from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.mapping.channels import quantised
 from surfel_mapper.poses.buffer import TransformBuffer
@@ -99,6 +100,20 @@ class SensorModels:
         self.num_refits = 0
         self._cameras: dict[tuple[float, ...], CameraModel] = {}
         self._checked: tuple[Scan | None, LidarModel | None] = (None, None)
+
+    @classmethod
+    def configured(
+        cls, config: Config, transforms: TransformBuffer, mount: Callable[[str], object]
+    ) -> SensorModels:
+        """
+        Return the sensors of a configuration, whose scans come with a tree of frames.
+
+        ``mount`` adds the configured place of a frame to the tree; it is called for the frame of
+        the sensor, which no scan has.
+        """
+        if config.tsdf.sensor_frame:
+            mount(config.tsdf.sensor_frame)
+        return cls(config.tsdf, transforms)
 
     def of(self, scan: Scan) -> CameraModel | LidarModel | None:
         """

@@ -140,7 +140,7 @@ def chosen_topics(reader: BagReader, request: Request, config: Config) -> list[s
     if config.input.kind == 'depth':
         choose = reader.topics.choose_image
     topics = [choose(name) for name in dict.fromkeys(names)]
-    for name in config.tsdf.image_topics.values():
+    for name in config.image_topics.values():
         reader.topics.choose_image(f'/{name.lstrip("/")}')
     return topics
 
@@ -248,7 +248,7 @@ def depth_feed(
 
 def scene_feed(mapper: Mapper) -> SceneFeed | None:
     """Return the feed of colour and label images; None if none are configured."""
-    if not mapper.config.tsdf.image_topics:
+    if not mapper.config.image_topics:
         return None
     from surfel_mapper.offline.image_feeds import SceneFeed
 

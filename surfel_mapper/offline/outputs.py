@@ -13,13 +13,14 @@ import os
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.offline.summary import rounded
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
+    from surfel_mapper.config import Config
     from surfel_mapper.pipeline import Mapper, Update
     from surfel_mapper.pipeline.map_part import ApartMap
     from surfel_mapper.viz.history import History
@@ -27,19 +28,48 @@ if TYPE_CHECKING:
 BAG = 'bag'
 """Format that is written while mapping: a bag of normals in the directory ``normals``."""
 
-OF_MODELS = ('dxf', '3dm')
-"""Formats of planes and surfaces; they need ``layers.models.enabled``."""
-
-FORMATS = {
+MAP_FORMATS = {
     'ply': 'map.ply',
     'pcd': 'map.pcd',
     'parquet': 'map.parquet',
     'npz': 'map.npz',
-    'dxf': 'models.dxf',
-    '3dm': 'models.3dm',
     BAG: 'normals',
 }
-"""File of each format in the output directory; npz and parquet are exact, to be loaded again."""
+"""File of each format of the map; npz and parquet are exact, to be loaded again."""
+
+
+def known_formats() -> dict[str, str]:
+    """Return the file of each format in the output directory: of the map, and of all layers."""
+    from surfel_mapper.config import load_layer_packages
+    from surfel_mapper.layers import formats
+
+    load_layer_packages()
+    return {**MAP_FORMATS, **{name: layer.formats[name] for name, layer in formats().items()}}
+
+
+def check_layer_formats(names: Sequence[str], config: Config) -> None:
+    """
+    Raise unless the layers that write some formats are switched on, and can write them.
+
+    Raises
+    ------
+    ConfigError
+        If a layer is switched off.
+    DependencyError
+        If a package that it needs for the format is not installed.
+
+    """
+    from surfel_mapper.layers import formats, load
+
+    found = formats()
+    for name in (name for name in names if name in found):
+        layer = found[name]
+        if layer.switch and not config.to_mapping()[layer.switch]:
+            raise ConfigError(
+                f'formats: {name} is written by the layer {layer.name}, expected {layer.switch}: '
+                'true in the configuration'
+            )
+        load(layer).check_formats([name])
 
 
 def output_directory(recording: Path, wanted: Path | None) -> Path:
@@ -88,7 +118,7 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
     Raises
     ------
     DependencyError
-        If pyarrow, ezdxf or rhino3dm is needed and not installed.
+        If pyarrow is needed and not installed.
     FileFormatError
         If a file of the output directory cannot be written.
 
@@ -97,22 +127,15 @@ def check_formats(formats: Sequence[str], output: Path) -> None:
         from surfel_mapper.files.parquet import import_pyarrow
 
         import_pyarrow()
-    if 'dxf' in formats:
-        from surfel_mapper.files.model_files import import_ezdxf
-
-        import_ezdxf()
-    if '3dm' in formats:
-        from surfel_mapper.files.model_3dm import import_rhino3dm
-
-        import_rhino3dm()
     from surfel_mapper.files.trajectory import TRAJECTORY
 
-    names = [FORMATS[name] for name in formats if name != BAG]
+    files = known_formats()
+    names = [files[name] for name in formats if name != BAG]
     for name in [*names, TRAJECTORY, 'map.png', 'report.html', 'summary.json']:
         if (output / name).exists():
             check_writable(output / name)
-    if BAG in formats and (output / FORMATS[BAG]).is_file():
-        raise FileFormatError(f'{output / FORMATS[BAG]}: a file, expected a bag or nothing')
+    if BAG in formats and (output / files[BAG]).is_file():
+        raise FileFormatError(f'{output / files[BAG]}: a file, expected a bag or nothing')
 
 
 class ScanTrajectory:
@@ -203,7 +226,8 @@ def write_maps(
 
     output.mkdir(parents=True, exist_ok=True)
     for name in formats:
-        write_map(output / FORMATS[name], name, mapper, window=window)
+        if name in MAP_FORMATS:
+            write_map(output / MAP_FORMATS[name], name, mapper, window=window)
     trajectory.write(output / TRAJECTORY)
     for old in (*output.glob('apart_*.npz'), *output.glob('apart_*.tum')):
         old.unlink()
@@ -271,7 +295,8 @@ def write_files(
     in_view = drawn_surfels(mapper.map, mapper.config.map.min_points, place, most_shown(meshes))
     write_report(page, title, summary, surfels, history, picture, meshes, sections, in_view)
     write_json(figures, summary)
-    maps = [output / FORMATS[name] for name in formats]
+    files = known_formats()
+    maps = [output / files[name] for name in formats]
     return [*maps, output / TRAJECTORY, picture, page, figures]
 
 

@@ -72,7 +72,7 @@ class ReplayOptions:
         Close loops, and align all scans with each other at the end; the latter keeps all points
         in memory until then. By default loops are closed if poses come from registration.
     formats : tuple of str
-        Formats of the map: ply, pcd, parquet, npz, dxf, bag.
+        Formats: ply, pcd, parquet, npz and bag of the map, dxf and 3dm of the layer models.
     poses_out : Path, optional
         File for the poses of the scans, as TUM text.
     truth : Path, optional
@@ -213,7 +213,7 @@ def replay(
 def configured(config: Config | str | Path | None, options: ReplayOptions) -> Config:
     """Return the configuration for a replay with some options, after checking their formats."""
     from surfel_mapper.config import Config, load_config
-    from surfel_mapper.offline.outputs import FORMATS, OF_MODELS
+    from surfel_mapper.offline.outputs import check_layer_formats, known_formats
 
     if config is not None and not isinstance(config, (Config, str, Path)):
         raise ConfigError(
@@ -221,15 +221,11 @@ def configured(config: Config | str | Path | None, options: ReplayOptions) -> Co
             'Config.from_mapping(settings) takes a dict'
         )
     settings = config if isinstance(config, Config) else load_config(config)
-    unknown = [name for name in options.formats if name not in FORMATS]
+    known = known_formats()
+    unknown = [name for name in options.formats if name not in known]
     if unknown:
-        raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(FORMATS)}')
-    of_models = [name for name in options.formats if name in OF_MODELS]
-    if of_models and not settings.models.enabled:
-        raise ConfigError(
-            f'formats: {of_models[0]} holds planes and surfaces, expected layers.models.enabled: '
-            'true in the configuration'
-        )
+        raise ConfigError(f'formats: {unknown[0]!r}, expected some of {", ".join(known)}')
+    check_layer_formats(options.formats, settings)
     if options.align:
         settings = settings.replace({'window.keep_points': True})
     if not settings.map.threads:
@@ -382,9 +378,9 @@ def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag
     """Begin the bag of normals; it is complete when the files are closed, or does not exist."""
     from surfel_mapper.bags.writer import BagWriter
     from surfel_mapper.offline.normals_bag import NormalsBag
-    from surfel_mapper.offline.outputs import BAG, FORMATS
+    from surfel_mapper.offline.outputs import BAG, MAP_FORMATS
 
-    writer = BagWriter(directory / FORMATS[BAG], overwrite=True)
+    writer = BagWriter(directory / MAP_FORMATS[BAG], overwrite=True)
     return NormalsBag(files.enter_context(writer), mapper)
 
 

@@ -85,9 +85,7 @@ class Inserter:
         self.map = surfel_map
         self.window = SlidingWindow(self.map)
         self._set_limits(config)
-        if config.tsdf.sensor_frame:
-            poses.mount(config.tsdf.sensor_frame)
-        sensors = SensorModels(config.tsdf, poses.transforms)
+        sensors = SensorModels.configured(config, poses.transforms, poses.mount)
         around = Surroundings(surfel_map=self.map, window=self.window, sensors=sensors)
         self.aligner = WindowAligner(lambda scan, pose: moments_at(scan, pose, self.map, config))
         self.loops = LoopCloser(config, self.map, self.window) if config.loops.enabled else None

@@ -137,7 +137,7 @@ class Inputs:
             warm_up()
         for topic in self.cloud_topics:
             self._subscribe_clouds(topic)
-        for kind, name in self._config.tsdf.image_topics.items():
+        for kind, name in self._config.image_topics.items():
             self._subscribe_images(kind, self._node.resolve_topic_name(name))
         self._subscriptions.start()
 

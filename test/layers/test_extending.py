@@ -14,8 +14,10 @@ import pytest
 from surfel_mapper import layers
 from surfel_mapper.config import Config, unregister_stage
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.offline.replay import replay, ReplayOptions
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
+from test.bags import recorded
 
 PAGE = Path(__file__).parents[2] / 'docs' / 'extending.md'
 SWITCH = {'layers.heights.enabled': True, 'pose.source': 'identity'}
@@ -77,6 +79,22 @@ def test_settings_of_a_layer_from_outside_are_checked_and_change_while_running(h
     assert path.read_text() == '0 0 -0.500\n1 0 2.500\n'
     with pytest.raises(ConfigError, match=r'layers\.heights\.enabled: cannot change'):
         mapper.reconfigure(config.replace({'layers.heights.enabled': False}))
+
+
+def test_a_layer_from_outside_writes_a_format_of_its_own(heights, tmp_path):
+    layers.unregister('heights')
+    file = {'columns': 'heights.txt'}
+    layers.register('heights', 'heights:HeightsLayer', 'layers.heights.enabled', file)
+    bag = recorded.write_rosbag2(tmp_path / 'bag', recorded.drive())
+    options = ReplayOptions(formats=('ply', 'columns'))
+    with pytest.raises(ConfigError, match=r'columns is written by the layer heights, expected '):
+        replay(bag, output=tmp_path / 'off', options=options)
+    config = Config.from_mapping({'layers.heights.enabled': True})
+    done = replay(bag, output=tmp_path / 'on', config=config, options=options)
+    assert tmp_path / 'on' / 'heights.txt' in done.written
+    assert (tmp_path / 'on' / 'heights.txt').read_text().count('\n') == len(
+        done.mapper.heights.lowest
+    )
 
 
 def test_two_layers_of_one_name_are_refused(heights):

@@ -18,7 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.files.model_files import write_models
+from surfel_mapper.files.model_3dm import import_rhino3dm
+from surfel_mapper.files.model_files import import_ezdxf, write_models
 from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
 from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
 from surfel_mapper.layers.models.pictures import drawings_of, panels_of, section_of
@@ -124,6 +125,14 @@ class ModelsLayer(Layer):
                 depth=OUTLINES_KEPT,
             ),
         )
+
+    @classmethod
+    def check_formats(cls, formats: Sequence[str]) -> None:
+        """Raise DependencyError unless ezdxf and rhino3dm are installed, if they are needed."""
+        if 'dxf' in formats:
+            import_ezdxf()
+        if '3dm' in formats:
+            import_rhino3dm()
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
         """Write models.json and models.obj, and Parquet, DXF and 3dm if asked for."""
