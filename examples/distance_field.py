@@ -19,7 +19,7 @@ import numpy as np
 
 from surfel_mapper import DistanceField
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.files.ply import write_mesh
+from surfel_mapper.files.mesh_ply import write_mesh
 from surfel_mapper.simulation import Lidar, Simulation, World
 
 

@@ -132,38 +132,6 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
         file.write(table.view(np.uint8).data)
 
 
-def write_mesh(path: str | Path, mesh: Mesh, origin_m: npt.ArrayLike = (0.0, 0.0, 0.0)) -> None:
-    """
-    Write a mesh as a binary PLY, with the colours and labels of the vertices if it has any.
-
-    The origin, (3,) m, is added to the vertices.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be written.
-
-    """
-    columns = dict(zip('xyz', (mesh.vertices + np.asarray(origin_m)).T, strict=True))
-    if len(mesh.colors):
-        columns.update(zip(('red', 'green', 'blue'), mesh.colors.T, strict=True))
-    if len(mesh.labels):
-        columns['label'] = mesh.labels
-    layout = np.dtype([('count', 'u1'), ('corners', '<i4', (3,))])
-    faces = np.empty(len(mesh), layout)
-    faces['count'], faces['corners'] = 3, mesh.triangles
-    properties, vertices = as_table(columns)
-    header = (
-        'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'
-        f'element vertex {len(vertices)}\n{properties}'
-        f'element face {len(faces)}\nproperty list uchar int vertex_indices\nend_header\n'
-    )
-    with replace_file(path) as file:
-        file.write(header.encode('ascii'))
-        file.write(vertices.view(np.uint8).data)
-        file.write(faces.view(np.uint8).data)
-
-
 def as_table(columns: Mapping[str, npt.NDArray[Any]]) -> tuple[str, npt.NDArray[Any]]:
     """Return columns as the lines of a header and as a structured array."""
     layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])

@@ -66,6 +66,7 @@ def save_state(
     *,
     compress: bool = False,
     copies: int = 1,
+    lasting: bool = True,
 ) -> None:
     """
     Write arrays and attributes to a file, atomically.
@@ -82,6 +83,8 @@ def save_state(
         Compress with zlib: a map gets 1.7 times smaller and takes 4 times as long.
     copies : int
         How many times the memory of the arrays a reader needs, as it tells ``load_state``.
+    lasting : bool
+        Whether to wait until the bytes are on the disk; False for temporary files.
 
     Raises
     ------
@@ -108,7 +111,7 @@ def save_state(
         ],
     }
     manifest['sha256'] = content_sha256(manifest, contiguous.values())
-    with replace_file(path) as file:
+    with replace_file(path, lasting=lasting) as file:
         size = write_archive(file, manifest, contiguous, zipfile.ZIP_DEFLATED * compress)
         if size * copies > max(FLOOR_BYTES, BYTES_PER_BYTE * file.tell()):
             file.seek(0)

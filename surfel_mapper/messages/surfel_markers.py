@@ -21,6 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.geometry import face_normals
 from surfel_mapper.mapping.ages import Ages
 from surfel_mapper.messages.kernels.discs import draw_discs, draw_normals
+from surfel_mapper.messages.kernels.triangles import draw_triangles
 from surfel_mapper.messages.markers import ADD, DELETE, LINE_LIST, Marker, TRIANGLE_LIST
 
 if TYPE_CHECKING:
@@ -208,12 +209,9 @@ def mesh_marker(mesh: Mesh, *, number: int, stamp_ns: int, frame_id: str) -> Mar
         Of the mesh.
 
     """
-    corners = mesh.vertices[mesh.triangles]
-    colors = np.ones((len(mesh), 3, 4), np.float32)
-    if len(mesh.colors):
-        colors[..., :3] = mesh.colors[mesh.triangles] / np.float32(255.0)
-    else:
-        colors[..., :3] = shade(corners)[:, None, None]
+    points, colors = np.empty((3 * len(mesh), 3)), np.empty((3 * len(mesh), 4), np.float32)
+    light = LIGHT / np.linalg.norm(LIGHT)
+    draw_triangles(mesh.vertices, mesh.triangles, mesh.colors, light, points, colors)
     return Marker(
         ns='mesh',
         id=number,
@@ -221,8 +219,8 @@ def mesh_marker(mesh: Mesh, *, number: int, stamp_ns: int, frame_id: str) -> Mar
         action=ADD if len(mesh) else DELETE,
         frame_id=frame_id,
         stamp_ns=stamp_ns,
-        points=corners.reshape(-1, 3),
-        colors=colors.reshape(-1, 4),
+        points=points,
+        colors=colors,
     )
 
 

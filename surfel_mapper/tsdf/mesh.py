@@ -10,11 +10,13 @@ edge are welded, within a block and between blocks.
 
 An update has two halves: ``changes`` copies the changed blocks that can have a surface, in the
 thread that owns the map, and ``apply`` makes their triangles, in any thread.
+
+One module: all of it is about the triangles of blocks, and how they are joined.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, KeysView
+from collections.abc import Iterable, KeysView, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -74,7 +76,7 @@ EMPTY = Mesh(
 @dataclass(frozen=True, kw_only=True)
 class BlockMesh(Mesh):
     """
-    The triangles of the cubes whose first corner lies in one block.
+    The triangles of the cubes whose first corners lie in some blocks.
 
     Attributes
     ----------
@@ -195,20 +197,17 @@ class Mesher:
                 touched.add(key)
         return touched
 
-    def mesh(self) -> Mesh:
+    def mesh(self) -> BlockMesh:
         """Return the triangles of all blocks with welded vertices."""
         return self.welded(self._meshes)
 
-    def welded(self, keys: Iterable[int]) -> Mesh:
+    def welded(self, keys: Iterable[int]) -> BlockMesh:
         """Return the triangles of some blocks, by their keys, with welded vertices."""
         meshes = [self._meshes[key] for key in keys if key in self._meshes]
         if not meshes:
-            return EMPTY
-        firsts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes])
+            return BlockMesh(**vars(EMPTY), edges=np.empty((0, 4), np.int32))
+        joined = concatenated(meshes)
         edges = np.concatenate([mesh.edges for mesh in meshes]).astype(np.int64)
-        triangles = np.concatenate(
-            [mesh.triangles + first for mesh, first in zip(meshes, firsts, strict=False)]
-        )
         high = edges[:, 0] << 32 | (edges[:, 1] + (1 << 31))
         low = edges[:, 2] << 2 | edges[:, 3]
         order = np.lexsort((low, high))
@@ -217,14 +216,24 @@ class Mesher:
         number = np.empty(len(order), np.int64)
         number[order] = np.cumsum(is_new) - 1
         kept = order[is_new]
-        labels = np.concatenate([mesh.labels for mesh in meshes])
-        colors = np.concatenate([mesh.colors for mesh in meshes])
-        return Mesh(
-            vertices=np.concatenate([mesh.vertices for mesh in meshes])[kept],
-            triangles=number[triangles].astype(np.int32),
+        colors, labels = joined.colors, joined.labels
+        return BlockMesh(
+            edges=edges[kept].astype(np.int32),
+            vertices=joined.vertices[kept],
+            triangles=number[joined.triangles].astype(np.int32),
             colors=colors[kept] if len(colors) else colors,
             labels=labels[kept] if len(labels) else labels,
         )
+
+    def parts(self, keys: Iterable[int] | None = None) -> Mesh:
+        """
+        Return the triangles of some blocks, by their keys, or of all, each with its own vertices.
+
+        Where blocks meet vertices occur several times; viewers of triangles do not need them
+        welded, which takes longer than marching cubes.
+        """
+        meshes = self._meshes
+        return concatenated([meshes[key] for key in (meshes if keys is None else keys)])
 
     def keys(self) -> KeysView[int]:
         """Return the keys of the blocks that have triangles."""
@@ -306,6 +315,31 @@ class Mesher:
         second = places > 0.5
         near = np.where(second, labels[:, 1], labels[:, 0])
         return np.where(near >= 0, near, np.where(second, labels[:, 0], labels[:, 1]))
+
+
+def concatenated(meshes: Sequence[Mesh]) -> Mesh:
+    """Return the triangles of some meshes."""
+    if not meshes:
+        return EMPTY
+    firsts = np.cumsum([0] + [len(mesh.vertices) for mesh in meshes[:-1]])
+    triangles = np.concatenate([mesh.triangles for mesh in meshes])
+    triangles += np.repeat(firsts, [len(mesh) for mesh in meshes]).astype(np.int32)[:, None]
+    return Mesh(
+        vertices=np.concatenate([mesh.vertices for mesh in meshes]),
+        triangles=triangles,
+        colors=np.concatenate([mesh.colors for mesh in meshes]),
+        labels=np.concatenate([mesh.labels for mesh in meshes]),
+    )
+
+
+def together(parts: Sequence[Mesh]) -> Mesh:
+    """Return the mesh of parts whose triangles count the vertices of all of them."""
+    return Mesh(
+        vertices=np.concatenate([part.vertices for part in parts]),
+        triangles=np.concatenate([part.triangles for part in parts]),
+        colors=np.concatenate([part.colors for part in parts]),
+        labels=np.concatenate([part.labels for part in parts]),
+    )
 
 
 def label_colors(labels: Int32) -> UInt8:

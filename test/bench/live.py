@@ -196,14 +196,20 @@ class Node:
     """The node as a process, in a with-block."""
 
     def __init__(
-        self, voxel_size_m: float, mount: list[float], window: int, extra: dict[str, str]
+        self,
+        voxel_size_m: float,
+        mount: list[float],
+        window: int,
+        extra: dict[str, str],
+        further: Mapping[str, Any] | None = None,
     ) -> None:
-        settings = {
+        settings: dict[str, Any] = {
             'pose.source': 'odometry',
             'frames.base_to_sensor': mount,
             'map.voxel_size_m': voxel_size_m,
             'window.max_scans': window,
             'publish.normals_rate_hz': 2.0,
+            **(further or {}),
         }
         self._output = tempfile.NamedTemporaryFile('w+')  # noqa: SIM115
         self._process = subprocess.Popen(
@@ -223,13 +229,22 @@ class Node:
         self._process.wait(TIMEOUT_S)
         self._output.close()
 
+    def text(self) -> str:
+        """Return the output of the node so far."""
+        return Path(self._output.name).read_text(encoding='utf-8')
+
     def wait_for(self, text: str) -> None:
         """Wait until the output of the node contains a text."""
         end_s = time.monotonic() + TIMEOUT_S
-        while text not in (output := Path(self._output.name).read_text(encoding='utf-8')):
+        while text not in (output := self.text()):
             if self._process.poll() is not None or time.monotonic() > end_s:
                 raise RuntimeError(f'the node did not say {text!r}: {output}')
             time.sleep(0.02)
+
+    def keep_to_one_core(self) -> None:
+        """Run all threads of the node on one core."""
+        for thread in Path(f'/proc/{self._process.pid}/task').iterdir():
+            os.sched_setaffinity(int(thread.name), {0})
 
     def cpu_s(self) -> float:
         """Return the processor time of the node so far."""

@@ -11,7 +11,7 @@ Errors of meshes are distances from the equations of street and room; a mesh tha
 than half complete fails. ``mesh_ms`` is the processor time of the whole mesh, made anew.
 
 Rows ``layer`` are the time of a scan in the layer of a mapper, its check of the sensor included.
-Then follow clouds of other kinds, see any_cloud.py.
+Then follow clouds of other kinds, see any_cloud.py, and the node with the field, live_tsdf.py.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from surfel_mapper.tsdf.range_image import from_depth, from_points, RangeImage
 from surfel_mapper.tsdf.sensors import LidarModel
 from test.bench import room
 from test.bench.any_cloud import cloud_rows
+from test.bench.live_tsdf import live_rows
 from test.bench.machine import one_core
 from test.bench.mesh_error import mesh_error
 from test.bench.options import Options
@@ -116,7 +117,7 @@ def run(options: Options) -> list[Row]:
         rows += image_rows(room_cases(options, scans)[0])
         rows += esdf_rows(street_cases(options, scans)[1])
         rows += layer_rows(street_cases(options, scans)[1])
-    return rows + cloud_rows(options)
+    return rows + cloud_rows(options) + live_rows(options)
 
 
 def layer_rows(case: Case) -> list[Row]:

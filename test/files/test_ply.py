@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.ply import read_points, write_mesh, write_points, write_surfels
+from surfel_mapper.files.mesh_ply import write_mesh
+from surfel_mapper.files.ply import read_points, write_points, write_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from test.messages.examples import make_surfels

@@ -36,6 +36,7 @@ REFERENCES = {
     'messages/kernels/attach.py': 'messages/test_scan_normals.py',
     'messages/kernels/coordinates.py': 'messages/test_pointcloud2.py',
     'messages/kernels/discs.py': 'messages/test_surfel_markers.py',
+    'messages/kernels/triangles.py': 'messages/test_surfel_markers.py',
     'models/kernels/bisection.py': 'models/kernels/test_bisection.py',
     'models/kernels/bspline.py': 'models/test_bspline.py',
     'models/kernels/bspline_incremental.py': 'models/kernels/test_bspline_incremental.py',

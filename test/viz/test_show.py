@@ -14,8 +14,9 @@ from scipy.spatial import cKDTree
 from surfel_mapper import SurfelMap, Trajectory
 from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import save_map
+from surfel_mapper.files.mesh_ply import write_mesh
 from surfel_mapper.files.parquet_tiles import Tile, write_tile
-from surfel_mapper.files.ply import write_mesh, write_points
+from surfel_mapper.files.ply import write_points
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.viz.discs import CORNERS
 from test.bags.recorded import drive, write_rosbag2

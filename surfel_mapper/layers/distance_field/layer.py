@@ -21,14 +21,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.config import Config
+from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.errors import CloudFormatError
-from surfel_mapper.files.ply import write_mesh
-from surfel_mapper.files.tsdf_archive import BlockArchive
+from surfel_mapper.files.mesh_ply import write_mesh_parts
+from surfel_mapper.files.tsdf_archive import BlockArchive, joined
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
+from surfel_mapper.layers.distance_field.whole_surface import surface_parts
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
     Contains,
@@ -49,11 +50,11 @@ from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
 from surfel_mapper.scan import Scan
-from surfel_mapper.tsdf.blocks import BlockMap
+from surfel_mapper.tsdf.blocks import block_keys, BlockMap, Blocks
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
 from surfel_mapper.tsdf.measurements import Integrated
-from surfel_mapper.tsdf.mesh import Mesh, Mesher
+from surfel_mapper.tsdf.mesh import Mesh, Mesher, together
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
 
@@ -192,8 +193,10 @@ class TsdfLayer(Layer):
         return self._mesher.mesh()
 
     def clear_region(self, contains: Contains) -> None:
-        """Set the voxels in a region to unknown; those of the archive stay."""
+        """Set the voxels in a region to unknown, those of the archive too."""
         self.blocks.clear_region(contains)
+        if self._archive is not None:
+            self._archive.edit(partial(cleared, config=self.config.tsdf, contains=contains))
 
     def warm_up(self) -> None:
         """Compile the kernels, for points of either type."""
@@ -214,6 +217,7 @@ class TsdfLayer(Layer):
                 layer = TsdfLayer(config, around)
                 layer.insert(Scan(points=two_beams(dtype), stamp_ns=0, frame_id=''), np.eye(4))
         layer.mesh()
+        list(layer._whole_mesh.messages(Moment()))
         if self.config.esdf.rate_hz:
             layer.esdf.known()
 
@@ -298,16 +302,17 @@ class TsdfLayer(Layer):
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
         """Write mesh.ply, of the archive too."""
         path = directory / 'mesh.ply'
-        write_mesh(path, self._whole_surface(), self.around.surfel_map.origin_m)
+        write_mesh_parts(path, self._surface_parts(), self.around.surfel_map.origin_m)
         return [path]
 
     def drawings(self) -> Sequence[Drawing]:
         """Return the mesh, of the archive too."""
-        return [MeshDrawing(name='mesh', mesh=self._whole_surface())]
+        return [MeshDrawing(name='mesh', mesh=together(list(self._surface_parts())))]
 
-    def _whole_surface(self) -> Mesh:
-        blocks = self.whole()
-        return self.mesh() if blocks is self.blocks else DistanceField(blocks=blocks).mesh()
+    def _surface_parts(self) -> Iterable[Mesh]:
+        if self._archive is None or not self._archive.num_blocks:
+            return [self.mesh()]
+        return surface_parts(self.blocks, self._archive)
 
     def _all_tiles(self, now: Moment) -> Iterable[bytes]:
         return self._live_mesh.complete(now) if self.config.tsdf.mesh_rate_hz else ()
@@ -357,6 +362,19 @@ class TsdfLayer(Layer):
         """Fuse a scan of the window at its final pose, if it waits for that."""
         scan = self._waiting.pop(windowed.stamp_ns, None)
         return [] if scan is None else [self.insert(scan, windowed.T_map_sensor)]
+
+
+def cleared(blocks: Blocks, *, config: TsdfConfig, contains: Contains) -> Blocks:
+    """Return blocks whose voxels in a region are unknown, without those that become empty."""
+    found = []
+    while len(blocks):  # a block may occur several times
+        one = BlockMap(replace(config, max_blocks=0))
+        _, first = np.unique(block_keys(blocks.index), return_index=True)
+        one.insert(blocks.part(first))
+        one.clear_region(contains)
+        found.append(one.copied(one.rows()))
+        blocks = blocks.part(np.delete(np.arange(len(blocks)), first))
+    return joined(found)
 
 
 def centered(scan: Scan, T_scan_sensor: npt.NDArray[np.float64]) -> Scan:

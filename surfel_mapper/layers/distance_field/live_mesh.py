@@ -75,7 +75,7 @@ class LiveMesh:
             tiles = [tile for tile, keys in self._tiles.items() if keys]
             markers.append(clearing(now))
         for tile in tiles:
-            mesh = self._mesher.welded(self._tiles[tile])
+            mesh = self._mesher.parts(self._tiles[tile])
             number = self._numbers.setdefault(tile, len(self._numbers))
             stamp_ns, frame_id = now.stamp_ns, now.frame_id
             markers.append(mesh_marker(mesh, number=number, stamp_ns=stamp_ns, frame_id=frame_id))
@@ -122,7 +122,7 @@ class WholeMesh:
 
     def _marker(self, changes: Changes, now: Moment) -> Iterator[bytes]:
         self._mesher.apply(changes)
-        mesh = self._mesher.mesh()
+        mesh = self._mesher.parts()
         yield marker_bytes(
             mesh_marker(mesh, number=0, stamp_ns=now.stamp_ns, frame_id=now.frame_id)
         )
