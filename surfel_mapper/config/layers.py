@@ -571,7 +571,7 @@ class ModelsLayerConfig(Stage):
         4, 'Planes and surfaces of fewer voxels become Gaussians.', low=1, high=100_000
     )
     absorb: bool = setting(
-        True, 'Voxels with few points and rough ones join the flat neighbour that they lie on.'
+        True, 'Patches grow over sparse and rough voxels that lie on them, and join across these.'
     )
 
 

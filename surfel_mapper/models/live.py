@@ -89,8 +89,8 @@ class LiveModels:
         start = perf_counter()
         self._surfels = self._model = None
         change = self._graph.update()
-        touched, rows, starts = self._regrouped(change)
-        members, ends = self._charts(rows, starts)
+        touched, rows, starts, bridges = self._regrouped(change)
+        members, ends = self._charts(rows, starts, bridges)
         old = self._old_patches(change, touched)
         labels = self._graph.label[members].astype(np.int64)
         matched = match(old, labels, ends, self._next_id)
@@ -157,7 +157,8 @@ class LiveModels:
             models.update()
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
-            bisected(models._graph, np.arange(2, dtype=np.int32), 0.5, 1)
+            none = np.empty((0, 2), np.int32)
+            bisected(models._graph, np.arange(2, dtype=np.int32), none, 0.5, 1)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])
@@ -173,7 +174,7 @@ class LiveModels:
             'bytes': model.size_bytes,
         }
 
-    def _regrouped(self, change: GraphChange) -> tuple[npt.NDArray[np.bool_], Rows, Indices]:
+    def _regrouped(self, change: GraphChange) -> tuple[npt.NDArray[np.bool_], Rows, Indices, Rows]:
         """
         Recompute connected components around changes.
 
@@ -185,25 +186,30 @@ class LiveModels:
             Their rows, component by component.
         (K + 1,) int64
             First row of each, and M.
+        (B, 2) int32
+            Pairs of connected rows without a link.
 
         """
         graph = self._graph
         size = len(graph.key)
         rows, flags = np.empty(size, np.int32), np.zeros(size, np.bool_)
-        flags[change.relinked] = True
+        flags[change.relinked] = flags[change.touched] = True
         single = (graph.kind == FLAT) & (graph.component < 0)
         apart = rows[: rows_of_groups(graph.component, flags, single, rows)].copy()
         parent = np.empty(len(apart), np.int64)
-        connected_components(apart, graph.links, graph.neighbours, graph.places, parent)
+        places, none = graph.places, np.empty((0, 2), np.int32)
+        connected_components(apart, graph.links, graph.neighbours, places, none, parent)
+        group = np.full(size, -1, np.int32)
+        group[apart] = parent
+        bridges = graph.bridges(group)
+        connected_components(apart, graph.links, graph.neighbours, places, bridges, parent)
         name_components(apart, parent, graph.key, graph.component)
         flags[:] = False
-        flags[change.touched] = True
-        flags[change.relinked] = False
         flags[graph.component[apart]] = True
         flags[graph.component[change.hosts]] = True
         single[:] = False
         num = rows_of_groups(graph.component, flags, single, rows)
-        return flags, *self._sorted(rows[:num], graph.component)
+        return flags, *self._sorted(rows[:num], graph.component), bridges
 
     def _sorted(self, rows: Rows, group: Rows) -> tuple[Rows, Indices]:
         """Return rows sorted by group, and the start of each group."""
@@ -211,13 +217,15 @@ class LiveModels:
         num = sort_by_group(rows, group, self._graph.places, ordered, starts)
         return ordered, starts[: num + 1]
 
-    def _charts(self, rows: Rows, starts: Indices) -> tuple[Rows, Indices]:
+    def _charts(self, rows: Rows, starts: Indices, bridges: Rows) -> tuple[Rows, Indices]:
         """Return the voxels of patches with those they host, and the start of each patch."""
         graph, least = self._graph, self.config.min_voxels
         large = np.flatnonzero(np.diff(starts) >= least)
         kept = np.repeat(np.diff(starts) >= least, np.diff(starts))
         ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
-        charts = chart_components(graph, rows[kept], ends, self.config.fold_angle_deg, least)
+        charts = chart_components(
+            graph, rows[kept], ends, bridges, self.config.fold_angle_deg, least
+        )
         number = np.full(len(graph.key), -1, np.int32)
         for k, chart in enumerate(charts):
             number[chart] = k
@@ -252,7 +260,7 @@ class LiveModels:
         before, was_gaussian = graph.label[every].astype(np.int64), graph.is_gaussian[every]
         graph.label[every], graph.is_gaussian[every] = -1, False
         graph.label[members] = np.repeat(np.array(ids, np.int32), np.diff(ends))
-        kind = graph.kind[every]
+        kind = graph.own_kind[every]
         now_gaussian = (graph.label[every] < 0) & (kind != YOUNG) & (kind != NONE)
         new = now_gaussian & ~was_gaussian
         before[new] = self._next_id + np.arange(new.sum())

@@ -28,10 +28,20 @@ from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.mapping.moments import unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.kernels.surfel_classes import classify, FLAT, mark_material, NONE
+from surfel_mapper.models.kernels.surfel_classes import (
+    classify,
+    classify_sparse,
+    FLAT,
+    mark_material,
+    NONE,
+)
 from surfel_mapper.models.kernels.surfel_links import (
+    find_bridges,
     find_hosts,
+    flag_components,
     link_neighbours,
+    ROUNDS,
+    spread,
     unlink,
     update_links,
 )
@@ -65,10 +75,14 @@ class SurfelGraph:
         Key of the voxel in each row, -1 for none.
     count, position, normal, eigenvalues, covariance, axes
         Its surfel; covariance xx xy xz yy yz zz; axes as in models/kernels/surfel_classes.py.
+    own_kind, own_normal
+        Class and normal of the voxel alone; kind and normal take sparse voxels with those around.
     kind, links, neighbours
         See models/kernels/surfel_classes.py and models/kernels/surfel_links.py.
     host : (R,) int32
-        The flat neighbour on whose plane a voxel that is not flat lies, -1 for none.
+        The flat voxel nearby on whose plane a voxel that is not flat lies, -1 for none.
+    level : (R,) uint8
+        Number of steps from a flat voxel over others with hosts; 0 without a host.
     component : (R,) int32
         Connected component, by the row of its voxel of least key; -1 if not flat.
     label : (R,) int32
@@ -113,9 +127,9 @@ class SurfelGraph:
         none = np.empty(0, np.int32)
         self.key = np.empty(0, np.int64)
         self.count = np.empty(0, np.int64)
-        self.position, self.normal, self.eigenvalues = np.empty((3, 0, 3))
+        self.position, self.normal, self.own_normal, self.eigenvalues = np.empty((4, 0, 3))
         self.covariance, self.axes = np.empty((0, 6)), np.empty((0, 2, 3))
-        self.kind = np.empty(0, np.uint8)
+        self.kind = self.own_kind = self.level = np.empty(0, np.uint8)
         self.links = np.empty(0, np.uint64)
         self.neighbours = np.empty((0, len(self._neighbour_steps)), np.int32)
         self.host, self.component, self.label, self.places = (none,) * 4
@@ -147,16 +161,18 @@ class SurfelGraph:
             self.map.find(keys).reshape(len(came), len(self._neighbour_steps)),
             self.neighbours,
         )
+        changed, here = here, self._around(here, near, 1) if self._absorbs else here
         was_flat = self.kind[here] == FLAT
-        self._measure(here)
+        self._measure(changed, here)
         is_flat = self.kind[here] == FLAT
         relinked.append(self.component[here[was_flat != is_flat]])
         touched = self.component[here]
         self.component[here[~is_flat]] = -1
         relinked.append(self._relinked(here, marked, num))
-        rehosted, old_hosts, new_hosts = self._rehosted(here, near)
+        rehosted, old_hosts, new_hosts, around = self._rehosted(here, near)
+        relinked.append(around)
         return GraphChange(
-            num_voxels=len(here) + len(gone.key),
+            num_voxels=len(changed) + len(gone.key),
             rows=np.concatenate([here, rehosted]),
             relinked=unique_components(relinked),
             touched=unique_components([touched, self.component[old_hosts[old_hosts >= 0]]]),
@@ -171,7 +187,7 @@ class SurfelGraph:
         The first ``num`` rows of ``marked`` are those that ``unlink`` has marked already.
         """
         self._is_here[here] = True
-        state = (self.kind, self.position, self.normal)
+        state = (self.kind, self.position, self.normal, self.own_kind)
         num = update_links(
             here,
             self._is_here,
@@ -194,7 +210,7 @@ class SurfelGraph:
         total = np.where(e2 > 0.0, e0 + e1 + e2, np.nan)
         return Surfels(
             position=self.position[held],
-            normal=self.normal[held],
+            normal=self.own_normal[held],
             planarity=2.0 * (e1 - e0) / total,
             curvature=e0 / total,
             eigenvalues=eigenvalues,
@@ -233,30 +249,59 @@ class SurfelGraph:
     def _blank(self, rows: npt.NDArray[Any]) -> None:
         """Reset rows whose voxels are gone."""
         self.key[rows] = self.host[rows] = self.component[rows] = self.label[rows] = -1
-        self.kind[rows] = NONE
+        self.kind[rows], self.own_kind[rows], self.level[rows] = NONE, NONE, 0
         self.is_gaussian[rows] = False
         self._reported_count[rows] = 0
 
-    def _measure(self, rows: Rows) -> None:
-        """Copy surfels from the map, classify them, and mark material changes."""
-        before = self.kind[rows]
+    def _around(self, rows: Rows, emptied: Rows, steps: int) -> Rows:
+        """Return rows, those of neighbours of emptied voxels, and all within some steps."""
+        if 2 * len(rows) > len(self.key):
+            return np.flatnonzero(self.key >= 0).astype(np.int32)
+        found = np.empty(len(self.key), np.int32)
+        start = np.concatenate([rows, emptied.ravel()])
+        num = spread(start, self.neighbours, steps, self._is_here, found)
+        around = found[:num]
+        return around[self.key[around] >= 0]
+
+    def _measure(self, rows: Rows, around: Rows) -> None:
+        """Copy surfels from the map, classify them and those around, mark material changes."""
+        before = self.kind[around]
         surfels = self.map.surfels_of(rows)
         self.count[rows], self.position[rows] = surfels.num_points, surfels.position
-        self.normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
+        self.own_normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
         self.covariance[rows] = self.map.covariances_of(rows)
         classify(
             rows,
             self.count,
-            self.normal,
+            self.own_normal,
             self.covariance,
             self._class_rules,
-            self.kind,
+            self.own_kind,
             self.axes,
         )
+        if self._absorbs:
+            alone = (
+                self.count,
+                self.position,
+                self.own_normal,
+                self.covariance,
+                self.eigenvalues,
+            )
+            classify_sparse(
+                around,
+                self.neighbours,
+                self.own_kind,
+                alone,
+                self._class_rules,
+                self.kind,
+                self.normal,
+            )
+        else:
+            self.kind[rows], self.normal[rows] = self.own_kind[rows], surfels.normal
         self.is_material[:] = False
         reported = (self._reported_count, self._reported_position, self._reported_normal)
         mark_material(
-            rows,
+            around,
             before,
             self.count,
             self.position,
@@ -267,26 +312,45 @@ class SurfelGraph:
             self.is_material,
         )
 
-    def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows]:
-        """Recompute hosts: rows, hosts before and now."""
+    def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows, Rows]:
+        """Recompute hosts: rows, hosts before and now, and components that may be connected."""
         if not self._absorbs:
             none = np.empty(0, np.int32)
-            return none, none, none
-        near = np.zeros(len(self.key) + 1, np.bool_)
-        near[emptied] = near[self.neighbours[here]] = True  # -1 wraps to the last
-        near[here] = True
-        rows = np.flatnonzero(near[:-1] & (self.kind != FLAT) & (self.kind != NONE))
-        rows = rows.astype(np.int32)
-        before = self.host[rows]
-        hosts = np.empty(len(rows), np.int32)
-        state = (self.kind, self.position, self.normal)
-        find_hosts(rows, self.neighbours, state, self.covariance, self._host_rules, hosts)
+            return none, none, none, none
+        around = self._around(here, emptied, ROUNDS)
+        rows = around[(self.kind[around] != FLAT) & (self.kind[around] != NONE)]
         flat = here[self.kind[here] == FLAT]
-        changed = (before != hosts) | self.is_material[rows]
-        once = np.concatenate([self.host[flat], before[changed]])
-        self.host[flat] = -1
-        self.host[rows] = hosts
-        return rows[changed], once, hosts[changed]
+        before, was = self.host[rows], self.host[flat]
+        self.host[flat], self.level[flat] = -1, 0
+        state = (self.kind, self.position, self.normal)
+        rules = self._host_rules
+        find_hosts(rows, self.neighbours, state, self.covariance, rules, self.host, self.level)
+        changed = (before != self.host[rows]) | self.is_material[rows]
+        flags = np.zeros(len(self.key), np.bool_)
+        flag_components(around, self.neighbours, self.host, self.component, flags)
+        once = np.concatenate([was, before[changed]])
+        components = np.flatnonzero(flags).astype(np.int32)
+        return rows[changed], once, self.host[rows[changed]], components
+
+    def bridges(self, group: Rows) -> npt.NDArray[np.int32]:
+        """
+        Return pairs (B, 2) of flat voxels of one surface with sparse or rough ones between them.
+
+        Parameters
+        ----------
+        group : (R,) int32
+            Connected component by links of each row, -1 for rows that are left out.
+
+        """
+        hosted = np.flatnonzero(self.level > 0).astype(np.int32)
+        state = (self.kind, self.position, self.normal, self.own_kind)
+        used = hosted, self.host, self.neighbours, state, self._link_rules, group
+        pairs = np.empty((4096, 2), np.int32)
+        num = find_bridges(*used, pairs)
+        if num > len(pairs):
+            pairs = np.empty((num, 2), np.int32)
+            find_bridges(*used, pairs)
+        return pairs[:num]
 
 
 def half_neighbourhood(reach: int) -> npt.NDArray[np.int64]:

@@ -11,6 +11,9 @@ Source: Duff et al. 2017 for the orthonormal basis.
 import math
 
 from numba import njit
+import numpy as np
+
+from surfel_mapper.kernels.symmetric3 import eigen_frame
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
 """Class of a voxel: empty, too few points, flat surfel, not flat."""
@@ -65,6 +68,99 @@ def classify(chosen, count, normal, covariance, rules, kind, axes):
         axes[row, 1, 0] = least * (cosine * vx - sine * ux)
         axes[row, 1, 1] = least * (cosine * vy - sine * uy)
         axes[row, 1, 2] = least * (cosine * vz - sine * uz)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
+    """
+    Classify voxels that are not flat by the points of their surroundings.
+
+    A voxel with few points, or points on a line, is flat if its points lie on a plane with those
+    of its neighbours, of which none is flat by itself; it has the normal of that plane, on the
+    side of most normals around. Beside flat voxels it may get a host instead, which does not blur
+    curved surfaces.
+
+    rows        (K,) int32; those that are flat by themselves keep class and normal
+    neighbours  (R, A) int32, rows of the neighbours of each, -1 for none
+    own         (R,) uint8, class by the points of the voxel alone
+    surfels     count (R,), position (R, 3), normal (R, 3), covariance (R, 6) and eigenvalues
+                (R, 3) of single voxels
+    rules       of classify
+    kind        (R,) uint8, normal (R, 3) float64, out
+    """
+    count, position, own_normal, covariance, eigenvalues = surfels
+    sums, scatter = np.empty(10), np.empty((3, 3))
+    value, axes = np.empty(3), np.empty((3, 3))
+    for row in rows:
+        kind[row] = own[row]
+        for j in range(3):
+            normal[row, j] = own_normal[row, j]
+        if own[row] == FLAT or own[row] == NONE or not eigenvalues[row, 0] < rules[1]:
+            continue
+        origin, near = position[row], neighbours[row]
+        sums[:] = 0.0
+        add_moments(row, origin, count, position, covariance, sums)
+        has_flat = False
+        for h in range(len(near)):
+            if near[h] >= 0:
+                has_flat |= own[near[h]] == FLAT
+        if has_flat:
+            continue
+        for h in range(len(near)):
+            if near[h] >= 0:
+                add_moments(near[h], origin, count, position, covariance, sums)
+        if sums[0] < rules[0]:
+            continue
+        plane_of(sums, scatter, value, axes)
+        n = axes[0]
+        away = (n[0] * sums[1] + n[1] * sums[2] + n[2] * sums[3]) / sums[0]
+        if not (value[0] < rules[1] and value[1] > LEAST_WIDTH * value[2]):
+            continue
+        if not away * away + variance(covariance[row], n[0], n[1], n[2]) < rules[1]:
+            continue
+        votes = 0.0
+        for h in range(-1, len(near)):
+            other = near[h] if h >= 0 else row
+            if other >= 0 and not math.isnan(own_normal[other, 0]):
+                m = own_normal[other]
+                votes += count[other] * (m[0] * n[0] + m[1] * n[1] + m[2] * n[2])
+        kind[row] = FLAT
+        for j in range(3):
+            normal[row, j] = -n[j] if votes < 0.0 else n[j]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def add_moments(row, origin, count, position, covariance, sums):
+    """Add the points of a voxel to moments (10,) about an origin: n, x y z, xx xy xz yy yz zz."""
+    n = np.float64(count[row])
+    x, y, z = (
+        position[row, 0] - origin[0],
+        position[row, 1] - origin[1],
+        position[row, 2] - origin[2],
+    )
+    c, less = covariance[row], max(n - 1.0, 0.0)
+    sums[0] += n
+    sums[1] += n * x
+    sums[2] += n * y
+    sums[3] += n * z
+    sums[4] += n * x * x + less * c[0]
+    sums[5] += n * x * y + less * c[1]
+    sums[6] += n * x * z + less * c[2]
+    sums[7] += n * y * y + less * c[3]
+    sums[8] += n * y * z + less * c[4]
+    sums[9] += n * z * z + less * c[5]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def plane_of(sums, scatter, value, axes):
+    """Compute eigenvalues (3,), m^2, and axes (3, 3) of moments (10,), ascending."""
+    n, k = sums[0], 4
+    for a in range(3):
+        for b in range(a, 3):
+            scatter[a, b] = (sums[k] - sums[1 + a] * sums[1 + b] / n) / max(n - 1.0, 1.0)
+            scatter[b, a] = scatter[a, b]
+            k += 1
+    eigen_frame(scatter, value, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -15,10 +15,18 @@ import numpy as np
 from surfel_mapper.models.kernels.region_merging import same_surface_products
 from surfel_mapper.models.kernels.surfel_classes import FLAT, variance
 
+ROUNDS = 3
+"""Patches grow by so many voxels over sparse and rough ones."""
+
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def are_linked(i, j, kind, position, normal, rules):
-    """Return whether two neighbours are pieces of one surface; see same_surface."""
+def are_linked(i, j, state, rules):
+    """
+    Return whether two neighbours are pieces of one surface; see same_surface.
+
+    Voxels that are flat with those around only are linked on planes: these hide an arc.
+    """
+    kind, position, normal, own = state
     if kind[i] != FLAT or kind[j] != FLAT:
         return False
     away = cosine = n_i = n_j = 0.0
@@ -30,6 +38,8 @@ def are_linked(i, j, kind, position, normal, rules):
         n_j += normal[j, k] * delta
     if not away < rules[4]:
         return False  # voxel indices wrap around at the limit of the grid
+    if (own[i] != FLAT or own[j] != FLAT) and not abs(cosine) > rules[0]:
+        return False
     return same_surface_products(cosine, n_i, n_j, 1.0, rules)
 
 
@@ -107,13 +117,13 @@ def update_links(chosen, is_chosen, neighbours, state, rules, links, marks, mark
     chosen      (K,) int32, rows
     is_chosen   (R,) bool, whether a row is one of them
     neighbours  (R, 2 H) int32
-    state       kind (R,), position (R, 3), normal (R, 3)
+    state       kind (R,), position (R, 3), normal (R, 3), class (R,) of the voxel alone
     rules       see same_surface, but the fifth is the square of the longest distance, m^2
     num         number of rows already marked
 
     Returns how many rows are marked.
     """
-    kind, position, normal = state
+    kind = state[0]
     half = neighbours.shape[1] // 2
     for i in range(len(chosen)):
         row = np.int64(chosen[i])
@@ -126,18 +136,49 @@ def update_links(chosen, is_chosen, neighbours, state, rules, links, marks, mark
         for h in range(half):
             after, before = np.int64(neighbours[row, h]), np.int64(neighbours[row, half + h])
             if after >= 0 and kind[row] == FLAT:
-                joined = are_linked(row, after, kind, position, normal, rules)
+                joined = are_linked(row, after, state, rules)
                 num = set_link(row, after, h, joined, links, marks, marked, num)
             if before >= 0 and not is_chosen[before] and kind[before] == FLAT:
-                joined = are_linked(before, row, kind, position, normal, rules)
+                joined = are_linked(before, row, state, rules)
                 num = set_link(before, row, h, joined, links, marks, marked, num)
     return num
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def find_hosts(chosen, neighbours, state, covariance, rules, host):
+def spread(rows, neighbours, steps, marks, marked):
     """
-    Find for voxels that are not flat the flat neighbour on whose plane they lie.
+    List rows and those within some steps of them; return how many there are.
+
+    rows        (K,) int32, -1 for none
+    neighbours  (R, A) int32, rows of the neighbours of each, -1 for none
+    marks       (R,) bool, all False; restored afterwards
+    marked      (R,) int32, out
+    """
+    num = 0
+    for row in rows:
+        if row >= 0:
+            num = mark(row, marks, marked, num)
+    low = 0
+    for _ in range(steps):
+        high = num
+        for i in range(low, high):
+            for h in range(neighbours.shape[1]):
+                other = neighbours[marked[i], h]
+                if other >= 0:
+                    num = mark(other, marks, marked, num)
+        low = high
+    for i in range(num):
+        marks[marked[i]] = False
+    return num
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def find_hosts(chosen, neighbours, state, covariance, rules, host, level):
+    """
+    Find for voxels that are not flat a flat one on whose plane they lie.
+
+    Patches grow over voxels with few points and rough ones: first over neighbours of flat voxels,
+    then over neighbours of these, and so on; a voxel has the nearest plane of its first round.
 
     chosen      (K,) int32, rows
     neighbours  (R, A) int32, rows of the neighbours of each, -1 for none
@@ -145,25 +186,83 @@ def find_hosts(chosen, neighbours, state, covariance, rules, host):
     covariance  (R, 6) float64, m^2
     rules       largest distance m, largest variance along the normal m^2, square of the longest
                 distance m^2
-    host        (K,) int32, out: row with the nearest plane, -1 for none
+    host        (R,) int32, in place for chosen rows: row with the nearest plane, -1 for none
+    level       (R,) uint8, in place for chosen rows: the round, 0 without a host
     """
     kind, position, normal = state
-    for i in range(len(chosen)):
-        row = np.int64(chosen[i])
-        best = rules[0]
-        host[i] = -1
-        c = covariance[row]
+    for row in chosen:
+        host[row], level[row] = -1, 0
+    for step in range(1, ROUNDS + 1):
+        for i in range(len(chosen)):
+            row = np.int64(chosen[i])
+            if kind[row] == FLAT or level[row] != 0:
+                continue
+            best = rules[0]
+            c = covariance[row]
+            for h in range(neighbours.shape[1]):
+                near = neighbours[row, h]
+                if near < 0 or level[near] != step - 1:
+                    continue
+                other = host[near] if step > 1 else near
+                if kind[other] != FLAT:
+                    continue
+                x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]
+                dx = position[row, 0] - position[other, 0]
+                dy = position[row, 1] - position[other, 1]
+                dz = position[row, 2] - position[other, 2]
+                if not dx * dx + dy * dy + dz * dz < rules[2]:
+                    continue
+                away = abs(x * dx + y * dy + z * dz)
+                if away < best and variance(c, x, y, z) < rules[1]:
+                    best = away
+                    host[row], level[row] = other, step
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def flag_components(rows, neighbours, host, component, flags):
+    """
+    Flag the components of voxels, of their neighbours, and of the hosts of both.
+
+    rows       (K,) int32; component (R,) int32; flags (R,) bool, in place
+    """
+    for row in rows:
+        for h in range(-1, neighbours.shape[1]):
+            other = neighbours[row, h] if h >= 0 else row
+            if other < 0:
+                continue
+            root = host[other] if host[other] >= 0 else other
+            if component[root] >= 0:
+                flags[component[root]] = True
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def find_bridges(hosted, host, neighbours, state, rules, group, pairs):
+    """
+    List pairs of flat voxels of one surface that are connected by voxels that they host.
+
+    hosted      (K,) int32, rows with a host
+    host        (R,) int32; neighbours (R, A) int32; state and rules of update_links
+    group       (R,) int32, connected component by links, -1 for rows that are not used
+    pairs       (P, 2) int32, out; pairs beyond are counted only
+
+    Returns how many pairs there are; only pairs of different components are listed.
+    """
+    num = 0
+    for i in range(len(hosted)):
+        one = np.int64(host[hosted[i]])
+        last = np.int64(-1)
+        if group[one] < 0:
+            continue
         for h in range(neighbours.shape[1]):
-            other = neighbours[row, h]
-            if other < 0 or kind[other] != FLAT:
+            near = neighbours[hosted[i], h]
+            if near < 0:
                 continue
-            x, y, z = normal[other, 0], normal[other, 1], normal[other, 2]
-            dx = position[row, 0] - position[other, 0]
-            dy = position[row, 1] - position[other, 1]
-            dz = position[row, 2] - position[other, 2]
-            if not dx * dx + dy * dy + dz * dz < rules[2]:
+            other = np.int64(host[near]) if host[near] >= 0 else np.int64(near)
+            if other == last or group[other] < 0 or group[other] == group[one]:
                 continue
-            away = abs(x * dx + y * dy + z * dz)
-            if away < best and variance(c, x, y, z) < rules[1]:
-                best = away
-                host[i] = other
+            last = other
+            if are_linked(one, other, state, rules):
+                if num < len(pairs):
+                    pairs[num, 0], pairs[num, 1] = one, other
+                num += 1
+    return num

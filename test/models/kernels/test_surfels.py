@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import connected_components as scipy_components
 from surfel_mapper.models.kernels.surfel_classes import (
     across,
     classify,
+    classify_sparse,
     FLAT,
     mark_material,
     NONE,
@@ -31,8 +32,12 @@ from surfel_mapper.models.kernels.surfel_groups import (
     sort_by_group,
 )
 from surfel_mapper.models.kernels.surfel_links import (
+    find_bridges,
     find_hosts,
+    flag_components,
     link_neighbours,
+    ROUNDS,
+    spread,
     unlink,
     update_links,
 )
@@ -161,7 +166,7 @@ def test_links_follow_changes_and_equal_brute_force(call):
         found = np.where((table >= 0) & present[table], table, -1)[part]
         call(link_neighbours, part, found, neighbours)
         is_chosen[part] = True
-        state = kind, position, normal
+        state = kind, position, normal, kind
         count = call(
             update_links, part, is_chosen, neighbours, state, RULES, links, marks, marked, 0
         )
@@ -195,8 +200,17 @@ def test_components_equal_scipy_and_are_named_by_the_least_key(call):
     _, expected = scipy_components(coo_array((np.ones(len(i)), (i, table[i, h])), (num, num)))
     rows = np.flatnonzero(kind == FLAT).astype(np.int32)
     places, parent = np.full(num, -1, np.int32), np.empty(len(rows), np.int64)
-    call(connected_components, rows, links, table, places, parent)
+    none = np.empty((0, 2), np.int32)
+    call(connected_components, rows, links, table, places, none, parent)
     assert (places == -1).all()
+    same = parent[:, None] == parent[None]
+    np.testing.assert_array_equal(same, expected[rows][:, None] == expected[rows][None])
+
+    bridges = rows[[[0, -1], [3, -2]]]
+    call(connected_components, rows, links, table, places, bridges, parent)
+    both_ends = np.concatenate([np.stack([i, table[i, h]]), bridges.T], axis=1)
+    bridged = coo_array((np.ones(both_ends.shape[1]), tuple(both_ends)), (num, num))
+    _, expected = scipy_components(bridged)
     same = parent[:, None] == parent[None]
     np.testing.assert_array_equal(same, expected[rows][:, None] == expected[rows][None])
 
@@ -207,26 +221,131 @@ def test_components_equal_scipy_and_are_named_by_the_least_key(call):
         assert members[key[members].argmin()] == name
 
 
+def brute_hosts(table, kind, position, normal, six, rules):
+    """Return host and round of every voxel that is not flat, round by round."""
+    host, level = np.full(len(kind), -1), np.zeros(len(kind), int)
+    for step in range(1, ROUNDS + 1):
+        before, was = host.copy(), level.copy()
+        for row in np.flatnonzero((kind != FLAT) & (was == 0)):
+            near = [j for j in table[row] if j >= 0]
+            if step == 1:
+                roots = [j for j in near if kind[j] == FLAT]
+            else:
+                roots = [before[j] for j in near if kind[j] != FLAT and was[j] == step - 1]
+            found = [
+                (abs(normal[j] @ (position[row] - position[j])), k, j)
+                for k, j in enumerate(roots)
+                if normal[j] ** 2 @ six[row, [0, 3, 5]] < rules[1]
+                and abs(normal[j] @ (position[row] - position[j])) < rules[0]
+            ]
+            if found:
+                host[row], level[row] = min(found)[2], step
+    return host, level
+
+
 @both
-def test_hosts_are_the_flat_neighbours_of_least_plane_distance(call):
+def test_hosts_grow_round_by_round_over_the_nearest_planes(call):
     table, kind, position, normal = grid_of_surfels(7)
+    kind[np.random.default_rng(3).random(len(kind)) < 0.7] = YOUNG
     six = np.abs(np.random.default_rng(8).normal(0.0, 1e-4, (len(table), 6)))
     six[:, [1, 2, 4]] = 0.0
-    chosen, limit, variance = np.flatnonzero(kind != FLAT).astype(np.int32), 0.05, 1e-4
-    host = np.empty(len(chosen), np.int32)
-    call(find_hosts, chosen, table, (kind, position, normal), six, (limit, variance, 1e9), host)
-    for row, found in zip(chosen, host, strict=True):
-        near = [
-            (abs(normal[j] @ (position[row] - position[j])), j)
-            for j in table[row]
-            if j >= 0
-            and kind[j] == FLAT
-            and normal[j] ** 2 @ six[row, [0, 3, 5]] < variance
-            and abs(normal[j] @ (position[row] - position[j])) < limit
-        ]
-        assert found == min(near, default=(0.0, -1))[1]
-    assert (host >= 0).any()
+    chosen = np.flatnonzero(kind != FLAT).astype(np.int32)
+    host, level = np.full(len(kind), -1, np.int32), np.zeros(len(kind), np.uint8)
+    rules, state = (0.05, 1e-4, 1e9), (kind, position, normal)
+    call(find_hosts, chosen, table, state, six, rules, host, level)
+    expected = brute_hosts(table, kind, position, normal, six, rules)
+    assert host.tolist() == expected[0].tolist()
+    assert level.tolist() == expected[1].tolist()
+    assert {1, 2} <= set(level.tolist())
     assert NONE == 0
+
+    # after a change, the voxels around it are enough
+    kind[chosen[5]] = FLAT
+    host[chosen[5]], level[chosen[5]] = -1, 0
+    found, marks = np.empty(len(kind), np.int32), np.zeros(len(kind), bool)
+    around = found[: call(spread, chosen[5:6], table, ROUNDS, marks, found)]
+    rest = around[kind[around] != FLAT]
+    call(find_hosts, rest, table, state, six, rules, host, level)
+    expected = brute_hosts(table, kind, position, normal, six, rules)
+    assert host.tolist() == expected[0].tolist()
+
+
+@both
+def test_spread_lists_all_within_some_steps(call):
+    table, kind, _, _ = grid_of_surfels(11)
+    marks, found = np.zeros(len(kind), bool), np.empty(len(kind), np.int32)
+    start = np.array([3, -1, 40], np.int32)
+    expected = {3, 40}
+    for steps in range(3):
+        num = call(spread, start, table, steps, marks, found)
+        assert len(set(found[:num].tolist())) == num
+        assert set(found[:num].tolist()) == expected
+        assert not marks.any()
+        expected |= {int(j) for i in expected for j in table[i] if j >= 0}
+
+
+@both
+def test_bridges_join_the_hosts_of_touching_voxels_of_one_surface(call):
+    table, kind, position, normal = grid_of_surfels(12)
+    rng = np.random.default_rng(13)
+    kind[rng.random(len(kind)) < 0.6] = ROUGH
+    flat = np.flatnonzero(kind == FLAT)
+    host = np.where(kind == FLAT, -1, rng.choice(flat, len(kind))).astype(np.int32)
+    hosted = np.flatnonzero(host >= 0).astype(np.int32)
+    group = np.where(kind == FLAT, rng.integers(-1, 6, len(kind)), -1).astype(np.int32)
+    expected = set()
+    for row in hosted:
+        one = host[row]
+        for near in table[row][table[row] >= 0]:
+            other = host[near] if host[near] >= 0 else near
+            if min(group[one], group[other]) < 0 or group[one] == group[other]:
+                continue
+            delta, cosine = position[one] - position[other], normal[one] @ normal[other]
+            first, second = normal[one] @ delta, normal[other] @ delta
+            on_plane = abs(cosine) > RULES[0] and 0.5 * (abs(first) + abs(second)) < RULES[1]
+            if on_plane or (cosine > RULES[2] and 0.5 * abs(first + second) < RULES[3]):
+                expected.add((int(one), int(other)))
+    pairs = np.empty((2000, 2), np.int32)
+    state = kind, position, normal, kind
+    num = call(find_bridges, hosted, host, table, state, RULES, group, pairs)
+    assert {tuple(pair) for pair in pairs[:num].tolist()} == expected
+    assert len(expected) > 5
+    assert call(find_bridges, hosted, host, table, state, RULES, group, pairs[:1]) == num
+
+    flags, rows = np.zeros(len(kind), bool), hosted[:2]
+    component = np.where(kind == FLAT, np.arange(len(kind)), -1).astype(np.int32)
+    call(flag_components, rows, table, host, component, flags)
+    near = {int(j) for row in rows for j in (row, *table[row]) if j >= 0}
+    assert set(np.flatnonzero(flags)) == {int(host[j]) if host[j] >= 0 else j for j in near}
+
+
+@both
+def test_sparse_voxels_are_flat_on_the_plane_of_all_points_around(call):
+    rng = np.random.default_rng(14)
+    table = np.array([[1, 2, -1], [0, 2, -1], [0, 1, 3], [2, -1, -1]], np.int32)
+    tilt = np.array([[1.0, 0.0, 0.1], [0.0, 1.0, 0.0], [-0.1, 0.0, 1.0]])
+    clouds = [
+        (rng.uniform(0.0, 0.4, (6, 3)) * [1, 1, 1e-3] + [0.5 * k, 0.0, 0.0]) @ tilt.T
+        for k in range(4)
+    ]
+    clouds[3][:, 2] += 0.2  # off the plane of the others
+    counts, means, six, full = packed(clouds)
+    values, vectors = np.linalg.eigh(full)
+    normals = np.ascontiguousarray(vectors[:, :, 0]) * np.sign(vectors[:, 2:, 0])
+    own = np.full(4, YOUNG, np.uint8)
+    kind, normal = np.zeros(4, np.uint8), np.empty((4, 3))
+    rows, alone = np.arange(4, dtype=np.int32), (counts, means, normals, six, values)
+    rules = (15.0, 1e-4, SIZE_M)
+    call(classify_sparse, rows, table, own, alone, rules, kind, normal)
+    assert kind.tolist() == [FLAT, FLAT, YOUNG, YOUNG]
+    pooled = np.concatenate(clouds[:3])
+    expected = np.linalg.eigh(np.cov(pooled.T))[1][:, 0]
+    np.testing.assert_allclose(normal[0], expected * np.sign(expected[2]), atol=1e-9)
+    np.testing.assert_array_equal(normal[3], normals[3])
+
+    own[1] = FLAT  # beside it they may get a host instead
+    call(classify_sparse, rows, table, own, alone, rules, kind, normal)
+    assert kind.tolist() == [YOUNG, FLAT, YOUNG, YOUNG]
 
 
 @both
