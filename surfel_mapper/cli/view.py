@@ -10,6 +10,7 @@ only. A bag or folder of scans is mapped while it is shown, and nothing is writt
 from __future__ import annotations
 
 import argparse
+from concurrent.futures import ThreadPoolExecutor
 import os
 from pathlib import Path
 import sys
@@ -19,6 +20,7 @@ from surfel_mapper.cli._arguments import positive_int, UsageError
 from surfel_mapper.cli._progress import progress
 
 if TYPE_CHECKING:
+    from surfel_mapper.viz.contents import Content
     from surfel_mapper.viz.scene import Scene
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories and bags.'
@@ -88,7 +90,6 @@ def shown(args: argparse.Namespace) -> int:
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
-    import_rerun()
     if args.live is not None:
         show_live(args)
         return 0
@@ -102,14 +103,19 @@ def shown(args: argparse.Namespace) -> int:
             show_recording(recordings[0], args, scene)
             finish(scene)
         return 0
-    found = [
-        each
-        for path in args.what
-        for each in contents(path, (path.resolve().name if path.is_dir() else '') if many else '')
-    ]
-    with opened(args) as scene:
+
+    def read() -> list[Content]:
+        names = [path.resolve().name if many and path.is_dir() else '' for path in args.what]
+        pairs = zip(args.what, names, strict=True)
+        return [each for path, name in pairs for each in contents(path, name)]
+
+    with ThreadPoolExecutor(1) as reader:  # a large map takes as long to read as rerun to import
+        reading = reader.submit(read)
         from surfel_mapper.viz.show import show_contents
 
+        import_rerun()
+        found = reading.result()
+    with opened(args) as scene:
         about = show_contents(
             scene,
             found,

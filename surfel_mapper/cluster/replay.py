@@ -4,8 +4,8 @@
 Replay of several bags, or with several processes: one map of them all, in tiles.
 
 The map is a Parquet dataset, ``map/tile_i=*/tile_j=*/surfels.parquet``; picture and report show
-a sample of its surfels. All bags have to be in one fixed frame; those without poses are brought
-into that of the first (common_frame.py).
+tiles of many surfels by larger voxels. All bags have to be in one fixed frame; those without poses
+are brought into that of the first (common_frame.py).
 """
 
 from __future__ import annotations
@@ -256,7 +256,7 @@ def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResul
         f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
         f'{tiled.surfels} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
     )
-    draw_map(tiled.sample, picture, title, origin_m=summary['origin_m'])
-    write_report(page, title, summary, tiled.sample, picture=picture)
+    draw_map(tiled.drawn, picture, title, origin_m=summary['origin_m'])
+    write_report(page, title, summary, tiled.sample, picture=picture, drawn=tiled.drawn)
     write_json(figures, summary)
     return [tiled.directory, picture, page, figures]

@@ -28,7 +28,7 @@ import numpy as np
 
 from surfel_mapper.cluster.executors import Executor
 from surfel_mapper.cluster.shards import peak_bytes
-from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.errors import FileFormatError, MapError, MapLimitError
 from surfel_mapper.files.map_state import FILE, load_map, window_stamps_ns
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
@@ -38,12 +38,14 @@ from surfel_mapper.files.parquet_tiles import (
     read_part,
     split_map,
     Tile,
+    TILE_BITS,
     tile_part,
     tiles_in,
     write_shard,
     write_tile,
 )
 from surfel_mapper.files.trajectory import read_trajectory, trajectory_beside
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import concatenated, Surfels
 
 DATASET = 'map'
@@ -52,8 +54,8 @@ DATASET = 'map'
 FILES = ('map.parquet', 'map.npz')
 """Files of an exact map inside the output directory of a replay by one process."""
 
-SAMPLE = 100_000
-"""About this many surfels are returned for pictures."""
+DRAWN = 75_000
+"""Limit of the surfels returned for pictures; the view of a report takes 80,000."""
 
 _log = logging.getLogger(__name__)
 
@@ -77,7 +79,7 @@ class TileTask:
     min_points : int
         Points that a voxel needs to count as a surfel.
     share : float
-        Share of its surfels that is returned, for pictures; 1: all.
+        Share of its surfels that is returned, for pictures and charts; 1: all.
 
     """
 
@@ -89,7 +91,7 @@ class TileTask:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TileResult:
-    """Figures of a tile, and a sample of its surfels."""
+    """Figures of a tile, and surfels of it; see TiledMap."""
 
     voxel_size_m: float
     origin_m: tuple[float, ...]
@@ -98,6 +100,7 @@ class TileResult:
     surfels: int
     core_s: float
     sample: Surfels
+    drawn: Surfels
     peak_bytes: int
 
 
@@ -120,7 +123,9 @@ class TiledMap:
     core_s : float
         Processor time of merging, s, without the digest.
     sample : Surfels
-        Some of its surfels, for pictures.
+        Every n-th of its surfels, for histograms.
+    drawn : Surfels
+        For pictures: tiles with more surfels than their share by those of the exact coarser map.
     peak_bytes : int
         The most memory of a process that merged.
 
@@ -137,6 +142,7 @@ class TiledMap:
     nbytes: int
     core_s: float
     sample: Surfels
+    drawn: Surfels
     peak_bytes: int
 
     def summary(self) -> dict[str, Any]:
@@ -181,8 +187,21 @@ def merge_tile(task: TileTask) -> TileResult:
         surfels=len(surfels),
         core_s=time.process_time() - began_core,
         sample=surfels.select(rows),
+        drawn=drawn_tile(surfel_map, surfels, task.min_points, wanted),
         peak_bytes=peak_bytes(),
     )
+
+
+def drawn_tile(surfel_map: SurfelMap, surfels: Surfels, min_points: int, at_most: int) -> Surfels:
+    """Return the surfels of the finest level with at most ``at_most``, else of the coarsest."""
+    for level in range(1, TILE_BITS + 1):
+        if len(surfels) <= at_most:
+            break
+        try:
+            surfels = surfel_map.coarsen(level).surfels(min_points)
+        except MapLimitError:  # a parked sensor: too many points for larger voxels
+            break
+    return surfels
 
 
 def merge_maps(
@@ -244,7 +263,7 @@ def merge_parts(
     """Make every tile, take the digest, and give the dataset its name."""
     if not parts:
         raise MapError('no scan was mapped')
-    share = min(SAMPLE / sum(part.num_voxels for found in parts.values() for part in found), 1.0)
+    share = min(DRAWN / sum(part.num_voxels for found in parts.values() for part in found), 1.0)
     fresh = directory.resolve() / f'.{DATASET}-{secrets.token_hex(8)}.part'
     tasks = [
         TileTask(
@@ -271,6 +290,7 @@ def merge_parts(
         nbytes=sum(path.stat().st_size for path in tiles_in(directory / DATASET).values()),
         core_s=sum(tile.core_s for tile in tiles),
         sample=concatenated([tile.sample for tile in tiles]),
+        drawn=concatenated([tile.drawn for tile in tiles]),
         peak_bytes=max(tile.peak_bytes for tile in tiles),
     )
 

@@ -26,7 +26,7 @@ from surfel_mapper.errors import DependencyError, FileFormatError, MapError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.moments import pack_keys
+from surfel_mapper.mapping.moments import check_possible, digest_of, pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 KIND, VERSION = 'surfel_mapper surfels', 1
@@ -96,6 +96,49 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
         If pyarrow is not installed.
 
     """
+    moments, surfel_map, digest = _read(path, voxel_size_m)
+    insert(surfel_map, moments, path)
+    found = surfel_map.digest()
+    if found != digest:
+        raise FileFormatError(f'{path}: damaged: digest {found}, expected {digest}')
+    return surfel_map
+
+
+def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
+    """
+    Return the moments of the map in a Parquet file, and an empty map of its kind.
+
+    For viewers: read_map takes several times as long, to fill a table of voxels.
+
+    Raises
+    ------
+    FileFormatError
+        If the file cannot be read, is damaged, or of another kind or version.
+    DependencyError
+        If pyarrow is not installed.
+
+    """
+    moments, empty, digest = _read(path, None)
+    try:
+        check_possible(moments)
+    except MapError as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+    if (moments.key[1:] < moments.key[:-1]).any():
+        moments = moments.select(np.argsort(moments.key))
+    found = digest_of(
+        empty.voxel_size_m,
+        empty.level,
+        len(moments),
+        empty.columns,
+        lambda name: [getattr(moments, name)],
+    )
+    if found != digest:
+        raise FileFormatError(f'{path}: damaged: digest {found}, expected {digest}')
+    return moments, empty
+
+
+def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, SurfelMap, Any]:
+    """Return the moments in a file, an empty map of its kind, and the digest that it states."""
     arrow, parquet = import_pyarrow()
     try:
         with open(path, 'rb') as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
@@ -111,13 +154,7 @@ def read_map(path: str | Path, *, voxel_size_m: float | None = None) -> SurfelMa
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except (arrow.ArrowException, ValueError, LookupError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
-    fill(surfel_map, columns, path)
-    digest = surfel_map.digest()
-    if digest != attributes.get('digest'):
-        raise FileFormatError(
-            f'{path}: damaged: digest {digest}, expected {attributes.get("digest")}'
-        )
-    return surfel_map
+    return moments_of(surfel_map, columns, path), surfel_map, attributes.get('digest')
 
 
 def check_size(
@@ -255,6 +292,19 @@ def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
 
 def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
     """Insert the moments in the columns of a file into a map."""
+    insert(surfel_map, moments_of(surfel_map, columns, path), path)
+
+
+def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> None:
+    """Insert the moments of a file into a map."""
+    try:
+        surfel_map.insert(moments)
+    except MapError as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+
+
+def moments_of(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> ScanMoments:
+    """Return the moments in the columns of a file of a map."""
 
     def table(names: tuple[str, ...]) -> npt.NDArray[np.int64]:
         stacked = [columns[name] for name in names]
@@ -269,8 +319,8 @@ def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
             'view': table(VIEWS),
             'channels': table(channel_columns(surfel_map)),
         }
-        surfel_map.insert(checked_moments(parts, surfel_map, 'rows'))
-    except (MapError, ValueError, TypeError) as error:
+        return checked_moments(parts, surfel_map, 'rows')
+    except (ValueError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
 
 

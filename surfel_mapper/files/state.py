@@ -22,6 +22,7 @@ import math
 import os
 from pathlib import Path
 import re
+import struct
 from typing import Any, BinaryIO
 import zipfile
 import zlib
@@ -49,6 +50,9 @@ MEMBER_BYTES = 1000
 
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
+
+LOCAL_HEADER, LOCAL_MAGIC = struct.Struct('<4s22x2H'), b'PK\3\4'
+"""Header of a member of a zip archive: its mark, the lengths of its name and of further fields."""
 
 ENCRYPTED = 1
 """Bit of a zip member's flags."""
@@ -253,10 +257,34 @@ def array_header(content: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[A
 
 def read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[Any]:
     """Return one array whose header has been checked."""
-    content = read_bytes(archive, info)
+    is_stored = info.compress_type == zipfile.ZIP_STORED
+    content = (read_stored if is_stored else read_bytes)(archive, info)
     shape, dtype, start = array_header(bytes(content[:NPY_HEADER_BYTES]), info.filename)
     array: npt.NDArray[Any] = np.frombuffer(content, dtype, offset=start).reshape(shape)
     return array
+
+
+def read_stored(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> memoryview:
+    """
+    Return a member that is not compressed, in one read.
+
+    zipfile copies it twice and adds it up for a second check, beside the hash of the content.
+    """
+    file = archive.fp
+    assert file is not None, 'the archive is open'
+    file.seek(info.header_offset)
+    header = file.read(LOCAL_HEADER.size)
+    if len(header) < LOCAL_HEADER.size:
+        raise EOFError(f'{info.filename}: its header is missing')
+    magic, name_bytes, extra_bytes = LOCAL_HEADER.unpack(header)
+    if magic != LOCAL_MAGIC:
+        raise ValueError(f'{info.filename}: no header of a member where the directory states it')
+    file.seek(name_bytes + extra_bytes, os.SEEK_CUR)
+    content = np.empty(info.file_size, np.uint8).data
+    found = file.readinto(content)  # type: ignore[attr-defined]  # of a file in binary mode
+    if found < len(content):
+        raise EOFError(f'{info.filename}: {len(content) - found} bytes missing')
+    return content
 
 
 def read_bytes(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> bytearray:

@@ -103,3 +103,8 @@ class Ages:
         within = np.empty(len(keys), np.int64)
         num = keys_within(keys, np.uint64(wider), within)
         return ThinnedKeys(keys, wider, within[:num].copy())
+
+
+def ages_s(last_seen_ns: npt.NDArray[np.int64], newest_ns: int) -> npt.NDArray[np.float64]:
+    """Return the ages of surfels at a stamp, s; nan for those that no scan has seen."""
+    return np.where(last_seen_ns < 0, np.nan, (newest_ns - last_seen_ns) / 1e9)

@@ -26,8 +26,8 @@ import numpy.typing as npt
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
-from surfel_mapper.mapping.kernels.voxels import first_impossible
 from surfel_mapper.mapping.moments import (
+    check_possible,
     digest_of,
     pack_keys,
     ScanMoments,
@@ -122,7 +122,7 @@ class MomentMap:
         """
         self._check_lattice(moments)
         if not moments.is_reduced:
-            self._check_possible(moments)
+            check_possible(moments)
         self._check_counts(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)
@@ -322,17 +322,6 @@ class MomentMap:
             raise MapError(
                 f'moments with the channels {moments.channel_names}; '
                 f'this map has {self._channel_names}'
-            )
-
-    def _check_possible(self, moments: ScanMoments) -> None:
-        """Raise MapError if no points of a voxel can have these moments."""
-        key, count, total, product, view = moments.arrays
-        row = first_impossible(key, count, total, product, view, moments.view_is_sum, self.level)
-        if row >= 0:
-            raise MapError(
-                f'row {row} of the moments: key {moments.key[row]}, {moments.count[row]} points, '
-                f'sums {moments.total[row].tolist()}, products {moments.product[row].tolist()}, '
-                f'views {moments.view[row].tolist()}; expected those of points in a voxel'
             )
 
     def _check_counts(self, moments: ScanMoments) -> None:

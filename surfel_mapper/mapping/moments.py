@@ -10,7 +10,7 @@ the length of the window nor the size of the map.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 import hashlib
 import struct
@@ -19,9 +19,20 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import MapLimitError
-from surfel_mapper.kernels.layout import BITS, INDEX_BITS, INDEX_MASK, INDEX_OFFSET
-from surfel_mapper.mapping.kernels.voxels import coarsen
+from surfel_mapper.errors import MapError, MapLimitError
+from surfel_mapper.kernels.layout import (
+    BITS,
+    COUNT,
+    INDEX_BITS,
+    INDEX_MASK,
+    INDEX_OFFSET,
+    KEY,
+    PRODUCT,
+    ROW,
+    SUM,
+    VIEW,
+)
+from surfel_mapper.mapping.kernels import voxels as kernels
 
 HASHED_ARRAYS = ('key', 'count', 'total', 'product', 'view')
 """The arrays of ScanMoments in the order in which a digest hashes them."""
@@ -194,6 +205,42 @@ def shifted_moments(moments: ScanMoments, voxels: npt.NDArray[np.int64]) -> Scan
     return replace(moments, key=pack_keys(index))
 
 
+def joined_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
+    """
+    Return the moments of all parts of a map, which share no voxel.
+
+    Raises
+    ------
+    MapError
+        If a voxel occurs twice.
+
+    """
+    names = (*HASHED_ARRAYS, 'channels')
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names
+    }
+    key = np.sort(arrays['key'])
+    twice = np.flatnonzero(key[1:] == key[:-1])
+    if len(twice):
+        index = unpack_keys(key[twice[:1]])[0].tolist()
+        raise MapError(f'{len(twice)} voxels occur twice, expected once each: {index}, ...')
+    return replace(parts[0], **arrays)
+
+
+def check_possible(moments: ScanMoments) -> None:
+    """Raise MapError if no points of a voxel can have these moments."""
+    key, count, total, product, view = moments.arrays
+    row = kernels.first_impossible(
+        key, count, total, product, view, moments.view_is_sum, moments.level
+    )
+    if row >= 0:
+        raise MapError(
+            f'row {row} of the moments: key {moments.key[row]}, {moments.count[row]} points, '
+            f'sums {moments.total[row].tolist()}, products {moments.product[row].tolist()}, '
+            f'views {moments.view[row].tolist()}; expected those of points in a voxel'
+        )
+
+
 def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
     """
     Return the moments of voxels 2^level times larger, exactly.
@@ -206,24 +253,61 @@ def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
         0 or more.
 
     """
-    num_fine = len(moments)
-    table = np.full(1 << max(2 * num_fine - 1, 1).bit_length(), -1, np.int32)
-    keys, rows = np.empty(num_fine, np.int64), np.empty(num_fine, np.int64)
-    sums = np.zeros((num_fine, 13), np.int64)
-    num = coarsen(moments.arrays, moments.level, level, table, keys, sums, rows)
-    channels = np.zeros((num, moments.channels.shape[1]), np.int64)
-    np.add.at(channels, rows, moments.channels)
+    slab, channels = coarse_slab(moments, np.arange(len(moments)), level)
     return replace(
         moments,
         voxel_size_m=moments.voxel_size_m * 2**level,
         level=moments.level + level,
-        key=keys[:num],
-        count=sums[:num, 0].copy(),
-        total=sums[:num, 1:4].copy(),
-        product=sums[:num, 4:10].copy(),
-        view=sums[:num, 10:13].copy(),
+        key=slab[:, KEY].copy(),
+        count=slab[:, COUNT].copy(),
+        total=slab[:, SUM : SUM + 3].copy(),
+        product=slab[:, PRODUCT : PRODUCT + 6].copy(),
+        view=slab[:, VIEW : VIEW + 3].copy(),
         channels=channels,
     )
+
+
+def coarse_keys(
+    key: npt.NDArray[np.int64], level: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int32]]:
+    """Return the keys (C,) of the voxels 2^level times larger, and that of each voxel, (K,)."""
+    table = np.full(1 << max(2 * len(key) - 1, 1).bit_length(), -1, np.int32)
+    keys, rows = np.empty_like(key), np.empty(len(key), np.int32)
+    num = kernels.coarse_rows(key, level, table, keys, rows)
+    return keys[:num], rows
+
+
+def coarse_slab(
+    moments: ScanMoments, chosen: npt.NDArray[np.int64], level: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """
+    Return the exact sums of some voxels in voxels 2^level times larger.
+
+    Parameters
+    ----------
+    moments : ScanMoments
+        Moments of a map, with summed views.
+    chosen : (K,) int64
+        The voxels, of those of the moments.
+    level : int
+        0 or more.
+
+    Returns
+    -------
+    (C, 16) int64
+        Rows in the layout of kernels/layout.py, in the order of first appearance.
+    (C, number of channels) int64
+        Sums of the channels.
+
+    """
+    keys, rows = coarse_keys(moments.key[chosen], level)
+    slab = np.zeros((len(keys), ROW), np.int64)
+    slab[:, KEY] = keys
+    kernels.sum_coarse(moments.arrays, chosen, rows, moments.level, level, slab)
+    channels = np.zeros((len(keys), moments.channels.shape[1]), np.int64)
+    if channels.size:
+        np.add.at(channels, rows, moments.channels[chosen])
+    return slab, channels
 
 
 def digest_of(

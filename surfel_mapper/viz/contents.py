@@ -18,14 +18,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files import map_state, model_files, parquet, ply
+from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
 from surfel_mapper.files.trajectory import read_trajectory, Trajectory
-from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
-from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.moments import joined_moments, ScanMoments, unpack_keys
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import DrawnDiscs, RGB
@@ -63,7 +62,6 @@ class ExactMap:
     name : str
         Path in the viewer, below ``map``.
     moments : ScanMoments
-    columns : tuple of str
     origin_m : (3,) float64, m
     scans : list of WindowedScan
         Those of its window, for ages.
@@ -72,15 +70,8 @@ class ExactMap:
 
     name: str
     moments: ScanMoments
-    columns: tuple[str, ...]
     origin_m: Array
     scans: list[WindowedScan] = field(default_factory=list)
-
-    @classmethod
-    def of(cls, name: str, surfel_map: SurfelMap, scans: list[WindowedScan]) -> ExactMap:
-        """Return a map to be shown."""
-        moments, origin_m = surfel_map.moments(), surfel_map.origin_m
-        return cls(name, moments, surfel_map.columns, origin_m, scans)
 
     def middle(self) -> Array:
         """Return the median of the voxels in the fixed frame, (3,) m."""
@@ -160,10 +151,13 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
     name = name or path.stem
     if path.suffix == '.npz':
         moments, empty, scans = map_state.load_moments(path)
-        yield ExactMap(name, moments, empty.columns, empty.origin_m, scans)
+        yield ExactMap(name, moments, empty.origin_m, scans)
     elif path.suffix == '.parquet':
-        yield ExactMap.of(name, parquet.read_map(path), [])
+        moments, empty = parquet.read_moments(path)
+        yield ExactMap(name, moments, empty.origin_m)
     elif path.suffix == '.obj':
+        from surfel_mapper.files import model_files  # 0.15 s, with all of the models
+
         yield ShownMesh(name, model_files.read_obj(path))
     elif path.suffix in ASSETS:
         yield Asset(name, path)
@@ -199,23 +193,20 @@ def in_directory(path: Path, name: str) -> Iterator[Content]:
 
 def tiles(directory: Path, name: str) -> ExactMap:
     """Return the map in a dataset of tiles."""
-    found = tiles_in(directory)
-    whole: SurfelMap | None = None
-    parts = []
-    for place in found.values():
-        surfel_map = parquet.read_map(place)
-        if whole is None:
-            whole = SurfelMap(
-                surfel_map.voxel_size_m,
-                columns=surfel_map.columns,
-                level=surfel_map.level,
-                origin_m=surfel_map.origin_m,
-            )
-        parts.append(surfel_map)
-    assert whole is not None, 'a dataset has tiles'
-    for part in parts:
-        whole.merge(part)
-    return ExactMap.of(name, whole, [])
+    kinds, parts = set(), []
+    for path in tiles_in(directory).values():
+        moments, empty = parquet.read_moments(path)
+        kinds.add((empty.voxel_size_m, empty.level, empty.columns, *empty.origin_m.tolist()))
+        parts.append(moments)
+    if len(kinds) > 1:
+        raise FileFormatError(
+            f'{directory}: tiles of several maps: voxel size, level, columns and origin '
+            f'{" and ".join(map(str, sorted(kinds)))}'
+        )
+    try:
+        return ExactMap(name, joined_moments(parts), empty.origin_m)
+    except MapError as error:
+        raise FileFormatError(f'{directory}: {error}') from error
 
 
 def cloud(path: Path, name: str) -> Cloud:

@@ -12,15 +12,16 @@ discs together stay within a limit.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels import layout
-from surfel_mapper.mapping.moments import coarse_moments, ScanMoments, unpack_keys
+from surfel_mapper.mapping.channels import means
+from surfel_mapper.mapping.moments import coarse_keys, coarse_slab, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import concatenated, Surfels
+from surfel_mapper.mapping.surfels import concatenated, derive, Surfels
 
 Array = npt.NDArray[np.float64]
 
@@ -37,14 +38,6 @@ STEPS = 60
 """Distances tried for the begin of the first coarser level, between a tile and the whole map."""
 
 
-class Level(NamedTuple):
-    """Moments of a level, and rows of its surfels by tile: those of tile t begin at starts[t]."""
-
-    moments: ScanMoments
-    rows: npt.NDArray[np.int64]
-    starts: npt.NDArray[np.int64]
-
-
 class DetailedMap:
     """
     A map in tiles that can be drawn at several levels.
@@ -53,9 +46,8 @@ class DetailedMap:
     ----------
     moments : ScanMoments
         Those of a map, as ``SurfelMap.moments`` returns them. A map of 5 million surfels is drawn
-        without its hash table, which takes longer to fill than all else.
-    columns : tuple of str
-        Columns of the map.
+        without its hash table, which takes longer to fill than all else, and only the tiles that
+        are drawn are summed, each at its level.
     min_points : int
         Voxels with fewer points are no surfels.
 
@@ -70,36 +62,39 @@ class DetailedMap:
 
     """
 
-    def __init__(self, moments: ScanMoments, columns: tuple[str, ...], min_points: int) -> None:
-        found = [moments]
-        while len(found) <= LEVELS and found[-1].level < MOST_LEVEL and len(found[-1]):
-            found.append(coarse_moments(found[-1], 1))
-        self._columns = columns
-        rows = [np.flatnonzero(each.count >= min_points) for each in found]
-        places = [
-            unpack_keys(each.key[row])[:, :2].astype(np.int64)
-            for each, row in zip(found, rows, strict=True)
-        ]
-        self.bits, self.tiles = tiles_of(places[-1], len(found) - 1)
+    def __init__(self, moments: ScanMoments, min_points: int) -> None:
+        self._moments, self._min_points = moments, min_points
+        keys, counts = [moments.key], [moments.count]
+        parents: list[npt.NDArray[np.int32]] = []
+        while len(keys) <= LEVELS and moments.level + len(parents) < MOST_LEVEL and len(keys[-1]):
+            key, parent = coarse_keys(keys[-1], 1)
+            # float64 is exact below 2^53
+            count = np.bincount(parent, counts[-1], len(key)).astype(np.int64)
+            if count.max() > layout.MAX_MAP_COUNT >> 2 * (moments.level + len(keys)):
+                break  # sums of its moments may overflow
+            keys.append(key)
+            counts.append(count)
+            parents.append(parent)
+        places = unpack_keys(keys[-1])[:, :2].astype(np.int64)
+        self.bits, self.tiles = tiles_of(places, len(parents))
         self.edge_m = moments.voxel_size_m * 2.0**self.bits
-        self.levels = [
-            self._sorted(each, row, place >> (self.bits - level))
-            for level, (each, row, place) in enumerate(zip(found, rows, places, strict=True))
-        ]
-        self.counts = np.array([np.diff(level.starts) for level in self.levels])
+        place = places >> (self.bits - len(parents))
+        tile = np.searchsorted(packed(self.tiles), packed(place)).astype(np.uint16)
+        tiles = [tile]  # of the voxels of each level
+        for parent in reversed(parents):
+            tiles.insert(0, tiles[0][parent])
+        self.counts = np.array(
+            [
+                np.bincount(tile[count >= min_points], minlength=len(self.tiles))
+                for tile, count in zip(tiles, counts, strict=True)
+            ]
+        )
+        self._rows = np.argsort(tiles[0], kind='stable')
+        self._ends = np.cumsum(np.bincount(tiles[0], minlength=len(self.tiles)))
 
     def __len__(self) -> int:
         """Return the number of tiles."""
         return len(self.tiles)
-
-    def _sorted(
-        self, moments: ScanMoments, rows: npt.NDArray[np.int64], tile: npt.NDArray[np.int64]
-    ) -> Level:
-        # the coarser voxel of a surfel has as many points, so its tile is among the tiles
-        number = np.searchsorted(packed(self.tiles), packed(tile)).astype(np.uint16)
-        order = np.argsort(number, kind='stable')
-        starts = np.searchsorted(number[order], np.arange(len(self.tiles) + 1))
-        return Level(moments, rows[order], starts)
 
     def choose(self, place: npt.ArrayLike, at_most: int) -> npt.NDArray[np.int64]:
         """
@@ -114,7 +109,7 @@ class DetailedMap:
 
         """
         distance = self._distances(np.asarray(place, np.float64))
-        last = len(self.levels) - 1
+        last = len(self.counts) - 1
         tiles = np.arange(len(self.tiles))
         if self.counts[0].sum() <= at_most:
             return np.zeros(len(tiles), np.int64)
@@ -130,11 +125,14 @@ class DetailedMap:
 
     def surfels(self, tile: int, level: int) -> Surfels:
         """Return the surfels of a tile at a level."""
-        moments, rows, starts = self.levels[level]
-        part = moments.select(rows[starts[tile] : starts[tile + 1]])
-        surfel_map = SurfelMap(part.voxel_size_m, columns=self._columns, level=part.level)
-        surfel_map.insert(part)
-        return surfel_map.surfels()
+        moments = self._moments
+        rows = self._rows[self._ends[tile - 1] if tile else 0 : self._ends[tile]]
+        slab, sums = coarse_slab(moments, rows, level)
+        chosen = np.flatnonzero(slab[:, layout.COUNT] >= self._min_points).astype(np.int32)
+        bits = layout.BITS + moments.level + level
+        surfels = derive(slab, chosen, moments.voxel_size_m * 2**level, bits)
+        channels = means(sums[chosen], surfels.num_points, moments.channel_names)
+        return replace(surfels, channels=channels)
 
     def _distances(self, place: Array) -> Array:
         """Return the horizontal distance of each tile from a place, (T,) m; 0 inside."""
@@ -164,7 +162,7 @@ def drawn_surfels(
     surfels = surfel_map.surfels(min_points)
     if len(surfels) <= at_most:
         return surfels
-    found = DetailedMap(surfel_map.moments(), surfel_map.columns, min_points)
+    found = DetailedMap(surfel_map.moments(), min_points)
     level = found.choose(place, at_most)
     return concatenated([found.surfels(tile, int(level[tile])) for tile in range(len(found))])
 

@@ -15,14 +15,13 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.ages import Ages, ages_s
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Asset, Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
-from surfel_mapper.viz.viewer import ages_s
 
 Array = npt.NDArray[np.float64]
 
@@ -115,7 +114,7 @@ def detailed(
 ) -> Tiles:
     """Return the discs of a map by tile, fine near a place of the shared frame."""
     shift = shown.origin_m - origin_m
-    whole = DetailedMap(shown.moments, shown.columns, min_points)
+    whole = DetailedMap(shown.moments, min_points)
     level = whole.choose(place - shift, most_discs)
     found = {}
     for tile, (i, j) in enumerate(whole.tiles):

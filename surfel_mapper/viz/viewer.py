@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing, RingsDrawing
-from surfel_mapper.mapping.ages import Ages
+from surfel_mapper.mapping.ages import Ages, ages_s
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.messages.model_messages import quaternions
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
@@ -200,11 +200,6 @@ class Viewer:
             newest_ns = max((scan.stamp_ns for scan in scans), default=0)
             values['age'] = ages_s(stamps, newest_ns)
         return DrawnDiscs.of(surfels, values)
-
-
-def ages_s(last_seen_ns: npt.NDArray[np.int64], newest_ns: int) -> npt.NDArray[np.float64]:
-    """Return the ages of surfels at a stamp, s; nan for those that no scan has seen."""
-    return np.where(last_seen_ns < 0, np.nan, (newest_ns - last_seen_ns) / 1e9)
 
 
 def picked(points: npt.NDArray[Any]) -> npt.NDArray[Any]:

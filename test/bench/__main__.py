@@ -25,6 +25,7 @@ BENCHES = (
     'threads',
     'scaling',
     'start',
+    'view',
     'live',
     'offline',
     'compare',

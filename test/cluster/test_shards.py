@@ -9,6 +9,7 @@ import math
 import numpy as np
 import pytest
 
+from surfel_mapper.cluster import tiles
 from surfel_mapper.cluster.executors import never, SerialExecutor
 from surfel_mapper.cluster.map_reduce import map_bags
 from surfel_mapper.cluster.shards import (
@@ -252,7 +253,24 @@ def test_progress_adds_up_to_the_recording_and_the_tiles(tmp_path):
     assert sum(s for kind, s in told if kind == 'map') == pytest.approx(RECORDED_S, abs=0.01)
     assert sum(n for kind, n in told if kind == 'merge') == mapped.map.tiles
     assert len(mapped.positions) >= 60
-    assert len(mapped.map.sample) == mapped.map.surfels
+    assert len(mapped.map.sample) == len(mapped.map.drawn) == mapped.map.surfels
+
+
+def test_pictures_show_tiles_of_many_surfels_by_their_coarser_map(tmp_path, monkeypatch):
+    bag, config = written(tmp_path, 'plain')
+    monkeypatch.setattr(tiles, 'DRAWN', 400)
+
+    mapped = map_bags(shards_of(bag, config, 1.0), SerialExecutor(), tmp_path / 'out')
+
+    whole = in_one_go(bag, config).map
+    coarser = [
+        {tuple(row) for row in whole.coarsen(level).surfels(config.map.min_points).position}
+        for level in range(7)
+    ]
+    drawn = {tuple(row) for row in mapped.map.drawn.position}
+    assert 0 < len(drawn) <= 400 + mapped.map.tiles < mapped.map.surfels
+    assert not drawn & coarser[0]
+    assert drawn <= set().union(*coarser)
 
 
 def test_a_shard_is_the_same_file_each_time_it_is_mapped(tmp_path):

@@ -26,7 +26,7 @@ def hills():
 
 
 def detailed(surfel_map):
-    return DetailedMap(surfel_map.moments(), surfel_map.columns, MIN_POINTS)
+    return DetailedMap(surfel_map.moments(), MIN_POINTS)
 
 
 def rows(surfels):

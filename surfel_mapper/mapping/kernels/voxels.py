@@ -282,23 +282,17 @@ def holds_exactly(moments, view_weight, rows, row, place):
 
 
 @kernel()
-def coarsen(moments, fine_level, level, table, keys, sums, rows):
+def coarse_rows(fine_keys, level, table, keys, rows):
     """
-    Sum moments into voxels 2^level times larger; return the number of coarse voxels.
+    Find the voxels 2^level times larger; return their number.
 
-    moments     keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
-    fine_level  level of the given moments
-    table       (B,) int32, B a power of two and at least 2 K, all -1
-    keys        (K,) int64, out: voxel keys in the order of first appearance
-    sums        (K, 13) int64, zeros, out: count, total, product, view
-    rows        (K,) int64, out: row of the coarse voxel of each fine voxel
+    fine_keys  (K,) int64
+    table      (B,) int32, B a power of two and at least 2 K, all -1
+    keys       (K,) int64, out: keys of the coarse voxels in the order of first appearance
+    rows       (K,) int32, out: row of the coarse voxel of each fine voxel
     """
-    fine_keys, count, total, product, view = moments
     shift = hash_shift(len(table))
     mask = len(table) - 1
-    fine = np.int64(1) << (BITS + fine_level)
-    middle = fine // 2 - (fine << level) // 2
-    below = (np.int64(1) << level) - 1
     num = 0
     for i in range(len(fine_keys)):
         key = fine_keys[i]
@@ -318,25 +312,48 @@ def coarsen(moments, fine_level, level, table, keys, sums, rows):
             table[place] = row
             keys[row] = coarse
         rows[i] = row
+    return num
+
+
+@kernel()
+def sum_coarse(moments, chosen, rows, fine_level, level, slab):
+    """
+    Sum the moments of voxels in rows of voxels 2^level times larger.
+
+    moments     keys (N,) int64, count (N,), total (N, 3), product (N, 6), view (N, 3)
+    chosen      (K,) int64, the voxels to sum, of the N
+    rows        (K,) int32, row of the coarse voxel of each, as coarse_rows finds it
+    fine_level  level of the given moments
+    slab        (C, 16) int64, zeros, out; the keys are not written
+    """
+    fine_keys, count, total, product, view = moments
+    fine = np.int64(1) << (BITS + fine_level)
+    middle = fine // 2 - (fine << level) // 2
+    below = (np.int64(1) << level) - 1
+    for k in range(len(chosen)):
+        i, row = chosen[k], np.int64(rows[k])
+        key = fine_keys[i]
+        x = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+        y = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+        z = (key & INDEX_MASK) - INDEX_OFFSET
         # d: from the coarse centre to the fine centre
         n = np.int64(count[i])
         dx = (x & below) * fine + middle
         dy = (y & below) * fine + middle
         dz = (z & below) * fine + middle
         sx, sy, sz = np.int64(total[i, 0]), np.int64(total[i, 1]), np.int64(total[i, 2])
-        sums[row, 0] += n
-        sums[row, 1] += sx + n * dx
-        sums[row, 2] += sy + n * dy
-        sums[row, 3] += sz + n * dz
-        sums[row, 4] += product[i, 0] + dx * sx + dx * sx + n * dx * dx
-        sums[row, 5] += product[i, 1] + dx * sy + dy * sx + n * dx * dy
-        sums[row, 6] += product[i, 2] + dx * sz + dz * sx + n * dx * dz
-        sums[row, 7] += product[i, 3] + dy * sy + dy * sy + n * dy * dy
-        sums[row, 8] += product[i, 4] + dy * sz + dz * sy + n * dy * dz
-        sums[row, 9] += product[i, 5] + dz * sz + dz * sz + n * dz * dz
+        slab[row, COUNT] += n
+        slab[row, SUM] += sx + n * dx
+        slab[row, SUM + 1] += sy + n * dy
+        slab[row, SUM + 2] += sz + n * dz
+        slab[row, PRODUCT] += product[i, 0] + dx * sx + dx * sx + n * dx * dx
+        slab[row, PRODUCT + 1] += product[i, 1] + dx * sy + dy * sx + n * dx * dy
+        slab[row, PRODUCT + 2] += product[i, 2] + dx * sz + dz * sx + n * dx * dz
+        slab[row, PRODUCT + 3] += product[i, 3] + dy * sy + dy * sy + n * dy * dy
+        slab[row, PRODUCT + 4] += product[i, 4] + dy * sz + dz * sy + n * dy * dz
+        slab[row, PRODUCT + 5] += product[i, 5] + dz * sz + dz * sz + n * dz * dz
         for axis in range(3):
-            sums[row, 10 + axis] += np.int64(view[i, axis])
-    return num
+            slab[row, VIEW + axis] += np.int64(view[i, axis])
 
 
 @kernel()
