@@ -33,7 +33,7 @@ LINT_STAMP := $(LINT)/.ready
 # ouster-sdk pins a rosbags that is too old for bags/: pip would complain at each installation.
 OUSTER := $(CURDIR)/$(VENV)/ouster
 
-.PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist settings clean
+.PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist notebooks settings clean
 
 demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
@@ -102,6 +102,9 @@ dist: $(DOCS_STAMP)  ## build wheel and sdist into dist/; run tests of the sdist
 	"$$check/venv/bin/python" -m pip install -q --disable-pip-version-check dist/*.whl && \
 	cd "$$check" && venv/bin/surfel-mapper simulate street --output street --scans 3 --columns 256 && \
 	venv/bin/surfel-mapper replay street --output mapped
+
+notebooks: $(STAMP)  ## write the notebooks of the tutorials from their pages, and run them
+	$(BIN)/python -m test.docs.notebooks
 
 settings: $(STAMP)  ## write default.yaml and the table of docs/settings.md from config/
 	$(BIN)/python -m test.settings

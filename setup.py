@@ -75,6 +75,16 @@ VIEWER = [
     'rerun-sdk>=0.27',  # view, replay --view and --rrd; 0.27 is the first that places the eye
 ]
 
+GLTF = [
+    'trimesh>=4.4',  # view --glb; MIT, Python alone, and numpy
+]
+
+NOTEBOOKS = [
+    'nbformat>=5.7',  # writes the notebooks of the tutorials
+    'nbclient>=0.8',  # runs them
+    'ipykernel>=6.20',  # the Python that they run in
+]
+
 RUNNER = [
     'pytest>=7.4,<9',  # 9 drops what colcon test relies on
     'pytest-timeout>=2.2',  # a test that hangs names itself
@@ -90,6 +100,9 @@ TEST = [
     *LOOPS,
     *ALIGN,
     *VIEWER,
+    *GLTF,
+    *NOTEBOOKS,
+    'evo>=1.28',  # an independent reader of trajectories, and judge of their errors
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
     'plyfile>=1.0.1',  # an independent reader of what we write
@@ -155,6 +168,8 @@ setup(
         'align': ALIGN,
         'loops': LOOPS,
         'viewer': VIEWER,
+        'gltf': GLTF,
+        'notebooks': NOTEBOOKS,
         'ros': ROS,
         'test': TEST,
         'lint': LINT,

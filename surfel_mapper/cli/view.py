@@ -21,6 +21,7 @@ from surfel_mapper.cli._progress import progress
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
+    from surfel_mapper.viz.gltf import GltfScene
     from surfel_mapper.viz.scene import Scene
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories and bags.'
@@ -72,6 +73,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument('--browser', action='store_true', help='serve a page until Ctrl-C')
     where.add_argument('--rrd', type=Path, metavar='FILE', help='write a file for rerun instead')
+    where.add_argument(
+        '--glb', type=Path, metavar='FILE', help='write glTF instead, for Blender and web pages'
+    )
     add('--port', type=positive_int, default=0, metavar='N', help='of the page (a free one)')
 
 
@@ -91,12 +95,15 @@ def shown(args: argparse.Namespace) -> int:
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
     if args.live is not None:
+        if args.glb is not None:
+            raise UsageError('--glb writes what files hold, not a live node')
         show_live(args)
         return 0
     many = len(args.what) > 1
     recordings = [path for path in args.what if path.exists() and not is_shown(path)]
-    if recordings and many:
-        raise UsageError(f'{recordings[0]}: a recording is shown alone')
+    if recordings and (many or args.glb is not None):
+        reason = 'a recording is shown alone' if many else 'map it by replay first for --glb'
+        raise UsageError(f'{recordings[0]}: {reason}')
     if recordings:
         with opened(args) as scene:
             announce(scene)
@@ -113,9 +120,11 @@ def shown(args: argparse.Namespace) -> int:
         reading = reader.submit(read)
         from surfel_mapper.viz.show import show_contents
 
-        import_rerun()
+        if args.glb is None:
+            import_rerun()
         found = reading.result()
-    with opened(args) as scene:
+
+    def show_all(scene: Scene | GltfScene) -> None:
         about = show_contents(
             scene,
             found,
@@ -126,6 +135,14 @@ def shown(args: argparse.Namespace) -> int:
         )
         for name, sentence in about.items():
             print(f'{name}: {sentence}')
+
+    if args.glb is not None:
+        from surfel_mapper.viz.gltf import GltfScene
+
+        show_all(GltfScene(args.glb))
+        return 0
+    with opened(args) as scene:
+        show_all(scene)
         announce(scene)
         finish(scene)
     return 0

@@ -21,6 +21,7 @@ from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import Asset, Cloud, Content, ExactMap, ShownMesh, Way
 from surfel_mapper.viz.detail import DetailedMap
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
+from surfel_mapper.viz.gltf import GltfScene
 from surfel_mapper.viz.scene import ORANGE, RED, Scene
 
 Array = npt.NDArray[np.float64]
@@ -36,7 +37,7 @@ ROUND_M = 1000.0
 
 
 def show_contents(
-    scene: Scene,
+    scene: Scene | GltfScene,
     contents: Sequence[Content],
     *,
     colouring: str = 'normal',
@@ -49,7 +50,7 @@ def show_contents(
 
     Parameters
     ----------
-    scene : Scene
+    scene : Scene or GltfScene
         Where they are shown.
     contents : sequence of Content
         As ``contents`` of contents.py yields them.
@@ -140,7 +141,7 @@ def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
     return DrawnDiscs.of(surfels, {'age': ages_s(seen_ns, newest_ns)})
 
 
-def show_cloud(scene: Scene, cloud: Cloud) -> str:
+def show_cloud(scene: Scene | GltfScene, cloud: Cloud) -> str:
     """Show surfels of a file as discs, or points."""
     path = f'map/{cloud.name}'
     if cloud.discs is None:
@@ -150,7 +151,7 @@ def show_cloud(scene: Scene, cloud: Cloud) -> str:
     return f'{len(cloud.discs):,} surfels, without their moments: at one level of detail'
 
 
-def show_way(scene: Scene, way: Way, origin_m: Array) -> str:
+def show_way(scene: Scene | GltfScene, way: Way, origin_m: Array) -> str:
     """Show a trajectory as a line, and as a sensor that moves if it has stamps."""
     poses = way.trajectory
     xyz = poses.xyz - origin_m

@@ -56,6 +56,16 @@ def steps(block):
         yield command, [line.strip() for line in shown]
 
 
+def shell_path(folder):
+    """Return a PATH on which surfel-mapper and python are ours, by scripts in a folder."""
+    tools = folder / 'tools'
+    tools.mkdir()
+    for name, arguments in (('python', ''), ('surfel-mapper', ' -m surfel_mapper.cli.main')):
+        (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}"{arguments} "$@"\n')
+        (tools / name).chmod(0o755)
+    return f'{tools}:{os.environ["PATH"]}'
+
+
 @pytest.fixture
 def shell(tmp_path, monkeypatch, capsys):
     """
@@ -63,14 +73,9 @@ def shell(tmp_path, monkeypatch, capsys):
 
     A verb alone runs in this process, which has its modules and kernels loaded.
     """
-    tools = tmp_path / 'tools'
-    tools.mkdir()
-    for name, arguments in (('python', ''), ('surfel-mapper', ' -m surfel_mapper.cli.main')):
-        (tools / name).write_text(f'#!/bin/sh\nexec "{sys.executable}"{arguments} "$@"\n')
-        (tools / name).chmod(0o755)
+    path = shell_path(tmp_path)
     folder = tmp_path / 'folder'
     folder.mkdir()
-    path = f'{tools}:{os.environ["PATH"]}'
 
     def run(command):
         verb, *arguments = shlex.split(command)

@@ -22,6 +22,7 @@ from surfel_mapper.evaluation.trajectory_errors import (
     drift,
     relative_errors,
 )
+from surfel_mapper.files.trajectory import Trajectory
 from surfel_mapper.geometry import pose_matrix, se3_exp
 
 EVO_APE = {
@@ -72,6 +73,37 @@ def test_relative_errors_are_those_of_evo(name, step):
     found = relative_errors(*wandering(), step=step).summary()[name]
 
     assert list(found.values()) == pytest.approx(EVO_RPE[step][name], rel=1e-7)
+
+
+def test_evo_reads_our_files_and_finds_the_same_errors(tmp_path):
+    metrics = pytest.importorskip('evo.core.metrics', reason='evo is not installed')
+    from evo.core import sync
+    from evo.tools import file_interface
+
+    estimated, true = wandering()
+    stamp_ns = 1_700_000_000_000_000_000 + 100_000_000 * np.arange(len(true))
+    trajectories = []
+    for name, poses in (('true', true), ('estimated', estimated)):
+        Trajectory.from_matrices(poses, stamp_ns).save(tmp_path / f'{name}.tum')
+        read = file_interface.read_tum_trajectory_file(str(tmp_path / f'{name}.tum'))
+        np.testing.assert_allclose(read.poses_se3, poses, atol=1e-8)
+        np.testing.assert_allclose(read.timestamps, stamp_ns / 1e9, atol=1e-6)
+        trajectories.append(read)
+    reference, estimate = sync.associate_trajectories(*trajectories)
+    assert len(reference.timestamps) == len(true)
+
+    estimate.align(reference)
+    for kind, relation in (
+        ('translation_m', metrics.PoseRelation.translation_part),
+        ('rotation_deg', metrics.PoseRelation.rotation_angle_deg),
+    ):
+        ape = metrics.APE(relation)
+        ape.process_data((reference, estimate))
+        ours = absolute_errors(estimated, true).summary()[kind]
+        for name, value in ours.items():
+            assert value == pytest.approx(
+                ape.get_statistic(metrics.StatisticsType[name]), rel=1e-5
+            )
 
 
 def test_a_trajectory_that_is_only_moved_has_no_error_but_where_it_is_not_aligned():

@@ -177,6 +177,32 @@ def test_the_picture_of_a_street_has_road_and_walls_in_colours_of_their_own(tmp_
     assert (red > green + 30).sum() > 500  # walls along the street
 
 
+def test_the_animation_of_a_drive_has_a_frame_a_scan_and_moves(tmp_path, run):
+    text = run('drive_animation.py', 'drive.webp', '3', folder=tmp_path)
+    assert int(re.search(r': 3 frames, ([\d,]+) surfels', text)[1].replace(',', '')) > 1000
+    with Image.open(tmp_path / 'drive.webp') as animation:
+        assert (animation.n_frames, animation.info['loop']) == (3, 0)
+        frames = []
+        for number in range(3):
+            animation.seek(number)
+            frames.append(np.asarray(animation.convert('RGB'), np.int64))
+            assert animation.info['duration'] == 100
+    red, green, blue = frames[-1].reshape(-1, 3).T
+    assert (blue > red + 30).sum() > 2000  # the road
+    assert (red > green + 30).sum() > 2000  # walls
+    assert np.abs(frames[2] - frames[0]).mean() > 1.0
+
+
+def test_the_animation_in_the_readme_takes_fifteen_seconds():
+    with Image.open(ROOT / 'docs/images/drive.webp') as animation:
+        lengths = []
+        for number in range(animation.n_frames):
+            animation.seek(number)
+            animation.load()
+            lengths.append(animation.info['duration'])
+    assert sum(lengths) == 15_000
+
+
 def test_the_picture_of_filters_shows_fewer_points_and_ground(tmp_path, run):
     text = run('filter_picture.py', 'filters.png', folder=tmp_path)
     before, after, ground = map(

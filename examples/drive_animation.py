@@ -1,0 +1,75 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Fifteen seconds of a drive as an animation: the surfels of the last scans, from behind the sensor.
+
+A lidar in a simulated street gives ten scans a second, one a frame. Each is added to the map and
+the one 60 scans before is removed, so the map moves with the sensor. Surfels are ellipses shaded
+by normal and light, the points of the scan are orange, the trajectory red. A second argument is
+the number of scans, 150 by default.
+
+    python examples/drive_animation.py drive.webp
+"""
+
+from collections import deque
+import sys
+
+import numpy as np
+from PIL import Image
+
+from surfel_mapper import SurfelMap
+from surfel_mapper.simulation import Lidar, Simulation, World
+from surfel_mapper.viz.perspective import Camera
+
+WINDOW, VOXEL_SIZE_M, FRAME_MS, QUALITY = 60, 0.3, 100, 30
+BEHIND_M, ABOVE_M, AHEAD_M, BELOW_M = 11.0, 6.0, 14.0, 1.5
+ORANGE, RED = (240, 130, 30), (219, 41, 33)
+
+
+def camera(poses):
+    """Return a camera behind and above the sensor, which looks ahead of it."""
+    ahead = np.sum([pose[:3, 0] for pose in list(poses)[-15:]], axis=0)
+    ahead[2] = 0.0
+    ahead /= np.linalg.norm(ahead)
+    place = poses[-1][:3, 3]
+    return Camera(
+        place=place - BEHIND_M * ahead + [0.0, 0.0, ABOVE_M],
+        target=place + AHEAD_M * ahead - [0.0, 0.0, BELOW_M],
+    )
+
+
+def frame(surfels, points, poses):
+    """Return the picture of a map, a scan in its frame, and the trajectory."""
+    view = camera(poses)
+    image = view.image()
+    view.paint_surfels(image, surfels)
+    view.paint_points(image, points, 0.05, ORANGE)
+    way = np.array([pose[:3, 3] for pose in poses]) - [0.0, 0.0, BELOW_M]
+    steps = np.arange(0.0, len(way) - 1, 0.05)
+    line = np.stack([np.interp(steps, np.arange(len(way)), axis) for axis in way.T], axis=1)
+    view.paint_points(image, line, 0.06, RED)
+    return Image.fromarray(np.rint(image).clip(0, 255).astype(np.uint8))
+
+
+def main(path, num_scans='150'):
+    """Drive, map, draw."""
+    world, lidar = World.street(seed=1, length_m=160.0), Lidar(beams=64, columns=1024)
+    street = Simulation(world, lidar, num_scans=int(num_scans))
+    surfel_map = SurfelMap(VOXEL_SIZE_M)
+    window, poses, frames = deque(), deque(maxlen=WINDOW), []
+    for scan in street.scans():
+        pose = street.drive.T_odom_sensor(scan.stamp_ns)
+        window.append(surfel_map.add(scan.points, T_map_sensor=pose))
+        if len(window) > WINDOW:
+            surfel_map.remove(window.popleft())
+        poses.append(pose)
+        points = scan.points[np.isfinite(scan.points).all(axis=1)][::40]
+        points = points @ pose[:3, :3].T + pose[:3, 3]
+        frames.append(frame(surfel_map.surfels(min_points=3), points, poses))
+    pages = {'save_all': True, 'append_images': frames[1:], 'duration': FRAME_MS, 'loop': 0}
+    frames[0].save(path, **pages, quality=QUALITY, method=6)
+    print(f'{path}: {len(frames)} frames, {len(surfel_map.surfels(min_points=3)):,} surfels')
+
+
+if __name__ == '__main__':
+    main(*sys.argv[1:])
