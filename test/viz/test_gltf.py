@@ -13,7 +13,7 @@ import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.cli.main import main
-from surfel_mapper.files.ply import write_mesh
+from surfel_mapper.files.mesh_ply import write_mesh
 from surfel_mapper.viz.discs import CORNERS, DrawnDiscs, shaded
 from test.viz.test_mesh import sphere
 from test.viz.test_show import ground, ground_map, UTM
