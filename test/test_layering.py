@@ -74,6 +74,7 @@ HOMES = {
     'rerun': ('viz/',),
     'rerun_bindings': ('viz/',),
     'rhino3dm': ('files/model_3dm',),
+    'trimesh': ('viz/gltf',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),
     'rosidl_runtime_py': ('ros/',),

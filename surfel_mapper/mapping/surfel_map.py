@@ -27,10 +27,10 @@ import numpy.typing as npt
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
+from surfel_mapper.mapping.coarsening import coarse_moments
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
 from surfel_mapper.mapping.moment_map import MomentMap
 from surfel_mapper.mapping.moments import (
-    coarse_moments,
     looks_like_millimetres,
     MILLIMETRES,
     ScanMoments,

@@ -19,7 +19,8 @@ import numpy.typing as npt
 
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
-from surfel_mapper.mapping.moments import coarse_keys, coarse_slab, ScanMoments, unpack_keys
+from surfel_mapper.mapping.coarsening import coarse_keys, coarse_slab
+from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import concatenated, derive, Surfels
 
