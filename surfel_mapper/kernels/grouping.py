@@ -49,7 +49,7 @@ def find_runs(keys, num, starts):
     keys    (CHUNK,) int64, of which num count
     starts  (CHUNK + 1,) int32, out: first point of each run, and num after the last
     """
-    num_runs = 0
+    num_runs = np.int64(0)  # an int here would compile kernels that take it for a literal 0 too
     previous = np.int64(-2)
     for i in range(num):
         starts[num_runs] = i
