@@ -18,6 +18,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from itertools import chain
+import logging
+import math
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +29,8 @@ from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
+
+logger = logging.getLogger(__name__)
 
 FORMATS = ('tum', 'kitti', 'csv')
 
@@ -55,6 +59,13 @@ UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
 MOST_SECONDS = 10**11
 """Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
+
+EXACT_SKEW, MAX_SKEW = 1e-5, 2e-3
+"""
+Largest entries of R R^T - I: of rotations taken as they are, and of those taken at all.
+
+Files of six digits are within the first; the second is that of determinants of 0.999.
+"""
 
 MAX_LINE_BYTES = 1 << 16
 """Limit of the length of a line; poses have some hundred characters."""
@@ -322,15 +333,19 @@ def column_name(text: str) -> tuple[str, str]:
 
 def kitti_poses(path: str | Path, lines: Iterable[tuple[str, str]]) -> Trajectory:
     """Return the poses of a KITTI file, each the upper three rows of a matrix."""
-    numbers = array('d')
+    numbers, most_skew = array('d'), 0.0
     for where, line in lines:
         columns = line.split()
         if len(columns) != 12:
             raise FileFormatError(f'{where}: {len(columns)} columns, expected 12: 3 rows of 4')
-        values = floats(columns, where)
-        if not is_rotation(np.array(values).reshape(3, 4)[:, :3]):
+        values = np.array(floats(columns, where)).reshape(3, 4)
+        skew = skew_of(values[:, :3])
+        if not skew <= MAX_SKEW:
             raise FileFormatError(f'{where}: its first three columns are no rotation')
-        numbers.extend(values)
+        values[:, :3] = nearest_rotation(values[:, :3])
+        most_skew = max(most_skew, skew)
+        numbers.extend(values.ravel())
+    warn_of_skew(path, most_skew)
     rows = np.array(numbers).reshape(-1, 3, 4)
     turns = np.empty((len(rows), 4))
     pose = np.eye(4)
@@ -340,12 +355,30 @@ def kitti_poses(path: str | Path, lines: Iterable[tuple[str, str]]) -> Trajector
     return Trajectory(stamps, rows[:, :, 3].copy(), turns)
 
 
-def is_rotation(matrix: npt.NDArray[np.float64]) -> bool:
-    """Return whether a (3, 3) matrix is a rotation, to the few digits of such files."""
+def skew_of(matrix: npt.NDArray[np.float64]) -> float:
+    """Return the largest entry of R R^T - I of a (3, 3) matrix; inf if it is no rotation."""
     if not np.isfinite(matrix).all() or np.abs(matrix).max() > 2.0:
-        return False
-    skew = np.abs(matrix @ matrix.T - np.eye(3)).max()
-    return bool(skew < 1e-3 and np.linalg.det(matrix) > 0.0)
+        return math.inf
+    skew = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    return skew if np.linalg.det(matrix) > 0.0 else math.inf
+
+
+def nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the rotation nearest to a (3, 3) matrix; itself if it is within EXACT_SKEW."""
+    if skew_of(matrix) <= EXACT_SKEW:
+        return matrix
+    left, _, right = np.linalg.svd(matrix)
+    return np.asarray(left @ right, np.float64)
+
+
+def warn_of_skew(path: str | Path, skew: float) -> None:
+    """Warn that rotations in a file are not orthonormal, if they are not."""
+    if skew > EXACT_SKEW:
+        logger.warning(
+            '%s: rotations are not orthonormal, R R^T - I has up to %.2g (at most %g is taken); '
+            'the nearest orthonormal ones are used',
+            *(path, skew, MAX_SKEW),
+        )
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:

@@ -34,11 +34,14 @@ from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.trajectory import (
     check_pose,
     floats,
-    is_rotation,
+    MAX_SKEW,
     nanoseconds,
+    nearest_rotation,
     numbered_lines,
     read_trajectory,
+    skew_of,
     Trajectory,
+    warn_of_skew,
 )
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 
@@ -227,7 +230,9 @@ def mulran(path: Path) -> Dataset | None:
         return Dataset('MulRan', files, stamps_ns)
     times_ns, rows = stamped_rows(poses_path, 12, ',')
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    poses = [rigid(poses_path, row) @ T_base_lidar for row in rows]
+    found = [nearest_pose(poses_path, row) for row in rows]
+    warn_of_skew(poses_path, max((skew for _, skew in found), default=0.0))
+    poses = [pose @ T_base_lidar for pose, _ in found]
     return Dataset('MulRan', files, stamps_ns, trajectory(poses_path, times_ns, poses), poses_path)
 
 
@@ -385,17 +390,32 @@ def calibration(path: Path) -> dict[str, Floats]:
 
 
 def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:
-    """Return the (4, 4) pose of 12 numbers, row by row; raise FileFormatError if it is none."""
+    """Return the pose of 12 numbers, as nearest_pose; warn if they are no exact rotation."""
+    pose, skew = nearest_pose(path, numbers)
+    warn_of_skew(path, skew)
+    return pose
+
+
+def nearest_pose(path: Path, numbers: npt.ArrayLike) -> tuple[Floats, float]:
+    """
+    Return the (4, 4) pose nearest to 12 numbers, row by row, and how far they are off (skew_of).
+
+    Raises
+    ------
+    FileFormatError
+        If they are no pose.
+
+    """
     flat = np.ravel(np.asarray(numbers, np.float64))
-    if (
-        len(flat) != 12
-        or not np.isfinite(flat).all()
-        or not is_rotation(flat.reshape(3, 4)[:, :3])
-    ):
+    is_pose = len(flat) == 12 and bool(np.isfinite(flat).all())
+    skew = skew_of(flat.reshape(3, 4)[:, :3]) if is_pose else np.inf
+    if not skew <= MAX_SKEW:
         raise FileFormatError(
             f'{path}: {flat.tolist()}, expected 3 rows of a rotation and a place'
         )
-    return np.vstack([flat.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    pose = np.vstack([flat.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    pose[:3, :3] = nearest_rotation(pose[:3, :3])
+    return pose, skew
 
 
 def check_number(path: Path, rows: Sized, files: Sequence[Path]) -> None:

@@ -74,6 +74,22 @@ def test_kitti_rows_are_matrices_without_stamps(tmp_path):
     np.testing.assert_allclose(found.q_xyzw[1], [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-15)
 
 
+@pytest.mark.parametrize('determinant', [0.9995, 0.99901, 1.0009])
+def test_kitti_rotations_of_few_digits_are_made_orthonormal_with_a_warning(
+    tmp_path, caplog, determinant
+):
+    angle = np.radians(30.0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    matrix = np.eye(4)[:3]
+    matrix[:2, :2] = turn
+    matrix[:, 0] *= determinant
+    text = ' '.join(f'{value:.17g}' for value in matrix.ravel())
+    found = read_trajectory(text_file(tmp_path, f'{KITTI.strip()}\n{text}\n'))
+    np.testing.assert_allclose(found.q_xyzw[2], [0, 0, np.sin(angle / 2), np.cos(angle / 2)])
+    assert 'rotations are not orthonormal' in caplog.text
+    assert len(caplog.records) == 1
+
+
 def test_kitti_stamps_come_from_the_times_beside_it(tmp_path):
     text_file(tmp_path, '0.000000e+00\n1.036224e-01\n', 'times.txt')
 
@@ -117,6 +133,7 @@ def test_csv_columns_are_found_by_name_and_stamps_by_unit(tmp_path, text):
         ('-1 0 0 0 0 0 0 1', None, ":1: time '-1'"),
         ('2 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('1 0 0 0 0 1 0 0 0 0 -1 0', None, ':1: .* no rotation'),
+        ('0.998 0 0 0 0 1 0 0 0 0 1 0', None, ':1: .* no rotation'),
         ('stamp,x,y,z\n0,0,0,0', None, ':1: columns stamp, x, y, z; expected a header'),
         ('stamp_s,x,y,z,qx,qy,qz,qw', None, 'only a header'),
         ('stamp_s,x,y,z,qx,qy,qz,qw\n1,2', None, ':2: 2 columns, expected 8'),
