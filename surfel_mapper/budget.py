@@ -16,11 +16,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+import errno
 from functools import cache
 import os
 from pathlib import Path
 import stat
 import time
+from typing import BinaryIO
 
 FLOOR_BYTES = 64 << 20
 """Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
@@ -39,6 +41,9 @@ VARIABLE = 'SURFEL_MAPPER_MAX_BYTES'
 
 MAX_TEXT_BYTES = 1 << 20
 """Size limit of files that people write: settings, chains of filters, metadata.yaml."""
+
+
+NOT_REGULAR = 'not a regular file'
 
 
 class Budget:
@@ -187,11 +192,30 @@ def read_small_file(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
     """
     with open(path, 'rb', opener=open_without_blocking) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise ValueError('not a regular file')
+            raise ValueError(NOT_REGULAR)
         content = file.read(max_bytes + 1)
     if len(content) > max_bytes:
         raise ValueError(f'larger than {max_bytes} bytes')
     return content
+
+
+def open_regular(path: str | Path) -> BinaryIO:
+    """
+    Return a file opened for reading, whose size is what can be read of it.
+
+    Of devices and pipes it is not: /dev/zero has no end, and a pipe without a writer blocks.
+
+    Raises
+    ------
+    OSError
+        If the file cannot be opened, or is not a regular file.
+
+    """
+    file = open(path, 'rb', opener=open_without_blocking)  # noqa: SIM115 - for the caller
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(errno.EINVAL, NOT_REGULAR)
+    return file
 
 
 def open_without_blocking(path: str, flags: int) -> int:

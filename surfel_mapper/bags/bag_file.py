@@ -22,7 +22,7 @@ from typing import ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ class BagFile(ABC):
         self._by_id: dict[int, Connection] = {}
         self._counts: Counter[int] = Counter()
         self.start_time, self.end_time = 2**63 - 1, 0
-        self._file = open(path, 'rb')  # noqa: SIM115 - closed by close
+        self._file = open_regular(path)
         try:
             with self._budget.clock():
                 self._survey()

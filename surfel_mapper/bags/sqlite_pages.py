@@ -31,6 +31,7 @@ from surfel_mapper.bags.bag_file import (
     INDEX_COLUMNS,
     MESSAGE_BYTES,
 )
+from surfel_mapper.budget import open_regular
 
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection
@@ -205,7 +206,7 @@ def pages(header: bytes) -> tuple[int, int]:
 
 def is_short(path: Path) -> bool:
     """Return whether a database is shorter than its header states; SQLite opens some of these."""
-    with open(path, 'rb') as file:
+    with open_regular(path) as file:
         size, num_pages = pages(file.read(HEADER_BYTES))
     return path.stat().st_size < size * num_pages
 

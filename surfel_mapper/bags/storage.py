@@ -20,6 +20,7 @@ from surfel_mapper.bags.paths import is_ros1, unpacked_name
 from surfel_mapper.bags.ros1 import Ros1File
 from surfel_mapper.bags.sqlite import SqliteFile
 from surfel_mapper.bags.sqlite_pages import is_short, SalvagedSqlite
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import BagError, DependencyError
 
 OURS: dict[str, type[BagFile]] = {'.mcap': McapFile, '.db3': SalvagedSqlite, '.bag': Ros1File}
@@ -66,7 +67,7 @@ def open_storage(path: Path, named: Path | None = None) -> BagFile:
 def open_ours(path: Path, named: Path) -> BagFile:
     """Return a file opened by our own reader; raise ValueError or BagError if it has nothing."""
     kind = OURS[suffix(path)]
-    with open(path, 'rb') as file:
+    with open_regular(path) as file:
         if file.read(len(kind.MAGIC)) != kind.MAGIC:
             raise ValueError(f'its first bytes are not those of {suffix(path)}')
     storage = kind(path)

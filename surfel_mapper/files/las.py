@@ -18,7 +18,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
@@ -165,7 +165,7 @@ def check_header(path: str | Path) -> None:
     laspy loops over as many records as the header states, and reads the points that are there.
     Source: the specification of LAS 1.4 of the ASPRS, table 3.
     """
-    with open(path, 'rb') as file:
+    with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         header = file.read(HEADER_BYTES).ljust(HEADER_BYTES, b'\0')
     start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Mapping, Sequence
+from functools import partial
 import io
 import itertools
 import json
@@ -22,7 +23,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.model_3dm import write_3dm
@@ -35,6 +36,9 @@ if TYPE_CHECKING:
     from surfel_mapper.tsdf.mesh import Mesh
 
 FORMAT, VERSION = 'surfel_mapper models', 1
+
+MAX_LINE_BYTES = 1 << 20
+"""Length of a line of OBJ: a polygon of 100,000 corners."""
 
 CHECK_EVERY = 1024
 """Number of lines of an OBJ file after which the time is checked."""
@@ -251,16 +255,19 @@ def read_obj(path: str | Path) -> Mesh:
 
     vertices, triangles, number = array('d'), array('i'), 0
     try:
-        budget = Budget(path, Path(path).stat().st_size, FileFormatError)
-        with open(path, encoding='utf-8', errors='replace') as file, budget.clock():
-            for number, line in enumerate(file, start=1):
+        budget = Budget.of_file(path, FileFormatError)
+        with open_regular(path) as file, budget.clock():
+            lines = iter(partial(file.readline, MAX_LINE_BYTES), b'')
+            for number, line in enumerate(lines, start=1):
+                if len(line) == MAX_LINE_BYTES:
+                    raise ValueError(f'over {MAX_LINE_BYTES} characters')
                 if not number % CHECK_EVERY:
                     budget.check_time()
-                kind, *words = line.split() or ['']
-                if kind == 'v':
+                kind, *words = line.split() or [b'']
+                if kind == b'v':
                     vertices.extend(map(float, words[:3]))
-                elif kind == 'f':  # a/b/c: vertex, texture, normal; below zero: from the end
-                    corners = [int(word.partition('/')[0]) for word in words]
+                elif kind == b'f':  # a/b/c: vertex, texture, normal; below zero: from the end
+                    corners = [int(word.partition(b'/')[0]) for word in words]
                     corners = [c - 1 if c > 0 else len(vertices) // 3 + c for c in corners]
                     for second, third in itertools.pairwise(corners[1:]):
                         triangles.extend((corners[0], second, third))

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError, MapError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
@@ -141,7 +141,7 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
     """Return the moments in a file, an empty map of its kind, and the digest that it states."""
     arrow, parquet = import_pyarrow()
     try:
-        with open(path, 'rb') as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
+        with open_regular(path) as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
             names = moment_names(surfel_map)

@@ -25,6 +25,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.parquet import (
@@ -296,7 +297,7 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
     arrow, parquet = import_pyarrow()
     try:
         with (
-            open(path, 'rb') as file,
+            open_regular(path) as file,
             parquet.ParquetFile(file, metadata=footer, **FOOTER_LIMITS) as content,
         ):
             known = footer is not None

@@ -27,7 +27,7 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.text_table import read_table
@@ -142,7 +142,7 @@ def read_points(path: str | Path) -> Columns:
 
     """
     try:
-        with open(path, 'rb') as file:
+        with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             budget = Budget(path, size, FileFormatError)
             with budget.clock():

@@ -24,7 +24,7 @@ from typing import Any, BinaryIO, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.text_table import read_table
@@ -162,7 +162,7 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
 
     """
     try:
-        with open(path, 'rb') as file:
+        with open_regular(path) as file:
             file_size = os.fstat(file.fileno()).st_size
             budget = Budget(path, file_size, FileFormatError)
             with budget.clock():
@@ -202,7 +202,7 @@ def read_mesh(path: str | Path) -> Mesh | None:
     from surfel_mapper.tsdf.mesh import Mesh
 
     try:
-        with open(path, 'rb') as file:
+        with open_regular(path) as file:
             layout, count = read_faces_header(path, file)
             if layout is None or not count:
                 return None

@@ -30,7 +30,7 @@ import zlib
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
@@ -167,7 +167,7 @@ def load_state(
 
     """
     try:
-        with open(path, 'rb') as file, zipfile.ZipFile(file) as archive:
+        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             budget = Budget(path, os.fstat(file.fileno()).st_size, FileFormatError)
             with budget.clock():
                 return read_archive(path, archive, budget, copies)

@@ -17,6 +17,7 @@ from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from io import TextIOWrapper
 from itertools import chain
 import logging
 import math
@@ -25,7 +26,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
@@ -251,7 +252,7 @@ def trajectory_beside(path: Path) -> Path | None:
 def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]]:
     """Yield file:line and text of all lines but comments; a commented CSV header is kept."""
     try:
-        with open(path, encoding='utf-8-sig') as file:
+        with TextIOWrapper(open_regular(path), encoding='utf-8-sig') as file:
             number = 0
             while line := file.readline(MAX_LINE_BYTES):
                 number += 1

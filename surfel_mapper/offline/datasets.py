@@ -21,13 +21,14 @@ from dataclasses import dataclass
 from datetime import datetime, timezone
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.scan_files import read_scan
@@ -329,8 +330,10 @@ def packed(path: Path, dtype: np.dtype[Any]) -> npt.NDArray[Any]:
 def content_of(path: Path) -> bytes:
     """Return the content of a file; raise FileFormatError if it cannot be read."""
     try:
-        Budget.of_file(path, FileFormatError).take(path.stat().st_size, 'its content')
-        return path.read_bytes()
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            Budget(path, size, FileFormatError).take(size, 'its content')
+            return file.read()
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 

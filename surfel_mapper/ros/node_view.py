@@ -11,6 +11,7 @@ of discs is found from the gaps between them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 import logging
 import time
 from typing import Any
@@ -23,7 +24,9 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
+from surfel_mapper.errors import CloudFormatError, one_line
 from surfel_mapper.messages.pointcloud2 import to_scan
+from surfel_mapper.pipeline.drops import described
 from surfel_mapper.ros.base_node import LATCHED
 from surfel_mapper.ros.context import context
 from surfel_mapper.tsdf.mesh import Mesh
@@ -33,6 +36,8 @@ from surfel_mapper.viz.scene import Scene
 
 SILENT_S = 5.0
 """Time without surfels after which a warning names the topics that were found, s."""
+
+NORMALS = {'normal_x', 'normal_y', 'normal_z'}
 
 log = logging.getLogger(__name__)
 
@@ -58,10 +63,22 @@ class NodeView:
         self._scene, self._colouring = scene, colouring
         self.num_shown = 0
         changes = QoSProfile(depth=10)
-        node.create_subscription(PointCloud2, f'{name}/normals', self._on_normals, LATCHED)
-        node.create_subscription(PointCloud2, f'{name}/changed', self._on_changed, changes)
-        node.create_subscription(Marker, f'{name}/mesh', self._on_mesh, LATCHED)
-        node.create_subscription(MarkerArray, f'{name}/planes', self._on_planes, LATCHED)
+        for topic, kind, show, qos in (
+            ('normals', PointCloud2, self._on_normals, LATCHED),
+            ('changed', PointCloud2, self._on_changed, changes),
+            ('mesh', Marker, self._on_mesh, LATCHED),
+            ('planes', MarkerArray, self._on_planes, LATCHED),
+        ):
+            topic = f'{name}/{topic}'
+            node.create_subscription(kind, topic, partial(self._show, node, topic, show), qos)
+
+    def _show(self, node: Any, topic: str, show: Callable[[Any], None], msg: Any) -> None:
+        """Show a message; one that cannot be shown is left out, with a warning."""
+        try:
+            show(msg)
+        except Exception as error:  # anyone can publish there
+            text = one_line(f'{topic}: a message is not shown: {described(error)}')
+            node.get_logger().warning(text, throttle_duration_sec=1.0)
 
     def _on_normals(self, msg: PointCloud2) -> None:
         """Show all surfels."""
@@ -77,6 +94,8 @@ class NodeView:
     def _discs(self, msg: PointCloud2) -> DrawnDiscs:
         """Return the surfels of a cloud, and go to its stamp."""
         scan = to_scan(msg)
+        if not scan.columns.keys() >= NORMALS:
+            raise CloudFormatError(f'no {", ".join(sorted(NORMALS))} among its columns')
         self._scene.set_stamp(scan.stamp_ns)
         return discs_of(scan.points.astype(np.float64), scan.columns)
 
@@ -94,7 +113,7 @@ class NodeView:
             if marker.type == Marker.TRIANGLE_LIST:
                 self._scene.mesh(path, marker_mesh(marker))
             elif marker.type == Marker.LINE_LIST:
-                lines = list(places_of(marker).reshape(-1, 2, 3))
+                lines = list(places_of(marker, 2).reshape(-1, 2, 3))
                 self._scene.lines(path, lines, colours_of(marker)[::2])
 
 
@@ -136,8 +155,22 @@ def silence(node: Any, name: str) -> str:
     return f'{topic}: nothing publishes it; nodes that publish such a map: {others}'
 
 
-def places_of(marker: Marker) -> npt.NDArray[np.float64]:
-    """Return the points of a marker, (N, 3) m."""
+def places_of(marker: Marker, corners: int) -> npt.NDArray[np.float64]:
+    """
+    Return the points of a marker, (N, 3) m, of shapes of that many corners.
+
+    Raises
+    ------
+    CloudFormatError
+        If the last shape is not complete, or colours are not one for each point.
+
+    """
+    number, colours = len(marker.points), len(marker.colors)
+    if number % corners or colours not in (0, number):
+        raise CloudFormatError(
+            f'marker {marker.ns!r}: {number} points and {colours} colours, expected {corners} '
+            'points a shape, and no colours or one for each'
+        )
     return np.array([(p.x, p.y, p.z) for p in marker.points]).reshape(-1, 3)
 
 
@@ -146,12 +179,14 @@ def colours_of(marker: Marker) -> npt.NDArray[np.uint8]:
     each = [(c.r, c.g, c.b) for c in marker.colors] or [
         (marker.color.r, marker.color.g, marker.color.b)
     ] * len(marker.points)
-    return np.rint(255.0 * np.array(each).reshape(-1, 3)).astype(np.uint8)
+    shares = np.clip(np.nan_to_num(np.array(each).reshape(-1, 3)), 0.0, 1.0)
+    found: npt.NDArray[np.uint8] = np.rint(255.0 * shares).astype(np.uint8)
+    return found
 
 
 def marker_mesh(marker: Marker) -> Mesh:
     """Return the triangles of a marker."""
-    places = places_of(marker)
+    places = places_of(marker, 3)
     number = len(places) // 3
     return Mesh(
         vertices=places,

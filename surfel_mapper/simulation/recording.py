@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from surfel_mapper.bags.writer import BagWriter
+from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import ConfigError, FileFormatError
 from surfel_mapper.messages.pointcloud2 import CloudBytes, Field
 from surfel_mapper.messages.poses import StampedPose
@@ -147,7 +148,7 @@ def load_simulation(path: str | Path) -> Simulation:
     world = World.load(Path(path) / WORLD_FILE)
     file = Path(path) / SIMULATION_FILE
     try:
-        found = json.loads(file.read_text(encoding='utf-8'))
+        found = json.loads(read_small_file(file))
         lidar, drive = Lidar(**_tuples(found['lidar'])), Drive(**_tuples(found['drive']))
         return Simulation(
             world, lidar, drive, num_scans=found['num_scans'], rolling=found['rolling']

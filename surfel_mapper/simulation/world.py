@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.circuit import circuit_primitives, Corners
@@ -312,7 +313,7 @@ class World:
 
         """
         try:
-            return cls.from_mapping(json.loads(Path(path).read_text(encoding='utf-8')))
+            return cls.from_mapping(json.loads(read_small_file(path)))
         except OSError as error:
             raise FileFormatError(f'{path}: cannot be read: {error.strerror}') from error
         except ValueError as error:

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
 from surfel_mapper.files.parquet_tiles import tiles_in
@@ -160,6 +162,7 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
 
         yield ShownMesh(name, model_files.read_obj(path))
     elif path.suffix in ASSETS:
+        check_asset(path)
         yield Asset(name, path)
     elif path.suffix in TRAJECTORIES:
         yield Way(name, read_trajectory(path))
@@ -172,6 +175,16 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
             f'{path}: expected a bag, a folder, or a file ending in '
             f'{", ".join(dict.fromkeys([*EXACT, *CLOUDS, ".obj", *ASSETS, *TRAJECTORIES]))}'
         )
+
+
+def check_asset(path: Path) -> None:
+    """Raise FileFormatError if rerun could not read a file, or not in the memory there is."""
+    try:
+        with open_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            Budget(path, size, FileFormatError).take(3 * size, 'its copies for the viewer')
+    except OSError as error:
+        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
 def in_directory(path: Path, name: str) -> Iterator[Content]:

@@ -18,6 +18,7 @@ from __future__ import annotations
 import contextlib
 import errno
 from itertools import count
+import json
 import os
 import signal
 import subprocess
@@ -272,7 +273,7 @@ def test_a_replay_out_of_memory_once_leaves_the_whole_map_or_none(tmp_path):
     failures = 0
     for number in numbers if EVERY else (200_000, 2_000_000):
         output = tmp_path / str(number)
-        command = [sys.executable, '-m', 'test.fuzz.allocation', str(number), bag, output]
+        command = [sys.executable, '-m', 'test.fuzz.allocation', 'one', str(number), bag, output]
         done = subprocess.run([*map(str, command)], capture_output=True, text=True)
         crashed = EVERY and done.returncode == -signal.SIGSEGV  # in numba, see MOST_CRASHES
         assert crashed or done.returncode in (0, 1), (number, done.returncode, done.stderr)
@@ -285,6 +286,33 @@ def test_a_replay_out_of_memory_once_leaves_the_whole_map_or_none(tmp_path):
     print(f'replay: {failures} allocations failed')
     assert failures
 
+
+def test_each_allocation_of_a_replay_up_to_its_map_leaves_a_whole_map_or_none(tmp_path):
+    pytest.importorskip('_testcapi', reason='this Python lacks _testcapi')
+    scan = recorded.Entries()
+    points = np.random.default_rng(1).uniform(-2.0, 2.0, (50, 3))
+    scan.cloud('/points', recorded.START_NS, points)
+    bag = recorded.write_rosbag2(tmp_path / 'bag', scan)
+    stride = 1 if EVERY else SAMPLED
+    command = [
+        sys.executable,
+        '-m',
+        'test.fuzz.allocation',
+        'until_the_map',
+        stride,
+        bag,
+        tmp_path,
+    ]
+    done = subprocess.run([*map(str, command)], capture_output=True, text=True)
+    assert not done.returncode, (done.stdout, done.stderr)
+    counts = json.loads(done.stdout)
+    print(f'replay up to its map: {counts}')
+    assert counts['failed'] > 5
+    assert counts['crashed'] <= MOST_CRASHES * counts['failed']
+
+
+SAMPLED = 2003
+"""Stride of the allocations that fail without SURFEL_MAPPER_EVERY_FAILURE."""
 
 LAST_ALLOCATION = 20_000_000
 """More than the allocations of the replay of a small bag with its imports."""

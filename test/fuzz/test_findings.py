@@ -35,9 +35,11 @@ from surfel_mapper.errors import (
     FileFormatError,
     MapError,
     PoseError,
+    SurfelMapperError,
 )
 from surfel_mapper.files import pcd, ply
 from surfel_mapper.files.map_state import load_map, save_map
+from surfel_mapper.files.model_files import read_obj
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.files.trajectory import read_trajectory
@@ -46,7 +48,10 @@ from surfel_mapper.filters.chain import Chain
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.compressed_image import unpacked as unpacked_image
 from surfel_mapper.messages.pointcloud2 import Field, to_scan
+from surfel_mapper.offline.datasets import content_of
 from surfel_mapper.poses import buffer as buffer_module
+from surfel_mapper.simulation.world import World
+from surfel_mapper.viz.contents import contents
 from test.bags import recorded
 from test.fuzz import corpus
 from test.fuzz.memory import reset_peak, resident
@@ -848,7 +853,7 @@ def test_a_line_of_poses_without_an_end_is_refused(tmp_path):
     assert 'poses.txt:1: a line of over 65536 characters' in str(error)
     assert peak < 1_000_000
     error, peak = peak_of(lambda: read_trajectory('/dev/zero'))
-    assert '/dev/zero:1: a line of over 65536 characters' in str(error)
+    assert '/dev/zero: cannot be read: not a regular file' in str(error)
     assert peak < 1_000_000
 
 
@@ -878,3 +883,50 @@ def test_counts_in_the_header_of_las_are_compared_with_the_file(
     with pytest.raises(FileFormatError, match=problem):
         read_scan(path)
     assert time.thread_time() - start_s < 0.5
+
+
+SHOWN = ('.obj', '.glb', '.stl', '.parquet', '.ply')
+"""Files that only ``view`` reads, or reads otherwise."""
+
+READERS = {
+    'a.mcap': BagReader,
+    'a.bag': BagReader,
+    'a.db3': BagReader,
+    'a.ply': read_scan,
+    'a.pcd': read_scan,
+    'a.bin': read_scan,
+    'a.las': read_scan,
+    'a.tum': read_trajectory,
+    'a.npz': load_map,
+    **{f'b{suffix}': lambda path: list(contents(path)) for suffix in SHOWN},
+    'c.bin': content_of,
+    'world.json': World.load,
+}
+
+
+@pytest.mark.parametrize('name', READERS)
+@pytest.mark.parametrize('kind', ['pipe', 'device'])
+def test_pipes_and_devices_are_refused(tmp_path, name, kind):
+    """A pipe blocked the reader for good, /dev/zero took memory without end."""
+    if '.las' in name:
+        pytest.importorskip('laspy')
+    path = tmp_path / name
+    if kind == 'pipe':
+        os.mkfifo(path)
+    else:
+        path.symlink_to('/dev/zero')
+    reset_peak()
+    before = resident('VmRSS')
+    with pytest.raises(SurfelMapperError, match=r'not a regular file|no such file'):
+        READERS[name](path)
+    assert resident('VmHWM') - before < 64 << 20
+
+
+def test_a_line_of_a_model_without_end_is_refused(tmp_path):
+    path = tmp_path / 'a.obj'
+    path.write_bytes(b'v 0 0 0\n' + b'f' + b' 1' * 5_000_000)
+    reset_peak()
+    before = resident('VmRSS')
+    with pytest.raises(FileFormatError, match=r'line 2 is damaged: over 1048576 characters'):
+        read_obj(path)
+    assert resident('VmHWM') - before < 64 << 20  # was 800 MB
