@@ -32,6 +32,7 @@ from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.growth import (
     add_facets,
     estimate_noise,
+    extend_planes,
     grow,
     Grown,
     grown,
@@ -191,6 +192,7 @@ def grow_sparse(
         of_row[voxels.rows] = owner
         before = of_row[coarse.rows]
         after = np.maximum(before, -1)
+        extend_planes(coarse, after, curved, (size_m, found.tolerance_m))
         num = add_facets(coarse, after, len(normals), (size_m, found.tolerance_m), config)
         table = owner_table(coarse, after)
         index, normals, bent = join_patches(pieces_of(coarse, table, num), view, noise, finest)

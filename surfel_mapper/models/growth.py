@@ -35,7 +35,7 @@ from surfel_mapper.models.kernels.growth import (
     sample_distances,
     SLOTS,
 )
-from surfel_mapper.models.kernels.joining import rename_owners, sort_owners
+from surfel_mapper.models.kernels.joining import plane_frames, rename_owners, sort_owners
 from surfel_mapper.models.kernels.voxel_points import (
     block_noise,
     find_core,
@@ -80,6 +80,9 @@ TOLERANCE_SIGMAS, TOLERANCE_VOXELS, MOST_TOLERANCE_VOXELS = 3.0, 0.03, 0.5
 
 NOISE_SIGMAS = 2.5
 """Tolerance by the noise of the sensor at least: noise beyond a voxel is cut into layers."""
+
+FAR_SIGMAS = 2.0
+"""Tolerance of a plane in coarse voxels: these sigmas and the tolerance of facets, at most."""
 
 SAMPLES = 20_000
 """Points for the tolerances of all patches, about."""
@@ -323,6 +326,54 @@ def extend_patches(
     flat = free[1], free[3], math.cos(math.radians(GROWTH_ANGLE_DEG))
     grow_patches(*state, voxels.adjacent, label, *shape, flat, candidate, planes)
     assign_points(*state, label, *shape, candidate, planes, owner)
+
+
+def extend_planes(
+    voxels: VoxelPoints,
+    owner: Owners,
+    curved: npt.NDArray[np.bool_],
+    sizes: tuple[float, float],
+) -> None:
+    """
+    Grow flat patches over the free points of coarse voxels; write their owners.
+
+    Parameters
+    ----------
+    voxels : VoxelPoints
+        The points by coarse voxel.
+    owner : (P,) int32
+        Patch of every point, FREE for none.
+    curved : (K,) bool
+        Patches that are not extended.
+    sizes : (float, float)
+        Edge of the coarse voxels, and the tolerance of facets, m.
+
+    """
+    number = len(curved)
+    if not number:
+        return
+    table = owner_table(voxels, owner)
+    starts, voxel, points, weights = sorted_table(table, 0, number)
+    means, normals, values = np.empty((3, number, 3))
+    plane_frames(points, weights, starts, means, normals, values)
+    planes = np.column_stack([normals, -np.einsum('ij,ij->i', normals, means)])
+    sigma = np.sqrt(np.maximum(values[:, 0], 0.0))
+    tolerance = np.minimum(TOLERANCE_SIGMAS * sigma, FAR_SIGMAS * sigma + sizes[1])
+    tolerance[curved] = 0.0
+    # the patch of a coarse voxel is the one with most of its points
+    patch = np.repeat(np.arange(number, dtype=np.int32), np.diff(starts))
+    label = np.full(len(voxels.starts) - 1, -1, np.int32)
+    order = np.argsort(weights, kind='stable')
+    order = order[~curved[patch[order]]]
+    label[voxel[order]] = patch[order]
+    free = free_surfels(voxels, owner, *sizes)
+    found = np.empty_like(owner)
+    extend_patches(voxels, label, (planes[label], tolerance), free, found)
+    rows = np.flatnonzero((owner < 0) & (found >= 0))
+    on = found[rows]
+    away = np.einsum('ij,ij->i', voxels.points[rows], planes[on, :3]) + planes[on, 3]
+    near = np.abs(away) < tolerance[on]
+    owner[rows[near]] = on[near]
 
 
 def add_facets(
