@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import math
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
@@ -302,3 +303,27 @@ def _cross(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArra
     """Return the cross product of two (3,) vectors; np.cross takes 20 times as long."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+
+
+def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return values as float64; raise ValueError, with their name, if they are not numbers."""
+    try:
+        return np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
+        raise ValueError(f'{name}: {shown}, expected numbers') from None
+
+
+def as_whole(name: str, value: object) -> int:
+    """Return a whole number; raise TypeError, with its name, for anything else, also for bool."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        shown = f'a {type(value).__name__}' if isinstance(value, np.ndarray) else repr(value)
+        raise TypeError(f'{name}: {shown}, expected a whole number')
+    return int(value)
+
+
+def as_path(path: object) -> Path:
+    """Return a path; raise TypeError for anything but text and paths."""
+    if not isinstance(path, (str, Path)):
+        raise TypeError(f'path: {path!r:.60}, expected a str or Path')
+    return Path(path)

@@ -29,7 +29,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
+from surfel_mapper.geometry import as_numbers, check_rigid, pose_matrix, q_xyzw
 
 logger = logging.getLogger(__name__)
 
@@ -128,7 +128,7 @@ class Trajectory:
             If shapes or types are wrong, or a transform is not rigid.
 
         """
-        poses = np.asarray(T_fixed_sensor, np.float64)
+        poses = as_numbers('T_fixed_sensor', T_fixed_sensor)
         if poses.ndim != 3 or poses.shape[1:] != (4, 4):
             raise ValueError(f'T_fixed_sensor: shape {poses.shape}, expected (S, 4, 4)')
         for row, pose in enumerate(poses):

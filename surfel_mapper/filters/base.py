@@ -27,6 +27,7 @@ import numpy.typing as npt
 from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.columns import LazyColumns
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.scan import Scan
 
@@ -68,7 +69,7 @@ def as_scan(points: Scan | npt.ArrayLike) -> Scan:
         return points
     array = np.asarray(points)
     if array.dtype not in (np.float32, np.float64):
-        array = array.astype(np.float64)
+        array = as_numbers('points', array)
     return Scan(points=array.reshape(-1, 3) if array.size == 0 else array, stamp_ns=0, frame_id='')
 
 

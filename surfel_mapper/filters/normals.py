@@ -17,6 +17,7 @@ import numpy.typing as npt
 from surfel_mapper.filters.base import as_scan
 from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.shapes import SurfaceNormal
+from surfel_mapper.geometry import as_numbers
 
 
 def estimate_normals(
@@ -68,9 +69,10 @@ def estimate_normals(
     middle = places[0]
     found = np.asarray(chosen.apply(places - middle).columns[NORMALS], np.float64)
     if viewpoint is not None:
-        sight = np.asarray(viewpoint, np.float64) - places
-        if sight.shape != places.shape or not np.isfinite(sight).all():
+        sensor = as_numbers('viewpoint', viewpoint)
+        if sensor.shape != (3,) or not np.isfinite(sensor).all():
             raise ValueError(f'viewpoint: {viewpoint}, expected x y z, finite')
+        sight = sensor - places
         found = np.where((found * sight).sum(axis=1)[:, None] < 0.0, -found, found)
     result[finite] = found
     return result

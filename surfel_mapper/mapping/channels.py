@@ -68,11 +68,15 @@ def quantised(
         If a column is missing or of another length.
 
     """
+    if not isinstance(columns, Mapping):
+        raise TypeError(
+            f'columns: a {type(columns).__name__}, expected arrays by name: {", ".join(names)}'
+        )
     parts = []
     for name in names:
         if missing_columns(columns, (name,)):
             raise ValueError(f'column {name}: missing, expected one row for {num_points} points')
-        column = columns['rgba' if name not in columns else name]
+        column = np.asarray(columns['rgba' if name not in columns else name])
         if len(column) != num_points:
             raise ValueError(
                 f'column {name}: of length {len(column)}, expected one row for {num_points} points'

@@ -24,6 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import (
@@ -88,7 +89,7 @@ class MomentMap:
 
     @origin_m.setter
     def origin_m(self, value: npt.ArrayLike) -> None:
-        origin = np.array(value, np.float64)
+        origin: npt.NDArray[np.float64] = as_numbers('origin_m', value).copy()
         if origin.shape != (3,) or not np.isfinite(origin).all():
             raise ValueError(f'origin_m: {origin.tolist()}, expected x y z, finite')
         origin.setflags(write=False)
@@ -233,7 +234,13 @@ class MomentMap:
         if voxel_index is None:
             chosen = self._table.changed_after(-1, 1)
         else:
-            chosen = self._table.find(np.unique(pack_keys(voxel_index)))
+            index = np.asarray(voxel_index)
+            if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
+                raise ValueError(
+                    f'voxel_index: {index.dtype} {index.shape}, expected integers (K, 3); points '
+                    'are added by add'
+                )
+            chosen = self._table.find(np.unique(pack_keys(index)))
             chosen = chosen[chosen >= 0]
         return self._moments_of(chosen[np.argsort(self._table.rows.array[chosen, layout.KEY])])
 

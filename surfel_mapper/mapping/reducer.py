@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.geometry import check_rigid
+from surfel_mapper.geometry import as_numbers, check_rigid
 from surfel_mapper.kernels.grouping import build_table, CHUNK
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised
@@ -127,10 +127,14 @@ class Reducer:
         if T_map_sensor is not None:
             check_rigid('T_map_sensor', T_map_sensor)
         pose = np.eye(4) if T_map_sensor is None else np.asarray(T_map_sensor, np.float64)
-        seen_from = np.full(3, np.nan) if origin is None else np.asarray(origin, np.float64)
+        seen_from = np.full(3, np.nan) if origin is None else as_numbers('origin', origin)
         if seen_from.shape != (3,) or (origin is not None and not np.isfinite(seen_from).all()):
             raise ValueError('origin: expected the finite position of the sensor, x y z')
-        values = quantised(columns or {}, self._columns, len(points)) if self._columns else None
+        values = (
+            quantised({} if columns is None else columns, self._columns, len(points))
+            if self._columns
+            else None
+        )
         range_sq = np.array([min_range_m**2, max_range_m**2])
         scale = (1 << BITS) / self.voxel_size_m
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
@@ -191,7 +195,11 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
 
     Arrays that fulfil this and are writeable are not copied.
     """
-    array = np.asarray(points)
+    try:
+        array = np.asarray(points)
+    except ValueError:  # lists of unequal length, or a sequence of other things
+        kind = type(points).__name__
+        raise ValueError(f'points: a {kind} of unequal rows, expected (N, 3) numbers') from None
     if array.size == 0 and array.ndim < 2:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:

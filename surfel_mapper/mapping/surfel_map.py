@@ -25,6 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.geometry import as_numbers, as_path, as_whole
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.coarsening import coarse_moments
@@ -115,7 +116,7 @@ class SurfelMap(MomentMap):
             )
         if not 0.0 < voxel_size_m < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
-        if threads < 1:
+        if as_whole('threads', threads) < 1:
             raise ValueError(f'threads: {threads}, expected 1 or more')
         super().__init__(float(voxel_size_m), columns, level, origin_m)
         self._reported = self.version
@@ -156,7 +157,7 @@ class SurfelMap(MomentMap):
 
         """
         if T_map_sensor is not None:
-            T_map_sensor = np.asarray(T_map_sensor, np.float64)
+            T_map_sensor = as_numbers('T_map_sensor', T_map_sensor)
             if origin is None and T_map_sensor.shape == (4, 4):
                 origin = T_map_sensor[:3, 3]
         moments = self.reduce(points, T_map_sensor, origin=origin, columns=columns)
@@ -234,13 +235,14 @@ class SurfelMap(MomentMap):
             the voxel, so that the selection changes little while the map grows.
 
         """
+        min_points = as_whole('min_points', min_points)
         if at_most is None:
             return self._derive(self._table.changed_after(-1, min_points))
         return self._derive(self._table.thinned(min_points, at_most))
 
     def num_surfels(self, min_points: int = 1) -> int:
         """Return the number of voxels of at least min_points points."""
-        return len(self._table.changed_after(-1, min_points))
+        return len(self._table.changed_after(-1, as_whole('min_points', min_points)))
 
     def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
         """Return the surfels of rows (K,) that ``find`` returned."""
@@ -265,7 +267,10 @@ class SurfelMap(MomentMap):
             Voxels with fewer points are skipped.
 
         """
-        if since is None:
+        min_points = as_whole('min_points', min_points)
+        if since is not None:
+            since = as_whole('since', since)
+        else:
             since, self._reported = max(self._reported, self.cleared_at), self.version
         changed = self._changes.since(since, self._table.rows.array, max(min_points, 1))
         if changed is None:
@@ -301,7 +306,7 @@ class SurfelMap(MomentMap):
 
         """
         highest = layout.INDEX_BITS - 1 - self.level
-        if not 0 <= level <= highest:
+        if not 0 <= as_whole('level', level) <= highest:
             raise ValueError(
                 f'level: {level}, expected 0 to {highest} for a map of level {self.level}'
             )
@@ -359,7 +364,7 @@ class SurfelMap(MomentMap):
             If the file cannot be read, is damaged or not exact.
 
         """
-        found: SurfelMap = _files().load_surfel_map(Path(path))
+        found: SurfelMap = _files().load_surfel_map(as_path(path))
         return found
 
     def save(self, path: str | Path) -> str:
@@ -378,7 +383,7 @@ class SurfelMap(MomentMap):
             If the suffix is another, or the file cannot be written.
 
         """
-        return str(_files().save_surfel_map(Path(path), self))
+        return str(_files().save_surfel_map(as_path(path), self))
 
     def __reduce__(self) -> Any:
         """Pickle the exact state; ``copy`` and ``deepcopy`` use it too."""

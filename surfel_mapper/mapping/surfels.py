@@ -90,7 +90,7 @@ class Surfels:
 
     def __getitem__(self, row: Any) -> Any:
         """Return one surfel (OneSurfel) for an integer, Surfels for a slice, mask or rows."""
-        if not isinstance(row, (int, np.integer)):
+        if isinstance(row, bool) or not isinstance(row, (int, np.integer)):
             return self.select(row)
         if not 0 <= row < len(self):
             raise IndexError(no_row(int(row), len(self)))
@@ -181,15 +181,25 @@ class Surfels:
         Raises
         ------
         IndexError
-            If a row is negative: ``SurfelIndex.at`` returns -1 for a voxel without a surfel.
+            If a row is negative, because ``SurfelIndex.at`` returns -1 for a voxel without a
+            surfel, or beyond the last; if rows are neither whole numbers nor a mask (K,).
 
         """
         if not isinstance(rows, slice):
             rows = np.asarray(rows)
             if rows.size == 0 and rows.dtype != np.bool_:
                 rows = rows.astype(np.int64)
-            if rows.dtype.kind == 'i' and rows.size and rows.min() < 0:
-                raise IndexError(no_row(int(rows.min()), len(self)))
+            if rows.ndim != 1 or rows.dtype.kind not in 'iub':
+                raise IndexError(
+                    f'rows {rows.dtype} {rows.shape}, expected whole numbers (R,), a mask (K,) or '
+                    'a slice; fields are attributes, as surfels.position'
+                )
+            if rows.dtype == np.bool_:
+                if len(rows) != len(self):
+                    raise IndexError(f'a mask of {len(rows)}, expected one of {len(self)} surfels')
+            elif rows.size and not 0 <= rows.min() <= rows.max() < len(self):
+                worst = rows.min() if rows.min() < 0 else rows.max()
+                raise IndexError(no_row(int(worst), len(self)))
         return Surfels(
             position=self.position[rows],
             normal=self.normal[rows],

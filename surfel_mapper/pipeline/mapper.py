@@ -179,6 +179,11 @@ class Mapper:
         ``input.reset_after_s`` clears the map, if the next message agrees; else the scan is
         dropped. The topic is for the log.
         """
+        if not isinstance(scan, Scan):
+            raise TypeError(
+                f'a {type(scan).__name__}, expected a Scan: Scan(points=..., stamp_ns=..., '
+                'frame_id=...)'
+            )
         self.counters.received += 1
         if topic:
             self._drops.name_topic(scan.frame_id, topic)

@@ -12,7 +12,18 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from surfel_mapper import Config, diff, estimate_normals, Mapper, replay, Scan, SurfelMap, Surfels
+from surfel_mapper import (
+    Config,
+    diff,
+    DistanceField,
+    estimate_normals,
+    Mapper,
+    replay,
+    Scan,
+    SurfelMap,
+    Surfels,
+    Trajectory,
+)
 from surfel_mapper.errors import ConfigError, DependencyError, FileFormatError, MapError
 from surfel_mapper.pipeline import Mapper as PipelineMapper
 
@@ -265,6 +276,92 @@ MISTAKES = {
         lambda _: Scan(points=[[1.0, 2.0, 3.0]], stamp_ns=0, frame_id='lidar'),
         ValueError,
         'points: list, expected an array',
+    ),
+    'no number of points': (
+        lambda m: m.surfels('5'),
+        TypeError,
+        r"min_points: '5', expected a whole number",
+    ),
+    'points as their least number': (lambda m: m.surfels(POINTS), TypeError, 'a ndarray'),
+    'half a point': (lambda m: m.num_surfels(2.5), TypeError, r'min_points: 2\.5'),
+    'a name as version': (lambda m: m.surfels_changed(since='a'), TypeError, "since: 'a'"),
+    'half a level': (lambda m: m.coarsen(1.0), TypeError, r'level: 1\.0, expected a whole number'),
+    'yes as level': (lambda m: m.coarsen(True), TypeError, 'level: True'),
+    'half a thread': (lambda _: SurfelMap(0.5, threads=2.5), TypeError, r'threads: 2\.5'),
+    'a word as origin': (
+        lambda _: SurfelMap(0.5, origin_m='auto'),
+        ValueError,
+        "origin_m: 'auto', expected numbers",
+    ),
+    'a frame as position': (lambda m: m.add(POINTS, 'lidar'), ValueError, "origin: 'lidar'"),
+    'a frame as pose': (
+        lambda m: m.add(POINTS, T_map_sensor='map'),
+        ValueError,
+        "T_map_sensor: 'map', expected numbers",
+    ),
+    'rows of unequal length': (
+        lambda m: m.add([[1, 2, 3], [1, 2]]),
+        ValueError,
+        'points: a list of unequal rows',
+    ),
+    'surfels as points': (lambda m: m.add(m.surfels()), ValueError, 'points: a Surfels'),
+    'a column without name': (
+        lambda _: SurfelMap(0.5, columns=('intensity',)).add(POINTS, columns=POINTS[:, 0]),
+        TypeError,
+        'columns: a ndarray, expected arrays by name',
+    ),
+    'one voxel for a list': (
+        lambda m: m.moments([1, 2]),
+        ValueError,
+        r'integers \(K, 3\)',
+    ),
+    'points for voxels': (lambda m: m.moments(POINTS), ValueError, 'voxel_index: float64'),
+    'a half row': (lambda m: m.surfels()[1.0], IndexError, 'expected whole numbers'),
+    'the name of a field': (lambda m: m.surfels()['position'], IndexError, 'as surfels.position'),
+    'no row': (lambda m: m.surfels()[None], IndexError, 'expected whole numbers'),
+    'yes for a row': (lambda m: m.surfels()[True], IndexError, 'expected whole numbers'),
+    'a mask of others': (
+        lambda m: m.surfels()[np.ones(3, bool)],
+        IndexError,
+        r'a mask of 3, expected one of \d+ surfels',
+    ),
+    'rows beyond the last': (
+        lambda m: m.surfels().select([99_999]),
+        IndexError,
+        r'row 99999 of \d+ surfels',
+    ),
+    'a sensor in the plane': (
+        lambda _: estimate_normals(POINTS, viewpoint=[1.0, 2.0]),
+        ValueError,
+        'viewpoint: .* expected x y z',
+    ),
+    'a frame as sensor': (
+        lambda _: estimate_normals(POINTS, viewpoint='lidar'),
+        ValueError,
+        "viewpoint: 'lidar', expected numbers",
+    ),
+    'a file for normals': (lambda _: estimate_normals('a.ply'), ValueError, 'expected numbers'),
+    'a map for normals': (lambda m: estimate_normals(m), ValueError, 'points: '),
+    'a number to load': (
+        lambda _: SurfelMap.load(3),
+        TypeError,
+        'path: 3, expected a str',
+    ),
+    'nothing to save to': (lambda m: m.save(None), TypeError, 'path: None'),
+    'a word as trajectory': (
+        lambda _: Trajectory.from_matrices('x'),
+        ValueError,
+        "T_fixed_sensor: 'x', expected numbers",
+    ),
+    'points for a scan': (
+        lambda _: PipelineMapper().add_scan(POINTS),
+        TypeError,
+        'a ndarray, expected a Scan',
+    ),
+    'settings of a field by name': (
+        lambda _: DistanceField({'voxel_size_m': 0.1}),
+        TypeError,
+        'config: a dict, expected a TsdfConfig',
     ),
     'an unknown setting': (
         lambda _: Config.from_mapping({'map.voxel_size': 1.0}),

@@ -52,6 +52,11 @@ class DistanceField:
     def __init__(
         self, config: TsdfConfig | None = None, *, blocks: BlockMap | None = None
     ) -> None:
+        if not isinstance(config, (TsdfConfig, type(None))):
+            raise TypeError(
+                f'config: a {type(config).__name__}, expected a TsdfConfig: '
+                'TsdfConfig(voxel_size_m=0.1)'
+            )
         self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
         self.config = self.blocks.config
         self._mesher = Mesher(self.blocks)
