@@ -230,6 +230,11 @@ class MomentMap:
         voxel_index : (K, 3) int, optional
             The voxels; those that the map does not contain are skipped. By default all.
 
+        Raises
+        ------
+        ValueError
+            If the voxels are not integers (K, 3).
+
         """
         if voxel_index is None:
             chosen = self._table.changed_after(-1, 1)

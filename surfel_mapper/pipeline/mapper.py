@@ -177,7 +177,7 @@ class Mapper:
         A scan without points or frame, or with a stamp that is not newer than the last of its
         frame, is dropped and counted. A stamp that goes back by more than
         ``input.reset_after_s`` clears the map, if the next message agrees; else the scan is
-        dropped. The topic is for the log.
+        dropped. The topic is for the log. Raises TypeError for anything but a Scan.
         """
         if not isinstance(scan, Scan):
             raise TypeError(
