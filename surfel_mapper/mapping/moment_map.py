@@ -241,10 +241,8 @@ class MomentMap:
         else:
             index = np.asarray(voxel_index)
             if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
-                raise ValueError(
-                    f'voxel_index: {index.dtype} {index.shape}, expected integers (K, 3); points '
-                    'are added by add'
-                )
+                kind = f'{index.dtype} {index.shape}'
+                raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
             chosen = self._table.find(np.unique(pack_keys(index)))
             chosen = chosen[chosen >= 0]
         return self._moments_of(chosen[np.argsort(self._table.rows.array[chosen, layout.KEY])])
