@@ -8,11 +8,6 @@ The publishers of the table are processes that use rclpy and its defaults only.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-import subprocess
-import sys
-
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
@@ -20,70 +15,21 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
-from surfel_mapper.ros.context import FASTDDS_VARIABLES, PROFILE
+from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from test.ros.live import Peer, reliably, START_NS
+from test.ros.ordinary import node_on_defaults, NUMBER, publish
 
 SIZES = (200_000, 800_000, 2_000_000, 4_000_000, 8_000_000)
-NUMBER = 12
-"""Clouds of each size and kind of publisher, more than its queue holds."""
-
-ATTEMPTS = 3
-"""The promise is for a machine with time to spare: the publisher keeps 10 clouds, that is 1 s."""
-
-DEFAULTS = ['--ros-args', '-p', 'pose.source:=identity', '-p', 'window.max_scans:=5']
-DEFAULTS += ['-p', 'input.max_waiting_clouds:=1000', '-p', 'publish.diagnostics_rate_hz:=10.0']
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
 
 
 @pytest.fixture(scope='module')
 def node(prefork, tmp_path_factory):
-    """Run a node with Fast DDS' defaults."""
-    from test.ros.live import Process
-
-    with pytest.MonkeyPatch.context() as patch:
-        for name in FASTDDS_VARIABLES:
-            patch.delenv(name, raising=False)
-        node = Process(['node', *DEFAULTS], tmp_path_factory.mktemp('qos'))
+    """Run a node that other tests of this file share."""
+    with node_on_defaults(tmp_path_factory.mktemp('qos')) as node:
         yield node
-        node.kill()
-
-
-def publish(peer, node, first_ns, reliability, *, profile, promised):
-    """Run a publisher; return the number of clouds received of each size."""
-    env = {key: value for key, value in os.environ.items() if key not in FASTDDS_VARIABLES}
-    if profile:
-        env['FASTRTPS_DEFAULT_PROFILES_FILE'] = str(PROFILE)
-    command = [sys.executable, str(Path(__file__).with_name('plain_publisher.py'))]
-    command += [reliability, str(NUMBER), str(first_ns)]
-    received = {}
-    peer.diagnosis({'state': 'active', 'normals': 'not oriented'})
-    with subprocess.Popen(
-        command, env=env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    ) as publisher:
-        for size in SIZES:
-            for _ in range(ATTEMPTS if size in promised else 1):
-                received[size] = publish_size(peer, publisher, size, size in promised)
-                if received[size] == NUMBER:
-                    break
-        publisher.stdin.close()
-    node.check()
-    return received
-
-
-def publish_size(peer, publisher, size, is_promised):
-    """Publish clouds of one size; return the number received."""
-    before = int(peer.diagnosis()[1]['scans.received'])
-    publisher.stdin.write(f'{size}\n')
-    publisher.stdin.flush()
-    assert publisher.stdout.readline().strip() == str(size)
-    try:
-        expected = {'scans.received': before + NUMBER}
-        peer.diagnosis(expected, timeout_s=20.0 if is_promised else 1.0)
-    except AssertionError:
-        return int(peer.diagnosis()[1]['scans.received']) - before
-    return NUMBER
 
 
 @pytest.mark.parametrize(
@@ -99,7 +45,9 @@ def test_all_clouds_of_the_promised_sizes_arrive(node, peer, reliability, profil
     number = 2 * (reliability == 'reliable') + profile
     first_ns = START_NS + number * 1000 * 10**9
 
-    received = publish(peer, node, first_ns, reliability, profile=profile, promised=promised)
+    peer.diagnosis({'normals': 'not oriented'})
+    options = {'profile': profile, 'promised': promised, 'sizes': SIZES}
+    received = publish(peer, node, first_ns, reliability, **options)
 
     print(reliability, 'with profile' if profile else 'default', received)
     missing = {size: received[size] for size in promised if received[size] != NUMBER}
