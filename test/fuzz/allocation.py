@@ -8,8 +8,8 @@ forked: threads that share the work of a scan would be missing in a child.
 
 ``until_the_map``: each allocation, or each of a stride, of a small replay by one thread fails
 once, from opening the bag to the map that is written. Imports are done and kernels loaded before;
-children that are forked from there try a batch each. A child that dies ends its batch. Prints the
-counts as JSON.
+children that are forked from there try a batch each. A child that dies ends its batch: numba dies
+if it cannot allocate, and NumPy (2.3) fills an index without end. Prints the counts as JSON.
 """
 
 from __future__ import annotations
@@ -33,6 +33,9 @@ from surfel_mapper.offline.replay import ReplayOptions
 SETTINGS = {'map.threads': 1, 'pose.source': 'identity'}
 BATCH, SMALL_BATCH = 50, 5
 """Failures a process, all or a stride of them: forking takes as long as a failing replay."""
+
+HANGS_S = 20
+"""Processor time of a replay after which its process is ended; it takes .1 s."""
 
 WHOLE, LEAST = 200, 5
 """Allocations in a row, and tried ones, after which a map is left: those before it are through."""
@@ -59,14 +62,14 @@ def until_the_map(stride: str, bag: str, folder: str) -> int:
         expected = small_replay(bag, Path(folder, f'warm{number}'))
     gc.collect()
     gc.freeze()
-    counts = {'failed': 0, 'crashed': 0, 'last': 0}
+    counts = {'failed': 0, 'crashed': 0, 'hung': 0, 'last': 0}
     written, numbers = 0, itertools.count(0, int(stride))
     size = BATCH if int(stride) == 1 else SMALL_BATCH
     batch = list(itertools.islice(numbers, size))
     while written < max(WHOLE // int(stride), LEAST):
         results, code = in_child(batch, bag, folder, expected)
         counts['failed'] += results.count(FAILED) + results.count(WRITTEN)
-        if WRONG in results or code not in (0, -signal.SIGSEGV):
+        if WRONG in results or code not in (0, -signal.SIGSEGV, -signal.SIGVTALRM):
             print(
                 f'allocation {batch[len(results) - 1]}: {results[-1:]!r}, {code}', file=sys.stderr
             )
@@ -74,7 +77,7 @@ def until_the_map(stride: str, bag: str, folder: str) -> int:
         for result in results:
             written = 0 if result == FAILED else written + 1
         if code:
-            counts['crashed'] += 1
+            counts['crashed' if code == -signal.SIGSEGV else 'hung'] += 1
             results += bytes(1)
         counts['last'] = batch[len(results) - 1]
         batch = batch[len(results) :]
@@ -90,6 +93,7 @@ def in_child(batch: list[int], bag: str, folder: str, expected: str) -> tuple[by
     if not child:
         try:
             for number in batch:
+                signal.setitimer(signal.ITIMER_VIRTUAL, HANGS_S)
                 os.write(writing, bytes([result_of(number, bag, folder, expected)]))
         finally:
             os._exit(0)
