@@ -13,6 +13,7 @@ the optical centre fit no candidate, and are fused point by point instead (point
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -44,6 +45,9 @@ CLUSTER_GAP_DEG = 0.05
 NEAR_M = 0.1
 """Nearer points are ignored: many drivers send zeros for missing returns."""
 
+STEEPEST = math.sin(math.radians(89.9))
+"""Sine of the largest elevation; above, the azimuth of a point is hardly defined."""
+
 LEAST_FIT = 0.9
 """
 Smallest share of fitting points for a model to be used; see ``fit_share``. Real lidars have 0.92
@@ -74,10 +78,11 @@ class Angles:
 
     @classmethod
     def of(cls, points: npt.NDArray[Any], ring: npt.NDArray[Any] | None = None) -> Angles:
-        """Return the directions of the points that are finite and beyond NEAR_M."""
+        """Return the directions of the points that are finite, beyond NEAR_M and not overhead."""
         x, y, z = points.T.astype(np.float64)
-        range_m = np.sqrt(x * x + y * y + z * z)
-        valid = np.isfinite(range_m) & (range_m > NEAR_M)
+        with np.errstate(over='ignore', invalid='ignore'):  # of any float64, nan too
+            range_m = np.sqrt(x * x + y * y + z * z)
+            valid = np.isfinite(range_m) & (range_m > NEAR_M) & (np.abs(z) < STEEPEST * range_m)
         x, y, z, range_m = x[valid], y[valid], z[valid], range_m[valid]
         return cls(
             elevation=np.degrees(np.arcsin(z / range_m)),

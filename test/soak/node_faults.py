@@ -47,9 +47,10 @@ from test.bench.report import Row
 from test.bench.street import Street
 from test.fuzz.mutations import cut, flip, overwrite, randomise
 from test.ros.live import Peer, Process, stamp
-from test.soak import unreliable_layer
 from test.soak.core import BASE, CONFIG, there_and_back, TURN_M
 from test.soak.faults import FAULT_SHARE, RATE_HZ, serialised
+
+LAYER = 'test.soak.unreliable_layer'
 
 PERIOD_NS = 50_000_000
 FIRST_NS = 1_700_000_000_000_000_000
@@ -112,6 +113,15 @@ URLS = (
 BAD_NUMBERS = (math.nan, math.inf, -math.inf, 1e30, -1e38, 5e-324)
 
 
+def install_layer(folder: Path) -> None:
+    """Write the metadata of a package with the layer that fails into a folder of sys.path."""
+    info = folder / 'unreliable-1.0.dist-info'
+    info.mkdir()
+    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: unreliable\nVersion: 1.0\n')
+    points = f'[surfel_mapper.layers]\nunreliable = {LAYER}\n'
+    (info / 'entry_points.txt').write_text(points)
+
+
 class FaultyNode:
     """A node that is driven along a street, with faults on the way."""
 
@@ -125,7 +135,7 @@ class FaultyNode:
         self.faults: Counter[str] = Counter()
         self.answers: Counter[str] = Counter()
         self.rng, self.folder = random.Random(seed), folder
-        unreliable_layer.install(folder)
+        install_layer(folder)
         given = [item for k, v in SETTINGS.items() for item in ('-p', f'{k}:={v}')]
         self.node = Process(['node', '--ros-args', *given], folder)
         self.peer = Peer()

@@ -3,13 +3,13 @@
 """
 A layer that fails at random, once or until it is switched off, for soaks of the node.
 
-A package of its own registers it by an entry point, as other packages register theirs.
+A package of its own registers it by an entry point, as other packages register theirs; importing
+this module adds its setting to those of the process.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 import random
 
 from surfel_mapper.config import register_stage, setting, Stage
@@ -67,15 +67,6 @@ class UnreliableLayer(Layer):
     def _fail(self):
         if self._fails or self._rng.random() < ONCE:
             raise self._rng.choice(FAILURES)('the layer fails, as it is made to')
-
-
-def install(folder: Path) -> None:
-    """Write the metadata of a package with this layer into a folder of sys.path."""
-    info = folder / 'unreliable-1.0.dist-info'
-    info.mkdir()
-    (info / 'METADATA').write_text('Metadata-Version: 2.1\nName: unreliable\nVersion: 1.0\n')
-    points = f'[surfel_mapper.layers]\nunreliable = {__name__}\n'
-    (info / 'entry_points.txt').write_text(points)
 
 
 register('unreliable', f'{__name__}:UnreliableLayer', switch='layers.unreliable.enabled')

@@ -68,6 +68,18 @@ def test_points_without_two_beams_are_refused(points):
         fitted_lidar(points, **RANGES)
 
 
+def test_points_overhead_and_of_any_size_do_not_count():
+    lidar = LidarModel(rows=16, columns=360, vertical_fov_deg=30.0)
+    points = 5.0 * lidar.directions.reshape(-1, 3)
+    odd = [[0.0, 0.0, 3.0], [0.0, 0.0, -3.0], [1e-9, 0.0, 3.0], [1e200, 1e200, -1e300]]
+    odd += [[np.nan, 1.0, 1.0], [np.inf, -np.inf, 1.0]]
+    limits = {'min_range_m': 0.5, 'max_range_m': 20.0}
+
+    assert fitted_lidar(np.vstack([points, odd]), **limits) == fitted_lidar(points, **limits)
+    with pytest.raises(CloudFormatError, match='two beams or more'):
+        fitted_lidar(np.array(odd), **limits)
+
+
 def test_beams_without_rings_are_the_clusters_of_elevations():
     beams = (12.0, 7.5, 4.0, 1.0, -0.5, -3.0, -9.0, -20.0)
     points, _ = points_of(LidarModel(rows=8, columns=256, beam_elevations_deg=beams))
