@@ -14,7 +14,7 @@ are charged to the budget of the file, and the sum of its unpacked chunks is lim
 records of equal size are read in blocks, and the places of a small number of messages are kept
 from the survey, so that 100,000 messages take a tenth of a second.
 
-It is one module as all its parts share the budget and what is kept: each makes room for others.
+One module: all parts share the budget, and drop what they keep when another needs memory.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class ChunkedFile(BagFile):
         """
 
     def _begin_again(self) -> None:
-        """Forget what was read through an index that is not used; its chunks had other numbers."""
+        """Forget what a rejected index stated: without it, chunks have other numbers."""
         self._forget_places()
         self._budget.give_back(sum(map(len, self._kept.values())))
         for found in (self._by_id, self._counts, self._chunks, self._kept, self.skipped_at):

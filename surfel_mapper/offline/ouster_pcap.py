@@ -79,7 +79,7 @@ class OusterPcap:
         Return the points (N, 3), m, of a scan in the frame of the sensor, and their columns.
 
         ``t`` is the time in ns since the first column, by the clock of the lidar; ``ring`` the
-        beam from the top. Of two returns the first is taken; what was not hit is left out.
+        beam from the top. Of two returns the first is taken; pixels without a return are left out.
 
         Raises
         ------

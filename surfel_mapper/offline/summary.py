@@ -17,7 +17,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     Return the summary in a few lines for people.
 
     The times of the stages are those of the whole replay by scan received, in the thread that
-    maps; ``other`` is what is left of the total: mostly giving scans to a second thread.
+    maps; ``other`` is the rest of the total, mostly the time to pass scans to a second thread.
     """
     from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
 

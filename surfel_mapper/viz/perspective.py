@@ -39,7 +39,7 @@ class Camera:
     Attributes
     ----------
     place, target : (3,) float64, m
-        Where it is and where it looks, in the frame of the map; z is up.
+        Position and direction of view, in the frame of the map; z is up.
     width, height : int, px
     focal_px : float
     nearest_m, haze_m : float

@@ -6,8 +6,8 @@ Publish clouds as an ordinary driver does: rclpy and its defaults, nothing of th
 ``python plain_publisher.py reliable|best_effort NUMBER FIRST_STAMP_NS cloud|depth`` publishes,
 once the topic has a subscriber, NUMBER messages at 10 Hz for each size in bytes read from stdin,
 and confirms each size on stdout. Depth images have 640 pixels of 16 bits a row, and each comes
-with its camera info. A reliable publisher waits until the messages that it keeps have arrived:
-where there is no time to spare, more of them would be on their way.
+with its camera info. A reliable publisher waits until the messages that it keeps have arrived,
+as on a loaded machine its queue overflows.
 """
 
 from array import array
