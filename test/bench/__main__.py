@@ -36,6 +36,7 @@ BENCHES = (
     'registration',
     'tracking',
     'loops',
+    'long_drive',
     'outputs',
     'tsdf',
     'models',

@@ -13,6 +13,7 @@ memory is stated. Peers have their own defaults, but for one thread and a voxel 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Sequence
 from itertools import pairwise
 import json
 import math
@@ -21,7 +22,6 @@ import resource
 import sys
 import tempfile
 import time
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -108,16 +108,17 @@ def ours(drive: Recording) -> Row:
         }
         command = [sys.executable, '-m', 'test.bench.loops']
         found: Row = json.loads(output(command, input=json.dumps(job), cwd=ROOT))
-        before, after, at = (
-            np.load(Path(scratch) / f'{n}.npy') for n in ('before', 'after', 'at')
-        )
-    true = drive.poses[at]
+        return {'who': 'ours', **errors_around(Path(scratch), drive.poses), **found}
+
+
+def errors_around(directory: Path, poses: npt.NDArray[np.float64]) -> Row:
+    """Return the errors of the poses before and after the loops, which ``closed`` wrote."""
+    before, after, at = (np.load(directory / f'{name}.npy') for name in ('before', 'after', 'at'))
+    true = poses[at]
     return {
-        'who': 'ours',
         'mapped': len(at),
         **{f'{name}_before': value for name, value in errors(before, true).items()},
         **errors(after, true),
-        **found,
     }
 
 
@@ -149,8 +150,28 @@ def path_m(poses: npt.NDArray[np.float64]) -> float:
 def main() -> None:
     """Map the scans of the job on stdin by registration, close the loops, write the poses."""
     job = json.load(sys.stdin)
-    directory = job['directory']
+    files = zip(job['scans'], job['stamps_ns'], strict=True)
+    scans = (
+        Scan(points=np.load(path), stamp_ns=stamp_ns, frame_id='lidar') for path, stamp_ns in files
+    )
     keep_freed_memory()
+    found = closed(scans, job['stamps_ns'], job['directory'])
+    json.dump(found, sys.stdout)
+
+
+def closed(
+    scans: Iterable[Scan],
+    stamps_ns: Sequence[int],
+    directory: str,
+    progress: Callable[[Row], object] = lambda row: None,
+) -> Row:
+    """
+    Map scans by registration and close the loops; write before.npy, after.npy and at.npy.
+
+    The files have the poses, (M, 4, 4), and the numbers of the scans that were mapped. Seconds are
+    those of the processor, without those in which scans are made or read. ``progress`` is called
+    every thousand scans.
+    """
     mapper = Mapper(
         Config.from_mapping(
             {
@@ -162,34 +183,44 @@ def main() -> None:
         )
     )
     mapper.warm_up()
-    start, begun = time.process_time(), time.perf_counter()
-    stamps: dict[int, npt.NDArray[np.float64]] = {}
-    for path, stamp_ns in zip(job['scans'], job['stamps_ns'], strict=True):
-        mapper.add_scan(Scan(points=np.load(path), stamp_ns=stamp_ns, frame_id='lidar'))
-        stamps.update({u.stamp_ns: u.T_map_sensor for u in mapper.insert_ready()})
+    begun, odometry_s = time.perf_counter(), 0.0
+    for place, scan in enumerate(scans, start=1):
+        start = time.process_time()
+        mapper.add_scan(scan)
+        for _ in mapper.insert_ready():
+            pass
+        odometry_s += time.process_time() - start
+        if place % 1000 == 0:
+            progress({'scans': place, 'odometry_cpu_s': odometry_s, 'peak_mb': peak_mb()})
     mapper.finish()
     assert mapper.loops is not None
-    middle, before = time.process_time(), mapper.loops.T_map_sensor
-    odometry_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
-    move = mapper.close_loops()
-    number = {stamp_ns: place for place, stamp_ns in enumerate(job['stamps_ns'])}
+    before, odometry_mb = mapper.loops.T_map_sensor, peak_mb()
+    start = time.process_time()
+    move = mapper.close_loops(lambda text: progress({'loops': text, 'peak_mb': peak_mb()}))
+    loops_s = time.process_time() - start
+    number = {stamp_ns: place for place, stamp_ns in enumerate(stamps_ns)}
     found = {'before': before, 'after': mapper.loops.T_map_sensor}
     found['at'] = np.array([number[stamp_ns] for stamp_ns in mapper.loops.stamps_ns])
     for name, array in found.items():
         np.save(Path(directory) / f'{name}.npy', array)
-    said: dict[str, Any] = {
+    return {
         'loops': len(move.closure.loops),
         'refused': len(move.closure.refusals),
-        'odometry_cpu_s': middle - start,
-        'loops_cpu_s': time.process_time() - middle,
-        'cpu_s': time.process_time() - start,
+        'odometry_cpu_s': odometry_s,
+        'loops_cpu_s': loops_s,
+        'cpu_s': odometry_s + loops_s,
         'wall_s': time.perf_counter() - begun,
         'odometry_peak_mb': odometry_mb,
-        'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
+        'peak_mb': peak_mb(),
+        'voxels': mapper.map.num_voxels,
         'spool_mb': mapper.loops.nbytes / 1e6,
         'said': str(move),
     }
-    json.dump(said, sys.stdout)
+
+
+def peak_mb() -> float:
+    """Return the largest memory of this process so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
 if __name__ == '__main__':

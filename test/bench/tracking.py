@@ -5,12 +5,13 @@ Tracking on hard input: thinned scans, trucks that move along, spins, corridors,
 
 Errors are the root mean square of the positions after the best fit of the whole track, all with
 one estimator. Our rows have the counts of the summary of a replay: lost, ambiguous and degenerate
-scans, parts that stayed apart. Peers run at 0.5 and 1 m voxels; the better is shown.
+scans, parts that stayed apart. Peers run at 0.5 and 1 m voxels; the better is shown. The last
+column compares ours with the best of the peers, and the last row counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 import os
 from pathlib import Path
 import tempfile
@@ -20,6 +21,7 @@ import numpy as np
 
 from surfel_mapper.config import Config
 from surfel_mapper.evaluation.trajectory_errors import absolute_errors
+from surfel_mapper.offline.summary import MOST_SURROUNDED
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.bench.machine import one_core
@@ -30,6 +32,14 @@ from test.bench.registration import recorded, Recording, rms, SIZES_M
 from test.bench.report import Row
 from test.bench.scenarios import Scenario, scenarios
 
+EQUAL = 1.05
+"""Errors that differ by a smaller factor are as good as each other."""
+
+BETTER = 'better than both'
+
+TWICE = 2.0
+"""Factor above which ours is called worse."""
+
 THINNED = (('hall_os0_full', 2), ('hall_os0_full', 3), ('hall_os0_long', 2))
 """Real bags of which every second or third scan is taken."""
 
@@ -37,7 +47,8 @@ THINNED = (('hall_os0_full', 2), ('hall_os0_full', 3), ('hall_os0_long', 2))
 def run(options: Options) -> list[Row]:
     """Return a row a sequence."""
     with one_core(), tempfile.TemporaryDirectory() as scratch:
-        return [row(options, each) for each in sequences(options, Path(scratch))]
+        rows = [row(options, each) for each in sequences(options, Path(scratch))]
+    return [*rows, total(rows)] if options.peers else rows
 
 
 def row(options: Options, sequence: Recording) -> Row:
@@ -53,7 +64,30 @@ def row(options: Options, sequence: Recording) -> Row:
             except PeerError as error:
                 result[f'{peer.name}: not measured'] = str(error)
         result[f'{peer.name}_m'] = min(errors, default=None)
-    return result
+    return {**result, 'ours is': verdict(result)} if options.peers else result
+
+
+def verdict(row: Row) -> str:
+    """Return how the error of ours compares with the best peer's, and if the summary warns."""
+    measured = [row.get(f'{peer.name}_m') for peer in ODOMETRY_PEERS]
+    errors = [error for error in measured if error is not None]
+    if len(errors) < len(measured):
+        return ''
+    ratio = row['ours_m'] / min(errors)
+    if ratio * EQUAL < 1.0:
+        found = BETTER
+    elif ratio <= EQUAL:
+        found = 'as good as the best'
+    else:
+        found = 'within twice the best' if ratio <= TWICE else 'worse'
+    warns = row['ambiguous'] or row['degenerate'] or row['surrounded'] >= MOST_SURROUNDED
+    return f'{found}, reported' if warns else found
+
+
+def total(rows: Sequence[Row]) -> Row:
+    """Return the row that counts the sequences in which ours is better than both peers."""
+    better = sum(str(row['ours is']).startswith(BETTER) for row in rows)
+    return {'sequence': 'all', 'ours is': f'{BETTER} on {better} of {len(rows)}'}
 
 
 def ours(sequence: Recording) -> Row:

@@ -39,11 +39,18 @@ def cast(
     """
     apart = 0 if len(origins) == 1 else 1
     ray, start = np.empty(6), np.empty(6)
+    last = -1
     for row in range(len(directions)):
         for axis in range(3):
             ray[axis] = origins[row * apart, axis]
             ray[3 + axis] = directions[row, axis]
         nearest, found = range_m[row], -1
+        if last >= 0:
+            # Neighbours often hit the same primitive; its distance prunes most of the tree.
+            into_primitive(ray, pose[last], start)
+            distance, face = hit(start, kind[last], half[last])
+            if distance < nearest:
+                nearest = np.nextafter(distance, np.inf)
         node = 0
         while node < len(node_next):
             if not meets(ray, node_box[node], nearest):
@@ -54,7 +61,7 @@ def cast(
                 into_primitive(ray, pose[primitive], start)
                 distance, face = hit(start, kind[primitive], half[primitive])
                 if distance < nearest:
-                    nearest, found = distance, primitive * FACES + face
+                    nearest, found, last = distance, primitive * FACES + face, primitive
             node += 1
         range_m[row], surface[row] = nearest, found
 

@@ -5,13 +5,15 @@ Feed scans to the odometry of one peer and time it; runs in the environment of t
 
 The job is JSON on stdin: the module, voxel_size_m, the files of the scans, and the file for the
 poses, (S, 4, 4), corrected at the end if the peer closes loops. JSON on stdout has clock time,
-processor time, which depends little on other load, and the memory.
+processor time, which depends little on other load, and the memory. Peers print progress on stdout,
+which goes to stderr here.
 """
 
 from __future__ import annotations
 
 from importlib import import_module
 import json
+import os
 import resource
 import sys
 from time import perf_counter, process_time
@@ -22,6 +24,8 @@ import numpy as np
 def main() -> None:
     """Run the job."""
     job = json.load(sys.stdin)
+    stdout = os.fdopen(os.dup(1), 'w')
+    os.dup2(2, 1)  # also for the C++ code of a peer
     odometry = import_module(job['module']).Odometry(job['voxel_size_m'])
     milliseconds, cpu_ms, poses = [], [], []
     for path in job['scans']:
@@ -41,7 +45,8 @@ def main() -> None:
         'finish_s': process_time() - end,
         'peak_mb': resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
     }
-    json.dump(result, sys.stdout)
+    json.dump(result, stdout)
+    stdout.close()
 
 
 if __name__ == '__main__':
