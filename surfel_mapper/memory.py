@@ -31,12 +31,12 @@ LARGEST = 31 << 20
 
 def keep_freed_memory() -> None:
     """
-    Make glibc keep freed blocks of up to 31 MiB, and up to 62 MiB of freed memory in total.
+    Make glibc keep freed blocks of up to 31 MiB, and up to 62 MiB at the end of each arena.
 
-    Freeing a block that came from the system raises glibc's threshold for such blocks to its
-    size, and the threshold for returning memory to twice the size (mallopt(3), M_MMAP_THRESHOLD).
-    The block is never touched, so it costs nothing. Without glibc this has no effect; thresholds
-    set by the environment stay.
+    Each thread that allocates has an arena. Freeing a block that came from the system raises
+    glibc's threshold for such blocks to its size, and the threshold for returning memory to twice
+    the size (mallopt(3), M_MMAP_THRESHOLD). The block is never touched, so it costs nothing.
+    Without glibc this has no effect; thresholds set by the environment stay.
     """
     bytes(LARGEST)
 

@@ -11,11 +11,12 @@ of zstd can be made to unpack to gigabytes. The modules for zstd and lz4 come wi
 from __future__ import annotations
 
 import bz2
+import os
 from pathlib import Path
 import sys
-from typing import Any
+from typing import Any, BinaryIO
 
-from surfel_mapper.budget import limit_for, stated_limit
+from surfel_mapper.budget import limit_for, open_regular, stated_limit
 from surfel_mapper.errors import BagError, DependencyError
 
 PIECE_BYTES = 1 << 16
@@ -106,11 +107,13 @@ def unpack_file(path: Path, target: Path) -> bool:
     Raises
     ------
     BagError
-        If it is not zstd, damaged before its end, or unpacks to more than is plausible.
+        If it is no regular file, not zstd, damaged before its end, or unpacks to more than is
+        plausible.
 
     """
-    with open(path, 'rb') as source, open(target, 'wb') as sink:
-        machine, left = decompressor('zstd'), max_unpacked_file_bytes(path.stat().st_size)
+    with open_packed(path) as source, open(target, 'wb') as sink:
+        size = os.fstat(source.fileno()).st_size
+        machine, left = decompressor('zstd'), max_unpacked_file_bytes(size)
         packed = source.read(PIECE_BYTES)
         while packed or not (machine.needs_input or machine.eof):
             if machine.eof:  # the next frame
@@ -126,6 +129,14 @@ def unpack_file(path: Path, target: Path) -> bool:
             if not packed and (machine.eof or machine.needs_input):
                 packed = source.read(PIECE_BYTES)
         return bool(machine.eof)
+
+
+def open_packed(path: Path) -> BinaryIO:
+    """Return a regular file opened for reading; raise BagError for others."""
+    try:
+        return open_regular(path)
+    except OSError as error:
+        raise BagError(f'{path}: cannot be read: {error.strerror or error}') from error
 
 
 def max_unpacked_bytes(packed_size: int) -> int:

@@ -79,6 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Fit models, write the files, report."""
     from surfel_mapper.config import ModelsConfig
+    from surfel_mapper.files.atomic import make_directory
     from surfel_mapper.files.model_files import write_models
     from surfel_mapper.layers.drawings import PointsPicture
     from surfel_mapper.layers.models.pictures import panels_of
@@ -93,7 +94,7 @@ def run(args: argparse.Namespace) -> int:
         noise_per_range_sq=args.noise_per_range_sq,
     )
     model = fit(points, config, viewpoint)
-    args.output.mkdir(parents=True, exist_ok=True)
+    make_directory(args.output)
     write_models(args.output, model.translated(origin_m), args.formats)
     picture = PointsPicture(
         file_name='models.png', panels=panels_of(points, model), viewpoint=viewpoint

@@ -66,6 +66,32 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         raise
 
 
+def make_directory(directory: Path) -> None:
+    """
+    Make a directory and its parents, unless they exist.
+
+    Raises
+    ------
+    FileFormatError
+        If a file is in its place or in that of a parent, or it cannot be made.
+
+    """
+    nearest_directory(directory)
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise FileFormatError(f'{directory}: cannot be made: {error.strerror or error}') from error
+
+
+def nearest_directory(directory: Path) -> Path:
+    """Return the directory or its nearest parent that exists; FileFormatError for a file there."""
+    absolute = directory.absolute()
+    nearest = next(path for path in (absolute, *absolute.parents) if os.path.lexists(path))
+    if not nearest.is_dir():
+        raise FileFormatError(f'{directory}: {nearest} is a file, expected a directory')
+    return nearest
+
+
 def sync_directory(directory: Path) -> None:
     """Wait until the names in a directory are on the disk, if the file system supports it."""
     descriptor = os.open(directory, os.O_RDONLY)

@@ -27,7 +27,7 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.atomic import make_directory, replace_file
 from surfel_mapper.files.parquet import (
     attributes_of,
     check_size,
@@ -116,7 +116,7 @@ def write_shard(path: str | Path, surfel_map: SurfelMap) -> dict[Tile, Part]:
 
 def write_tile(path: str | Path, surfel_map: SurfelMap) -> None:
     """Write the map of one tile, atomically; missing directories are created."""
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    make_directory(Path(path).parent)
     columns = map_columns(surfel_map)
     block = columns['i'] >> BLOCK_BITS
     rows = np.split(np.arange(len(block)), _starts(block)[1:])

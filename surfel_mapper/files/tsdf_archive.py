@@ -20,6 +20,7 @@ import weakref
 import numpy as np
 
 from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.tsdf.blocks import Blocks
 
@@ -52,9 +53,9 @@ class BlockArchive:
     def __init__(self, directory: str | Path) -> None:
         parent = Path(directory).expanduser()
         try:
-            parent.mkdir(parents=True, exist_ok=True)
+            make_directory(parent)
             self._directory = Path(mkdtemp(prefix='tsdf-', dir=parent))
-        except OSError as error:
+        except (FileFormatError, OSError) as error:
             raise FileFormatError(f'layers.tsdf.archive_directory: {error}') from error
         weakref.finalize(self, rmtree, self._directory, ignore_errors=True)
         self._files: dict[Region, list[tuple[int, Path]]] = {}

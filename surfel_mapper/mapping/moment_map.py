@@ -245,7 +245,7 @@ class MomentMap:
                 raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
             chosen = self._table.find(np.unique(pack_keys(index)))
             chosen = chosen[chosen >= 0]
-        return self._moments_of(chosen[np.argsort(self._table.rows.array[chosen, layout.KEY])])
+        return self._moments_of(chosen[np.argsort(self._table.values(chosen, layout.KEY))])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of rows, in the given order; a copy."""
@@ -283,7 +283,7 @@ class MomentMap:
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
         """Return the keys (K,) of the voxels of at least min_points points, in any order."""
         rows = self._table.changed_after(-1, min_points)
-        return np.asarray(self._table.rows.array[rows, layout.KEY])
+        return self._table.values(rows, layout.KEY)
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
@@ -291,9 +291,8 @@ class MomentMap:
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the voxel keys of rows (K,), -1 for empty rows."""
-        slab = self._table.rows.array
-        keys = np.where(slab[rows, layout.COUNT] > 0, slab[rows, layout.KEY], -1)
-        return np.asarray(keys, np.int64)
+        counts, keys = (self._table.values(rows, name) for name in (layout.COUNT, layout.KEY))
+        return np.where(counts > 0, keys, -1)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
         """
@@ -340,7 +339,7 @@ class MomentMap:
         if self._table.num_points + moments.num_points <= limit:
             return  # usual: even all points in one voxel would be allowed
         found = self._table.find(moments.key)
-        held = np.where(found >= 0, self._table.rows.array[found, layout.COUNT], 0)
+        held = np.where(found >= 0, self._table.values(found, layout.COUNT), 0)
         largest = int((held + moments.count).max(initial=0))
         if largest > limit:
             raise MapLimitError(

@@ -113,7 +113,7 @@ class VoxelTable:
             if self._channels:
                 if len(self._channels.array) < len(self.rows.array):
                     self._channels.grow(len(self.rows.array))
-                self._channels.array[found] += moments.channels
+                self._channels.array[found.astype(np.intp)] += moments.channels
         except BaseException:
             self._undo(moments, found, version)
             raise
@@ -159,8 +159,18 @@ class VoxelTable:
             fallen,
         )
         if self._channels and missing < 0:
-            self._channels.array[rows] -= moments.channels
+            self._channels.array[rows.astype(np.intp)] -= moments.channels
         return int(missing), rows, fallen[:num_fallen]
+
+    def values(self, chosen: npt.NDArray[Any], column: int) -> npt.NDArray[np.int64]:
+        """
+        Return a column of some rows, (K,).
+
+        With indices of another width than intp NumPy (2.4) may end the process when memory runs
+        out, both in reading elements and in assigning.
+        """
+        found: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), column]
+        return found
 
     def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """Return the channel sums of some rows, (K, C)."""

@@ -23,6 +23,7 @@ from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import BagError, CloudFormatError, FileFormatError, FilterError
 from surfel_mapper.files import pcd, ply
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.filters.columns import as_fields
@@ -111,7 +112,7 @@ def filter_clouds(
             raise FileFormatError(f'{target}: exists; choose another output, or overwrite it')
     chain.warm_up()
     for source, target in pairs:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        make_directory(target.parent)
         if is_bag(source):
             work.filter_bag(source, target, overwrite)
         else:

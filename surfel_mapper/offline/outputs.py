@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.files.atomic import make_directory, nearest_directory
 from surfel_mapper.offline.summary import rounded
 
 if TYPE_CHECKING:
@@ -91,10 +92,7 @@ def output_directory(recording: Path, wanted: Path | None) -> Path:
     """
     full = recording.resolve()
     directory = wanted or Path(f'{full.stem if recording.is_file() else full.name}_surfels')
-    absolute = directory.absolute()
-    nearest = next(path for path in (absolute, *absolute.parents) if path.exists())
-    if not nearest.is_dir():
-        raise FileFormatError(f'{directory}: {nearest} is a file, expected a directory')
+    nearest = nearest_directory(directory)
     if not os.access(nearest, os.W_OK):
         raise FileFormatError(f'{directory}: no permission to write in {nearest}')
     return directory
@@ -224,7 +222,7 @@ def write_maps(
     """
     from surfel_mapper.files.trajectory import TRAJECTORY
 
-    output.mkdir(parents=True, exist_ok=True)
+    make_directory(output)
     for name in formats:
         if name in MAP_FORMATS:
             write_map(output / MAP_FORMATS[name], name, mapper, window=window)

@@ -28,6 +28,7 @@ from surfel_mapper.errors import (
     MapError,
     SurfelMapperError,
 )
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
@@ -254,7 +255,7 @@ def with_loops(config: Config, options: ReplayOptions, directory: Path) -> Confi
     can_move = not options.window and config.map.mode != 'frozen' and not config.map.load
     if not (is_wanted and can_move):
         return config
-    directory.mkdir(parents=True, exist_ok=True)
+    make_directory(directory)
     kept_in = config.loops.directory or str(directory)
     return config.replace({'loops.enabled': True, 'loops.directory': kept_in})
 

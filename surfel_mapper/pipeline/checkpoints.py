@@ -16,6 +16,7 @@ import time
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.pipeline.mapper import Mapper
 from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
 
@@ -62,7 +63,7 @@ class Checkpoints:
         mapper = self._mapper
         self._saved_s, version = time.monotonic(), mapper.map.version
         newest, before = checkpoint_paths(mapper.config.output)
-        newest.parent.mkdir(parents=True, exist_ok=True)
+        make_directory(newest.parent)
         files = [(newest, before)]
         for (new, _), (old, _) in zip(*(layer_files(p, mapper) for p in files[0]), strict=True):
             files.append((new, old))

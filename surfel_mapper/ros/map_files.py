@@ -13,6 +13,7 @@ from urllib.parse import unquote, urlsplit
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.files.atomic import make_directory
 from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
@@ -36,7 +37,7 @@ def save_map(mapper: Mapper) -> str:
     """
     output = mapper.config.output
     directory = directory_of(output)
-    directory.mkdir(parents=True, exist_ok=True)
+    make_directory(directory)
     path = directory / f'{output.map_name}.ply'
     state = path.with_suffix('.npz')
     beside = [file for file, _ in layer_files(state, mapper)]

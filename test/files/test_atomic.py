@@ -12,7 +12,7 @@ import sys
 import pytest
 
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.atomic import make_directory, replace_file
 
 
 def write(path, *chunks, then=None):
@@ -139,3 +139,16 @@ def test_a_full_device_is_noticed_at_the_last_flush(tmp_path):
         with pytest.raises(FileFormatError, match='No space left'):
             write(tmp_path / 'map.ply', b'few')
         assert os.listdir(tmp_path) == ['other']
+
+
+def test_a_directory_is_made_with_its_parents_or_the_file_in_its_place_is_named(tmp_path):
+    make_directory(tmp_path / 'a' / 'b')
+    make_directory(tmp_path / 'a' / 'b')
+    assert (tmp_path / 'a' / 'b').is_dir()
+    (tmp_path / 'file').write_bytes(b'')
+    (tmp_path / 'link').symlink_to('nowhere')
+    for name, below in (('file', ''), ('file', 'a'), ('link', '')):
+        path = tmp_path / name / below
+        said = f'{path}: {tmp_path / name} is a file, expected a directory'
+        with pytest.raises(FileFormatError, match=f'^{said}$'):
+            make_directory(path)

@@ -15,6 +15,7 @@ if it cannot allocate, and NumPy (2.3) fills an index without end. Prints the co
 from __future__ import annotations
 
 import _testcapi
+import faulthandler
 import gc
 import itertools
 import json
@@ -24,6 +25,7 @@ from pathlib import Path
 import shutil
 import signal
 import sys
+from typing import Any
 
 from surfel_mapper import replay
 from surfel_mapper.config import Config
@@ -56,14 +58,14 @@ def one(number: str, bag: str, output: str) -> int:
     return 0
 
 
-def until_the_map(stride: str, bag: str, folder: str) -> int:
+def until_the_map(first: str, stride: str, bag: str, folder: str) -> int:
     """Let allocations fail in turn; return 1 if a map or a file was not as it has to be."""
     for number in range(3):
         expected = small_replay(bag, Path(folder, f'warm{number}'))
     gc.collect()
     gc.freeze()
-    counts = {'failed': 0, 'crashed': 0, 'hung': 0, 'last': 0}
-    written, numbers = 0, itertools.count(0, int(stride))
+    counts: dict[str, Any] = {'failed': 0, 'crashed': [], 'hung': [], 'last': 0}
+    written, numbers = 0, itertools.count(int(first), int(stride))
     size = BATCH if int(stride) == 1 else SMALL_BATCH
     batch = list(itertools.islice(numbers, size))
     while written < max(WHOLE // int(stride), LEAST):
@@ -77,7 +79,11 @@ def until_the_map(stride: str, bag: str, folder: str) -> int:
         for result in results:
             written = 0 if result == FAILED else written + 1
         if code:
-            counts['crashed' if code == -signal.SIGSEGV else 'hung'] += 1
+            ended = counts['crashed' if code == -signal.SIGSEGV else 'hung']
+            ended.append(batch[len(results)])
+            print(
+                f'allocation {batch[len(results)]}: {signal.Signals(-code).name}', file=sys.stderr
+            )
             results += bytes(1)
         counts['last'] = batch[len(results) - 1]
         batch = batch[len(results) :]
@@ -91,6 +97,8 @@ def in_child(batch: list[int], bag: str, folder: str, expected: str) -> tuple[by
     reading, writing = os.pipe()
     child = os.fork()
     if not child:
+        faulthandler.enable()
+        faulthandler.register(signal.SIGVTALRM, chain=True)
         try:
             for number in batch:
                 signal.setitimer(signal.ITIMER_VIRTUAL, HANGS_S)

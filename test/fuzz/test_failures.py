@@ -190,11 +190,17 @@ def load(surfel_map, moments, path):
     assert loaded.digest() == surfel_map.digest()
 
 
+def read(surfel_map, moments, path):
+    assert len(surfel_map.moments()) == surfel_map.num_voxels
+    surfel_map.digest()
+    surfel_map.surfels_changed(0)
+
+
 def reduce(surfel_map, moments, path):
     surfel_map.reduce(np.zeros((10, 3)), np.eye(4))
 
 
-@pytest.mark.parametrize('operation', [insert, remove, load, reduce])
+@pytest.mark.parametrize('operation', [insert, remove, load, read, reduce])
 def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, operation):
     testcapi = pytest.importorskip('_testcapi', reason='this Python lacks _testcapi')
     surfel_map, path = map_of(1), tmp_path / 'a.npz'

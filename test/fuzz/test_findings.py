@@ -10,6 +10,7 @@ from dataclasses import replace
 from importlib.util import find_spec
 import io
 import os
+from pathlib import Path
 import sqlite3
 import struct
 import time
@@ -209,6 +210,15 @@ def test_unpacking_a_file_stops_at_the_plausible_size(little, tmp_path):
     with pytest.raises(BagError, match='more than is plausible'):
         unpack_file(path, tmp_path / 'out')
     assert (tmp_path / 'out').stat().st_size < 4 << 20
+
+
+def test_only_a_regular_file_is_unpacked(tmp_path):
+    pipe = tmp_path / 'a.mcap.zstd'
+    os.mkfifo(pipe)
+    for path in (pipe, Path('/dev/zero'), tmp_path, tmp_path / 'missing'):
+        with pytest.raises(BagError, match=rf'^{path}: cannot be read: '):
+            unpack_file(path, tmp_path / 'out')
+        assert not (tmp_path / 'out').exists()
 
 
 def test_a_file_of_several_frames_is_unpacked_whole(tmp_path):

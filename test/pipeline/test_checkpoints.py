@@ -155,3 +155,13 @@ def test_half_of_the_machine_is_the_limit_by_default():
     assert 0 < mapper.window.max_total_bytes <= total // 2
     assert unlimited.window.max_total_bytes == 0
     assert not mapper.window.keeps_scans
+
+
+def test_a_file_in_place_of_the_directory_is_reported(tmp_path, clock):
+    (tmp_path / 'maps').write_bytes(b'')
+    mapper = mapper_in(tmp_path / 'maps' / 'robot')
+    drive(mapper, 1.0)
+    clock.now_s += 11.0
+    said = f'{tmp_path}/maps/robot: {tmp_path}/maps is a file, expected a directory'
+    with pytest.raises(FileFormatError, match=f'^{said}$'):
+        Checkpoints(mapper).save()

@@ -9,6 +9,7 @@ import pytest
 
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
+from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.parquet_tiles import dataset_digest
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.checkpoints import load_start
@@ -56,3 +57,14 @@ def test_merging_a_saved_map_with_itself_warns(saved, tmp_path, caplog):
     directory, _ = saved
     assert main(['merge', str(directory), str(directory), '--output', str(tmp_path)]) == 0
     assert '3 of its 3 scans have stamps of scans in' in caplog.text
+
+
+def test_saving_where_a_file_has_the_name_of_the_directory_is_refused(tmp_path):
+    from surfel_mapper.ros.map_files import save_map
+
+    (tmp_path / 'maps').write_bytes(b'mine')
+    settings = {'pose.source': 'identity', 'output.directory': str(tmp_path / 'maps')}
+    said = f'{tmp_path}/maps: {tmp_path}/maps is a file, expected a directory'
+    with pytest.raises(FileFormatError, match=f'^{said}$'):
+        save_map(Mapper(Config.from_mapping(settings)))
+    assert (tmp_path / 'maps').read_bytes() == b'mine'

@@ -10,12 +10,17 @@ this module adds its setting to those of the process.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 import random
 
 from surfel_mapper.config import register_stage, setting, Stage
 from surfel_mapper.layers import Layer, Publication, register
+from test.soak.heap import write_heap
 
 FAILURES = (MemoryError, RuntimeError, ValueError, KeyError, ZeroDivisionError, OSError)
+
+REPORTED = 50
+"""Calls between two reports of the heap."""
 
 ONCE, FOR_GOOD = 0.02, 0.003
 """Probabilities that a call fails, and that all further calls do until the map is cleared."""
@@ -39,9 +44,13 @@ class UnreliableLayer(Layer):
         super().__init__(config, around)
         self._rng = random.Random(1)
         self._fails = False
+        self._calls = 0
 
     def follow(self, inserted):
-        """Follow a scan, or fail."""
+        """Follow a scan, or fail; report the heap of the process now and then."""
+        self._calls += 1
+        if self._calls % REPORTED == 0:
+            write_heap(Path.cwd())
         self._fails |= self._rng.random() < FOR_GOOD
         return self._fail()
 
