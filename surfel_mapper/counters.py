@@ -10,8 +10,8 @@ diagnostics add up: scans received = mapped + gated + localised + dropped + wait
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 import time
 from typing import Any
@@ -111,14 +111,9 @@ class Counters:
     stage_s: dict[str, float] = field(default_factory=dict)
     filters: dict[str, FilterCounts] = field(default_factory=dict)
 
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
+    def timed(self, stage: str) -> AbstractContextManager[None]:
         """Add the time of a with-block to a stage, in milliseconds."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.add_times({stage: (time.perf_counter() - start) * 1e3})
+        return _Timed(self, stage)
 
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
@@ -207,3 +202,18 @@ def percentiles(milliseconds: deque[float]) -> dict[str, float]:
         'median': round(float(np.median(milliseconds)), 3),
         'p99': round(float(np.percentile([*milliseconds][len(milliseconds) > 1 :], 99)), 3),
     }
+
+
+class _Timed(AbstractContextManager[None]):
+    """Adds the time of a with-block to a stage; a class, because it runs for every message."""
+
+    __slots__ = ('_counters', '_stage', '_start')
+
+    def __init__(self, counters: Counters, stage: str) -> None:
+        self._counters, self._stage = counters, stage
+
+    def __enter__(self) -> None:
+        self._start = time.perf_counter()
+
+    def __exit__(self, *_: object) -> None:
+        self._counters.add_times({self._stage: (time.perf_counter() - self._start) * 1e3})

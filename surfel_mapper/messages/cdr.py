@@ -16,10 +16,9 @@ millisecond as the bytes of two arrays. The tests compare both directions with r
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -36,16 +35,14 @@ FLOAT64_BYTES = 8
 NS_PER_S = 10**9
 
 
-@dataclass(frozen=True, slots=True)
-class Stamp:
+class Stamp(NamedTuple):
     """A builtin_interfaces/Time."""
 
     sec: int
     nanosec: int
 
 
-@dataclass(frozen=True, slots=True)
-class Header:
+class Header(NamedTuple):
     """A std_msgs/Header."""
 
     stamp: Stamp
@@ -104,12 +101,7 @@ class MessageReader:
 
     def floats(self, number: int) -> tuple[float, ...]:
         """Return the next ``number`` float64."""
-        layout = f'{self._order}{number}d'
-        if not self.is_ros1:
-            self._at += -(self._at - self._start) % FLOAT64_BYTES
-        values = struct.unpack_from(layout, self._raw, self._at)
-        self._at += number * FLOAT64_BYTES
-        return values
+        return self.numbers('d' * number)
 
     def sequence(self) -> memoryview:
         """Return the next sequence of bytes, as a view."""
@@ -122,7 +114,11 @@ class MessageReader:
 
     def string(self) -> str:
         """Return the next string."""
-        text = bytes(self.sequence())
+        size = self.number('I')
+        if size > self.remaining:
+            raise ValueError(f'{size} bytes announced, {self.remaining} left')
+        text = bytes(self._raw[self._at : self._at + size])
+        self._at += size
         return (text if self.is_ros1 else text.removesuffix(b'\x00')).decode()
 
 
@@ -171,10 +167,8 @@ class MessageWriter:
 
 def read_header(reader: MessageReader) -> Header:
     """Return the next std_msgs/Header; the sequence number of ROS 1 is skipped."""
-    if reader.is_ros1:
-        reader.number('I')
-    stamp = Stamp(reader.number('I' if reader.is_ros1 else 'i'), reader.number('I'))
-    return Header(stamp, reader.string())
+    *_, sec, nanosec = reader.numbers('III' if reader.is_ros1 else 'iI')
+    return Header(Stamp(sec, nanosec), reader.string())
 
 
 def write_header(writer: MessageWriter, stamp_ns: int, frame_id: str) -> None:

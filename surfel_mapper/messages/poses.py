@@ -104,7 +104,8 @@ def raw_poses(
             header = read_header(reader)
             child = frame_name(reader.string() if kind in (TF, ODOMETRY) else base)
             parent, at_ns = frame_name(header.frame_id), stamp_ns(header)
-            poses.append(StampedPose(parent, child, at_ns, reader.floats(3), reader.floats(4)))
+            values = reader.floats(7)
+            poses.append(StampedPose(parent, child, at_ns, values[:3], values[3:]))
         return poses
     except (struct.error, ValueError) as error:
         raise PoseError(

@@ -123,18 +123,19 @@ class WindowAligner:
     def reset(self) -> None:
         """Drop the correction, as for an empty map."""
         self.T_map_fixed: Transform = np.eye(4)
+        self._is_corrected = False
         self._samples: dict[int, tuple[object, Samples]] = {}
         self._num_new = 0
 
     def to_map(self, T_fixed_sensor: Transform) -> Transform:
         """Return the pose in the map of a sensor whose pose in the fixed frame is given."""
-        if np.array_equal(self.T_map_fixed, IDENTITY):
+        if not self._is_corrected:
             return T_fixed_sensor  # to the bit
         return compose(self.T_map_fixed, T_fixed_sensor)
 
     def to_fixed(self, T_map_sensor: Transform) -> Transform:
         """Return the pose in the fixed frame of a sensor whose pose in the map is given."""
-        if np.array_equal(self.T_map_fixed, IDENTITY):
+        if not self._is_corrected:
             return T_map_sensor  # to the bit
         return compose(inverse(self.T_map_fixed), T_map_sensor)
 
@@ -142,6 +143,7 @@ class WindowAligner:
         """Correct later scans as the newest one was moved in the map."""
         if not np.array_equal(T_after_before, IDENTITY):
             self.T_map_fixed = compose(T_after_before, self.T_map_fixed)
+            self._is_corrected = not np.array_equal(self.T_map_fixed, IDENTITY)
 
     def is_due(self, every_scans: int) -> bool:
         """Count a scan, and return whether it is time to align."""

@@ -104,7 +104,15 @@ class TransformBuffer:
         edge = self._edges.get(child)
         return None if edge is None or edge.is_static else edge.stamps[-1]
 
-    def add(self, parent: str, child: str, stamp_ns: int, T_parent_child: Transform) -> None:
+    def add(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        T_parent_child: Transform,
+        *,
+        is_checked: bool = False,
+    ) -> None:
         """
         Add the transform of an edge at one stamp.
 
@@ -116,6 +124,9 @@ class TransformBuffer:
             Time of the transform.
         T_parent_child : (4, 4) float64
             Takes points in the child frame to the parent frame; copied.
+        is_checked : bool
+            The transform was made by ``pose_matrix`` and is not changed later: it is neither
+            checked nor copied.
 
         Raises
         ------
@@ -129,7 +140,7 @@ class TransformBuffer:
         edge = self._edges.get(child)
         if edge is None or edge.is_static or edge.parent != parent:
             edge = self._edge(parent, child, is_static=False)
-        transform = rigid(parent, child, T_parent_child)
+        transform = T_parent_child if is_checked else rigid(parent, child, T_parent_child)
         before, is_back = len(edge.stamps), False
         if edge.stamps and stamp_ns < edge.stamps[-1] - self._reset_after_ns:
             edge.forget_oldest(before)
