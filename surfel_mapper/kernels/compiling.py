@@ -11,12 +11,22 @@ more, which took a quarter of the time to the first scan.
 Stands alone: kernels of any folder may use it.
 """
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 
 from numba import njit
+from numba.core.event import install_recorder
 
 kernel = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 """Compile a function that Python calls; takes the options of njit."""
 
 part = partial(kernel, inline='always')
 """Compile a function as lines of each kernel that calls it, with the options of that kernel."""
+
+
+@contextmanager
+def compilations() -> Iterator[Sequence[object]]:
+    """Give a list that grows with each function compiled, not loaded from the cache, meanwhile."""
+    with install_recorder('numba:compile') as recorder:
+        yield recorder.buffer

@@ -280,5 +280,6 @@ def derive(
         outputs = tuple(values[part] for values in surfels.arrays)
         derive_surfels(rows, chosen[part], voxel_size_m, bits, outputs)
 
-    share(derive_part, num, threads if num >= FEW else 1)
+    if num:  # else the kernel need not be compiled yet
+        share(derive_part, num, threads if num >= FEW else 1)
     return surfels

@@ -298,6 +298,8 @@ def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray
         # loads numba, for which an `info` of a bag without clouds does not wait
         from surfel_mapper.messages.kernels.coordinates import gather_coordinates
 
+        for values in views:
+            values.flags.writeable = False  # as of bytes: a writable array is another type
         x, y, z = map(np.atleast_2d, views)
         gather_coordinates(x, y, z, packed.T)
         return packed
@@ -308,8 +310,8 @@ def coordinates(points: Points, xyz: list[Field], budget: Budget) -> npt.NDArray
 
 def warm_up() -> None:
     """Compile the kernel that decodes clouds of float32."""
-    point = np.zeros((1, 3), np.float32)
-    cloud = from_columns(dict(zip('xyz', point.T, strict=True)))
+    points = np.zeros((2, 3), np.float32)  # a view of a single one would be contiguous
+    cloud = from_columns(dict(zip('xyz', points.T, strict=True)))
     to_scan(parse_cloud(cloud_bytes(cloud, stamp_ns=0, frame_id='')))
 
 

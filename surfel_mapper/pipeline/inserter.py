@@ -35,7 +35,7 @@ from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import has_own_frame
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.prepared import Prepared
-from surfel_mapper.pipeline.reduction import moments_at, Reduction, Step
+from surfel_mapper.pipeline.reduction import moments_at, Reduction, WarmUpSteps
 from surfel_mapper.pipeline.reduction import warm_up_steps as reduction_steps
 from surfel_mapper.pipeline.scan_images import ScanImages
 from surfel_mapper.pipeline.scan_poses import ScanPoses
@@ -44,6 +44,8 @@ from surfel_mapper.pipeline.window_aligner import Alignment, WindowAligner
 from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
+
+NO_ROWS = np.empty(0, np.int32)
 
 
 class Inserter:
@@ -156,12 +158,16 @@ class Inserter:
             self.loops.follow_window()
         return alignment
 
-    def warm_up_steps(self, config: Config) -> tuple[list[Step], list[Step]]:
+    def warm_up_steps(self, config: Config) -> WarmUpSteps:
         """Return the steps that compile all kernels; see Mapper.warm_up_steps."""
-        before, later = reduction_steps(config)
+        first_scan, every_scan, rare = reduction_steps(config)
+        is_registered = config.pose.source == 'registration'
+        if self.layers.follow_scans or is_registered or config.viewer.enabled:
+            first_scan, every_scan = [*first_scan, *every_scan], []  # these need surfels at once
         if config.window.keep_points:
-            later.append(self.aligner.warm_up)
-        return [partial(self.preparation.warm_up, config), *before, self.layers.warm_up], later
+            rare.append(self.aligner.warm_up)
+        prepare = partial(self.preparation.warm_up, config)
+        return WarmUpSteps([prepare, *first_scan, self.layers.warm_up], every_scan, rare)
 
     def reduces_ahead(self, config: Config) -> bool:
         """Return whether another thread prepares a scan while the one before is inserted."""
@@ -318,7 +324,7 @@ class Inserter:
             frame_id=map_frame(config),
             T_map_sensor=prepared.T_map_sensor,
             num_points=0,
-            changed=self.map.surfels_changed(self.map.version),
+            changed=self.map.surfels_of(NO_ROWS),
             removed_voxel_index=np.empty((0, 3), np.int32),
             evictions=(),
             milliseconds=milliseconds,
@@ -349,7 +355,7 @@ class Inserter:
         After a failure (out of memory) the next scan reports those changes and removals too.
         """
         if not self.derives:
-            return self.map.surfels_changed(self.map.version)
+            return self.map.surfels_of(NO_ROWS)
         if self._unreported is not None:
             version = self._unreported[0]
             removed += self._unreported[1]

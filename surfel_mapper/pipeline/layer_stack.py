@@ -65,6 +65,16 @@ class LayerStack:
         return any(layer.needs_free_rays for layer in self)
 
     @property
+    def follow_scans(self) -> bool:
+        """Whether a layer does anything when a scan is inserted."""
+        methods = ('follow', 'voxels_to_clear')
+        return any(
+            getattr(type(layer), name) is not getattr(Layer, name)
+            for layer in self
+            for name in methods
+        )
+
+    @property
     def images(self) -> Images:
         """The images that scans are joined with: those of the first layer that wants any."""
         wanted = (layer.images for layer in self)

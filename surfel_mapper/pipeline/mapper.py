@@ -39,7 +39,7 @@ from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
 from surfel_mapper.pipeline.loop_closer import LoopCloser, LoopMove
 from surfel_mapper.pipeline.map_origin import MapOrigin
-from surfel_mapper.pipeline.reduction import Step
+from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.pipeline.regions import Region
 from surfel_mapper.pipeline.scan_poses import ScanPoses
 from surfel_mapper.pipeline.scan_queue import ScanQueue
@@ -521,26 +521,21 @@ class Mapper:
 
     def warm_up(self) -> None:
         """Compile every kernel that mapping needs, for all types that scans may have."""
-        before, later = self.warm_up_steps()
-        for step in (*before, *later):
-            step()
+        for steps in self.warm_up_steps():
+            for step in steps:
+                step()
 
-    def warm_up_steps(self) -> tuple[list[Step], list[Step]]:
+    def warm_up_steps(self) -> WarmUpSteps:
         """
         Return the steps of ``warm_up``, for callers that do not want to wait for all of them.
 
-        Returns
-        -------
-        before : list of callable
-            Compile the kernels that the first scan needs by the settings.
-        later : list of callable
-            Compile all others: those of evictions, of points of another type, of voxels of 65536
-            points. They change nothing of the mapper, so another thread may call them while scans
-            are mapped; a kernel that is needed earlier is compiled by the first call.
-
+        They change nothing of the mapper, so another thread may call them while scans are mapped;
+        a kernel that is needed earlier is compiled by the first call. Scans can be mapped after
+        the steps of the first list, with ``derives`` False until after those of the second.
         """
-        before, later = self._inserter.warm_up_steps(self.config)
-        return before, [*later, regions.warm_up]
+        steps = self._inserter.warm_up_steps(self.config)
+        steps.rare.append(regions.warm_up)
+        return steps
 
     def summary(self) -> dict[str, Any]:
         """Return counts, times and figures of the map, for files, reports and diagnostics."""

@@ -33,6 +33,26 @@ from surfel_mapper.threads import pool
 Step = Callable[[], object]
 
 
+class WarmUpSteps(NamedTuple):
+    """
+    The steps that compile all kernels, in the order of need.
+
+    Attributes
+    ----------
+    first_scan : list of callable
+        Compile the kernels that insert a scan by the settings.
+    every_scan : list of callable
+        Compile those that remove a scan from the window, and derive the surfels that changed.
+    rare : list of callable
+        Compile all others: for points of another type, and voxels of 65536 points.
+
+    """
+
+    first_scan: list[Step]
+    every_scan: list[Step]
+    rare: list[Step]
+
+
 class Ahead(NamedTuple):
     """Result of the other thread: the points of a scan, and their moments or the error."""
 
@@ -201,38 +221,49 @@ def standing_sensor(config: Config) -> npt.NDArray[np.float64] | None:
     return np.array(values[:3])
 
 
-def warm_up_steps(config: Config) -> tuple[list[Step], list[Step]]:
-    """Return the steps that compile reduction, insertion and removal; see Mapper.warm_up_steps."""
+def warm_up_steps(config: Config) -> WarmUpSteps:
+    """Return the steps that compile reduction, insertion and removal."""
     expected: npt.DTypeLike = np.float32
     other: npt.DTypeLike = np.float64
     if config.deskew.enabled:  # which moves points in double precision
         expected, other = other, expected
-    later: list[Step] = [
-        partial(compile_removing, config, expected),
-        partial(compile_wide_sums, config, expected),
-        partial(compile_adding, config, other),
-        partial(compile_removing, config, other),
-        partial(compile_wide_sums, config, other),
-    ]
-    return [partial(compile_adding, config, expected)], later
+    return WarmUpSteps(
+        first_scan=[partial(compile_adding, config, expected)],
+        every_scan=[
+            partial(compile_removing, config, expected),
+            partial(compile_deriving, config, expected),
+        ],
+        rare=[
+            partial(compile_wide_sums, config, expected),
+            partial(compile_adding, config, other),
+            partial(compile_removing, config, other),
+            partial(compile_wide_sums, config, other),
+        ],
+    )
 
 
-def compile_adding(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile adding points of a type, and deriving surfels."""
+def compile_adding(config: Config, dtype: npt.DTypeLike) -> SurfelMap:
+    """Compile reducing and adding points of a type; return the map of one."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     surfel_map.add(np.zeros((1, 3), dtype), columns={n: np.zeros(1) for n in CHANNELS})
+    return surfel_map
+
+
+def compile_deriving(config: Config, dtype: npt.DTypeLike) -> None:
+    """Compile deriving surfels, of coarser maps too if they are published."""
+    surfel_map = compile_adding(config, dtype)
     surfel_map.surfels_changed(since=0)
+    if config.publish.levels:
+        surfel_map.coarsen(1).surfels()
 
 
 def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
-    """Compile removing points of a type, the digest, checks, and coarser maps if published."""
+    """Compile removing points of a type, the digest, and checks."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
     columns = {n: np.zeros(1) for n in CHANNELS}
     moments = surfel_map.add(np.zeros((1, 3), dtype), columns=columns)
     surfel_map.insert(replace(moments))  # a copy is checked
     surfel_map.digest()
-    if config.publish.levels:
-        surfel_map.coarsen(1).surfels()
     surfel_map.remove(moments)
 
 

@@ -103,12 +103,8 @@ class Outputs:
         self._origin.publish(update.stamp_ns)
         self._alignment.publish(update)
         self._layers.publish_update(update)
-        if self._has_clients():
-            self._publish_change(self._changes.after_scan(update))
-        else:
-            self._changes.reset()
-        if self._scan_normals.get_subscription_count():
-            self._publish_scan_normals(update)
+        if self._mapper.derives:
+            self._publish_surfels(update)
         if self._filtered.get_subscription_count():
             self._publish_filtered(update.filtered)
 
@@ -126,7 +122,7 @@ class Outputs:
         self._published.clear()
         self._origin.publish(self._stamp_ns)
         self._layers.expire()
-        if self._has_clients():
+        if self._mapper.derives and self._has_clients():
             self._publish_change(self._changes.collect())
 
     def start_timers(self, config: Config) -> None:
@@ -176,6 +172,14 @@ class Outputs:
         return response
 
     # The methods below run in the mapping thread.
+
+    def _publish_surfels(self, update: Update) -> None:
+        if self._has_clients():
+            self._publish_change(self._changes.after_scan(update))
+        else:
+            self._changes.reset()
+        if self._scan_normals.get_subscription_count():
+            self._publish_scan_normals(update)
 
     def _has_clients(self) -> bool:
         wants_changed = self._mapper.config.publish.changed

@@ -17,6 +17,7 @@ from rclpy.node import Node
 
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.kernels.compiling import compilations
 from surfel_mapper.memory import lasting_objects, rare_collections
 from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.pipeline import Mapper, Update
@@ -79,11 +80,17 @@ class Session:
         self.inputs = Inputs(node, config, self.thread, tasks.fail)
         log, start = node.get_logger(), time.monotonic()
         log.info('compiling kernels: a moment, the first time a quarter of a minute')
-        before, later = self.mapper.warm_up_steps()
-        with rare_collections():
-            for step in (warm_up_decoding, *before):
+        first_scan, every_scan, rare = self.mapper.warm_up_steps()
+        self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *rare]
+        with rare_collections(), compilations() as compiled:
+            for step in (warm_up_decoding, *first_scan):
                 step()
-        self._later: list[Callable[[], object]] = [partial(warm_up_outputs, config), *later]
+            if compiled and every_scan:
+                self.mapper.derives = False
+                self._later = [*every_scan, self._derive_from_now_on, *self._later]
+            else:  # the cache holds those too
+                for step in every_scan:
+                    step()
         self._compiler = threading.Thread(target=self._compile, name='compiling', daemon=True)
         self._is_closing = threading.Event()
         self.outputs = Outputs(node, self.mapper, self.thread)
@@ -105,7 +112,7 @@ class Session:
             raise
         with self._changing:
             self._is_active = True
-            self.outputs.start_timers(self.config)
+            self._start_timers()
         if self._compiler.ident is None:
             self._compiler.start()
 
@@ -123,7 +130,7 @@ class Session:
         with self._changing:
             self.config = config
             if self._is_active:
-                self.outputs.start_timers(config)
+                self._start_timers()
         self.thread.post(self._reconfigure)
 
     def close(self, *, save: bool) -> None:
@@ -172,12 +179,30 @@ class Session:
             seconds = time.monotonic() - start
             self._node.get_logger().info(f'all kernels ready after another {seconds:.1f} s')
 
+    def _derive_from_now_on(self) -> None:
+        """Publish surfels, whose kernels are compiled now; called in the compiling thread."""
+
+        def publish_all() -> None:
+            with self._changing:
+                self.mapper.derives = True
+                if self._is_active:
+                    self._start_timers()
+            self.outputs.expire()
+            self._node.get_logger().info('surfels are published from now on')
+
+        self.thread.post(publish_all)
+
+    def _start_timers(self) -> None:
+        """Start publishing at rates, once surfels can be derived; called with the lock held."""
+        if self.mapper.derives:
+            self.outputs.start_timers(self.config)
+
     def _on_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""
         if not self.latencies_s:
             self._node.get_logger().info(
                 f'first scan mapped: {update.num_points} points of frame {update.scan.frame_id}, '
-                f'{len(update.changed)} surfels'
+                f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)
         if self._viewer is not None:

@@ -193,7 +193,15 @@ def start_lidar(
 
 
 class Node:
-    """The node as a process, in a with-block."""
+    """
+    The node as a process, in a with-block.
+
+    Attributes
+    ----------
+    final : str
+        Its output, after the block.
+
+    """
 
     def __init__(
         self,
@@ -211,6 +219,7 @@ class Node:
             'publish.normals_rate_hz': 2.0,
             **(further or {}),
         }
+        self.final = ''
         self._output = tempfile.NamedTemporaryFile('w+')  # noqa: SIM115
         self._process = subprocess.Popen(
             [sys.executable, '-m', 'surfel_mapper.cli.main', 'node', '--ros-args']
@@ -227,6 +236,7 @@ class Node:
     def __exit__(self, *_: object) -> None:
         self._process.send_signal(signal.SIGINT)
         self._process.wait(TIMEOUT_S)
+        self.final = self.text()
         self._output.close()
 
     def text(self) -> str:

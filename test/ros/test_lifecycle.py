@@ -18,6 +18,7 @@ from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.ros.context import context
 from surfel_mapper.ros.main import executing
 from surfel_mapper.ros.node import MapperNode
@@ -144,7 +145,8 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
         changed = peer.parameters().set_parameters([Parameter('window.max_scans', value=2)])
         answers.extend(peer.result(changed).results)
 
-    monkeypatch.setattr(Mapper, 'warm_up_steps', lambda mapper: ([compile_until_set], []))
+    steps = WarmUpSteps([compile_until_set], [], [])
+    monkeypatch.setattr(Mapper, 'warm_up_steps', lambda mapper: steps)
     with context(ARGUMENTS):
         node = MapperNode()
         with executing(node):

@@ -1,0 +1,80 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""The steps that compile kernels cover the kernels that scans then need."""
+
+import subprocess
+import sys
+
+import pytest
+
+COMMON = """
+from array import array
+import gc
+from types import SimpleNamespace
+
+from numba.core.dispatcher import Dispatcher
+import numpy as np
+
+from surfel_mapper.config import Config
+from surfel_mapper.messages.pointcloud2 import (
+    cloud_bytes, from_columns, parse_cloud, to_scan, warm_up
+)
+from surfel_mapper.pipeline import Mapper
+
+def kernels():
+    return {
+        (kernel.py_func.__qualname__, signature)
+        for kernel in gc.get_objects() if isinstance(kernel, Dispatcher)
+        for signature in kernel.overloads
+    }
+
+def message(number, as_ros):
+    points = np.random.default_rng(number).uniform(-1, 1, (2000, 3)).astype(np.float32)
+    columns = {**dict(zip('xyz', points.T)), 'intensity': points[:, 0]}
+    raw = cloud_bytes(from_columns(columns), stamp_ns=number * 10**8, frame_id='lidar')
+    found = parse_cloud(raw)
+    if not as_ros:
+        return found
+    names = ('header', 'height', 'width', 'fields', 'is_bigendian', 'point_step', 'row_step')
+    parts = {name: getattr(found, name) for name in names}
+    return SimpleNamespace(**parts, data=array('B', bytes(found.data)), is_dense=True)
+
+def mapped(number):
+    mapper.add_scan(to_scan(message(number, as_ros=number % 2)))
+    return list(mapper.insert_ready())
+
+mapper = Mapper(Config.from_mapping({'pose.source': 'identity', 'window.max_scans': 2}))
+steps = mapper.warm_up_steps()
+warm_up()
+for step in steps.first_scan:
+    step()
+"""
+
+FIRST_SCANS = """
+before = kernels()
+mapper.derives = False
+updates = mapped(1) + mapped(2)
+"""
+
+EVERY_SCAN = """
+for step in steps.every_scan:
+    step()
+before = kernels()
+updates = [update for number in range(1, 6) for update in mapped(number)]
+assert len(updates[-1].changed) and updates[-1].evictions
+"""
+
+CHECK = """
+assert len(updates) >= 2, len(updates)
+print(sorted(map(str, kernels() - before)))
+"""
+
+
+@pytest.mark.parametrize('scans', [FIRST_SCANS, EVERY_SCAN], ids=['first', 'every'])
+def test_scans_need_no_kernel_beyond_those_of_their_steps(scans):
+    """In a new Python, whose kernels are loaded from the cache, not compiled, one by one."""
+    program = COMMON + scans + CHECK
+    done = subprocess.run(
+        [sys.executable, '-c', program], capture_output=True, text=True, check=False
+    )
+    assert (done.stdout.strip(), done.returncode) == ('[]', 0), done.stdout + done.stderr
