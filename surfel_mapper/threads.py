@@ -15,14 +15,28 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 import itertools
 import os
+import sys
+import threading
 
 PARTS = 4
 """Number of parts per thread into which rows are divided; an idle thread takes the next part."""
 
 
+BACKGROUND_NICE = 10
+"""Niceness added to threads in the background: of a busy core they get a tenth."""
+
+
 def usable_cores() -> int:
     """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0))
+
+
+def yield_to_others() -> None:
+    """Lower the priority of the calling thread; does nothing but on Linux."""
+    if sys.platform == 'linux':  # elsewhere threads have no priority of their own
+        thread = threading.get_native_id()
+        nice = os.getpriority(os.PRIO_PROCESS, thread) + BACKGROUND_NICE
+        os.setpriority(os.PRIO_PROCESS, thread, nice)
 
 
 @cache

@@ -130,8 +130,8 @@ class Publication:
     version : callable, optional
         Returns a value; a topic with a rate is published only if the value has changed.
     prepare : callable, optional
-        Does one step of the work for a new subscriber; returns True once ``messages`` is fast.
-        Scans are mapped between two steps.
+        Does one step of the work for a new subscriber, or for the next messages of a topic with a
+        rate; returns True once ``messages`` is fast. Scans are mapped between two steps.
     all_messages : callable, optional
         Replaces ``messages`` for a new subscriber, if ``messages`` returns changes since its last
         call.

@@ -5,8 +5,8 @@ The topics of all layers that are switched on.
 
 A layer describes its topics (layers/layer.py); they are published here, at their rates or when
 the layer has followed a scan. Messages are made in the mapping thread, between two scans, and for
-a new subscriber of a large layer in steps, each between two scans. Large ones are made in the
-background: the mapping thread copies their input, and scans are mapped meanwhile. The next
+a large layer in steps, each between two scans. Large ones are made in the background, by threads
+of low priority: the mapping thread copies their input, and scans are mapped meanwhile. The next
 ones wait until those before are published, so a slow reader gets fewer, and none twice.
 """
 
@@ -33,6 +33,8 @@ from surfel_mapper.layers import Layer, Moment, Publication
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.ros.base_node import result_of, steady_timer
 from surfel_mapper.ros.mapping_thread import MappingThread
+from surfel_mapper.ros.serialized import publish_serialized
+from surfel_mapper.threads import yield_to_others
 
 GRID = 'nav_msgs/msg/OccupancyGrid'
 """Topics of this type also have a service: ``~/get_grid`` returns the grid of ``~/grid``."""
@@ -136,7 +138,7 @@ class LayerTopic:
         self._published: object = None
         self._background: ThreadPoolExecutor | None = None
         if publication.in_background:
-            self._background = ThreadPoolExecutor(1, 'publishing')
+            self._background = ThreadPoolExecutor(1, 'publishing', initializer=yield_to_others)
         self._pending: Future[None] | None = None
         is_told = not self.has_rate or publication.all_messages is not None
         matched = self._on_matched if is_told else None
@@ -173,9 +175,11 @@ class LayerTopic:
     def post_if_due(self) -> None:
         """Post publishing to the mapping thread if the content changed and is subscribed to."""
         version = self._publication.version
-        is_new = version is None or self._published != version()
+        newest = version() if version is not None else None
+        is_new = version is None or self._published != newest
         is_busy = self._pending is not None and not self._pending.done()
         if is_new and not is_busy and (self._publication.is_eager or self._is_read()):
+            self._published = newest
             self._thread.post(self._publish)
 
     def publish_if_read(self) -> None:
@@ -203,10 +207,12 @@ class LayerTopic:
         return message
 
     def _publish(self) -> None:
-        version = self._publication.version
-        if version is not None:
-            self._published = version()
-        self._send(self._publication.messages(self._now()))
+        """Publish; at a rate, the messages are prepared one step at a time between scans."""
+        publication = self._publication
+        if self.has_rate and publication.prepare is not None and not publication.prepare():
+            self._thread.post(self._publish)
+            return
+        self._send(publication.messages(self._now()))
 
     def _publish_for_new(self) -> None:
         """Make missing content, one step at a time between scans, and then publish."""
@@ -229,7 +235,7 @@ class LayerTopic:
             for number, message in enumerate(messages):
                 if number:
                     self._publisher.wait_for_all_acked(PATIENCE)
-                self._publisher.publish(message)
+                publish_serialized(self._publisher, message)
         except Exception as error:
             self._thread.post(partial(fail, error))  # counted there, as of any other topic
 

@@ -85,11 +85,18 @@ def options(args: argparse.Namespace) -> Options:
 
 
 def run(names: Sequence[str], chosen: Options) -> list[Row]:
-    """Run benches and print the table of each; return all rows with the machine and options."""
+    """
+    Run benches and print the table of each; return all rows with the machine and options.
+
+    Rows go to stderr as they come: a long bench yields each when it is measured.
+    """
     found: list[Row] = []
     for name in names:
         load_before = load()
-        rows = import_module(f'test.bench.{name}').run(chosen)
+        rows = []
+        for row in import_module(f'test.bench.{name}').run(chosen):
+            rows.append(row)
+            print(f'{name}: {json.dumps(rounded(row))}', file=sys.stderr, flush=True)
         print(f'{name}: {summary(name)}')
         print(f'load {load_before} before, {load()} after\n{table(rows)}\n', flush=True)
         found += [{'bench': name, 'load': load_before, **rounded(row)} for row in rows]

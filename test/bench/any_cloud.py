@@ -77,13 +77,11 @@ class Case:
     settings: dict[str, Any]
 
 
-def cloud_rows(options: Options) -> list[Row]:
-    """Return a row for each cloud and setting."""
-    rows: list[Row] = []
+def cloud_rows(options: Options) -> Iterator[Row]:
+    """Yield a row for each cloud and setting."""
     for case in cases(options):
-        rows += [share_row(case, carve=carve) for carve in (False, True)]
-        rows += peer_rows(case, options) if options.peers else []
-    return rows
+        yield from (share_row(case, carve=carve) for carve in (False, True))
+        yield from peer_rows(case, options) if options.peers else ()
 
 
 def share_row(case: Case, *, carve: bool) -> Row:

@@ -32,24 +32,24 @@ WARM, SECONDS = 30, 30.0
 MESSAGES = {'mesh': 'Marker', 'mesh_tiles': 'MarkerArray'}
 
 
-def live_rows(options: Options) -> list[Row]:
-    """Return the rows; none without ROS."""
+def live_rows(options: Options) -> Iterator[Row]:
+    """Yield the rows; none without ROS."""
     try:
         import rclpy  # noqa: F401
     except ImportError:
         print('no rclpy: the node is not measured', file=sys.stderr)
-        return []
+        return
     street = Street(options)
     street.prepare(NUM_SCANS)
     isolate()
     seconds = SECONDS * min(options.scans / 100, 1.0)
     none = measured(options, street, seconds, has_field=False, reader='')
+    yield none
     field = measured(options, street, seconds, has_field=True, reader='')
-    rows = [none, {**field, 'more_than': none['case'], 'more_ms': beyond(field, none)}]
+    yield {**field, 'more_than': none['case'], 'more_ms': beyond(field, none)}
     for reader in MESSAGES:
         row = measured(options, street, seconds, has_field=True, reader=reader)
-        rows.append({**row, 'more_than': field['case'], 'more_ms': beyond(row, field)})
-    return rows
+        yield {**row, 'more_than': field['case'], 'more_ms': beyond(row, field)}
 
 
 def beyond(row: Row, other: Row) -> float:

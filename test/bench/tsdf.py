@@ -16,7 +16,7 @@ Then follow clouds of other kinds, see any_cloud.py, and the node with the field
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter, process_time
@@ -106,18 +106,19 @@ class Case:
     ours: dict[str, Any]
 
 
-def run(options: Options) -> list[Row]:
-    """Return a row for each package in every case; the first of each is ours."""
-    rows: list[Row] = []
+def run(options: Options) -> Iterator[Row]:
+    """Yield a row for each package in every case, the first of each ours, and all other rows."""
     scans = min(options.scans, 30)
-    for case in [*street_cases(options, scans), *room_cases(options, scans)]:
+    street, rooms = street_cases(options, scans), room_cases(options, scans)
+    for case in [*street, *rooms]:
         with one_core():
-            rows += case_rows(case, options)
+            rows = case_rows(case, options)
+        yield from rows
     with one_core():
-        rows += image_rows(room_cases(options, scans)[0])
-        rows += esdf_rows(street_cases(options, scans)[1])
-        rows += layer_rows(street_cases(options, scans)[1])
-    return rows + cloud_rows(options) + live_rows(options)
+        rows = [*image_rows(rooms[0]), *esdf_rows(street[1]), *layer_rows(street[1])]
+    yield from rows
+    yield from cloud_rows(options)
+    yield from live_rows(options)
 
 
 def layer_rows(case: Case) -> list[Row]:

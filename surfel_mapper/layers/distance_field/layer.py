@@ -242,6 +242,7 @@ class TsdfLayer(Layer):
             Publication(
                 topic='~/mesh',
                 type_name='visualization_msgs/msg/Marker',
+                prepare=lambda: self._whole_mesh.prepare(),
                 messages=lambda now: self._whole_mesh.messages(now),
                 in_background=True,
                 version=lambda: (id(self.blocks), self.blocks.version),
@@ -250,6 +251,7 @@ class TsdfLayer(Layer):
             Publication(
                 topic='~/mesh_tiles',
                 type_name='visualization_msgs/msg/MarkerArray',
+                prepare=lambda: not self.config.tsdf.mesh_rate_hz or self._live_mesh.prepare(),
                 messages=lambda now: self._live_mesh.changed(now),
                 all_messages=self._all_tiles,
                 in_background=True,

@@ -4,8 +4,8 @@
 The mesh of a distance field as one marker, or as markers that are updated tile by tile.
 
 A tile is a cube of TILE blocks a side and one marker, so viewers replace only changed tiles.
-The triangles are made while the messages are iterated, in any thread; only the copy of changed
-blocks is taken when the messages are asked for.
+The triangles are made while the messages are iterated, in any thread. Changed blocks are copied
+before, by the owner of the map: in steps between scans, and the rest when messages are asked for.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from surfel_mapper.messages.markers import (
 )
 from surfel_mapper.messages.surfel_markers import mesh_marker
 from surfel_mapper.tsdf.blocks import block_index, BlockMap
-from surfel_mapper.tsdf.mesh import Changes, Mesher
+from surfel_mapper.tsdf.mesh import Changes, Mesher, PORTION
 
 TILE = 8
 """Blocks along the edge of a tile: 12.8 m with voxels of 0.2 m, some 200 tiles about a lidar."""
@@ -37,6 +37,39 @@ CORNER_BYTES = 40
 """Bytes of a corner of a triangle: three float64, four float32."""
 
 Tile = tuple[int, int, int]
+
+
+class ChangedBlocks:
+    """
+    Copies of the blocks of a field that have changed, taken in steps.
+
+    Parameters
+    ----------
+    mesher : Mesher
+        What they are for.
+
+    """
+
+    def __init__(self, mesher: Mesher) -> None:
+        self._mesher = mesher
+        self._portions: Iterator[Changes] | None = None
+        self._copied: list[Changes] = []
+
+    def copy_next(self) -> bool:
+        """Copy the next blocks; return True if there are none left."""
+        if self._portions is None:
+            self._portions = self._mesher.portions(PORTION)
+        changes = next(self._portions, None)
+        if changes is not None:
+            self._copied.append(changes)
+        return changes is None
+
+    def take(self) -> list[Changes]:
+        """Copy the rest; return all since the last call."""
+        while not self.copy_next():
+            pass
+        copied, self._copied, self._portions = self._copied, [], None
+        return copied
 
 
 class LiveMesh:
@@ -55,19 +88,26 @@ class LiveMesh:
 
     def __init__(self, blocks: BlockMap) -> None:
         self._mesher = Mesher(blocks, visible_only=True)
+        self._changed = ChangedBlocks(self._mesher)
         self._tiles: dict[Tile, dict[int, None]] = {}
         self._numbers: dict[Tile, int] = {}
         self._is_known = False
 
+    def prepare(self) -> bool:
+        """Copy some of the changed blocks; return True once all are; called by the map's owner."""
+        return self._changed.copy_next()
+
     def changed(self, now: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of the tiles that have changed; called by the owner of the map."""
-        return self._messages(self._mesher.changes(), now, is_complete=False)
+        return self._messages(self._changed.take(), now, is_complete=False)
 
     def complete(self, now: Moment) -> Iterable[bytes]:
         """Return MarkerArrays of all tiles, which replace any before."""
-        return self._messages(self._mesher.changes(), now, is_complete=True)
+        return self._messages(self._changed.take(), now, is_complete=True)
 
-    def _messages(self, changes: Changes, now: Moment, *, is_complete: bool) -> Iterator[bytes]:
+    def _messages(
+        self, changes: list[Changes], now: Moment, *, is_complete: bool
+    ) -> Iterator[bytes]:
         tiles = self._apply(changes)
         markers, size = [], 0
         if is_complete or not self._is_known:  # a viewer may show tiles of an earlier map
@@ -86,9 +126,9 @@ class LiveMesh:
         if markers:
             yield marker_array(markers)
 
-    def _apply(self, changes: Changes) -> list[Tile]:
+    def _apply(self, changes: list[Changes]) -> list[Tile]:
         """Update the triangles; return the tiles that have changed."""
-        keys = sorted(self._mesher.apply(changes))
+        keys = sorted({key for part in changes for key in self._mesher.apply(part)})
         there, touched = self._mesher.keys(), dict[Tile, None]()
         for key, tile in zip(keys, tiles_of(keys), strict=True):
             touched[tile] = None
@@ -115,13 +155,19 @@ class WholeMesh:
 
     def __init__(self, blocks: BlockMap) -> None:
         self._mesher = Mesher(blocks, visible_only=True)
+        self._changed = ChangedBlocks(self._mesher)
+
+    def prepare(self) -> bool:
+        """Copy some of the changed blocks; return True once all are; called by the map's owner."""
+        return self._changed.copy_next()
 
     def messages(self, now: Moment) -> Iterable[bytes]:
         """Return one Marker; called by the owner of the map."""
-        return self._marker(self._mesher.changes(), now)
+        return self._marker(self._changed.take(), now)
 
-    def _marker(self, changes: Changes, now: Moment) -> Iterator[bytes]:
-        self._mesher.apply(changes)
+    def _marker(self, changes: list[Changes], now: Moment) -> Iterator[bytes]:
+        for part in changes:
+            self._mesher.apply(part)
         mesh = self._mesher.parts()
         yield marker_bytes(
             mesh_marker(mesh, number=0, stamp_ns=now.stamp_ns, frame_id=now.frame_id)
