@@ -4,11 +4,16 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+import os
+import sys
+import threading
+
 import numpy as np
 import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.threads import split
+from surfel_mapper.threads import BACKGROUND_NICE, split, yield_to_others
 
 
 @pytest.mark.parametrize('threads', [2, 3])
@@ -39,3 +44,12 @@ def test_every_row_is_in_one_part():
 def test_no_thread_at_all_is_refused():
     with pytest.raises(ValueError, match='threads: 0'):
         SurfelMap(0.5, threads=0)
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
+def test_background_thread_has_a_lower_priority_than_the_others():
+    def nice():
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    with ThreadPoolExecutor(1, initializer=yield_to_others) as background:
+        assert background.submit(nice).result() == min(nice() + BACKGROUND_NICE, 19)

@@ -191,13 +191,18 @@ class Mapper:
             self._drops.scan(scan, 'empty_frame_id', 'its header has no frame_id')
         elif len(scan) == 0:
             self._drops.scan(scan, 'no_points', 'it has no points')
-        elif self.map.columns and (missing := missing_columns(scan.columns, self.map.columns)):
+        elif missing := self._missing_columns(scan):
             reason = f'its points have no {" and no ".join(missing)}'
             self._drops.scan(scan, 'missing_column', reason)
         elif (timed := self._timed(scan)) is not None:
             own_ns, other_ns = self._queue.newest_ns, self.transforms.newest_ns
             refuse = partial(self._drops.scan, timed, 'odd_stamp')
             self._guard.take(scan.stamp_ns, own_ns, other_ns, partial(self._accept, timed), refuse)
+
+    def _missing_columns(self, scan: Scan) -> list[str]:
+        """Return the columns that the map sums and a scan has not, nor gets from images."""
+        missing, images = missing_columns(scan.columns, self.map.columns), self._inserter.images
+        return [name for name in missing if images is None or not images.will_give(scan, name)]
 
     def _accept(self, scan: Scan) -> None:
         """Queue a scan; if time was set back, clear the map first."""

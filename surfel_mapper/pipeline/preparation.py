@@ -24,6 +24,7 @@ from surfel_mapper.errors import (
 from surfel_mapper.filters.chain import Chain
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.layers import Surroundings
+from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.pipeline.drops import Drops
 from surfel_mapper.pipeline.local_map import LocalMap
 from surfel_mapper.pipeline.prepared import FilteredScan, Prepared
@@ -171,7 +172,7 @@ class Preparation:
             laps.end('filter')
         elif begun is not None and times is not None:
             laps.end('deskew')
-        if not self._count_filtered(found):
+        if not self._count_filtered(found) or not self._has_columns(found.filtered):
             return []
         prepared = Prepared(found.scan, found.filtered, pose)
         if self._poses.registered is None:
@@ -207,6 +208,14 @@ class Preparation:
         if not len(filtered):
             self._drops.scan(scan, 'filtered_out', 'the filters left none of its points')
         return len(filtered) > 0
+
+    def _has_columns(self, scan: Scan) -> bool:
+        """Return whether a scan has the columns that the map sums; if not, count the drop."""
+        missing = missing_columns(scan.columns, self._around.surfel_map.columns)
+        if missing:
+            reason = f'its points have no {" and no ".join(missing)}, by images and filters'
+            self._drops.scan(scan, 'missing_column', reason)
+        return not missing
 
     def _register(
         self, poses: RegisteredPoses, prepared: Prepared, times: PointTimes | None

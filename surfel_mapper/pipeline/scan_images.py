@@ -71,6 +71,14 @@ class ScanImages:
             if not has_column(scan, kind)
         )
 
+    def will_give(self, scan: Scan, column: str) -> bool:
+        """
+        Return whether every point of a scan gets a column from images, if they come.
+
+        Only the points of depth images do: a camera sees some of the points of a lidar.
+        """
+        return bool(scan.camera) and any(column in COLUMNS[kind] for kind in self._images)
+
     def joined(
         self, scan: Scan, place: Callable[[SceneImage], Transform]
     ) -> tuple[Scan, list[str]]:

@@ -37,8 +37,8 @@ def publish_serialized(publisher: Publisher, message: bytes) -> None:
     ------
     RuntimeError
         If the middleware refuses the message.
-    rclpy.handle.InvalidHandle
-        If the publisher is destroyed.
+    InvalidHandle
+        Of rclpy, if the publisher is destroyed.
 
     """
     with publisher.handle:

@@ -139,3 +139,27 @@ def test_color_of_another_size_leaves_the_depth_without(shape, caplog):
     assert 'expected 80 x 60 as the depth image has' in caplog.text
     assert len(mapper.tsdf.mesh()) > 1000
     assert not mapper.tsdf.blocks.color[:, 3].any()
+
+
+def test_map_sums_the_colours_of_the_image():
+    mapper = filled(scan_of(steps_mm()), **{'map.color': True, 'map.min_points': 1})
+    (color, _) = scene_images()
+    surfels = mapper.map.surfels(min_points=1)
+    totals = surfels.channels['red'] @ surfels.num_points
+    is_point = (steps_mm() > 0) & (steps_mm() < 65535)
+    assert totals == pytest.approx(color.pixels[is_point][:, 0].sum())
+
+
+def test_map_with_colours_drops_depth_images_without():
+    mapper = mapper_with(**{'map.color': True, 'layers.tsdf.image_tolerance_s': 0.01})
+    mapper.add_scan(scan_of(steps_mm()))
+    mapper.end_images()
+    assert mapped(mapper) == []
+    assert mapper.counters.dropped['missing_column'] == 1
+    assert mapper.map.num_voxels == 0
+
+
+def test_map_with_colours_refuses_lidar_scans_that_a_camera_sees_in_part():
+    mapper = mapper_with(**{'map.color': True})
+    mapper.add_scan(replace(scan_of(steps_mm(), has_image=False), camera=()))
+    assert mapper.counters.dropped['missing_column'] == 1

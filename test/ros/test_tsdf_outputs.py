@@ -53,6 +53,12 @@ def shown(arrays):
     return found
 
 
+def num_complete(arrays):
+    """Return how many of some MarkerArrays begin a complete set, which replaces all before."""
+    markers = (marker for message in arrays for marker in message.markers)
+    return sum(marker.action == Marker.DELETEALL for marker in markers)
+
+
 def test_the_sphere_around_a_lidar_comes_as_mesh_and_slice(start, peer):
     start_node(start, peer, **SETTINGS)
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
@@ -211,6 +217,7 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
 def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     start_node(start, peer, **SETTINGS, **{'layers.tsdf.max_range_m': 100.0})
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
+    peer.spin_until(lambda: num_complete(meshes) == 1)  # before the first scan, without triangles
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)
     half = directions[:, 0] > 0.0
     level = np.abs(directions[:, 2]) < 0.1
@@ -218,13 +225,12 @@ def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
     peer.publish('/odom', odometry(START_NS, (0.0, 0.0, 0.0)))
     peer.publish('/points', cloud(START_NS, ranges * directions))
     peer.spin_until(lambda: len(shown(meshes)) > 5)
-    num_before = len(meshes)
     late = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
+    peer.spin_until(lambda: num_complete(meshes) == 2)  # the complete set, for all readers
     peer.spin_until(lambda: late and shown(late).keys() == shown(meshes).keys())
     assert {n: m.points for n, m in shown(late).items()} == {
         n: m.points for n, m in shown(meshes).items()
     }
-    peer.spin_until(lambda: len(meshes) > num_before)  # the complete set, for all readers
     num_before = len(meshes)
 
     # The sphere comes 0.4 m nearer, the half at 30 m stays out of the image.
