@@ -54,7 +54,7 @@ def shown(arrays):
 
 
 def num_complete(arrays):
-    """Return how many of some MarkerArrays begin a complete set, which replaces all before."""
+    """Return the number of complete sets in some MarkerArrays; each replaces all before."""
     markers = (marker for message in arrays for marker in message.markers)
     return sum(marker.action == Marker.DELETEALL for marker in markers)
 
