@@ -3,20 +3,24 @@
 """Trucks on all sides that move along are mistaken for the world, and the summary says so."""
 
 from dataclasses import replace
+from functools import cache
 
 from surfel_mapper.config import Config
 from surfel_mapper.offline.summary import MOST_SURROUNDED, uncertain_text
 from surfel_mapper.pipeline import Mapper
 from test.bench.scenarios import LIDAR, scenarios
 
-SCENARIOS = {each.name: each for each in scenarios()}
+
+@cache
+def scenario_of(name):
+    return next(each for each in scenarios() if each.name == name)
 
 
 def summary_of(name, at_rest=False, num_scans=34):
     """Return the summary of the scans of a scenario, mapped by registration."""
-    scenario = replace(SCENARIOS[name], num_scans=num_scans, lidar=replace(LIDAR, columns=512))
+    scenario = replace(scenario_of(name), num_scans=num_scans, lidar=replace(LIDAR, columns=512))
     if at_rest:
-        scenario = replace(scenario, course=lambda time_s: SCENARIOS[name].course(0.0))
+        scenario = replace(scenario, course=lambda time_s: scenario_of(name).course(0.0))
     mapper = Mapper(Config.from_mapping({'pose.source': 'registration'}))
     for scan, _ in scenario.scans():
         mapper.add_scan(scan)

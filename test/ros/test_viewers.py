@@ -16,10 +16,8 @@ import numpy as np
 import pytest
 
 pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
-pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
 
 from geometry_msgs.msg import Point
-from rerun import chunk as reader
 from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
@@ -30,6 +28,11 @@ from test.ros.driving import arguments, drive, mapped, send
 from test.ros.live import cloud, LATCHED, NODE, room, START_NS, TIMEOUT_S
 
 NUM_SCANS = 6
+
+
+@pytest.fixture(autouse=True)
+def _rerun():
+    pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
 
 
 def in_order(places):
@@ -58,6 +61,8 @@ def recorded(port, file):
 
 def shown(file, path):
     """Return the rows of positions that a path has had."""
+    from rerun import chunk as reader
+
     rows = []
     for chunk in reader.RrdReader(str(file)).stream().to_chunks():
         batch = chunk.to_record_batch()

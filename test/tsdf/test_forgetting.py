@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Surfaces that are gone, objects that come, and the cap that colours and labels obey."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -13,17 +15,20 @@ from surfel_mapper.tsdf.queries import FREE, labels_at, OCCUPIED, sample, states
 from test.tsdf.scenes import image_of, integrator, SMALL
 
 PERIOD_NS = 10**8
-WALL = image_of(SMALL, 2.0 * SMALL.ray_length)
-BEHIND = image_of(SMALL, 4.0 * SMALL.ray_length)
 PLACE = [[0.02, 0.02, 2.02]]
 DEEP = [[0.02, 0.02, z] for z in (2.02, 2.12, 2.22)]
 SIZES = dict(voxel_size_m=0.1, truncation_m=0.3, weight_mode='constant')
 
 
+@cache
+def wall_at(depth_m):
+    return image_of(SMALL, depth_m * SMALL.ray_length)
+
+
 def seen_through(one, first, num):
     """Return the number of scans until the place of the wall is free, at most num."""
     for number in range(num):
-        one.integrate(BEHIND, np.eye(4), (first + number) * PERIOD_NS)
+        one.integrate(wall_at(4.0), np.eye(4), (first + number) * PERIOD_NS)
         if (states(one.blocks, DEEP) == FREE).all():
             return number + 1
     return num
@@ -33,7 +38,7 @@ def seen_through(one, first, num):
 def test_a_wall_that_is_gone_becomes_free_in_time(forget_s):
     one = integrator(**SIZES, forget_s=forget_s)
     for number in range(300):
-        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+        one.integrate(wall_at(2.0), np.eye(4), number * PERIOD_NS)
     assert states(one.blocks, PLACE)[0] == OCCUPIED
     scans = seen_through(one, 300, 1000)
     assert 3 <= scans <= forget_s * 1e9 / PERIOD_NS
@@ -42,7 +47,7 @@ def test_a_wall_that_is_gone_becomes_free_in_time(forget_s):
 def test_without_forgetting_a_wall_stays_as_long_as_it_was_seen():
     one = integrator(**SIZES, forget_s=0.0)
     for number in range(300):
-        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+        one.integrate(wall_at(2.0), np.eye(4), number * PERIOD_NS)
     assert seen_through(one, 300, 60) == 60
 
 
@@ -61,11 +66,11 @@ def test_a_wall_that_is_gone_becomes_free_point_by_point():
 def test_an_object_in_space_that_was_free_for_long_appears_in_time():
     one = integrator(**SIZES, forget_s=2.0)
     for number in range(300):
-        one.integrate(BEHIND, np.eye(4), number * PERIOD_NS)
-    one.integrate(WALL, np.eye(4), 300 * PERIOD_NS)
+        one.integrate(wall_at(4.0), np.eye(4), number * PERIOD_NS)
+    one.integrate(wall_at(2.0), np.eye(4), 300 * PERIOD_NS)
     assert states(one.blocks, PLACE)[0] == FREE  # a single false measurement is no object
     for number in range(301, 320):
-        one.integrate(WALL, np.eye(4), number * PERIOD_NS)
+        one.integrate(wall_at(2.0), np.eye(4), number * PERIOD_NS)
     assert states(one.blocks, PLACE)[0] == OCCUPIED
 
 
@@ -82,7 +87,7 @@ def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(semantics, by_points)
         num_labels=2,
     )
     one = Integrator(BlockMap(config))
-    points = WALL.sensor.directions.reshape(-1, 3)[::7]
+    points = wall_at(2.0).sensor.directions.reshape(-1, 3)[::7]
     points = points * (2.0 / points[:, 2:])
     for number in range(550):
         label, color = (0, (200, 0, 0)) if number < 500 else (1, (0, 0, 200))
@@ -92,7 +97,7 @@ def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(semantics, by_points)
                 points, np.eye(4), colors=content[0], labels=content[1]
             )
         else:
-            image = WALL.with_images(
+            image = wall_at(2.0).with_images(
                 color=np.full((60, 80, 3), color, np.uint8), label=np.full((60, 80), label)
             )
             one.integrate(image, np.eye(4))

@@ -4,8 +4,6 @@
 
 import dataclasses
 
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 import numpy as np
 from PIL import Image
 import pytest
@@ -136,6 +134,9 @@ def test_the_axes_have_the_coordinates_of_the_fixed_frame():
     low, high = np.array([-3.0, 10.0, 0.0]), np.array([5.0, 50.0, 2.0])
     origin_m = np.array([400_000.3, 5_400_000.7, 0.0])
     frame = Frame.of(views(high - low)[0], (low, high), 10.0, origin_m)
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     axes = FigureCanvasAgg(Figure()).figure.add_subplot()
 
     label(axes, frame)

@@ -22,13 +22,16 @@ from surfel_mapper.viz.discs import CORNERS
 from test.bags.recorded import drive, write_rosbag2
 from test.viz.test_mesh import sphere
 
-reader = pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
-
 pytestmark = pytest.mark.skipif(find_spec('pyarrow') is None, reason='pyarrow is not installed')
 
 UTM = np.array([400_384.0, 5_400_576.0, 256.0])
 
 START_NS = 1_700_000_000_000_000_000
+
+
+@pytest.fixture(autouse=True)
+def _rerun():
+    pytest.importorskip('rerun.chunk', reason='rerun with a reader of its files')
 
 
 def ground(number=20_000, seed=0):
@@ -47,6 +50,8 @@ def ground_map(origin_m=(0.0, 0.0, 0.0), columns=()):
 
 def shown(tmp_path, *arguments):
     """Return the last row of each component in the recording of a view, by entity and name."""
+    from rerun import chunk as reader
+
     file = tmp_path / 'shown.rrd'
     assert main(['view', *map(str, arguments), '--rrd', str(file)]) == 0
     found = {}
