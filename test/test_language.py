@@ -11,10 +11,8 @@ from __future__ import annotations
 
 import ast
 from functools import cache
-import io
 from pathlib import Path
 import re
-import tokenize
 from typing import NamedTuple
 
 ROOT = Path(__file__).parents[1]
@@ -38,6 +36,13 @@ OPENINGS = re.compile(r'(Be|Have|Know|Hear|What|Where|Who|Whoever|That|Those|Of)
 
 FIRST_WORDS = re.compile(r'test_(what|where|who|whoever|of|it|they|that|those|so)_')
 """First words of the name of a test that is no fact."""
+
+STRINGS_AND_COMMENTS = re.compile(
+    r"'''.*?'''" + r'|\"{3}.*?\"{3}' + r"|'(?:\\.|[^'\\])*'" + r'|"(?:\\.|[^"\\])*"'
+    r'|(?P<comment>#[^\n]*)',
+    re.DOTALL,
+)
+"""Matches whole strings first: a number sign in a string begins no comment."""
 
 
 def sources() -> list[Path]:
@@ -69,11 +74,10 @@ class Source(NamedTuple):
 def parsed(path: Path) -> Source:
     """Parse a Python file, once for all tests."""
     text = path.read_text(encoding='utf-8')
-    lines = io.StringIO(text).readline
     comments = [
-        (token.start[0], token.string)
-        for token in tokenize.generate_tokens(lines)
-        if token.type == tokenize.COMMENT
+        (text.count('\n', 0, match.start()) + 1, match['comment'])
+        for match in STRINGS_AND_COMMENTS.finditer(text)
+        if match['comment']
     ]
     docstrings, strings, functions = [], [], []
     for node in ast.walk(ast.parse(text)):
@@ -87,6 +91,7 @@ def parsed(path: Path) -> Source:
     return Source(comments, docstrings, strings, functions)
 
 
+@cache
 def texts(path: Path) -> list[tuple[int, str]]:
     """Return line and text of everything that a reader reads as English in a file."""
     if path.suffix != '.py':
