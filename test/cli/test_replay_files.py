@@ -269,12 +269,12 @@ from test.cli.small_disk import filled
 from test.cli.test_replay_files import contents
 
 disk, bag = Path(sys.argv[1]), sys.argv[2]
+arguments = ['replay', bag, '--output', str(disk / 'earlier'), '--json']
+assert main([*arguments, '--formats', sys.argv[3], '--duration', '0.3']) == 0
+before = contents(disk)
 for name in sys.argv[3].split(','):
-    arguments = ['replay', bag, '--formats', name, '--output', str(disk / name), '--json']
-    assert main([*arguments, '--duration', '0.3']) == 0
-    before = contents(disk)
     with filled(disk):
-        code = main(arguments)
+        code = main([*arguments, '--formats', name])
     print(json.dumps([name, code, contents(disk) == before]))
 """
 

@@ -98,9 +98,14 @@ def recorded(request, data_folder, tmp_path_factory):
     return bag, total, poses_in(poses)
 
 
-@pytest.mark.parametrize('every', [1, 2, 3])
+FULL, LONG = ('hall_os0_full', 22), ('hall_os0_long', 118)
+
+
 @pytest.mark.parametrize(
-    'recorded', [('hall_os0_full', 22), ('hall_os0_long', 118)], indirect=True, ids=str
+    ('recorded', 'every'),
+    [(FULL, 1), (FULL, 2), (FULL, 3), (LONG, 2), (LONG, 3)],
+    indirect=['recorded'],
+    ids=str,
 )
 def test_real_scans_of_a_hand_that_turns_fast_are_followed(recorded, tmp_path, every):
     # up to 48 deg and 0.8 m between two scans, 90 deg in every third, and no times of points

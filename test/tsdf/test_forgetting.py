@@ -87,7 +87,7 @@ def test_fifty_blue_after_500_red_are_blue_at_a_cap_of_ten(semantics, by_points)
         num_labels=2,
     )
     one = Integrator(BlockMap(config))
-    points = wall_at(2.0).sensor.directions.reshape(-1, 3)[::7]
+    points = wall_at(2.0).sensor.directions.reshape(-1, 3)[::37]
     points = points * (2.0 / points[:, 2:])
     for number in range(550):
         label, color = (0, (200, 0, 0)) if number < 500 else (1, (0, 0, 200))
