@@ -4,6 +4,8 @@
 LAS and LAZ files of points and surfels, by laspy.
 
 That is an extra: the formats have 30 kinds of records. On its own because it alone imports laspy.
+lazrs, its decoder of LAZ, ends the process if it cannot get memory, so all sizes by which lazrs
+allocates are compared with the file first; and it decodes by one thread, which allocates by fewer.
 Coordinates are scaled integers, often of a map projection, so they are returned as float64.
 """
 
@@ -13,7 +15,7 @@ import io
 import os
 from pathlib import Path
 import struct
-from typing import Any, TYPE_CHECKING
+from typing import Any, BinaryIO, TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -40,6 +42,15 @@ HEADER_BYTES = 375
 
 RECORD_BYTES, EXTENDED_RECORD_BYTES = 54, 60
 """Sizes of the heads of variable length records, before and behind the points."""
+
+POINT_FORMAT_AT, PACKED = 104, 0xC0
+"""Place of the format of points in the header, and its bits of LAZ."""
+
+LASZIP_RECORD = (b'laszip encoded', 22204)
+"""Name and number of the record that says how points are packed."""
+
+LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of the items of a point by their type; type 14, further bytes, has one for each byte."""
 
 PACKED_RATIO = 60
 """Memory per byte of a LAZ file, which packs a point into 3 to 10 bytes."""
@@ -69,12 +80,12 @@ def read_points(path: str | Path) -> dict[str, npt.NDArray[Any]]:
     laspy = import_laspy(path)
     try:
         check_header(path)
-        las = laspy.read(str(path))
-    except FileFormatError:
+        las = laspy.read(str(path), laz_backend=laspy.LazBackend.Lazrs)
+    except (FileFormatError, KeyboardInterrupt, SystemExit):
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except Exception as error:  # laspy passes on errors of its decoders, of many types
+    except BaseException as error:  # of decoders; a panic of Rust is no Exception
         raise FileFormatError(f'{path}: no LAS or LAZ file: {error}') from error
     names = set(las.point_format.dimension_names)
     columns: dict[str, npt.NDArray[Any]] = {
@@ -167,7 +178,10 @@ def check_header(path: str | Path) -> None:
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
-        header = file.read(HEADER_BYTES).ljust(HEADER_BYTES, b'\0')
+        header = file.read(HEADER_BYTES)
+        if len(header) >= POINT_FORMAT_AT and header[POINT_FORMAT_AT] & PACKED:
+            check_packed(path, file, header, size)
+    header = header.ljust(HEADER_BYTES, b'\0')
     start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)
     num_extended = 0
     if header[24:26] >= b'\x01\x04':
@@ -177,7 +191,7 @@ def check_header(path: str | Path) -> None:
             f'{path}: {num_records} and {num_extended} records of variable length in a file of '
             f'{size} bytes; damaged?'
         )
-    is_packed = point_format & 0xC0
+    is_packed = point_format & PACKED
     if start + count * point_size > size and not is_packed:
         raise FileFormatError(
             f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
@@ -186,3 +200,69 @@ def check_header(path: str | Path) -> None:
     ratio = PACKED_RATIO if is_packed else BYTES_PER_BYTE
     needed = count * (2 * point_size + COLUMN_BYTES)
     Budget(path, size, FileFormatError, ratio=ratio).take(needed, f'{count} points')
+
+
+def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> None:
+    """
+    Raise FileFormatError if a size by which the decoder of LAZ allocates does not fit the file.
+
+    These are the size of a point, the number of chunks, and the sizes of chunks and of the layers
+    in them. Each chunk begins with a point as it is. Source: the specification of LAZ 1.4,
+    compressed data, and the laszip record.
+    """
+    import lazrs
+
+    start, point_size = struct.unpack_from('<I', header, 96)[0], header[105] + (header[106] << 8)
+    record = laszip_record(file, header, min(start, size))
+    items = [struct.unpack_from('<HHH', record, at) for at in range(34, len(record) - 5, 6)]
+    stated = sum(item_size for _, item_size, _ in items)
+    if len(items) != struct.unpack_from('<H', record.ljust(34, b'\0'), 32)[0] or (
+        stated != point_size
+    ):
+        raise FileFormatError(
+            f'{path}: items of {stated} bytes in points of {point_size}; damaged?'
+        )
+    table_at = read_number(file, start, '<q')
+    table_at = read_number(file, size - 8, '<q') if table_at == -1 else table_at
+    is_inside = start < table_at <= size - 8
+    num_chunks = read_number(file, table_at + 4, '<I') if is_inside else 0
+    if not is_inside or (num_chunks - 1) * point_size > size:
+        raise FileFormatError(
+            f'{path}: {num_chunks} chunks of points at byte {table_at} of {size}; damaged?'
+        )
+    file.seek(start)
+    chunks = lazrs.read_chunk_table(file, lazrs.LazVlr(record)) if num_chunks else []
+    num_layers = sum(
+        item_size if kind == 14 else LAYERS.get(kind, 0) for kind, item_size, _ in items
+    )
+    at = start + 8
+    for number, (_, chunk_size) in enumerate(chunks):
+        file.seek(at + point_size + 4)
+        layers = np.frombuffer(file.read(4 * num_layers).ljust(4 * num_layers, b'\0'), '<u4')
+        if at + max(chunk_size, int(layers.sum(dtype=np.int64))) > size:
+            raise FileFormatError(
+                f'{path}: chunk {number} of the points ends beyond the file; truncated?'
+            )
+        at += chunk_size
+
+
+def laszip_record(file: BinaryIO, header: bytes, end: int) -> bytes:
+    """Return the record of LAZ among those of variable length, or none."""
+    at, num_records = struct.unpack_from('<H4xI', header, 94)
+    for _ in range(num_records):
+        if at + RECORD_BYTES > end:
+            break
+        file.seek(at)
+        name, number, length = struct.unpack_from('<2x16sHH', file.read(RECORD_BYTES))
+        if (name.rstrip(b'\0'), number) == LASZIP_RECORD:
+            return file.read(length)
+        at += RECORD_BYTES + length
+    return b''
+
+
+def read_number(file: BinaryIO, at: int, code: str) -> int:
+    """Return a number at a place of a file; bytes behind its end are 0."""
+    length = struct.calcsize(code)
+    file.seek(max(at, 0))
+    found: int = struct.unpack(code, file.read(length).ljust(length, b'\0'))[0]
+    return found

@@ -234,6 +234,43 @@ def trajectory() -> list[bytes]:
     ]
 
 
+def las() -> list[bytes]:
+    """Return LAS and LAZ files of points with times and colours."""
+    import laspy
+
+    found = []
+    for point_format, packed in ((3, False), (3, True), (6, True)):
+        made = laspy.LasData(laspy.LasHeader(point_format=point_format, version='1.4'))
+        made.x = made.y = made.z = made.gps_time = np.arange(float(NUM_POINTS))
+        file = io.BytesIO()
+        made.write(file, do_compress=packed)
+        found.append(file.getvalue())
+    return found
+
+
+def tile() -> list[bytes]:
+    """Return a tile of a map."""
+    from surfel_mapper.files.parquet_tiles import write_tile
+
+    return [written(lambda path: write_tile(path, small_map()[0]), 'a.parquet')]
+
+
+def shown() -> list[bytes]:
+    """Return triangles as OBJ, STL and glTF, after a byte for the kind."""
+    obj = b'v 0 0 0\nv 1 0 0\nv 0 1 0\nvn 0 0 1\nf 1//1 2//1 3//1\n'
+    stl = bytes(80) + struct.pack('<I', 1) + np.arange(12, dtype='<f4').tobytes() + bytes(2)
+    glb = struct.pack('<4sIII4s', b'glTF', 2, 24, 4, b'JSON') + b'{}  '
+    return [b'\0' + obj, b'\1' + stl, b'\2' + glb]
+
+
+def packets() -> list[bytes]:
+    """Return a capture of packets, and its metadata, after a byte that is odd for the latter."""
+    from test.fuzz.point_files import capture
+
+    captured, described = capture()
+    return [b'\0' + captured, b'\1' + described]
+
+
 def kitti_times() -> list[bytes]:
     """Return seconds."""
     return [b'0.0\n0.1\n0.2\n', b'1e0\n2E+1\n']

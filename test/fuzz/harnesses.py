@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from test.fuzz import corpus, files, messages, structures
+from test.fuzz import corpus, files, messages, point_files, structures
 
 
 class Harness(NamedTuple):
@@ -49,6 +49,14 @@ HARNESSES = {
     'cloud_structure': Harness(structures.cloud, corpus.noise, 200),
     'data_set': Harness(structures.data_set, corpus.noise, 400),
     'parquet_structure': Harness(structures.parquet, corpus.noise, 40),
+    'las': Harness(point_files.las, corpus.las, 150),
+    'las_structure': Harness(point_files.las_structure, corpus.noise, 80),
+    'ply_structure': Harness(point_files.ply_structure, corpus.noise, 300),
+    'pcd_structure': Harness(point_files.pcd_structure, corpus.noise, 300),
+    'trajectory_structure': Harness(point_files.trajectory_structure, corpus.noise, 100),
+    'tile': Harness(point_files.tile, corpus.tile, 60),
+    'shown': Harness(point_files.shown, corpus.shown, 300),
+    'packets': Harness(point_files.packets, corpus.packets, 60),
     'map_url': Harness(files.map_url, corpus.map_url, 1000),
     'map_name': Harness(files.map_name, corpus.map_url, 1000),
 }

@@ -895,6 +895,38 @@ def test_counts_in_the_header_of_las_are_compared_with_the_file(
     assert time.thread_time() - start_s < 0.5
 
 
+@pytest.mark.parametrize(
+    ('change', 'problem'),
+    [
+        (
+            lambda c, start, table, record: struct.pack_into('<I', c, table + 4, 2**32 - 1),
+            'chunks',
+        ),
+        (lambda c, start, table, record: struct.pack_into('<q', c, start, 2**62), 'chunks'),
+        (lambda c, start, table, record: struct.pack_into('<H', c, record + 36, 2**15), 'items'),
+        (lambda c, start, table, record: struct.pack_into('<I', c, start + 46, 2**31), 'beyond'),
+        (lambda c, start, table, record: c.__delitem__(slice(start + 60, None)), 'chunks'),
+    ],
+    ids=['chunks', 'place', 'items', 'layer', 'cut'],
+)
+def test_sizes_in_laz_are_compared_with_the_file(tmp_path, change, problem):
+    """Its decoder ended the process if it could not get the memory for the chunks stated."""
+    laspy = pytest.importorskip('laspy')
+    path = tmp_path / 'a.laz'
+    data = laspy.LasData(laspy.LasHeader(point_format=6, version='1.4'))
+    data.x = data.y = data.z = np.arange(5.0)
+    data.write(str(path))
+    assert read_scan(path)[0].tolist() == [[value] * 3 for value in range(5)]
+    content = bytearray(path.read_bytes())
+    start = struct.unpack_from('<I', content, 96)[0]
+    table = struct.unpack_from('<q', content, start)[0]
+    record = content.index(b'laszip encoded') + 52
+    change(content, start, table, record)
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=f'^{path}: .*{problem}'):
+        read_scan(path)
+
+
 SHOWN = ('.obj', '.glb', '.stl', '.parquet', '.ply')
 """Files that only ``view`` reads, or reads otherwise."""
 

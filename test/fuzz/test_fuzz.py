@@ -23,6 +23,11 @@ NEEDED = {
     'parquet_structure': 'pyarrow',
     'pcd': 'lzf',
     'mcap': 'mcap',
+    'las': 'laspy',
+    'las_structure': 'laspy',
+    'pcd_structure': 'lzf',
+    'tile': 'pyarrow',
+    'packets': 'ouster',
     'map_url': 'rclpy',
 }
 
