@@ -12,6 +12,7 @@ PYTHON ?= python3
 PYTEST_ARGS ?=
 TEST_PROCESSES ?= 3
 FUZZ_SECONDS ?= 10
+FUZZ_SHARE = $(VENV)/.fuzz-share
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
@@ -73,7 +74,9 @@ soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map dri
 
 fuzz: $(STAMP)  ## let every write and allocation fail; then search for inputs that break readers, a minute of each; FUZZ_SECONDS=600
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
-	SURFEL_MAPPER_EVERY_FAILURE=1 $(BIN)/python -m pytest -q -rP test/fuzz/test_failures.py
+	share=$$(cat $(FUZZ_SHARE) 2>/dev/null || echo 0); echo $$(((share + 1) % 32)) > $(FUZZ_SHARE); \
+	SURFEL_MAPPER_EVERY_FAILURE=$$share $(BIN)/python -m pytest -q -rP test/fuzz/test_failures.py
+	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
 lint: $(LINT_STAMP)  ## style, format, types, layers, language; needs no ROS

@@ -57,6 +57,7 @@ HOMES = {
     'lifecycle_msgs': ('ros/',),
     'kiss_matcher': ('evaluation/frames',),
     'laspy': ('files/las',),
+    'lazrs': ('files/las',),
     'llvmlite': ('kernels/',),
     'lz4': ('bags/',),
     'lzf': ('files/pcd',),

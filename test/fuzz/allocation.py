@@ -6,8 +6,8 @@ Replays in which one allocation of Python fails, in processes that end with them
 ``one``: a whole replay with its imports, in this process; exit code 0 if it did not fail. Not
 forked: threads that share the work of a scan would be missing in a child.
 
-``until_the_map``: each allocation, or each of a stride, of a small replay by one thread fails
-once, from opening the bag to the map that is written. Imports are done and kernels loaded before;
+``until_the_map``: the allocations of a stride of a small replay by one thread fail once each,
+from opening the bag to the map that is written. Imports are done and kernels loaded before;
 children that are forked from there try a batch each. A child that dies ends its batch: numba dies
 if it cannot allocate, and NumPy (2.3) fills an index without end. Prints the counts as JSON.
 """
@@ -66,7 +66,7 @@ def until_the_map(first: str, stride: str, bag: str, folder: str) -> int:
     gc.freeze()
     counts: dict[str, Any] = {'failed': 0, 'crashed': [], 'hung': [], 'last': 0}
     written, numbers = 0, itertools.count(int(first), int(stride))
-    size = BATCH if int(stride) == 1 else SMALL_BATCH
+    size = BATCH if int(stride) < BATCH else SMALL_BATCH
     batch = list(itertools.islice(numbers, size))
     while written < max(WHOLE // int(stride), LEAST):
         results, code = in_child(batch, bag, folder, expected)
