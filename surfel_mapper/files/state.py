@@ -23,7 +23,7 @@ import os
 from pathlib import Path
 import re
 import struct
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, IO
 import zipfile
 import zlib
 
@@ -131,11 +131,24 @@ def write_archive(
         text = json.dumps(manifest, indent=1, allow_nan=False)
         archive.writestr(zipfile.ZipInfo(MANIFEST), text, compress_type, compresslevel=1)
         for name, array in arrays.items():
-            content = io.BytesIO()
-            npy.write_array(content, array, allow_pickle=False)
             info = zipfile.ZipInfo(f'{name}.npy')  # without a date, so that bytes are equal
+            if compress_type == zipfile.ZIP_STORED:
+                info.file_size = array.nbytes + NPY_HEADER_BYTES  # decides on zip64
+                with archive.open(info, 'w') as member:
+                    write_npy(member, array)
+                continue
+            content = io.BytesIO()
+            write_npy(content, array)
             archive.writestr(info, content.getbuffer(), compress_type, compresslevel=1)
         return sum(info.file_size for info in archive.infolist())
+
+
+def write_npy(file: IO[bytes], array: npt.NDArray[Any]) -> None:
+    """Write a contiguous array as an npy file, piece by piece: it may be larger than memory."""
+    npy.write_array_header_1_0(file, npy.header_data_from_array_1_0(array))
+    content = array.reshape(-1).view(np.uint8)
+    for first in range(0, len(content), CHUNK_BYTES):
+        file.write(content[first : first + CHUNK_BYTES].data)
 
 
 def content_sha256(manifest: Mapping[str, Any], arrays: Iterable[npt.NDArray[Any]]) -> str:

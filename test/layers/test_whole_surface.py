@@ -1,6 +1,9 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""The mesh of a drive from its archive, region by region: that of all blocks in one map."""
+"""Mesh and file of a drive from its archive, region by region: those of all blocks in one map."""
+
+from functools import partial
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -10,9 +13,10 @@ from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import tsdf_archive
 from surfel_mapper.files.mesh_ply import write_mesh_parts
 from surfel_mapper.files.tsdf_archive import BlockArchive
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
 from surfel_mapper.layers.distance_field import whole_surface
 from surfel_mapper.layers.distance_field.layer import cleared
-from surfel_mapper.layers.distance_field.whole_surface import surface_parts
+from surfel_mapper.layers.distance_field.whole_surface import merged_parts, surface_parts
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.mesh import Mesher, together
 from test.tsdf.test_mesh import SIDE, write
@@ -158,3 +162,63 @@ def test_cleared_region_of_the_archive_stays_clear_and_later_blocks_come_in(
     again = together(list(surface_parts(BlockMap(settings), archive)))
     assert -1.6 < again.vertices[:, 0].min() < -1.4
     assert not ((again.vertices[:, 0] > -1.1) & (again.vertices[:, 0] < 0.55)).any()
+
+
+@pytest.mark.parametrize('stay', [0.0, 0.3])
+def test_saved_archive_is_the_file_of_all_blocks_in_memory(tmp_path, stay):
+    blocks = hilly(config())
+    archive = archived(tmp_path, blocks, stay=stay)
+    together_in_memory = BlockMap(blocks.config)
+    for part in archive:
+        together_in_memory.merge(part)
+    together_in_memory.merge(blocks.copied(blocks.rows()))
+    save_tsdf(tmp_path / 'memory.npz', together_in_memory)
+    parts = partial(merged_parts, blocks, archive)
+    save_tsdf_parts(tmp_path / 'disk.npz', blocks.config, parts)
+    assert (tmp_path / 'disk.npz').read_bytes() == (tmp_path / 'memory.npz').read_bytes()
+    assert len(np.load(tmp_path / 'disk.npz')['index']) > 200
+
+
+def test_empty_archive_is_saved_as_an_empty_field(tmp_path):
+    empty = BlockMap(config())
+    parts = partial(merged_parts, empty, BlockArchive(tmp_path / 'a'))
+    save_tsdf_parts(tmp_path / 'empty.npz', empty.config, parts)
+    assert load_tsdf(tmp_path / 'empty.npz', empty.config).num_blocks == 0
+
+
+def test_saving_an_archive_takes_the_memory_of_a_region(tmp_path, monkeypatch):
+    monkeypatch.setattr(tsdf_archive, 'REGION', 8)
+    monkeypatch.setattr(whole_surface, 'REGION', 8)
+    blocks = hilly(config(), shape=(96, 24, 5))
+    archive = archived(tmp_path, blocks, stay=0.0)
+    tracemalloc.start()
+    try:
+        for part in merged_parts(blocks, archive):
+            assert len(part) <= 8**3
+        of_parts = tracemalloc.get_traced_memory()[1]
+        tracemalloc.reset_peak()
+        save_tsdf_parts(tmp_path / 'm.npz', blocks.config, partial(merged_parts, blocks, archive))
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    size = (tmp_path / 'm.npz').stat().st_size
+    assert size > 20e6
+    assert peak < 0.5 * size
+    assert peak < of_parts + 3e6  # the pieces in which bytes are written, and the keys
+
+
+def test_archive_that_cannot_be_saved_leaves_the_old_file(tmp_path):
+    blocks = hilly(config())
+    archive = archived(tmp_path, blocks)
+    (tmp_path / 'map.npz').write_bytes(b'old')
+    files = sorted((tmp_path / 'archive').rglob('*.npz'))
+    files[0].write_bytes(b'rubbish')
+    parts = partial(merged_parts, blocks, archive)
+    with pytest.raises(FileFormatError, match=r'\.npz'):
+        save_tsdf_parts(tmp_path / 'map.npz', blocks.config, parts)
+    with pytest.raises(FileFormatError, match='nowhere'):
+        save_tsdf_parts(
+            tmp_path / 'nowhere' / 'map.npz', blocks.config, lambda: [hilly(config()).copied([0])]
+        )
+    assert (tmp_path / 'map.npz').read_bytes() == b'old'
+    assert sorted(path.name for path in tmp_path.iterdir()) == ['archive', 'map.npz']

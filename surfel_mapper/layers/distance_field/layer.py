@@ -25,11 +25,11 @@ from surfel_mapper.config import Config, TsdfConfig
 from surfel_mapper.errors import CloudFormatError
 from surfel_mapper.files.mesh_ply import write_mesh_parts
 from surfel_mapper.files.tsdf_archive import BlockArchive, joined
-from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
+from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf, save_tsdf_parts
 from surfel_mapper.layers.distance_field.field import DistanceField
 from surfel_mapper.layers.distance_field.live_mesh import LiveMesh, WholeMesh
 from surfel_mapper.layers.distance_field.obstacles import clearance_slice, slice_at
-from surfel_mapper.layers.distance_field.whole_surface import surface_parts
+from surfel_mapper.layers.distance_field.whole_surface import merged_parts, surface_parts
 from surfel_mapper.layers.drawings import Drawing, MeshDrawing
 from surfel_mapper.layers.layer import (
     Contains,
@@ -283,19 +283,13 @@ class TsdfLayer(Layer):
             ),
         )
 
-    def whole(self) -> BlockMap:
-        """Return the field, with the blocks of the archive if there is one."""
-        if self._archive is None or not self._archive.num_blocks:
-            return self.blocks
-        found = BlockMap(replace(self.config.tsdf, max_blocks=0))
-        for blocks in self._archive:
-            found.merge(blocks)
-        found.merge(self.blocks.copied(self.blocks.rows()))
-        return found
-
     def save(self, path: Path) -> None:
-        """Write the field, the archive included."""
-        save_tsdf(path, self.whole())
+        """Write the field, and the archive region by region."""
+        if self._archive is None or not self._archive.num_blocks:
+            save_tsdf(path, self.blocks)
+        else:
+            parts = partial(merged_parts, self.blocks, self._archive)
+            save_tsdf_parts(path, self.config.tsdf, parts)
 
     def load(self, path: Path) -> Callable[[], None]:
         """Read a field that ``save`` wrote; return the function that puts it in place."""

@@ -50,17 +50,11 @@ def surface_parts(blocks: BlockMap, archive: BlockArchive) -> Iterator[Mesh]:
         If a file of the archive cannot be read.
 
     """
-    rows = blocks.rows()
-    places = blocks.index(rows) // REGION
-    regions = archive.regions() | {(x, y, z) for x, y, z in np.unique(places, axis=0).tolist()}
     borders: dict[Region, Blocks] = {}
     numbers: dict[Edge, int] = {}
-    num_vertices = 0
-    for region in sorted(regions, reverse=True):
-        found = BlockMap(replace(blocks.config, max_blocks=0))
-        for archived in archive.region(region):
-            found.merge(archived)
-        found.merge(blocks.copied(rows[(places == region).all(axis=1)]))
+    num_vertices, is_empty = 0, True
+    for region, found in merged_regions(blocks, archive):
+        is_empty = False
         own = found.rows()
         keys = found.head[own, KEY].tolist()
         borders = {near: border for near, border in borders.items() if near[0] <= region[0] + 1}
@@ -74,8 +68,32 @@ def surface_parts(blocks: BlockMap, archive: BlockArchive) -> Iterator[Mesh]:
             edge: number for edge, number in numbers.items() if is_ahead(edge, region, blocks)
         }
         yield part
-    if not regions:
+    if is_empty:
         yield Mesher(blocks).mesh()
+
+
+def merged_regions(blocks: BlockMap, archive: BlockArchive) -> Iterator[tuple[Region, BlockMap]]:
+    """
+    Iterate over the regions of a field and its archive, from the highest to the lowest.
+
+    Each comes with the blocks in it; those that are in the archive several times, or in the field
+    as well, are merged.
+    """
+    rows = blocks.rows()
+    places = blocks.index(rows) // REGION
+    regions = archive.regions() | {(x, y, z) for x, y, z in np.unique(places, axis=0).tolist()}
+    for region in sorted(regions, reverse=True):
+        found = BlockMap(replace(blocks.config, max_blocks=0))
+        for archived in archive.region(region):
+            found.merge(archived)
+        found.merge(blocks.copied(rows[(places == region).all(axis=1)]))
+        yield region, found
+
+
+def merged_parts(blocks: BlockMap, archive: BlockArchive) -> Iterator[Blocks]:
+    """Iterate over the blocks of a field and its archive, each once, region by region."""
+    for _, found in merged_regions(blocks, archive):
+        yield found.copied(found.rows())
 
 
 def insert_above(found: BlockMap, region: Region, borders: dict[Region, Blocks]) -> None:
