@@ -27,6 +27,7 @@ BENCHES = (
     'start',
     'view',
     'live',
+    'live_long',
     'offline',
     'compare',
     'filters',

@@ -7,11 +7,11 @@ Four processes: a lidar and an odometry (live_publisher.py), the node, and this 
 subscribes to ``~/changed`` and to ``~/normals`` at 2 Hz. The lidar is an ordinary publisher:
 reliable, with the defaults of the middleware, or, in rows ``with profile``, with the profile for
 shared memory. A rate is sustained if every cloud published comes back as a change; the latency of
-``~/normals`` counts from the stamp of its latest scan. Idle is a node that has mapped, with
-nothing coming in. Rows ``transport`` are a subscriber of rclpy that only takes the clouds, in
-place of the node: no subscriber is faster.
+``~/normals`` counts from the stamp of its latest scan, while clouds come. Idle is a node that has
+mapped, with nothing coming in. Rows ``transport`` are a subscriber of rclpy that only takes the
+clouds, in place of the node: no subscriber is faster.
 
-Only the rows of the node at 20 Hz grow with ``--scans``: at 4000 each lasts ten minutes.
+Only the rows of the node at 20 Hz grow with ``--scans``; live_long.py has the long ones alone.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def measure(
 ) -> dict[str, Any]:
     """Return the row of a rate."""
     before_s, rss_mb = node.cpu_s(), node.resident_mb()
-    listener.normals_ms.clear()
+    listener.normals.clear()
     stamps = publish(
         options, listener.listen_until, rate_hz, round(rate_hz * seconds), profile=profile
     )
@@ -123,11 +123,26 @@ def measure(
         'what': 'live',
         'rate_hz': rate_hz,
         **latencies(stamps, listener.arrivals),
-        'normals': len(listener.normals_ms),
-        'normals_max_ms': max(listener.normals_ms, default=None),
+        **normals_ages(stamps, listener.normals),
         'rss_MB': node.resident_mb(),
         'rss_grown_MB': node.resident_mb() - rss_mb,
         'cpu_ms_scan': 1e3 * cpu_s / len(stamps),
+    }
+
+
+def normals_ages(stamps: Sequence[int], normals: Sequence[tuple[int, int]]) -> dict[str, Any]:
+    """
+    Return the number of full maps, and their largest age by the stamp of their latest scan.
+
+    normals has the time of arrival and the stamp of each, ns. One that comes after the last cloud
+    was published when its turn came, which is another time than the age of its scan.
+    """
+    during = [(came - stamp) / 1e6 for came, stamp in normals if came <= stamps[-1]]
+    after = [(came - stamp) / 1e6 for came, stamp in normals if came > stamps[-1]]
+    return {
+        'normals': len(normals),
+        'normals_max_ms': max(during, default=None),
+        'normals_last_ms': max(after, default=None),
     }
 
 
@@ -280,11 +295,11 @@ def listening() -> Iterator[Any]:
     from sensor_msgs.msg import PointCloud2
 
     class Listener:
-        """Records the arrival time of each change by its stamp, and the age of each full map."""
+        """Records arrivals of changes by stamp, and arrivals and stamps of full maps."""
 
         def __init__(self, listen_until: Listen) -> None:
             self.arrivals: dict[int, int] = {}
-            self.normals_ms: list[float] = []
+            self.normals: list[tuple[int, int]] = []
             self.listen_until = listen_until
 
         def on_changed(self, msg: PointCloud2) -> None:
@@ -292,7 +307,7 @@ def listening() -> Iterator[Any]:
 
         def on_normals(self, msg: PointCloud2) -> None:
             if msg.width:  # none before the first scan
-                self.normals_ms.append((time.time_ns() - stamp_ns(msg)) / 1e6)
+                self.normals.append((time.time_ns(), stamp_ns(msg)))
 
     def stamp_ns(msg: PointCloud2) -> int:
         return int(msg.header.stamp.sec * 10**9 + msg.header.stamp.nanosec)

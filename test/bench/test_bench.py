@@ -143,6 +143,18 @@ def test_every_bench_is_a_module_that_says_what_it_is():
         assert bench.summary(name).endswith('.')
 
 
+def test_a_full_map_after_the_last_cloud_does_not_count_for_its_age_under_load():
+    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    from test.bench import live
+
+    stamps = [0, 50_000_000, 100_000_000]
+    normals = [(30_000_000, 0), (95_000_000, 50_000_000), (530_000_000, 100_000_000)]
+    found = live.normals_ages(stamps, normals)
+    assert found == {'normals': 3, 'normals_max_ms': 45.0, 'normals_last_ms': 430.0}
+    empty = {'normals': 0, 'normals_max_ms': None, 'normals_last_ms': None}
+    assert live.normals_ages(stamps, []) == empty
+
+
 def test_normals_are_compared_with_the_true_ones(options):
     rows = bench.run(['accuracy'], options)
     assert [(row['voxel_m'], row['at']) for row in rows] == [
