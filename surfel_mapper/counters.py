@@ -115,6 +115,10 @@ class Counters:
         """Add the time of a with-block to a stage, in milliseconds."""
         return _Timed(self, stage)
 
+    def add_seconds(self, stage: str, seconds: float) -> None:
+        """Add time to the sum of a stage that is no time of a scan of its own."""
+        self.stage_s[stage] = self.stage_s.get(stage, 0.0) + seconds
+
     def drop(self, cause: str, frame_id: str, number: int = 1) -> None:
         """Count scans as dropped for a cause."""
         self.dropped[cause] += number
@@ -127,7 +131,7 @@ class Counters:
         """Add the times of a scan by stage."""
         for stage, time_ms in milliseconds.items():
             self.milliseconds.setdefault(stage, deque(maxlen=LATEST)).append(time_ms)
-            self.stage_s[stage] = self.stage_s.get(stage, 0.0) + 1e-3 * time_ms
+            self.add_seconds(stage, 1e-3 * time_ms)
 
     def add_filter(
         self,

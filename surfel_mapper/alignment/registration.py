@@ -25,17 +25,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.alignment.kernels.steps import move_pose, solve_step
 from surfel_mapper.alignment.surfel_planes import PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
-from surfel_mapper.geometry import (
-    compose,
-    inverse,
-    pose_matrix,
-    q_xyzw,
-    rotation_angle,
-    se3_exp,
-    Transform,
-)
+from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
 from surfel_mapper.kernels.layout import BITS, HALF
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import Reducer
@@ -53,6 +46,9 @@ COARSE_CELLS = 4000
 SAME_VOXELS = 0.03
 """Displacement of the points, as a share of the voxel size, up to which cells keep their surfels
 between two steps: 3 % of the cells at most would meet another one."""
+
+LEAST_RATIO = 1e-12
+"""Share of the information below which a direction is never determined: rounding."""
 
 SEARCH_STEP_DEG = 7.5
 """Step of the heading search, deg."""
@@ -374,20 +370,14 @@ def solve(
         Scale of rotations.
 
     """
-    weight = float(np.trace(hessian[:3, :3]))
-    if not weight > 0.0:
-        return np.zeros(6), np.eye(6), 1.0
-    radius_m = math.sqrt(float(np.trace(hessian[3:, 3:])) / weight) or 1.0
-    scale = np.array([1.0, 1.0, 1.0, radius_m, radius_m, radius_m])
-    values, vectors = np.linalg.eigh(hessian / (weight * np.outer(scale, scale)))
-    known = values >= max(min_ratio, 1e-12)
-    inverse = np.where(known, 1.0 / np.where(known, values, 1.0), 0.0)
-    step = -(vectors @ (inverse * (vectors.T @ (gradient / (weight * scale))))) / scale
-    return step, np.ascontiguousarray(vectors.T[~known]), radius_m
+    step, values, vectors = np.empty(6), np.empty(6), np.empty((6, 6))
+    least = max(min_ratio, LEAST_RATIO)
+    radius_m = float(solve_step(hessian, gradient, least, step, values, vectors))
+    return step, vectors[values < least], radius_m
 
 
 def moved(T_map_sensor: Transform, step: npt.NDArray[np.float64]) -> Transform:
     """Return a pose moved by step[:3], m, and rotated in place by the vector step[3:], rad."""
-    turn = se3_exp(np.concatenate([np.zeros(3), step[3:]]))
-    turned = compose(turn, T_map_sensor)
-    return pose_matrix(T_map_sensor[:3, 3] + step[:3], q_xyzw(turned))
+    pose = np.empty((4, 4))
+    move_pose(np.asarray(T_map_sensor, np.float64), step, pose)
+    return pose

@@ -43,7 +43,7 @@ def files_of(path: Path) -> list[Path]:
         information = metadata(path)
         return loose_files(path) if information is None else listed_files(path, information)
     if not path.is_file():
-        raise BagError(f'{path}: no such file or directory; expected a bag')
+        raise BagError(f'{path}: no such file or directory; expected a bag or scans')
     if not is_storage(path) and not is_ros1(path):
         raise BagError(
             f'{path}: not a bag; expected a rosbag2 directory, or a file ending in .mcap, .db3 '

@@ -37,6 +37,9 @@ class Parser(argparse.ArgumentParser):
             message = (
                 f'no verb {found[1]!r}{nearest(found[1], verbs) or ";"} verbs: {", ".join(verbs)}'
             )
+        found = re.search(r": invalid choice: '([^']*)' \(choose from (.*)\)$", message)
+        if found:
+            message += nearest(found[1], re.findall(r"[^', ]+", found[2]))
         super().error(message)
 
     def refuse_unknown(self, words: list[str]) -> NoReturn:

@@ -167,7 +167,8 @@ def folder_report(content: dict[str, Any]) -> str:
     """Return the figures of scans in files as lines of text."""
     columns = ', '.join(content['columns']) or 'none'
     return (
-        f'{content["bag"]}: {content["format"]}, {content["scans"]} scans, '
+        f'{content["bag"]}: {content["format"]}, {content["scans"]} '
+        f'{"scan" if content["scans"] == 1 else "scans"}, '
         f'{content["seconds"]:.1f} s\n'
         f'  first scan: {content["points"]} points; columns beside x y z: {columns}\n\n'
         f'{replay_line(content["replay"])}'

@@ -233,6 +233,7 @@ def feed(
         yield from mapper.insert_ready(more_follows=True)
     if scenes:
         mapper.end_images()
+    mapper.end_scans()
     yield from mapper.insert_ready()
     mapper.finish()
 

@@ -186,10 +186,10 @@ def replay(
             mapper.derives = bool(listening)  # the files hold the surfels of the end
             start_s = time.perf_counter()
             trajectory, was_stopped = mapped(recording, mapper, listen, progress, stopped)
-            replay_s = time.perf_counter() - start_s
             refuse_empty(recording, mapper, was_stopped)
             with write_first(partial(write_maps, directory, options.formats, mapper, trajectory)):
                 aligned = align(mapper, options)
+            replay_s = time.perf_counter() - start_s
             trajectory.follow_alignment(mapper)
             write_maps(directory, options.formats, mapper, trajectory, window=options.window)
             mapper.finish_layers()

@@ -132,6 +132,7 @@ class ScanFolder:
                 break
             self._add(mapper, number, frame)
             yield from mapper.insert_ready(more_follows=True)
+        mapper.end_scans()
         yield from mapper.insert_ready()
         mapper.finish()
 

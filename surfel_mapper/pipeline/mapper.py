@@ -19,6 +19,7 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 import logging
+import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -275,6 +276,11 @@ class Mapper:
         if self._inserter.images is not None:
             self._inserter.images.ended = True
 
+    def end_scans(self) -> None:
+        """Stop waiting for a scan after the first, which tells its velocity: no more come."""
+        if self.registered is not None:
+            self.registered.scans_ended = True
+
     def insert_ready(self, *, more_follows: bool = False) -> Iterator[Update]:
         """
         Map the waiting scans whose poses are there, in order; yield an Update for each.
@@ -294,7 +300,9 @@ class Mapper:
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
             yield from self._insert(*self._queue.posed.popleft())
         if self._queue.posed:
+            start = time.perf_counter()
             self._inserter.begin(*self._queue.posed[0], self.config)
+            self.counters.add_seconds('reduce', time.perf_counter() - start)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:
         """

@@ -89,6 +89,8 @@ class RegisteredPoses:
         The tracked frame; empty before the first scan.
     apart : list of ApartMap
         The latest parts that were not joined, at most MOST_PARTS.
+    scans_ended : bool
+        No scan follows those that came in.
 
     """
 
@@ -105,6 +107,7 @@ class RegisteredPoses:
         self._start = pose_matrix(start[:3], start[3:]) if start else np.eye(4)
         self._tracker = Tracker(self._registration, self._start)
         self.body = ''
+        self.scans_ended = False
         self._num_aligned = self._num_degenerate = self._num_parts = 0
         self._fits: deque[float] = deque(maxlen=LATEST)
 
@@ -142,7 +145,7 @@ class RegisteredPoses:
         Estimate the velocity for deskewing the first scan, from the scan after it.
 
         Both are skewed alike, so the motion between them is right; but if the first were mapped
-        without deskewing, later scans would not fit it.
+        without deskewing, later scans would not fit it. A single scan is taken to be at rest.
 
         Raises
         ------
@@ -151,6 +154,8 @@ class RegisteredPoses:
 
         """
         if scan.times is None or not self._tracker.is_new:
+            return
+        if following is None and self.scans_ended:
             return
         if following is None:
             raise PoseNotYetError('the first scan waits for the next, to be deskewed')

@@ -63,6 +63,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('repaly', 'a'), "no verb 'repaly', did you mean replay?"),
         (('fly',), "no verb 'fly'; verbs: node, replay"),
         (('replay', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
+        (('replay', 'a', '--poses-from', 'identiy'), ', did you mean identity?'),
         (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
         (('info', 'a', 'b'), 'too many arguments: b'),
         (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),

@@ -11,6 +11,7 @@ REFERENCES = {
     'alignment/kernels/edges.py': 'alignment/kernels/test_edges.py',
     'alignment/kernels/planes.py': 'alignment/kernels/test_planes.py',
     'alignment/kernels/registration.py': 'alignment/kernels/test_registration.py',
+    'alignment/kernels/steps.py': 'alignment/kernels/test_steps.py',
     'filters/kernels/boxes.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/limits.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/nearest.py': 'filters/test_neighbours.py',

@@ -104,15 +104,24 @@ def write_poses(tmp_path):
     return path
 
 
-def write_scans(folder, times_s=None):
+def write_scans(folder, times_s=None, num_scans=3):
     folder.mkdir()
     points = np.random.default_rng(1).uniform(-5.0, 5.0, (100, 3)).astype(np.float32)
     columns = dict(zip('xyz', points.T, strict=True))
     if times_s is not None:
         columns['time'] = np.float32(times_s)
-    for number in range(3):
+    for number in range(num_scans):
         pcd.write_points(folder / f'{number:010}.pcd', columns)
     return folder
+
+
+def test_a_single_scan_with_times_is_mapped_as_at_rest(tmp_path, capsys):
+    folder = write_scans(tmp_path / 'swept', np.linspace(0.0, 0.1, 100), num_scans=1)
+    assert main(['info', str(folder)]) == 0
+    assert 'scans in files, 1 scan, 0.0 s' in capsys.readouterr().out
+    assert main(['replay', str(folder), '--output', str(tmp_path / 'out')]) == 0
+    summary = json.loads((tmp_path / 'out' / 'summary.json').read_text())
+    assert (summary['scans']['mapped'], summary['points'], summary['deskewed']) == (1, 100, True)
 
 
 def test_scans_with_times_of_their_points_are_deskewed(tmp_path):
