@@ -14,7 +14,8 @@ would compress better than the budget allows is written uncompressed.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 import hashlib
 import io
 import json
@@ -223,11 +224,17 @@ def read_archive(
         check_header(archive, info, entry)
         budget.take(info.file_size * copies, f'array {entry["name"]}')
         budget.check_time()
-    arrays = {
-        entry['name']: read_array(archive, info)
-        for info, entry in zip(infos, manifest['arrays'], strict=True)
-    }
-    found = content_sha256(manifest, arrays.values())
+    arrays: dict[str, npt.NDArray[Any]] = {}
+
+    def read_arrays() -> Iterator[npt.NDArray[Any]]:
+        """Yield the arrays; each is read while the one before is hashed."""
+        with ThreadPoolExecutor(1) as reader:
+            reading = [reader.submit(read_array, archive, info) for info in infos]
+            for entry, future in zip(manifest['arrays'], reading, strict=True):
+                arrays[entry['name']] = future.result()
+                yield arrays[entry['name']]
+
+    found = content_sha256(manifest, read_arrays())
     if found != manifest['sha256'] or members:
         raise FileFormatError(
             f'{path}: damaged: content has sha256 {found} and {len(members)} unknown members, '

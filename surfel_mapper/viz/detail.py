@@ -23,6 +23,7 @@ from surfel_mapper.mapping.coarsening import coarse_keys, coarse_slab
 from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import concatenated, derive, Surfels
+from surfel_mapper.threads import share, usable_cores
 
 Array = npt.NDArray[np.float64]
 
@@ -65,33 +66,31 @@ class DetailedMap:
 
     def __init__(self, moments: ScanMoments, min_points: int) -> None:
         self._moments, self._min_points = moments, min_points
-        keys, counts = [moments.key], [moments.count]
-        parents: list[npt.NDArray[np.int32]] = []
-        while len(keys) <= LEVELS and moments.level + len(parents) < MOST_LEVEL and len(keys[-1]):
-            key, parent = coarse_keys(keys[-1], 1)
-            # float64 is exact below 2^53
-            count = np.bincount(parent, counts[-1], len(key)).astype(np.int64)
-            if count.max() > layout.MAX_MAP_COUNT >> 2 * (moments.level + len(keys)):
-                break  # sums of its moments may overflow
-            keys.append(key)
-            counts.append(count)
-            parents.append(parent)
-        places = unpack_keys(keys[-1])[:, :2].astype(np.int64)
-        self.bits, self.tiles = tiles_of(places, len(parents))
-        self.edge_m = moments.voxel_size_m * 2.0**self.bits
-        place = places >> (self.bits - len(parents))
-        tile = np.searchsorted(packed(self.tiles), packed(place)).astype(np.uint16)
-        tiles = [tile]  # of the voxels of each level
-        for parent in reversed(parents):
-            tiles.insert(0, tiles[0][parent])
-        self.counts = np.array(
-            [
-                np.bincount(tile[count >= min_points], minlength=len(self.tiles))
-                for tile, count in zip(tiles, counts, strict=True)
-            ]
+        last = min(LEVELS, MOST_LEVEL - moments.level)
+        # voxels in the order of their keys have runs of one column of the coarsest level each
+        column = (
+            moments.key
+            & ~np.int64((1 << layout.INDEX_BITS + last) - 1)
+            & ~(np.int64((1 << last) - 1) << 2 * layout.INDEX_BITS)
         )
-        self._rows = np.argsort(tiles[0], kind='stable')
-        self._ends = np.cumsum(np.bincount(tiles[0], minlength=len(self.tiles)))
+        begin = np.flatnonzero(np.diff(column, prepend=-1))
+        places = unpack_keys(column[begin])[:, :2].astype(np.int64) >> last
+        self.bits, self.tiles = tiles_of(places, last)
+        self.edge_m = moments.voxel_size_m * 2.0**self.bits
+        tile = np.searchsorted(packed(self.tiles), packed(places >> (self.bits - last)))
+        order = np.argsort(tile, kind='stable')
+        self._begin = begin[order]  # of the runs, in the order of their tiles
+        self._length = np.diff(begin, append=len(column))[order]
+        self._ends = np.cumsum(np.bincount(tile, minlength=len(self.tiles)))
+        self.counts = np.zeros((last + 1, len(self.tiles)), np.int64)
+        fits = np.ones((last + 1, len(self.tiles)), bool)
+
+        def count(part: slice) -> None:
+            for each in range(part.start, part.stop):
+                self._count(each, fits)
+
+        share(count, len(self.tiles), usable_cores())
+        self.counts = self.counts[fits.all(axis=1)]
 
     def __len__(self) -> int:
         """Return the number of tiles."""
@@ -127,13 +126,43 @@ class DetailedMap:
     def surfels(self, tile: int, level: int) -> Surfels:
         """Return the surfels of a tile at a level."""
         moments = self._moments
-        rows = self._rows[self._ends[tile - 1] if tile else 0 : self._ends[tile]]
-        slab, sums = coarse_slab(moments, rows, level)
+        slab, sums = coarse_slab(moments, self._voxels(tile), level)
         chosen = np.flatnonzero(slab[:, layout.COUNT] >= self._min_points).astype(np.int32)
         bits = layout.BITS + moments.level + level
         surfels = derive(slab, chosen, moments.voxel_size_m * 2**level, bits)
         channels = means(sums[chosen], surfels.num_points, moments.channel_names)
         return replace(surfels, channels=channels)
+
+    def all_surfels(self, level: npt.NDArray[np.int64]) -> list[Surfels]:
+        """Return the surfels of every tile, each at its level (T,)."""
+        found: dict[int, Surfels] = {}
+
+        def sum_up(part: slice) -> None:
+            for tile in range(part.start, part.stop):
+                found[tile] = self.surfels(tile, int(level[tile]))
+
+        share(sum_up, len(self.tiles), usable_cores())
+        return [found[tile] for tile in range(len(self.tiles))]
+
+    def _voxels(self, tile: int) -> npt.NDArray[np.int64]:
+        """Return the rows of the moments in a tile."""
+        runs = slice(self._ends[tile - 1] if tile else 0, self._ends[tile])
+        length = self._length[runs]
+        before = np.cumsum(length) - length
+        return np.repeat(self._begin[runs] - before, length) + np.arange(length.sum())
+
+    def _count(self, tile: int, fits: npt.NDArray[np.bool_]) -> None:
+        """Count the surfels of a tile at each level; note the levels whose sums may overflow."""
+        voxels = self._voxels(tile)
+        key, count = self._moments.key[voxels], self._moments.count[voxels]
+        for level in range(len(fits)):
+            if level:
+                key, parent = coarse_keys(key, 1)
+                # float64 is exact below 2^53
+                count = np.bincount(parent, count, len(key)).astype(np.int64)
+                limit = layout.MAX_MAP_COUNT >> 2 * (self._moments.level + level)
+                fits[level:, tile] &= count.max() <= limit
+            self.counts[level, tile] = np.count_nonzero(count >= self._min_points)
 
     def _distances(self, place: Array) -> Array:
         """Return the horizontal distance of each tile from a place, (T,) m; 0 inside."""
@@ -165,17 +194,17 @@ def drawn_surfels(
         return surfels
     found = DetailedMap(surfel_map.moments(), min_points)
     level = found.choose(place, at_most)
-    return concatenated([found.surfels(tile, int(level[tile])) for tile in range(len(found))])
+    return concatenated(found.all_surfels(level))
 
 
 def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArray[np.int64]]:
     """Return the bits of a tile and the sorted tiles that hold some columns of a level, (T, 2)."""
-    bits = level
-    while True:
-        found = np.unique(columns >> (bits - level), axis=0)
+    bits, found = level, columns
+    while True:  # of one number each: np.unique of rows takes 50 times as long
+        found = found[np.unique(packed(found), return_index=True)[1]]
         if len(found) <= MOST_TILES:
             return bits, found
-        bits += 1
+        bits, found = bits + 1, found >> 1
 
 
 def packed(tile: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

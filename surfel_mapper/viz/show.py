@@ -118,11 +118,11 @@ def detailed(
     whole = DetailedMap(shown.moments, min_points)
     level = whole.choose(place - shift, most_discs)
     found = {}
-    for tile, (i, j) in enumerate(whole.tiles):
-        surfels = whole.surfels(tile, int(level[tile]))
-        discs = with_age(surfels, shown, int(level[tile]))
+    every = zip(whole.tiles, level, whole.all_surfels(level), strict=True)
+    for (i, j), each_level, surfels in every:
+        discs = with_age(surfels, shown, int(each_level))
         name = f'tile_{i}_{j}'.replace('-', 'm')
-        values = {**discs.values, 'level': np.full(len(discs), level[tile])}
+        values = {**discs.values, 'level': np.full(len(discs), each_level)}
         found[name] = DrawnDiscs(discs.position + shift, discs.normal, discs.radius_m, values)
     drawn = sum(map(len, found.values()))
     total = int(whole.counts[0].sum())
