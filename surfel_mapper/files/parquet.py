@@ -40,6 +40,9 @@ ROW_BYTES = 3 * 8
 FOOTER_LIMITS = {'thrift_string_size_limit': 16 << 20, 'thrift_container_size_limit': 1 << 20}
 """Limits of the texts and lists in the footer of a file."""
 
+ROWS_READ = 1 << 16
+"""Number of rows that are unpacked and put into the arrays of moments at a time."""
+
 INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
 PRODUCTS = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
@@ -146,15 +149,23 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
             surfel_map = map_of(attributes, voxel_size_m, path)
             names = moment_names(surfel_map)
             check_size(content, names, path, os.fstat(file.fileno()).st_size)
-            table = content.read(columns=list(names))
-            columns = {name: int64_column(table, name) for name in names}
+            parts = moment_arrays(content.metadata.num_rows, surfel_map)
+            filled = 0
+            for batch in content.iter_batches(ROWS_READ, columns=list(names)):
+                columns = {name: int64_column(batch, name) for name in names}
+                rows = slice(filled, filled + len(columns['i']))
+                fill_rows(parts, rows, columns, surfel_map)
+                filled = rows.stop
+            if filled != len(parts['key']):
+                raise ValueError(f'{filled} rows, {len(parts["key"])} in the footer')
+            moments = checked_moments(parts, surfel_map, 'rows')
     except FileFormatError:
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except (arrow.ArrowException, ValueError, LookupError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
-    return moments_of(surfel_map, columns, path), surfel_map, attributes.get('digest')
+    return moments, surfel_map, attributes.get('digest')
 
 
 def check_size(
@@ -287,7 +298,7 @@ def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
     column = table.column(name)
     if column.null_count or str(column.type) not in ('int64', 'int32'):
         raise ValueError(f'column {name}: {column.type} with {column.null_count} missing')
-    return np.asarray(column.to_numpy(), np.int64)
+    return np.asarray(column, np.int64)
 
 
 def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
@@ -306,22 +317,32 @@ def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> Non
 def moments_of(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> ScanMoments:
     """Return the moments in the columns of a file of a map."""
 
-    def table(names: tuple[str, ...]) -> npt.NDArray[np.int64]:
-        stacked = [columns[name] for name in names]
-        return np.stack(stacked, axis=1) if stacked else np.empty((len(columns['i']), 0), np.int64)
-
     try:
-        parts = {
-            'key': pack_keys(table(INDEX)),
-            'count': columns['num_points'],
-            'total': table(SUMS),
-            'product': table(PRODUCTS),
-            'view': table(VIEWS),
-            'channels': table(channel_columns(surfel_map)),
-        }
+        parts = moment_arrays(len(columns['i']), surfel_map)
+        fill_rows(parts, slice(None), columns, surfel_map)
         return checked_moments(parts, surfel_map, 'rows')
     except (ValueError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
+
+
+def moment_arrays(num_rows: int, surfel_map: SurfelMap) -> Columns:
+    """Return arrays for the moments of a map, by their names in ScanMoments, to be filled."""
+    names = channel_columns(surfel_map)
+    widths = {'total': 3, 'product': 6, 'view': 3, 'channels': len(names)}
+    arrays: Columns = {
+        name: np.empty((num_rows, width), np.int64) for name, width in widths.items()
+    }
+    return {'key': np.empty(num_rows, np.int64), 'count': np.empty(num_rows, np.int64), **arrays}
+
+
+def fill_rows(parts: Columns, rows: slice, columns: Columns, surfel_map: SurfelMap) -> None:
+    """Write columns of a file into some rows of the arrays of moments."""
+    parts['key'][rows] = pack_keys(np.stack([columns[name] for name in INDEX], axis=1))
+    parts['count'][rows] = columns['num_points']
+    tables = {'total': SUMS, 'product': PRODUCTS, 'view': VIEWS}
+    for part, names in {**tables, 'channels': channel_columns(surfel_map)}.items():
+        for number, name in enumerate(names):
+            parts[part][rows, number] = columns[name]
 
 
 def import_pyarrow() -> tuple[Any, Any]:

@@ -36,6 +36,9 @@ MOST_LEVEL = layout.INDEX_BITS - 1
 MOST_TILES = 256
 """Limit of the tiles, each of which is an entity of the viewer."""
 
+BLOCK = 1 << 16
+"""Number of keys that are masked at a time; half a megabyte stays in the cache."""
+
 STEPS = 60
 """Distances tried for the begin of the first coarser level, between a tile and the whole map."""
 
@@ -67,20 +70,14 @@ class DetailedMap:
     def __init__(self, moments: ScanMoments, min_points: int) -> None:
         self._moments, self._min_points = moments, min_points
         last = min(LEVELS, MOST_LEVEL - moments.level)
-        # voxels in the order of their keys have runs of one column of the coarsest level each
-        column = (
-            moments.key
-            & ~np.int64((1 << layout.INDEX_BITS + last) - 1)
-            & ~(np.int64((1 << last) - 1) << 2 * layout.INDEX_BITS)
-        )
-        begin = np.flatnonzero(np.diff(column, prepend=-1))
-        places = unpack_keys(column[begin])[:, :2].astype(np.int64) >> last
+        begin, columns = column_runs(moments.key, last)
+        places = unpack_keys(columns)[:, :2].astype(np.int64) >> last
         self.bits, self.tiles = tiles_of(places, last)
         self.edge_m = moments.voxel_size_m * 2.0**self.bits
         tile = np.searchsorted(packed(self.tiles), packed(places >> (self.bits - last)))
         order = np.argsort(tile, kind='stable')
         self._begin = begin[order]  # of the runs, in the order of their tiles
-        self._length = np.diff(begin, append=len(column))[order]
+        self._length = np.diff(begin, append=len(moments))[order]
         self._ends = np.cumsum(np.bincount(tile, minlength=len(self.tiles)))
         self.counts = np.zeros((last + 1, len(self.tiles)), np.int64)
         fits = np.ones((last + 1, len(self.tiles)), bool)
@@ -205,6 +202,29 @@ def tiles_of(columns: npt.NDArray[np.int64], level: int) -> tuple[int, npt.NDArr
         if len(found) <= MOST_TILES:
             return bits, found
         bits, found = bits + 1, found >> 1
+
+
+def column_runs(
+    key: npt.NDArray[np.int64], level: int
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """
+    Return the first voxel of each run of voxels in one column of a level, and the columns' keys.
+
+    Files have voxels in the order of their keys, some 60 of a column one after the other. The keys
+    are taken in blocks, as memory for masks of all of them takes longer to get than to fill.
+    """
+    beyond = (np.int64(1) << level) - 1
+    mask = ~(beyond << 2 * layout.INDEX_BITS | (beyond + 1 << layout.INDEX_BITS) - 1)
+    begin, columns, before = [], [], np.int64(-1)
+    for start in range(0, len(key), BLOCK):
+        column = key[start : start + BLOCK] & mask
+        found = np.flatnonzero(np.diff(column, prepend=before))
+        begin.append(found + start)
+        columns.append(column[found])
+        before = column[-1]
+    if not begin:
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    return np.concatenate(begin), np.concatenate(columns)
 
 
 def packed(tile: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
