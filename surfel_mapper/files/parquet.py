@@ -316,7 +316,6 @@ def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> Non
 
 def moments_of(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> ScanMoments:
     """Return the moments in the columns of a file of a map."""
-
     try:
         parts = moment_arrays(len(columns['i']), surfel_map)
         fill_rows(parts, slice(None), columns, surfel_map)
