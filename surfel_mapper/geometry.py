@@ -19,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -322,8 +323,15 @@ def as_whole(name: str, value: object) -> int:
     return int(value)
 
 
-def as_path(path: object) -> Path:
-    """Return a path; raise TypeError for anything but text and paths."""
+def made_array(array: npt.NDArray[Any], dtype: Any, copy: bool | None) -> npt.NDArray[Any]:
+    """Return an array that was computed for np.asarray; raise ValueError if no copy may be."""
+    if copy is False:
+        raise ValueError('the array is computed, so that it cannot be had without a copy')
+    return array if dtype is None else array.astype(dtype)
+
+
+def as_path(path: object, name: str = 'path') -> Path:
+    """Return a path; raise TypeError, with its name, for anything but text and paths."""
     if not isinstance(path, (str, Path)):
-        raise TypeError(f'path: {path!r:.60}, expected a str or Path')
+        raise TypeError(f'{name}: {path!r:.60}, expected a str or Path')
     return Path(path)

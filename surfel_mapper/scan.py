@@ -123,6 +123,8 @@ class Scan:
                 f'stamp_ns: {self.stamp_ns!r}, expected whole nanoseconds as an int, such as '
                 'round(seconds * 1e9)'
             )
+        if not isinstance(self.frame_id, str):
+            raise TypeError(f'frame_id: {self.frame_id!r:.60}, expected the name of a frame')
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
         if self.depth is not None and self.depth.points is not points:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
     from surfel_mapper.viz.gltf import GltfScene
     from surfel_mapper.viz.scene import Scene
+    from surfel_mapper.viz.show import Shown
 
 SUMMARY = 'Show maps, clouds, meshes, models, trajectories and bags.'
 
@@ -124,8 +125,8 @@ def shown(args: argparse.Namespace) -> int:
             import_rerun()
         found = reading.result()
 
-    def show_all(scene: Scene | GltfScene) -> None:
-        about = show_contents(
+    def show_all(scene: Scene | GltfScene) -> Shown:
+        shown = show_contents(
             scene,
             found,
             colouring=args.color,
@@ -133,8 +134,9 @@ def shown(args: argparse.Namespace) -> int:
             most_discs=args.discs,
             min_points=args.min_points,
         )
-        for name, sentence in about.items():
-            print(f'{name}: {sentence}')
+        for name, sentence in shown.about.items():
+            print(f'{name}: {sentence}', flush=True)
+        return shown
 
     if args.glb is not None:
         from surfel_mapper.viz.gltf import GltfScene
@@ -142,8 +144,10 @@ def shown(args: argparse.Namespace) -> int:
         show_all(GltfScene(args.glb))
         return 0
     with opened(args) as scene:
-        show_all(scene)
+        found_maps = show_all(scene)
         announce(scene)
+        if scene.window and found_maps.is_coarse:
+            follow(scene, found_maps)
         finish(scene)
     return 0
 
@@ -171,6 +175,17 @@ def finish(scene: Scene) -> None:
     """Serve the page until it ends or Ctrl-C."""
     try:
         scene.wait()
+    except KeyboardInterrupt:
+        print(file=sys.stderr)
+
+
+def follow(scene: Scene, shown: Shown) -> None:
+    """Give the place looked at in a window the full detail, until it closes or Ctrl-C."""
+    from surfel_mapper.viz.eye import followed
+
+    try:
+        print('the detail follows the eye until the window closes, or Ctrl-C', file=sys.stderr)
+        followed(scene, shown)
     except KeyboardInterrupt:
         print(file=sys.stderr)
 

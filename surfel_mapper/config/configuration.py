@@ -249,6 +249,11 @@ def load_config(path: str | Path | None = None) -> Config:
     """
     if path is None:
         return Config()
+    if not isinstance(path, (str, Path)):
+        raise ConfigError(
+            f'path: a {type(path).__name__}, expected a str or Path of a YAML file; '
+            'Config.from_mapping(settings) takes a dict'
+        )
     try:
         content = read_yaml(path)
     except OSError as error:

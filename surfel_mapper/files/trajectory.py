@@ -22,6 +22,7 @@ from itertools import chain
 import logging
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +30,15 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.geometry import as_numbers, check_rigid, pose_matrix, q_xyzw
+from surfel_mapper.geometry import (
+    as_numbers,
+    as_path,
+    as_whole,
+    check_rigid,
+    made_array,
+    pose_matrix,
+    q_xyzw,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -101,6 +110,38 @@ class Trajectory:
         """Return the number of poses."""
         return len(self.xyz)
 
+    def __getitem__(self, row: Any) -> Any:
+        """
+        Return one pose (4, 4) for a whole number, a Trajectory for a slice.
+
+        Raises
+        ------
+        IndexError
+            If there is no such pose.
+        TypeError
+            If it is neither a whole number nor a slice; ``matrices`` takes every index of numpy.
+
+        """
+        if isinstance(row, slice):
+            stamps = None if self.stamp_ns is None else self.stamp_ns[row]
+            if stamps is not None and (np.diff(stamps) < 0).any():
+                raise IndexError(f'{row}: stamps would descend, expected a positive step')
+            return Trajectory(stamps, self.xyz[row], self.q_xyzw[row])
+        row = as_whole('pose', row)
+        if not -len(self) <= row < len(self):
+            raise IndexError(
+                f'pose {row} of {len(self)}, expected {-len(self)} to {len(self) - 1}'
+            )
+        return pose_matrix(self.xyz[row].tolist(), self.q_xyzw[row].tolist())
+
+    def __iter__(self) -> Iterator[npt.NDArray[np.float64]]:
+        """Yield the poses, (4, 4) each."""
+        return iter(self.matrices)
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return ``matrices``, (S, 4, 4), for np.asarray."""
+        return made_array(self.matrices, dtype, copy)
+
     def __repr__(self) -> str:
         """Return the number of poses and their duration."""
         if self.stamp_ns is None or not len(self):
@@ -154,10 +195,11 @@ class Trajectory:
     @classmethod
     def load(cls, path: str | Path) -> Trajectory:
         """Return the poses in a file, TUM, KITTI or CSV; raises FileFormatError."""
-        return read_trajectory(path)
+        return read_trajectory(as_path(path))
 
     def save(self, path: str | Path) -> None:
         """Write the poses as TUM text, which evo reads; raises FileFormatError."""
+        path = as_path(path)
         if self.stamp_ns is None:
             raise FileFormatError(f'{path}: poses without stamps, which TUM text needs')
         write_tum(path, self.stamp_ns, self.matrices)

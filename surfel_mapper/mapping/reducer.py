@@ -200,6 +200,11 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
     except ValueError:  # lists of unequal length, or a sequence of other things
         kind = type(points).__name__
         raise ValueError(f'points: a {kind} of unequal rows, expected (N, 3) numbers') from None
+    if array.dtype.names:  # Surfels, or a structured array
+        columns = ', '.join(array.dtype.names[:4])
+        raise ValueError(
+            f'points: a {type(points).__name__} of columns {columns}, ..., expected (N, 3) numbers'
+        )
     if array.size == 0 and array.ndim < 2:
         array = array.reshape(0, 3)
     if array.ndim != 2 or array.shape[1] != 3:

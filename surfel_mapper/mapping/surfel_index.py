@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.kernels.queries import best_around, rows_at
@@ -192,7 +193,7 @@ class SurfelIndex:
 
 def _places(points: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return points as (N, 3) float64 in C order."""
-    places = np.require(points, np.float64, ['C', 'A', 'W'])
+    places = np.require(as_numbers('points', points), requirements=['C', 'A', 'W'])
     if places.ndim != 2 or places.shape[1] != 3:
         raise ValueError(f'points: shape {places.shape}, expected (N, 3)')
     return places

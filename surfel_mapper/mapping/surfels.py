@@ -17,6 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError
+from surfel_mapper.geometry import made_array
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
 from surfel_mapper.threads import share
 
@@ -107,6 +108,10 @@ class Surfels:
     def __iter__(self) -> Iterator[OneSurfel]:
         """Yield the surfels one by one."""
         return (self[row] for row in range(len(self)))
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> npt.NDArray[Any]:
+        """Return ``to_numpy()`` for np.asarray."""
+        return made_array(self.to_numpy(), dtype, copy)
 
     def to_numpy(self) -> npt.NDArray[Any]:
         """

@@ -112,6 +112,13 @@ class SlidingWindow:
         *,
         max_voxels: int = 0,
     ) -> None:
+        if not isinstance(surfel_map, SurfelMap):
+            raise TypeError(f'a {type(surfel_map).__name__}, expected the SurfelMap of the window')
+        if not isinstance(config, (WindowConfig, type(None))):
+            raise TypeError(
+                f'config: a {type(config).__name__}, expected a WindowConfig: '
+                'WindowConfig(max_scans=100)'
+            )
         self.config = config or WindowConfig()
         self.max_voxels = max_voxels
         self.max_total_bytes = 0

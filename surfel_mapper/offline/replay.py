@@ -29,6 +29,7 @@ from surfel_mapper.errors import (
     SurfelMapperError,
 )
 from surfel_mapper.files.atomic import make_directory
+from surfel_mapper.geometry import as_path
 from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
@@ -173,9 +174,11 @@ def replay(
     from surfel_mapper.viz.history import History
 
     options = options or ReplayOptions()
-    request = path if isinstance(path, Request) else Request(path=Path(path))
+    request = path if isinstance(path, Request) else Request(path=as_path(path))
     settings = configured(config, options)
-    directory = output_directory(request.path, None if output is None else Path(output))
+    directory = output_directory(
+        request.path, None if output is None else as_path(output, 'output')
+    )
     check_outputs(directory, options)
     keep_freed_memory()  # saves 2 ms for each cloud of 4 MB
     with no_empty_directory(directory), open_recording(request, settings) as recording:

@@ -129,7 +129,7 @@ class Mapper:
         child: str,
         stamp_ns: int,
         xyz: Any,
-        q_xyzw: Any,
+        q_xyzw: Any = None,
         *,
         static: bool = False,
     ) -> None:
@@ -153,8 +153,19 @@ class Mapper:
         ------
         ValueError
             If the stamp is no whole number.
+        TypeError
+            If a frame is no name, or there is no orientation, as with a matrix for the pose.
 
         """
+        for name, frame in (('parent', parent), ('child', child)):
+            if not isinstance(frame, str):
+                raise TypeError(f'{name}: a {type(frame).__name__}, expected the name of a frame')
+        if q_xyzw is None:
+            given = f'{np.shape(xyz)} for the position' if xyz is not None else 'no position'
+            raise TypeError(
+                f'add_pose: {given} and no orientation, expected xyz (3,) and q_xyzw (4,); '
+                'Trajectory.from_matrices turns matrices (S, 4, 4) into these'
+            )
         if isinstance(stamp_ns, bool) or not isinstance(stamp_ns, (int, np.integer)):
             raise ValueError(
                 f'stamp_ns: {stamp_ns!r}, expected whole nanoseconds as an int, such as '

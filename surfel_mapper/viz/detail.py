@@ -79,7 +79,7 @@ class DetailedMap:
         self._begin = begin[order]  # of the runs, in the order of their tiles
         self._length = np.diff(begin, append=len(moments))[order]
         self._ends = np.cumsum(np.bincount(tile, minlength=len(self.tiles)))
-        self.counts = np.zeros((last + 1, len(self.tiles)), np.int64)
+        self.counts: npt.NDArray[np.int64] = np.zeros((last + 1, len(self.tiles)), np.int64)
         fits = np.ones((last + 1, len(self.tiles)), bool)
 
         def count(part: slice) -> None:
@@ -130,16 +130,26 @@ class DetailedMap:
         channels = means(sums[chosen], surfels.num_points, moments.channel_names)
         return replace(surfels, channels=channels)
 
-    def all_surfels(self, level: npt.NDArray[np.int64]) -> list[Surfels]:
-        """Return the surfels of every tile, each at its level (T,)."""
+    def all_surfels(
+        self, level: npt.NDArray[np.int64], tiles: npt.NDArray[np.int64] | None = None
+    ) -> list[Surfels]:
+        """Return the surfels of some tiles (K,), by default of all, each at its level (T,)."""
+        chosen = np.arange(len(self.tiles)) if tiles is None else tiles
         found: dict[int, Surfels] = {}
 
         def sum_up(part: slice) -> None:
-            for tile in range(part.start, part.stop):
+            for tile in chosen[part].tolist():
                 found[tile] = self.surfels(tile, int(level[tile]))
 
-        share(sum_up, len(self.tiles), usable_cores())
-        return [found[tile] for tile in range(len(self.tiles))]
+        share(sum_up, len(chosen), usable_cores())
+        return [found[tile] for tile in chosen.tolist()]
+
+    def nearest_first(
+        self, tiles: npt.NDArray[np.int64], place: npt.ArrayLike
+    ) -> npt.NDArray[np.int64]:
+        """Return tiles (K,) in the order of their distance from a place, (3,) m."""
+        distance = self._distances(np.asarray(place, np.float64))
+        return np.asarray(tiles[np.argsort(distance[tiles], kind='stable')])
 
     def _voxels(self, tile: int) -> npt.NDArray[np.int64]:
         """Return the rows of the moments in a tile."""

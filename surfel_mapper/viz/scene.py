@@ -63,11 +63,16 @@ class Scene:
         Address of the page in a browser.
     server : Server, optional
         The server of the page, which ends with the scene.
+    window : str, optional
+        Address of the window, which can be asked for the place that it looks at.
 
     """
 
-    def __init__(self, stream: Any, address: str = '', server: Server | None = None) -> None:
+    def __init__(
+        self, stream: Any, address: str = '', server: Server | None = None, window: str = ''
+    ) -> None:
         self.address = address
+        self.window = window
         self.colouring = Colouring()
         self.origin_m: Array = np.zeros(3)
         self._rerun = import_rerun()
@@ -93,8 +98,9 @@ class Scene:
         port = port or PORT
         stream = rerun.RecordingStream('surfel_mapper')
         rerun_bindings.spawn(port=port, extra_args=['--bind', LOOPBACK])
-        stream.connect_grpc(f'rerun+http://{LOOPBACK}:{port}/proxy')
-        return cls(stream)
+        window = f'rerun+http://{LOOPBACK}:{port}/proxy'
+        stream.connect_grpc(window)
+        return cls(stream, window=window)
 
     @classmethod
     def to_browser(cls, port: int = 0) -> Scene:

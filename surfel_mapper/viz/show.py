@@ -44,9 +44,9 @@ def show_contents(
     place: npt.ArrayLike | None = None,
     most_discs: int = MOST_DISCS,
     min_points: int = 5,
-) -> dict[str, str]:
+) -> Shown:
     """
-    Show contents; return a sentence about each by name.
+    Show contents, and return a sentence about each.
 
     Parameters
     ----------
@@ -75,19 +75,20 @@ def show_contents(
     looked_at = np.asarray(place_of(contents) if place is None else place, np.float64) - origin_m
     maps = [each for each in contents if isinstance(each, ExactMap)]
     shares = most_discs // max(len(maps), 1)
-    tiled = [detailed(each, min_points, looked_at, origin_m, shares) for each in maps]
+    tiled = [TiledMap(each, min_points, origin_m, shares) for each in maps]
+    tiles = [each.refine(looked_at) for each in tiled]
     clouds = [shifted_cloud(each, origin_m) for each in contents if isinstance(each, Cloud)]
-    parts = [part for tiles in tiled for part in tiles.discs.values()]
+    parts = [part for found in tiles for part in found.values()]
     parts += [each.discs for each in clouds if each.discs is not None]
     if any(map(len, parts)):
         scene.colouring = Colouring.over(colouring, parts)
     box = box_of([part.position for part in parts] + [each.position for each in clouds])
     scene.look(*box, looked_at)
     about = {}
-    for found in tiled:
-        for tile, discs in found.discs.items():
-            scene.discs(f'map/{found.name}/{tile}', discs, static=True)
-        about[found.name] = found.about
+    for each_map, found in zip(tiled, tiles, strict=True):
+        for path, discs in found.items():
+            scene.discs(path, discs, static=True)
+        about[each_map.name] = each_map.about()
     for each in clouds:
         about[each.name] = show_cloud(scene, each)
     for other in contents:
@@ -100,36 +101,99 @@ def show_contents(
         elif isinstance(other, Way):
             about[other.name] = show_way(scene, other, origin_m)
     scene.flush()
-    return about
+    return Shown(about, tiled)
 
 
-class Tiles:
-    """The discs of a map by tile, and a sentence about them."""
+class Shown:
+    """
+    Contents in a scene.
 
-    def __init__(self, name: str, discs: dict[str, DrawnDiscs], about: str) -> None:
-        self.name, self.discs, self.about = name, discs, about
+    Attributes
+    ----------
+    about : dict of str to str
+        A sentence about each content, by name.
+
+    """
+
+    def __init__(self, about: dict[str, str], tiled: list[TiledMap]) -> None:
+        self.about = about
+        self._tiled = tiled
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether some tiles are shown by larger voxels, so that another place has other ones."""
+        return any(each.level.any() for each in self._tiled)
+
+    def look(self, scene: Scene, place: npt.ArrayLike) -> int:
+        """
+        Give another place the full detail; return the number of tiles whose level changed.
+
+        Parameters
+        ----------
+        scene : Scene
+            Where the contents are shown.
+        place : (3,) float, m
+            In the frame of the scene.
+
+        """
+        found: dict[str, DrawnDiscs] = {}
+        for each in self._tiled:
+            found.update(each.refine(np.asarray(place, np.float64)))
+        for path, discs in found.items():
+            scene.discs(path, discs, static=True)
+        scene.flush()
+        return len(found)
 
 
-def detailed(
-    shown: ExactMap, min_points: int, place: Array, origin_m: Array, most_discs: int
-) -> Tiles:
-    """Return the discs of a map by tile, fine near a place of the shared frame."""
-    shift = shown.origin_m - origin_m
-    whole = DetailedMap(shown.moments, min_points)
-    level = whole.choose(place - shift, most_discs)
-    found = {}
-    every = zip(whole.tiles, level, whole.all_surfels(level), strict=True)
-    for (i, j), each_level, surfels in every:
-        discs = with_age(surfels, shown, int(each_level))
-        name = f'tile_{i}_{j}'.replace('-', 'm')
-        values = {**discs.values, 'level': np.full(len(discs), each_level)}
-        found[name] = DrawnDiscs(discs.position + shift, discs.normal, discs.radius_m, values)
-    drawn = sum(map(len, found.values()))
-    total = int(whole.counts[0].sum())
-    about = f'{total:,} surfels in voxels of {shown.moments.voxel_size_m:g} m'
-    if level.any():
-        about += f', shown as {drawn:,} on levels {level.min()} to {level.max()}'
-    return Tiles(shown.name, found, about)
+class TiledMap:
+    """
+    A map in the tiles of its detail, and the levels at which they are shown.
+
+    Parameters
+    ----------
+    shown : ExactMap
+        The map.
+    min_points : int
+        Voxels with fewer points are not shown.
+    origin_m : (3,) float64, m
+        Origin of the scene in the fixed frame.
+    most_discs : int
+        Limit of its discs.
+
+    """
+
+    def __init__(self, shown: ExactMap, min_points: int, origin_m: Array, most_discs: int) -> None:
+        self.name = shown.name
+        self._shown, self._most_discs = shown, most_discs
+        self._shift = shown.origin_m - origin_m
+        self._whole = DetailedMap(shown.moments, min_points)
+        self.level: npt.NDArray[np.int64] = np.full(len(self._whole), -1)
+
+    def refine(self, place: Array) -> dict[str, DrawnDiscs]:
+        """Return the discs of tiles whose level changes for a place, nearest first, by path."""
+        whole = self._whole
+        level = whole.choose(place - self._shift, self._most_discs)
+        tiles = whole.nearest_first(np.flatnonzero(level != self.level), place - self._shift)
+        self.level = level
+        found = {}
+        for tile, surfels in zip(tiles, whole.all_surfels(level, tiles), strict=True):
+            i, j = whole.tiles[tile]
+            discs = with_age(surfels, self._shown, int(level[tile]))
+            values = {**discs.values, 'level': np.full(len(discs), level[tile])}
+            name = f'tile_{i}_{j}'.replace('-', 'm')
+            found[f'map/{self.name}/{name}'] = DrawnDiscs(
+                discs.position + self._shift, discs.normal, discs.radius_m, values
+            )
+        return found
+
+    def about(self) -> str:
+        """Return a sentence about the map."""
+        counts, size_m = self._whole.counts, self._shown.moments.voxel_size_m
+        about = f'{counts[0].sum():,} surfels in voxels of {size_m:g} m'
+        if self.level.any():
+            drawn = counts[self.level, np.arange(len(self._whole))].sum()
+            about += f', shown as {drawn:,} on levels {self.level.min()} to {self.level.max()}'
+        return about
 
 
 def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:

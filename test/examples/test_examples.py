@@ -64,6 +64,20 @@ def run_process(name, *arguments, folder):
     return done.stdout
 
 
+def test_the_demo_without_ros_leaves_out_the_node_and_says_so(run, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, 'rclpy', None)
+    monkeypatch.setenv('PYTHONPATH', str(ROOT))
+    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
+        monkeypatch.setenv(name, '1')  # the demo sets them
+    out = run('demo.py', '--scans', 4, '--beams', 16, '--columns', 256, folder=tmp_path)
+
+    assert 'The live node is left out: ROS 2 is not installed' in out
+    assert 'demo/offline/map.png' in out
+    summary = json.loads((tmp_path / 'demo' / 'offline' / 'summary.json').read_text('utf-8'))
+    assert summary['scans']['mapped'] == 4
+    assert Image.open(tmp_path / 'demo' / 'offline' / 'map.png').size[0] > 500
+
+
 @pytest.fixture(scope='module')
 def street(tmp_path_factory):
     """Return a folder with the bag of a short drive, and its map."""

@@ -17,9 +17,11 @@ from surfel_mapper import (
     diff,
     DistanceField,
     estimate_normals,
+    load_config,
     Mapper,
     replay,
     Scan,
+    SlidingWindow,
     SurfelMap,
     Surfels,
     Trajectory,
@@ -219,7 +221,65 @@ def test_normals_of_a_cloud_are_those_of_its_planes(shift):
 
 POINTS = floor(10)
 
+POSES = Trajectory.from_matrices(
+    [[[1, 0, 0, i], [0, 1, 0, 2 * i], [0, 0, 1, 3], [0, 0, 0, 1]] for i in range(3)],
+    np.arange(3) * 10**9,
+)
+
 MISTAKES = {
+    'a word for points of an index': (
+        lambda m: m.index().at('here'),
+        ValueError,
+        "points: 'here', expected numbers",
+    ),
+    'no path of poses': (lambda _: Trajectory.load(None), TypeError, 'path: None, expected a str'),
+    'a number for a path of poses': (lambda _: POSES.save(3), TypeError, 'path: 3, expected'),
+    'a pose beyond the last': (lambda _: POSES[3], IndexError, 'pose 3 of 3, expected -3 to 2'),
+    'a word for a pose': (lambda _: POSES['a'], TypeError, "pose: 'a', expected a whole number"),
+    'poses backwards': (lambda _: POSES[::-1], IndexError, 'expected a positive step'),
+    'no bag': (lambda _: replay(None), TypeError, 'path: None, expected a str or Path'),
+    'a number for a bag': (lambda _: replay(3), TypeError, 'path: 3, expected a str or Path'),
+    'a list of bags': (lambda _: replay(['a', 'b']), TypeError, 'path: .*expected a str or Path'),
+    'a number for an output': (
+        lambda _: replay('a', output=3),
+        TypeError,
+        'output: 3, expected a str or Path',
+    ),
+    'a dict for a file of settings': (
+        lambda _: load_config({'map': 1}),
+        ConfigError,
+        'a dict, expected a str or Path of a YAML file; Config.from_mapping',
+    ),
+    'a matrix for a pose': (
+        lambda _: Mapper().add_pose('odom', 'base_link', 1, np.eye(4)),
+        TypeError,
+        r'\(4, 4\) for the position and no orientation.*Trajectory.from_matrices',
+    ),
+    'a matrix for a frame': (
+        lambda _: Mapper().add_pose(np.eye(4), 'base_link', 1, [0, 0, 0], [0, 0, 0, 1]),
+        TypeError,
+        'parent: a ndarray, expected the name of a frame',
+    ),
+    'a number for a frame': (
+        lambda _: Scan(points=POINTS, stamp_ns=1, frame_id=3),
+        TypeError,
+        'frame_id: 3, expected the name',
+    ),
+    'a length for the map of a window': (
+        lambda _: SlidingWindow(10),
+        TypeError,
+        'a int, expected the SurfelMap',
+    ),
+    'a length for the settings of a window': (
+        lambda m: SlidingWindow(m, 10),
+        TypeError,
+        'expected a WindowConfig',
+    ),
+    'a dict for the settings of a window': (
+        lambda m: SlidingWindow(m, {'max_scans': 10}),
+        TypeError,
+        r'WindowConfig\(max_scans=100\)',
+    ),
     'an array to remove': (lambda m: m.remove(POINTS), TypeError, 'expected the ScanMoments that'),
     'an array to insert': (lambda m: m.insert(POINTS), TypeError, 'points are added by add'),
     'moments to merge': (lambda m: m.merge(m.reduce(POINTS)), TypeError, 'another SurfelMap'),
@@ -380,6 +440,26 @@ def test_mistakes_get_a_sentence(kind):
     with pytest.raises(error, match=message):
         act(surfel_map)
     assert surfel_map.digest() == before
+
+
+def test_a_trajectory_is_a_sequence_of_matrices():
+    assert POSES[1].tolist() == [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]]
+    assert POSES[-1][:3, 3].tolist() == [2, 4, 3]
+    last = POSES[1:]
+    assert isinstance(last, Trajectory)
+    assert last.stamp_ns.tolist() == [10**9, 2 * 10**9]
+    assert [pose[0, 3] for pose in POSES] == [0, 1, 2]
+    assert np.asarray(POSES).shape == (3, 4, 4)
+    assert np.asarray(POSES, np.float32)[2, 1, 3] == 4.0
+
+
+def test_surfels_become_an_array_by_asarray(surfel_map):
+    surfels = surfel_map.surfels(5)
+    table = np.asarray(surfels)
+    assert table.shape == (len(surfels),)
+    np.testing.assert_array_equal(table['normal_z'], surfels.normal[:, 2])
+    with pytest.raises(ValueError, match='cannot be had without a copy'):
+        surfels.__array__(copy=False)
 
 
 def test_millimetres_are_warned_about_once(caplog):

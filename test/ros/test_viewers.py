@@ -85,12 +85,16 @@ def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
         peer.advertise('/odom', '/points')
         send(peer, drive(NUM_SCANS))
         peer.spin_until(lambda: len(changed) == NUM_SCANS)
-        time.sleep(1.0)
+        expected = [surfels_after(number + 1) for number in range(NUM_SCANS)]
+        deadline = time.monotonic() + TIMEOUT_S
+        while os.path.getsize(file) < 40 * len(expected[0]):  # a map: 12 bytes for a position
+            assert time.monotonic() < deadline
+            node.check()
+            peer.spin_for(0.1)
     node.stop()
 
     maps = shown(file, '/map/surfels')
     assert maps
-    expected = [surfels_after(number + 1) for number in range(NUM_SCANS)]
     for found in maps:
         same = [each for each in expected if len(each) == len(found)]
         assert any(np.allclose(in_order(found), in_order(each), atol=1e-4) for each in same)

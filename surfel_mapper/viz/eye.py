@@ -1,0 +1,68 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Eye: the full detail of a map follows the place that the window of rerun looks at.
+
+Rerun keeps the eye of a 3D view in its blueprint, with each motion of the mouse, and a client can
+read the blueprint of a window (0.41; the client is experimental there). A page in a browser has no
+such service, so its detail stays around ``--at``. It stands alone because it needs a window.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.viz.scene import Scene
+from surfel_mapper.viz.show import Shown
+
+EVERY_S = 0.5
+"""Time between two looks at the eye, s; a blueprint of a window is some kilobytes."""
+
+STARTING_S = 30.0
+"""Longest wait for the first answer of a window, s."""
+
+logger = logging.getLogger(__name__)
+
+
+def followed(scene: Scene, shown: Shown) -> None:
+    """
+    Give the place looked at the full detail, until the window closes.
+
+    Returns at once, with a sentence in the log, if this version of rerun cannot be asked.
+    """
+    try:
+        from rerun.experimental import ViewerClient
+
+        ask = ViewerClient.connect(scene.window).get_blueprint
+    except (ImportError, AttributeError):
+        logger.warning('this rerun cannot say where its eye is (0.41 can): the detail stays')
+        return
+    before: npt.NDArray[np.float64] | None = None
+    deadline = time.monotonic() + STARTING_S
+    while True:
+        try:
+            place = target(ask().blueprint)
+        except (ConnectionError, RuntimeError, TimeoutError) as error:
+            if before is None and time.monotonic() < deadline:
+                time.sleep(EVERY_S)
+                continue
+            logger.info('the window has closed: %s', error)
+            return
+        if place is not None and (before is None or (place != before).any()):
+            shown.look(scene, place)
+            before = place
+        time.sleep(EVERY_S)
+
+
+def target(blueprint: dict[str, Any]) -> npt.NDArray[np.float64] | None:
+    """Return the place that the first 3D view of a blueprint looks at, (3,) m; None without."""
+    for path, archetypes in blueprint.items():
+        found = archetypes.get('EyeControls3D', {}).get('look_target')
+        if path.endswith('/EyeControls3D') and found is not None:
+            return np.asarray(found, np.float64)
+    return None
