@@ -303,7 +303,13 @@ def int64_column(table: Any, name: str) -> npt.NDArray[np.int64]:
 
 def fill(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> None:
     """Insert the moments in the columns of a file into a map."""
-    insert(surfel_map, moments_of(surfel_map, columns, path), path)
+    try:
+        parts = moment_arrays(len(columns['i']), surfel_map)
+        fill_rows(parts, slice(None), columns, surfel_map)
+        moments = checked_moments(parts, surfel_map, 'rows')
+    except (ValueError, TypeError) as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
+    insert(surfel_map, moments, path)
 
 
 def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> None:
@@ -311,16 +317,6 @@ def insert(surfel_map: SurfelMap, moments: ScanMoments, path: str | Path) -> Non
     try:
         surfel_map.insert(moments)
     except MapError as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
-
-
-def moments_of(surfel_map: SurfelMap, columns: Columns, path: str | Path) -> ScanMoments:
-    """Return the moments in the columns of a file of a map."""
-    try:
-        parts = moment_arrays(len(columns['i']), surfel_map)
-        fill_rows(parts, slice(None), columns, surfel_map)
-        return checked_moments(parts, surfel_map, 'rows')
-    except (ValueError, TypeError) as error:
         raise FileFormatError(f'{path}: damaged: {error}') from error
 
 

@@ -75,7 +75,7 @@ def show_contents(
     looked_at = np.asarray(place_of(contents) if place is None else place, np.float64) - origin_m
     maps = [each for each in contents if isinstance(each, ExactMap)]
     shares = most_discs // max(len(maps), 1)
-    tiled = [TiledMap(each, min_points, origin_m, shares) for each in maps]
+    tiled = [RefinedMap(each, min_points, origin_m, shares) for each in maps]
     tiles = [each.refine(looked_at) for each in tiled]
     clouds = [shifted_cloud(each, origin_m) for each in contents if isinstance(each, Cloud)]
     parts = [part for found in tiles for part in found.values()]
@@ -115,7 +115,7 @@ class Shown:
 
     """
 
-    def __init__(self, about: dict[str, str], tiled: list[TiledMap]) -> None:
+    def __init__(self, about: dict[str, str], tiled: list[RefinedMap]) -> None:
         self.about = about
         self._tiled = tiled
 
@@ -145,7 +145,7 @@ class Shown:
         return len(found)
 
 
-class TiledMap:
+class RefinedMap:
     """
     A map in the tiles of its detail, and the levels at which they are shown.
 
