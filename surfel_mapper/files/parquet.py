@@ -7,7 +7,7 @@ Every voxel has a row, sorted by voxel: its index i j k, the quantities that Sur
 (x y z nx ny nz planarity curvature; x y z plus the origin of the map, in doubles), and the exact
 moments as int64 (num_points, sum_*, sum_**, view_*). The map is rebuilt from the moments with the
 same digest, which is in the file and compared, so a changed file is refused. Other tools read the
-columns by name.
+columns by name. Reading and writing are one module because they share the names of the columns.
 """
 
 from __future__ import annotations
