@@ -263,14 +263,6 @@ def shown() -> list[bytes]:
     return [b'\0' + obj, b'\1' + stl, b'\2' + glb]
 
 
-def packets() -> list[bytes]:
-    """Return a capture of packets, and its metadata, after a byte that is odd for the latter."""
-    from test.fuzz.point_files import capture
-
-    captured, described = capture()
-    return [b'\0' + captured, b'\1' + described]
-
-
 def kitti_times() -> list[bytes]:
     """Return seconds."""
     return [b'0.0\n0.1\n0.2\n', b'1e0\n2E+1\n']

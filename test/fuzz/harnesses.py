@@ -56,7 +56,7 @@ HARNESSES = {
     'trajectory_structure': Harness(point_files.trajectory_structure, corpus.noise, 100),
     'tile': Harness(point_files.tile, corpus.tile, 60),
     'shown': Harness(point_files.shown, corpus.shown, 300),
-    'packets': Harness(point_files.packets, corpus.packets, 60),
+    'packets': Harness(point_files.packets, corpus.noise, 200),
     'map_url': Harness(files.map_url, corpus.map_url, 1000),
     'map_name': Harness(files.map_name, corpus.map_url, 1000),
 }

@@ -25,6 +25,7 @@ from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.viz.contents import contents
 from test.fuzz.files import folder, refused, timed_read
+from test.fuzz.mutations import mutations
 from test.fuzz.source import Source
 from test.fuzz.structures import SIZES
 
@@ -263,17 +264,19 @@ def capture() -> tuple[bytes, bytes]:
 
 
 def packets(data: bytes) -> None:
-    """Read a capture, or its metadata if the first byte is odd."""
+    """Read a capture and its metadata, one of which is changed."""
     from surfel_mapper.offline.ouster_pcap import OusterPcap
 
-    captured, described = capture()
-    is_metadata = bool(data[:1] and data[0] % 2)
-    described = data[1:] if is_metadata else described
+    source = Source(data)
+    originals = capture()
+    number, seed = source.below(2), source.below(1 << 16)
+    *_, changed = mutations([originals[number]], 1, seed=seed)
+    captured, described = (changed, originals[1]) if number == 0 else (originals[0], changed)
     Path(folder().name, 'capture.json').write_bytes(described)
 
     def read(path: Path) -> None:
         found = OusterPcap(path)
-        for number in range(min(len(found.files), 5)):
-            found.scan(number)
+        for scan in range(min(len(found.files), 5)):
+            found.scan(scan)
 
-    refused(read, 'capture.pcap', captured if is_metadata else data[1:])
+    refused(read, 'capture.pcap', captured)

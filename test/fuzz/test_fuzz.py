@@ -8,7 +8,6 @@ The same inputs in every run, about 20,000; ``make fuzz`` searches on.
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 import logging
 
 import numpy as np
@@ -27,7 +26,7 @@ NEEDED = {
     'las_structure': 'laspy',
     'pcd_structure': 'lzf',
     'tile': 'pyarrow',
-    'packets': 'ouster',
+    'packets': 'ouster.sdk',
     'map_url': 'rclpy',
 }
 
@@ -41,8 +40,8 @@ def quiet():
 
 
 def harness(name):
-    if name in NEEDED and find_spec(NEEDED[name]) is None:
-        pytest.skip(f'{NEEDED[name]} is not installed')
+    if name in NEEDED:
+        pytest.importorskip(NEEDED[name], reason=f'{NEEDED[name]} is not installed')
     return HARNESSES[name]
 
 
