@@ -180,7 +180,7 @@ def check_header(path: str | Path) -> None:
         size = os.fstat(file.fileno()).st_size
         header = file.read(HEADER_BYTES)
         if len(header) >= POINT_FORMAT_AT and header[POINT_FORMAT_AT] & PACKED:
-            check_packed(path, file, header, size)
+            room = check_packed(path, file, header, size)
     header = header.ljust(HEADER_BYTES, b'\0')
     start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)
     num_extended = 0
@@ -192,6 +192,8 @@ def check_header(path: str | Path) -> None:
             f'{size} bytes; damaged?'
         )
     is_packed = point_format & PACKED
+    if is_packed and count > room:
+        raise FileFormatError(f'{path}: {count} points in chunks of {room}; damaged?')
     if start + count * point_size > size and not is_packed:
         raise FileFormatError(
             f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
@@ -202,13 +204,19 @@ def check_header(path: str | Path) -> None:
     Budget(path, size, FileFormatError, ratio=ratio).take(needed, f'{count} points')
 
 
-def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> None:
+def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> int:
     """
-    Raise FileFormatError if a size by which the decoder of LAZ allocates does not fit the file.
+    Return the number of points that the chunks of a LAZ file have room for.
 
-    These are the size of a point, the number of chunks, and the sizes of chunks and of the layers
-    in them. Each chunk begins with a point as it is. Source: the specification of LAZ 1.4,
-    compressed data, and the laszip record.
+    The decoder allocates by the size of a point, the number of chunks, and the sizes of chunks
+    and of the layers in them; it would read more points than stated from chunks of any size. Each
+    chunk begins with a point as it is. Source: the specification of LAZ 1.4, compressed data.
+
+    Raises
+    ------
+    FileFormatError
+        If one of them does not fit the file.
+
     """
     import lazrs
 
@@ -235,15 +243,19 @@ def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> 
     num_layers = sum(
         item_size if kind == 14 else LAYERS.get(kind, 0) for kind, item_size, _ in items
     )
-    at = start + 8
+    at, head = start + 8, point_size + 4 * (1 + num_layers)
     for number, (_, chunk_size) in enumerate(chunks):
         file.seek(at + point_size + 4)
         layers = np.frombuffer(file.read(4 * num_layers).ljust(4 * num_layers, b'\0'), '<u4')
-        if at + max(chunk_size, int(layers.sum(dtype=np.int64))) > size:
+        if at + chunk_size > size or (
+            num_layers and head + int(layers.sum(dtype=np.int64)) != chunk_size
+        ):
             raise FileFormatError(
-                f'{path}: chunk {number} of the points ends beyond the file; truncated?'
+                f'{path}: chunk {number} of the points has another size than its layers, or ends '
+                'beyond the file; damaged?'
             )
         at += chunk_size
+    return sum(num_points for num_points, _ in chunks)
 
 
 def laszip_record(file: BinaryIO, header: bytes, end: int) -> bytes:

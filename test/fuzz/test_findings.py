@@ -904,10 +904,11 @@ def test_counts_in_the_header_of_las_are_compared_with_the_file(
         ),
         (lambda c, start, table, record: struct.pack_into('<q', c, start, 2**62), 'chunks'),
         (lambda c, start, table, record: struct.pack_into('<H', c, record + 36, 2**15), 'items'),
-        (lambda c, start, table, record: struct.pack_into('<I', c, start + 46, 2**31), 'beyond'),
+        (lambda c, start, table, record: struct.pack_into('<I', c, start + 46, 2**31), 'layers'),
+        (lambda c, start, table, record: struct.pack_into('<I', c, record + 12, 1), 'chunks of 1'),
         (lambda c, start, table, record: c.__delitem__(slice(start + 60, None)), 'chunks'),
     ],
-    ids=['chunks', 'place', 'items', 'layer', 'cut'],
+    ids=['chunks', 'place', 'items', 'layer', 'count', 'cut'],
 )
 def test_sizes_in_laz_are_compared_with_the_file(tmp_path, change, problem):
     """Its decoder ended the process if it could not get the memory for the chunks stated."""
