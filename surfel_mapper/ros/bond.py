@@ -23,9 +23,12 @@ from surfel_mapper.ros.base_node import BaseNode, steady_timer
 
 TOPIC = 'bond'
 
-HEARTBEAT_PERIOD_S = 1.0
+HEARTBEAT_PERIOD_S = 0.25
+"""The manager waits for half of ``bond_timeout`` for the first heartbeat, 2 s by default. With one
+a second, discovery of a new subscriber and a busy machine can use these up."""
+
 HEARTBEAT_TIMEOUT_S = 4.0
-"""The defaults of bondcpp; both are sent with each heartbeat."""
+"""The default of bondcpp; it is sent with each heartbeat, like the period."""
 
 
 class Bond:
