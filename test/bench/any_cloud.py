@@ -120,7 +120,7 @@ def peer_rows(case: Case, options: Options) -> list[Row]:
     for number, scan in enumerate(case.scans):
         files.append(directory / f'{number:05d}.npy')
         np.save(files[-1], scan.points[in_range(scan.points)])
-    settings = {'voxel_size_m': VOXEL_M, 'truncation_m': TRUNCATION_M, 'carve': False}
+    settings = {'voxel_size_m': VOXEL_M, 'truncation_m': TRUNCATION_M, 'carve': False, 'meshes': 1}
     try:
         _, mesh, _ = run_tsdf(VDBFUSION, options.cache, files, np.array(case.poses), settings)
     except PeerError as error:
