@@ -249,7 +249,7 @@ class MomentMap:
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of rows, in the given order; a copy."""
-        rows = self._table.rows.array[chosen]
+        rows = self._table.rows.array[chosen.astype(np.intp)]  # see VoxelTable.values
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
             level=self.level,

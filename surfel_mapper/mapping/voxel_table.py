@@ -167,7 +167,7 @@ class VoxelTable:
         Return a column of some rows, (K,).
 
         With indices of another width than intp NumPy (2.4) may end the process when memory runs
-        out, both in reading elements and in assigning.
+        out, both in reading and in assigning.
         """
         found: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), column]
         return found
@@ -176,7 +176,7 @@ class VoxelTable:
         """Return the channel sums of some rows, (K, C)."""
         if not self._channels:
             return np.empty((len(chosen), 0), np.int64)
-        return np.asarray(self._channels.array[chosen])
+        return np.asarray(self._channels.array[chosen.astype(np.intp)])
 
     def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
         """Return the rows of at least min_points points that were changed after a version."""
