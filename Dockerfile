@@ -10,6 +10,7 @@
 FROM ros:jazzy-ros-base AS robot
 SHELL ["/bin/bash", "-o", "pipefail", "-c"]
 # numba and rosbags have no apt packages on Ubuntu 24.04, and packages of the system stay as they are.
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends \
         python3-matplotlib python3-numpy python3-pil python3-scipy python3-tqdm python3-venv \
         python3-yaml ros-jazzy-launch-ros ros-jazzy-nav-msgs ros-jazzy-tf2-msgs \
@@ -28,6 +29,7 @@ CMD ["ros2", "launch", "surfel_mapper", "mapper.launch.py"]
 
 FROM python:3.12-slim AS develop
 # make, git and a browser: for the tests, and for those that open report.html
+# hadolint ignore=DL3008
 RUN apt-get update && apt-get install -y --no-install-recommends chromium git make \
     && rm -rf /var/lib/apt/lists/*
 

@@ -12,7 +12,6 @@ PYTHON ?= python3
 PYTEST_ARGS ?=
 TEST_PROCESSES ?= 3
 FUZZ_SECONDS ?= 10
-FUZZ_SHARE = $(VENV)/.fuzz-share
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
 
 VENV := .venv
@@ -21,6 +20,7 @@ ifeq ($(and $(ROS_DISTRO),$(shell $(PYTHON) -c 'import rclpy; print("found")' 2>
 KIND := pypi
 OTHER := system
 EXTRAS := test,ros
+DEMO_EXTRAS := [ros]
 else
 KIND := system
 OTHER := pypi
@@ -28,6 +28,7 @@ EXTRAS := test
 VENV_FLAGS := --system-site-packages
 endif
 STAMP := $(VENV)/.ready-$(KIND)
+DEMO_STAMP := $(VENV)/.demo-$(KIND)
 DOCS_STAMP := $(VENV)/.docs-$(KIND)
 LINT := $(VENV)-lint
 LINT_STAMP := $(LINT)/.ready
@@ -36,7 +37,8 @@ OUSTER := $(CURDIR)/$(VENV)/ouster
 
 .PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist notebooks settings clean
 
-demo: $(STAMP)  ## simulate a street, map it live over DDS and from the bag, compare
+# The environment of the tests does too, and the one of the demo becomes it later.
+demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it live over DDS and from the bag, compare
 	$(BIN)/python examples/demo.py
 
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
@@ -74,9 +76,7 @@ soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map dri
 
 fuzz: $(STAMP)  ## let every write and allocation fail; then search for inputs that break readers, a minute of each; FUZZ_SECONDS=600
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[fuzz]'
-	share=$$(cat $(FUZZ_SHARE) 2>/dev/null || echo 0); echo $$(((share + 1) % 32)) > $(FUZZ_SHARE); \
-	SURFEL_MAPPER_EVERY_FAILURE=$$share $(BIN)/python -m pytest -q -rP test/fuzz/test_failures.py
-	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
+	SURFEL_MAPPER_EVERY_FAILURE=1 $(BIN)/python -m pytest -q -rP test/fuzz/test_failures.py
 	$(BIN)/python -m test.fuzz --seconds $(FUZZ_SECONDS)
 
 lint: $(LINT_STAMP)  ## style, format, types, layers, language; needs no ROS
@@ -123,6 +123,14 @@ $(STAMP): setup.py pyproject.toml
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --upgrade \
 		--target $(OUSTER) 'ouster-sdk>=1,<2' more-itertools
+	touch $@
+
+$(DEMO_STAMP): setup.py pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
+	@echo 'Once: packages from PyPI into $(VENV)/, about 190 MB to download, 700 MB on the disk'
+	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
+	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.$(DEMO_EXTRAS)'
 	touch $@
 
 $(LINT_STAMP): setup.py setup.cfg

@@ -102,7 +102,9 @@ TEST = [
     *VIEWER,
     *GLTF,
     *NOTEBOOKS,
-    'evo>=1.28',  # an independent reader of trajectories, and judge of their errors
+    # an independent reader of trajectories, and judge of their errors; GPL-3, so it is used by the
+    # tests alone, and nothing that is installed with the package imports it
+    'evo>=1.28',
     'playwright>=1.40',  # opens report.html in a browser, which it does not bring
     'pytest-xdist>=3.7',  # two processes: those of ROS wait, those of the others calculate
     'plyfile>=1.0.1',  # an independent reader of what we write
