@@ -26,10 +26,20 @@ A caller that wants to continue with the next scan catches SurfelMapperError.
 
 import logging
 
+MAX_LINE = 4000
+"""Limit of a message, characters; a name in a damaged file may have megabytes."""
+
 
 def one_line(text: object) -> str:
-    """Return text with control characters escaped: one line, without terminal sequences."""
+    """
+    Return text as one line without terminal sequences: control characters are escaped.
+
+    Of more than MAX_LINE characters the middle is left out.
+    """
     string = str(text)
+    if len(string) > MAX_LINE:
+        half = MAX_LINE // 2 - 20
+        string = f'{string[:half]} ... {len(string)} characters ... {string[-half:]}'
     if string.isprintable():
         return string
     return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in string)

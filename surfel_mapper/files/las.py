@@ -12,6 +12,7 @@ Coordinates are scaled integers, often of a map projection, so they are returned
 from __future__ import annotations
 
 import io
+import math
 import os
 from pathlib import Path
 import struct
@@ -191,17 +192,36 @@ def check_header(path: str | Path) -> None:
             f'{path}: {num_records} and {num_extended} records of variable length in a file of '
             f'{size} bytes; damaged?'
         )
+    check_units(path, header)
+    header_size = struct.unpack_from('<H', header, 94)[0]
+    if not header_size + num_records * RECORD_BYTES <= start <= size:
+        raise FileFormatError(
+            f'{path}: points from byte {start} of {size} on, behind a header of {header_size} '
+            f'bytes and {num_records} records; truncated, or damaged?'
+        )
     is_packed = point_format & PACKED
-    if is_packed and count > room:
+    if is_packed and (count > room or (room and not count)):
         raise FileFormatError(f'{path}: {count} points in chunks of {room}; damaged?')
-    if start + count * point_size > size and not is_packed:
+    waveforms = struct.unpack_from('<Q', header, 227)[0] if header[24:26] >= b'\x01\x03' else 0
+    found = (size - start) // max(point_size, 1)
+    if not is_packed and (count > found or (count < found and not num_extended | waveforms)):
         raise FileFormatError(
             f'{path}: {size} bytes, expected {start + count * point_size} for {count} points of '
-            f'{point_size} bytes; truncated?'
+            f'{point_size} bytes; truncated, or is its header damaged?'
         )
     ratio = PACKED_RATIO if is_packed else BYTES_PER_BYTE
     needed = count * (2 * point_size + COLUMN_BYTES)
     Budget(path, size, FileFormatError, ratio=ratio).take(needed, f'{count} points')
+
+
+def check_units(path: str | Path, header: bytes) -> None:
+    """Raise FileFormatError unless the units and offsets of coordinates are usable numbers."""
+    numbers = struct.unpack_from('<6d', header, 131)
+    if not all(map(math.isfinite, numbers)) or not all(numbers[:3]):
+        raise FileFormatError(
+            f'{path}: units {numbers[:3]} and offsets {numbers[3:]} of coordinates, expected '
+            'finite numbers, and units that are not 0'
+        )
 
 
 def check_packed(path: str | Path, file: BinaryIO, header: bytes, size: int) -> int:

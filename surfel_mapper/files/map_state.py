@@ -10,14 +10,16 @@ voxels and counts are checked, and the digest is compared.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import FileFormatError, MapError
+from surfel_mapper.budget import refusing
+from surfel_mapper.errors import ConfigError, FileFormatError, MapError
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.layout import MAX_MAP_COUNT
@@ -128,7 +130,7 @@ def load_map(
         raise FileFormatError(
             f'{path}: voxel size {found_m} m, expected map.voxel_size_m = {voxel_size_m} m'
         )
-    try:
+    with refusing(path, FileFormatError), map_errors(path):
         surfel_map = SurfelMap(
             found_m,
             columns=tuple(attributes['columns']),
@@ -146,8 +148,6 @@ def load_map(
         for scan in scans:
             held.insert(scan.moments)
         surfel_map.copy().subtract(held)  # checks that every scan can be evicted
-    except (MapError, ValueError, TypeError, LookupError) as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
     digest = surfel_map.digest()
     if digest != attributes.get('digest'):
         raise FileFormatError(
@@ -172,7 +172,7 @@ def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[Windowe
     arrays, attributes = load_state(path, copies=COPIES)
     if attributes.get('kind') != KIND:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
-    try:
+    with refusing(path, FileFormatError), map_errors(path):
         empty = SurfelMap(
             attributes['voxel_size_m'],
             columns=tuple(attributes['columns']),
@@ -182,8 +182,6 @@ def load_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap, list[Windowe
         moments = _moments(arrays, 'map', empty)
         check_possible(moments)
         return moments, empty, [_scan(arrays, n, empty) for n in range(_num_scans(arrays))]
-    except (MapError, ValueError, TypeError, LookupError) as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
 
 
 def window_stamps_ns(path: str | Path) -> list[int]:
@@ -199,24 +197,49 @@ def window_stamps_ns(path: str | Path) -> list[int]:
     arrays, attributes = load_state(path)
     if attributes.get('kind') != KIND or 'scans.stamp_ns' not in arrays:
         raise FileFormatError(f'{path}: contains {attributes.get("kind")!r}, expected a {KIND}')
-    return [int(stamp_ns) for stamp_ns in arrays['scans.stamp_ns']]
+    with refusing(path, FileFormatError):
+        _num_scans(arrays)
+    stamps: list[int] = arrays['scans.stamp_ns'].tolist()
+    return stamps
+
+
+@contextmanager
+def map_errors(path: str | Path) -> Iterator[None]:
+    """Name a file in the errors of the map that is made of its content."""
+    try:
+        yield
+    except (MapError, ConfigError) as error:
+        raise FileFormatError(f'{path}: damaged: {error}') from error
 
 
 def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
-    return len(arrays['scans.stamp_ns'])
+    """Return the number of scans of the window; raise ValueError if their stamps are invalid."""
+    stamps, poses = arrays['scans.stamp_ns'], arrays['scans.pose']
+    if stamps.dtype != np.int64 or stamps.ndim != 1 or (stamps < 0).any():
+        raise ValueError(
+            f'stamps of scans: {stamps.dtype} {stamps.shape}, expected int64, 0 or up'
+        )
+    if poses.dtype != np.float64 or poses.shape != (len(stamps), 4, 4):
+        raise ValueError(f'poses of scans: {poses.dtype} {poses.shape} for {len(stamps)} scans')
+    return len(stamps)
 
 
 def _scan(arrays: dict[str, npt.NDArray[Any]], number: int, surfel_map: SurfelMap) -> WindowedScan:
     """Return one scan of the window."""
     pose = arrays['scans.pose'][number]
-    if pose.dtype != np.float64:
-        raise ValueError(f'scan {number}: pose of {pose.dtype}, expected float64')
     check_rigid(f'pose of scan {number}', pose)
+    points = arrays.get(f'scan{number}.points')
+    if points is not None and (
+        points.dtype not in (np.float32, np.float64)
+        or points.shape[1:] != (3,)
+        or not np.isfinite(points).all()
+    ):
+        raise ValueError(f'points of scan {number}: {points.dtype} {points.shape}, or not finite')
     return WindowedScan(
         moments=_moments(arrays, f'scan{number}', surfel_map),
         stamp_ns=int(arrays['scans.stamp_ns'][number]),
         T_map_sensor=pose,
-        points=arrays.get(f'scan{number}.points'),
+        points=points,
     )
 
 

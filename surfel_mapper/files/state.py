@@ -26,12 +26,11 @@ import re
 import struct
 from typing import Any, BinaryIO, IO
 import zipfile
-import zlib
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular, refusing
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 
@@ -51,6 +50,15 @@ MEMBER_BYTES = 1000
 
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
+
+NPY_MAGIC = b'\x93NUMPY\x01\x00'
+
+NPY_HEADER = re.compile(
+    re.escape(NPY_MAGIC) + rb"(..)\{'descr': '([<>|][biuf][0-9]{1,2})', 'fortran_order': False, "
+    rb"'shape': \(((?:[0-9]{1,18}, ?)*(?:[0-9]{1,18})?)\), \} *\n",
+    re.DOTALL,
+)
+"""Header of an array: its size, and the type and shape of the array."""
 
 LOCAL_HEADER, LOCAL_MAGIC = struct.Struct('<4s22x2H'), b'PK\3\4'
 """Header of a member of a zip archive: its mark, the lengths of its name and of further fields."""
@@ -180,21 +188,15 @@ def load_state(
         If the file cannot be read, is of another format or version, or is damaged.
 
     """
-    try:
-        with open_regular(path) as file, zipfile.ZipFile(file) as archive:
-            budget = Budget(path, os.fstat(file.fileno()).st_size, FileFormatError)
-            with budget.clock():
+    with refusing(path, FileFormatError), open_regular(path) as file:
+        budget = Budget(path, os.fstat(file.fileno()).st_size, FileFormatError)
+        try:
+            with zipfile.ZipFile(file) as archive, budget.clock():
                 return read_archive(path, archive, budget, copies)
-    except FileFormatError:
-        raise
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except zipfile.BadZipFile as error:
-        raise FileFormatError(
-            f'{path}: {error}; expected a state of surfel_mapper: damaged, or another file'
-        ) from error
-    except (ValueError, LookupError, TypeError, EOFError, RuntimeError, zlib.error) as error:
-        raise FileFormatError(f'{path}: damaged: {error!r}') from error
+        except zipfile.BadZipFile as error:
+            raise FileFormatError(
+                f'{path}: {error}; expected a state of surfel_mapper: damaged, or another file'
+            ) from error
 
 
 def read_archive(
@@ -265,14 +267,20 @@ def check_header(
 
 
 def array_header(content: bytes, name: str) -> tuple[tuple[int, ...], np.dtype[Any], int]:
-    """Return shape and type of an array, and the offset of its numbers."""
-    stream = io.BytesIO(content)
-    if npy.read_magic(stream) != (1, 0):
-        raise ValueError(f'{name}: not an array of format 1.0')
-    shape, fortran_order, dtype = npy.read_array_header_1_0(stream)
-    if fortran_order:
-        raise ValueError(f'{name}: in Fortran order, expected C order')
-    return shape, dtype, stream.tell()
+    """
+    Return shape and type of an array, and the offset of its numbers.
+
+    numpy evaluates the header as a Python literal; here it has to be as ``save_state`` writes it.
+    """
+    found = NPY_HEADER.match(content)
+    if found is None:
+        raise ValueError(f'{name}: not an array of numbers of format 1.0, in C order')
+    size, dtype, shape = found.groups()
+    start = len(NPY_MAGIC) + 2 + int.from_bytes(size, 'little')
+    if found.end() != start:
+        raise ValueError(f'{name}: a header of {found.end()} bytes, expected {start}')
+    numbers = tuple(int(number) for number in shape.decode().replace(' ', '').split(',') if number)
+    return numbers, np.dtype(dtype.decode()), start
 
 
 def read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[Any]:

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.budget import refusing
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import FileFormatError, MapLimitError
 from surfel_mapper.files.state import load_state, save_state
@@ -200,10 +201,8 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
                 f'{path}: {name} {found}, expected layers.tsdf.{name} = {wanted}'
             )
     blocks = BlockMap(config)
-    try:
+    with refusing(path, FileFormatError):
         content = checked(blocks, arrays)
-    except (ValueError, LookupError, TypeError) as error:
-        raise FileFormatError(f'{path}: damaged: {error}') from error
     if config.max_blocks and len(content) > config.max_blocks:
         raise MapLimitError(
             f'{path}: {len(content)} blocks, expected at most layers.tsdf.max_blocks = '
