@@ -5,21 +5,27 @@ The rclpy features that the node builds on: a guarded Node, timers, and waiting 
 
 rclpy raises if a time on /clock is negative, or if a parameter is set to a value of an unknown
 type. Either error ends the executor and with it the node, so any process in the ROS domain could
-end it. ``BaseNode`` ignores or refuses such messages.
+end it. ``BaseNode`` ignores or refuses such messages. Any error of a callback would do the same,
+so each callback runs in ``surviving``: the error is counted and logged, a request is refused, and
+the node goes on.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future
-from functools import partial
+from contextlib import contextmanager
+from functools import partial, wraps
+import inspect
 import types
 from typing import Any, TypeVar
 
+from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import Executor
+from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
@@ -28,6 +34,9 @@ from rclpy.service import Service
 from rclpy.subscription import Subscription
 from rclpy.timer import Timer
 from rosgraph_msgs.msg import Clock as ClockMessage
+
+from surfel_mapper.pipeline.drops import described
+from surfel_mapper.ros.line_logger import LineLogger
 
 PARAMETER_TYPES = {kind.value for kind in Parameter.Type}
 
@@ -51,7 +60,26 @@ class CountedPublisher(Publisher):
 
 
 class BaseNode(Node):
-    """A node that survives malformed clock and parameter messages, and counts its publications."""
+    """A node that survives errors of its callbacks, and counts its publications."""
+
+    def get_logger(self) -> RcutilsLogger:
+        """Return the logger of the node; its messages are one line each."""
+        logger: RcutilsLogger = super().get_logger()
+        if not isinstance(logger, LineLogger):
+            self._logger = logger = LineLogger(logger.name)
+        return logger
+
+    def report_failure(self, task: str, error: Exception) -> None:
+        """Report an error of a callback that nothing expects; overridden to count it too."""
+        self.get_logger().error(f'{task} failed: {described(error)}', throttle_duration_sec=1.0)
+
+    @contextmanager
+    def surviving(self, task: str) -> Iterator[None]:
+        """Report an unexpected error of a with-block, and go on."""
+        try:
+            yield
+        except Exception as error:  # MemoryError too
+            self.report_failure(task, error)
 
     def create_publisher(self, *args: Any, **kwargs: Any) -> Publisher:
         """Create a publisher that counts its messages."""
@@ -63,7 +91,15 @@ class BaseNode(Node):
         """Create a subscription; the one to /clock ignores negative times."""
         if msg_type is ClockMessage:
             callback = partial(self._on_clock, callback)
-        return super().create_subscription(msg_type, topic, callback, *args, **kwargs)
+        survived = self._survived(f'a message on {topic}', callback)
+        return super().create_subscription(msg_type, topic, survived, *args, **kwargs)
+
+    def create_timer(
+        self, timer_period_sec: float, callback: Callable[..., None], *args: Any, **kwargs: Any
+    ) -> Timer:
+        """Create a timer."""
+        survived = self._survived('a timer', callback)
+        return super().create_timer(timer_period_sec, survived, *args, **kwargs)
 
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[..., Any], **kwargs: Any
@@ -71,7 +107,33 @@ class BaseNode(Node):
         """Create a service; those that set parameters refuse values of unknown types."""
         if srv_type in (SetParameters, SetParametersAtomically):
             callback = partial(_on_set_parameters, callback)
+        if srv_type is not ChangeState:  # its errors end the node, see MapperNode
+            callback = self._answered(srv_name, callback)
         return super().create_service(srv_type, srv_name, callback, **kwargs)
+
+    def _survived(self, task: str, callback: Callable[..., None]) -> Callable[..., None]:
+        """Return a callback whose errors are reported."""
+
+        @wraps(callback)
+        def survived(*args: Any) -> None:
+            with self.surviving(task):
+                callback(*args)
+
+        return survived
+
+    def _answered(self, name: str, callback: Callable[..., Any]) -> Callable[..., Any]:
+        """Return the callback of a service that refuses requests whose errors nothing expects."""
+
+        @wraps(callback)
+        async def answered(request: Any, response: Any) -> Any:
+            try:
+                answer = callback(request, response)
+                return await answer if inspect.isawaitable(answer) else answer
+            except Exception as error:  # MemoryError too
+                self.report_failure(f'a request to {name}', error)
+                return _refused(request, response, described(error))
+
+        return answered
 
     def _on_clock(self, set_time: Callable[[ClockMessage], None], msg: ClockMessage) -> None:
         if msg.clock.sec >= 0:
@@ -95,6 +157,19 @@ def _on_set_parameters(set_parameters: Callable[..., Any], request: Any, respons
         response.result = refused
     else:
         response.results = [refused] * len(request.parameters)
+    return response
+
+
+def _refused(request: Any, response: Any, reason: str) -> Any:
+    """Return the response that a request failed, in the terms of its service."""
+    result = SetParametersResult(successful=False, reason=reason)
+    if isinstance(response, SetParameters.Response):
+        response.results = [result] * len(request.parameters)
+    elif isinstance(response, SetParametersAtomically.Response):
+        response.result = result
+    elif hasattr(response, 'success'):
+        response.success = False
+        response.message = reason
     return response
 
 

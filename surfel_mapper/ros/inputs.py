@@ -18,7 +18,6 @@ from typing import Any
 
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
@@ -35,6 +34,7 @@ from surfel_mapper.messages.images import (
 )
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 from surfel_mapper.messages.poses import ODOMETRY, POSE, raw_poses, TF
+from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
@@ -67,7 +67,7 @@ class Inputs:
 
     Parameters
     ----------
-    node : Node
+    node : BaseNode
         The node that subscribes.
     config : Config
         Its stages input, pose and frames are used.
@@ -92,7 +92,7 @@ class Inputs:
 
     def __init__(
         self,
-        node: Node,
+        node: BaseNode,
         config: Config,
         thread: MappingThread,
         on_failure: Callable[[BaseException], None],

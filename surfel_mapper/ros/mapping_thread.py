@@ -140,6 +140,10 @@ class MappingThread:
         """Count a cloud that cannot be decoded."""
         self._lose(LostCloud('bad_cloud', topic, reason))
 
+    def report_failure(self, task: str, error: Exception) -> None:
+        """Count an error that nothing expects, of a callback in another thread."""
+        self._lose(LostPose(INTERNAL, f'{task} failed: {described(error)}'))
+
     def put_image(self, image: SceneImage) -> None:
         """Queue an image of colours or labels; like poses, they overtake clouds."""
         with self._changed:

@@ -93,6 +93,14 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         """The name of the state of the life cycle."""
         return str(self._state_machine.current_state[1])
 
+    def report_failure(self, task: str, error: Exception) -> None:
+        """Count an error of a callback that nothing expects, in the mapping thread, and log it."""
+        session = self._session
+        if session is None:
+            super().report_failure(task, error)
+        else:
+            session.thread.report_failure(task, error)
+
     def start(self) -> None:
         """Configure and activate; raises the reason if refused."""
         for transition in (self.trigger_configure, self.trigger_activate):

@@ -23,8 +23,15 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.node import Node
 from std_srvs.srv import SetBool, Trigger
 
-from surfel_mapper.errors import FileFormatError, MapError, PoseError, SurfelMapperError
+from surfel_mapper.errors import (
+    FileFormatError,
+    MapError,
+    one_line,
+    PoseError,
+    SurfelMapperError,
+)
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.regions import Ball, Box, MAX_CORNERS, Prism, Region
 from surfel_mapper.ros.base_node import result_of
 from surfel_mapper.ros.map_files import load_map, save_map
@@ -40,6 +47,9 @@ LOAD_ERRORS: tuple[tuple[type[Exception], int], ...] = (
     (Exception, LoadMap.Response.RESULT_UNDEFINED_FAILURE),
 )
 """Result code of ~/load_map by the error raised; the first match counts."""
+
+EXPECTED = (SurfelMapperError, OSError, ValueError)
+"""Errors of requests that are answered only; all others are counted too."""
 
 MAX_WAITING = 10
 """
@@ -96,7 +106,7 @@ class Services:
             try:
                 response.message = await self._run(action)
                 response.success = True
-            except (SurfelMapperError, OSError, ValueError, CancelledError) as error:
+            except Exception as error:  # MemoryError too
                 response.message = self._log_failure(error)
             return response
 
@@ -107,7 +117,7 @@ class Services:
     ) -> LoadMap.Response:
         try:
             await self._run(partial(self._load, request.map_url))
-        except (SurfelMapperError, OSError, ValueError, CancelledError) as error:
+        except Exception as error:  # MemoryError too
             self._log_failure(error)
             response.result = next(code for kind, code in LOAD_ERRORS if isinstance(error, kind))
             return response
@@ -142,9 +152,15 @@ class Services:
         self._node.get_logger().info(answer)
         return answer
 
-    def _log_failure(self, error: BaseException) -> str:
-        """Log why a request failed; return the text."""
-        text = 'the node is about to end' if isinstance(error, CancelledError) else str(error)
+    def _log_failure(self, error: Exception) -> str:
+        """Log why a request failed, and count it if nothing expects that; return the text."""
+        if isinstance(error, CancelledError):
+            text = 'the node is about to end'
+        elif isinstance(error, EXPECTED):
+            text = one_line(error)
+        else:
+            self._thread.report_failure('a request', error)
+            return described(error)
         self._node.get_logger().error(text)
         return text
 
@@ -201,7 +217,7 @@ class Services:
         try:
             region = prism(msg, self._mapper)
             log.info(self._clear_region(region, f'the polygon on {topic} in frame {frame_id}'))
-        except (PoseError, MapError, ValueError) as error:
+        except EXPECTED as error:
             log.warning(
                 f'polygon on {topic} in frame {frame_id!r} ignored: {error}',
                 throttle_duration_sec=1.0,

@@ -13,8 +13,6 @@ import threading
 import time
 from typing import TYPE_CHECKING
 
-from rclpy.node import Node
-
 from surfel_mapper.config import Config
 from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.kernels.compiling import compilations
@@ -22,6 +20,7 @@ from surfel_mapper.memory import lasting_objects, rare_collections
 from surfel_mapper.messages.pointcloud2 import warm_up as warm_up_decoding
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.checkpoints import Checkpoints, load_start
+from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.inputs import Inputs
 from surfel_mapper.ros.main_thread import TaskQueue
 from surfel_mapper.ros.map_files import save_map
@@ -44,7 +43,7 @@ class Session:
 
     Parameters
     ----------
-    node : Node
+    node : BaseNode
         The node that owns the topics and services.
     config : Config
         All settings.
@@ -68,7 +67,7 @@ class Session:
 
     """
 
-    def __init__(self, node: Node, config: Config, tasks: TaskQueue) -> None:
+    def __init__(self, node: BaseNode, config: Config, tasks: TaskQueue) -> None:
         """Compile the kernels, then create publishers and services."""
         self._node = node
         self._tasks = tasks

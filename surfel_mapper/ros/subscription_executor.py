@@ -34,13 +34,13 @@ from rclpy.event_handler import QoSMessageLostInfo, SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.guard_condition import GuardCondition
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import InvalidQosOverridesError, QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from surfel_mapper.errors import ConfigError
+from surfel_mapper.ros.base_node import BaseNode
 
 OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
 """Policies that a user can set for a subscription in ``qos_overrides``, beside reliability."""
@@ -136,14 +136,14 @@ class SubscriptionExecutor:
 
     Parameters
     ----------
-    node : Node
+    node : BaseNode
         The node that subscribes.
     on_failure : callable
         Called in the thread with an unexpected error, after which the thread ends.
 
     """
 
-    def __init__(self, node: Node, on_failure: Callable[[BaseException], None]) -> None:
+    def __init__(self, node: BaseNode, on_failure: Callable[[BaseException], None]) -> None:
         self._node = node
         self._on_failure = on_failure
         self._group = KeptFromExecutor()
@@ -340,7 +340,8 @@ class SubscriptionExecutor:
         reports = [(event, event.take_data()) for event in events if event.is_ready(wait_set)]
         for event, report in reports:
             if report:
-                event.callback(report)
+                with self._node.surviving('an event of a subscription'):
+                    event.callback(report)
 
     def _take_turn(self) -> bool:
         """Take a message of each other topic, all eager ones before it; False if none was left."""
@@ -357,7 +358,10 @@ class SubscriptionExecutor:
         if time.monotonic() > self._end_s:
             return False
         for subscription in reader.subscriptions():
-            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+            taken = None
+            with self._node.surviving(f'a message on {reader.topic}'):
+                handle = subscription.handle
+                taken = handle.take_message(subscription.msg_type, subscription.raw)
             if taken is None:
                 continue
             message, info = taken
@@ -365,7 +369,8 @@ class SubscriptionExecutor:
                 if info['source_timestamp'] in reader.seen:
                     return True
                 reader.seen.add(info['source_timestamp'])
-            reader.callback(message)
+            with self._node.surviving(f'a message on {reader.topic}'):
+                reader.callback(message)
             return True
         return False
 

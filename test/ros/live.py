@@ -24,6 +24,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
 
+from surfel_mapper.ros.base_node import BaseNode
+
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120.0
 """Longest wait for an event that takes a second on an idle machine."""
@@ -100,7 +102,7 @@ class Peer:
     def __init__(self, arguments=()):
         self._context = rclpy.Context()
         rclpy.init(args=list(arguments), context=self._context)
-        self.node = rclpy.create_node('peer', context=self._context)
+        self.node = BaseNode('peer', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._publishers = {}

@@ -110,13 +110,14 @@ def test_all_eager_messages_are_taken_before_every_other_one(peer, bench):
     assert bench.executor.topics() == ['/eager', '/others']
 
 
-def test_an_error_in_a_callback_ends_the_thread_and_is_reported(peer, bench):
+def test_an_error_of_the_thread_itself_ends_it_and_is_reported(peer, bench, monkeypatch):
     error = RuntimeError('unexpected')
 
-    def fail(message):
+    def fail():
         raise error
 
-    bench.executor.subscribe(String, 'others', fail, ALL)
+    bench.executor.subscribe(String, 'others', bench.take, ALL)
+    monkeypatch.setattr(bench.executor, '_follow_publishers', fail)
     bench.executor.start()
     published(peer, 'others', String, ['a'])
 
