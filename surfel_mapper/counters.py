@@ -44,6 +44,9 @@ LATEST = 1000
 MOST_FRAMES = 128
 """Number of frames and topics with separate counts of drops; further ones count as OTHERS."""
 
+MAX_NAME = 256
+"""Limit of the characters of such a name; those of longer names count as OTHERS too."""
+
 OTHERS = '(others)'
 
 
@@ -123,7 +126,8 @@ class Counters:
         """Count scans as dropped for a cause."""
         self.dropped[cause] += number
         is_new = frame_id not in self.dropped_by_frame
-        if is_new and len(self.dropped_by_frame) >= MOST_FRAMES:
+        is_over = len(self.dropped_by_frame) >= MOST_FRAMES or len(frame_id) > MAX_NAME
+        if is_new and is_over:
             frame_id = OTHERS
         self.dropped_by_frame.setdefault(frame_id, Counter())[cause] += number
 

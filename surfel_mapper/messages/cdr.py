@@ -34,6 +34,9 @@ FLOAT64_BYTES = 8
 
 NS_PER_S = 10**9
 
+MAX_FRAME_NAME = 256
+"""Limit of the characters of a frame's name: buffers, counters and messages hold thousands."""
+
 
 class Stamp(NamedTuple):
     """A builtin_interfaces/Time."""
@@ -168,7 +171,7 @@ class MessageWriter:
 def read_header(reader: MessageReader) -> Header:
     """Return the next std_msgs/Header; the sequence number of ROS 1 is skipped."""
     *_, sec, nanosec = reader.numbers('III' if reader.is_ros1 else 'iI')
-    return Header(Stamp(sec, nanosec), reader.string())
+    return Header(Stamp(sec, nanosec), checked_frame(reader.string()))
 
 
 def write_header(writer: MessageWriter, stamp_ns: int, frame_id: str) -> None:
@@ -180,8 +183,17 @@ def write_header(writer: MessageWriter, stamp_ns: int, frame_id: str) -> None:
 
 
 def frame_name(frame_id: str) -> str:
-    """Return the name of a frame without the leading slash of ROS 1."""
-    return str(frame_id).removeprefix('/')
+    """Return the name of a frame without the leading slash of ROS 1; see checked_frame."""
+    return checked_frame(str(frame_id)).removeprefix('/')
+
+
+def checked_frame(name: str) -> str:
+    """Return the name of a frame; raise CloudFormatError if it is longer than any real one."""
+    if len(name) > MAX_FRAME_NAME:
+        raise CloudFormatError(
+            f'frame {name[:20]!r}... of {len(name)} characters, expected at most {MAX_FRAME_NAME}'
+        )
+    return name
 
 
 def stamp_ns(header: Any) -> int:

@@ -38,6 +38,15 @@ MAX_PIXELS = 1 << 26
 PIXEL_BYTES = 6
 """Memory per pixel: three channels, decoded and as an array."""
 
+SCANS_PIXEL_BYTES = 12
+"""The same of a JPEG of several scans, of which the decoder keeps all coefficients."""
+
+JPEG_MAGIC, START_OF_SCAN = b'\xff\xd8', b'\xff\xda'
+"""First bytes of a JPEG; mark before each of its scans, which no compressed data contains."""
+
+MAX_SCANS = 32
+"""Limit of the scans of a JPEG: progressive ones have 10, a thumbnail one more."""
+
 ENCODINGS = {'L': 'mono8', 'RGB': 'rgb8', 'I;16': '16UC1', 'I;16B': '16UC1', 'I': '16UC1'}
 """Pillow's mode of an image, and the encoding of a message."""
 
@@ -142,7 +151,8 @@ def pixels_of(
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
             width, height = image.size
-            check_size(width, height, len(data), topic, size)
+            num_scans = checked_scans(data, topic)
+            check_size(width, height, len(data), topic, size, num_scans)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
     except CloudFormatError:
@@ -154,8 +164,25 @@ def pixels_of(
     return encoding, np.ascontiguousarray(pixels, '<u2' if encoding == '16UC1' else 'u1')
 
 
+def checked_scans(data: bytes, topic: str) -> int:
+    """
+    Return the scans of a JPEG, 0 of others; raise CloudFormatError for more than encoders write.
+
+    Each scan of 23 bytes makes the decoder pass over all pixels: 76 kB took over a minute.
+    """
+    number = data.count(START_OF_SCAN) if data.startswith(JPEG_MAGIC) else 0
+    if number > MAX_SCANS:
+        raise CloudFormatError(f'{topic}: a JPEG of {number} scans, expected at most {MAX_SCANS}')
+    return number
+
+
 def check_size(
-    width: int, height: int, num_bytes: int, topic: str, size: tuple[int, int] | None
+    width: int,
+    height: int,
+    num_bytes: int,
+    topic: str,
+    size: tuple[int, int] | None,
+    num_scans: int = 0,
 ) -> None:
     """Raise CloudFormatError if an image has another size than its camera, or too many pixels."""
     if size is not None and (width, height) != size:
@@ -165,6 +192,7 @@ def check_size(
         )
     if width * height > MAX_PIXELS:
         raise CloudFormatError(f'{topic}: {width} x {height} pixels, more than {MAX_PIXELS}')
-    floor = FLOOR_BYTES if size is None else max(FLOOR_BYTES, width * height * PIXEL_BYTES)
+    needed = width * height * (SCANS_PIXEL_BYTES if num_scans > 1 else PIXEL_BYTES)
+    floor = FLOOR_BYTES if size is None else max(FLOOR_BYTES, needed)
     budget = Budget(topic, num_bytes, CloudFormatError, floor=floor)
-    budget.take(width * height * PIXEL_BYTES, f'image of {width} x {height} pixels')
+    budget.take(needed, f'image of {width} x {height} pixels')

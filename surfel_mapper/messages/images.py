@@ -149,7 +149,7 @@ def depth_scan(image: CameraImage, topic: str = 'depth') -> Scan:
     return Scan(
         points=points,
         stamp_ns=stamp_ns,
-        frame_id=str(msg.header.frame_id),
+        frame_id=frame_name(msg.header.frame_id),
         camera=astuple(image.camera),
         depth=DepthImage(points=points, depth=depth),
         free=free_rays(depth, image.camera),

@@ -1,0 +1,316 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""Inputs made by hand that ended the process, hung, escaped as another error or were believed."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import struct
+import subprocess
+import sys
+import time
+from types import SimpleNamespace
+import zipfile
+
+import numpy as np
+from PIL import Image
+import pytest
+
+from surfel_mapper.budget import refusing
+from surfel_mapper.counters import Counters, OTHERS
+from surfel_mapper.errors import (
+    CloudFormatError,
+    FileFormatError,
+    MAX_LINE,
+    one_line,
+    PoseError,
+)
+from surfel_mapper.files.map_state import load_map, load_moments, save_map, window_stamps_ns
+from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.messages.cdr import MAX_FRAME_NAME
+from surfel_mapper.messages.compressed_image import unpacked
+from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud
+from surfel_mapper.messages.poses import raw_poses
+
+TIMEOUT_S = 120
+
+
+@pytest.fixture
+def saved(tmp_path):
+    """Return the path of a map with one scan in its window."""
+    surfel_map = SurfelMap(0.5)
+    moments = surfel_map.add(np.random.default_rng(0).normal(size=(500, 3)))
+    scan = WindowedScan(
+        moments=moments, stamp_ns=5, T_map_sensor=np.eye(4), points=np.zeros((2, 3))
+    )
+    path = tmp_path / 'map.npz'
+    save_map(path, surfel_map, [scan])
+    return path
+
+
+def changed(path, *, arrays=None, attributes=None, header=None):
+    """Write a map again with other arrays, attributes or header of the keys, and its hash."""
+    with zipfile.ZipFile(path) as archive:
+        manifest = json.loads(archive.read('manifest.json'))
+        found = {
+            entry['name']: np.load(io.BytesIO(archive.read(f'{entry["name"]}.npy')))
+            for entry in manifest['arrays']
+        }
+    found.update(arrays or {})
+    manifest['attributes'].update(attributes or {})
+    manifest['arrays'] = [
+        {'name': name, 'dtype': array.dtype.str, 'shape': array.shape}
+        for name, array in found.items()
+    ]
+    del manifest['sha256']
+    content = hashlib.sha256(json.dumps(manifest, sort_keys=True).encode())
+    for array in found.values():
+        content.update(array.tobytes())
+    manifest['sha256'] = content.hexdigest()
+    with zipfile.ZipFile(path, 'w') as archive:
+        archive.writestr('manifest.json', json.dumps(manifest))
+        for name, array in found.items():
+            stream = io.BytesIO()
+            np.lib.format.write_array(stream, array)
+            data = stream.getvalue()
+            if header and name == 'map.key':
+                text = header.encode() + b' ' * (-(len(header) + 11) % 64) + b'\n'
+                data = b'\x93NUMPY\x01\x00' + struct.pack('<H', len(text)) + text + data[128:]
+            archive.writestr(f'{name}.npy', data)
+
+
+@pytest.mark.parametrize(
+    'header',
+    [
+        "{'descr': ('<i8', 'fortran",
+        '(' * 5000,
+        '-' * 9000 + '1',
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (1" + '0' * 4000 + ',)}',
+        "{'descr': '|O', 'fortran_order': False, 'shape': (5,), }",
+        "{'descr': [('a','<i8')], 'fortran_order': False, 'shape': (5,), }",
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (-5,), }",
+        "{'descr': '<i8', 'fortran_order': True, 'shape': (5,), }",
+    ],
+    ids=['cut', 'brackets', 'signs', 'digits', 'objects', 'fields', 'negative', 'columns'],
+)
+def test_headers_of_arrays_are_not_evaluated(saved, header):
+    """NumPy parses them as Python: TokenError, MemoryError and a fifth of a second came of it."""
+    changed(saved, header=header)
+    for read in (load_map, load_moments, window_stamps_ns):
+        start_s = time.thread_time()
+        with pytest.raises(FileFormatError, match=r'map\.npz: damaged') as caught:
+            read(saved)
+        assert time.thread_time() - start_s < 0.1
+        assert len(str(caught.value)) <= MAX_LINE
+
+
+@pytest.mark.parametrize(
+    'arrays',
+    [
+        {'scans.stamp_ns': np.array([np.inf])},
+        {'scans.stamp_ns': np.array([np.nan])},
+        {'scans.stamp_ns': np.array([5.5])},
+        {'scans.stamp_ns': np.array([[5]])},
+        {'scans.stamp_ns': np.array(5)},
+        {'scans.stamp_ns': np.array([-5])},
+        {'scans.stamp_ns': np.array([2**64 - 1], np.uint64)},
+        {'scans.pose': np.stack([np.eye(4)] * 3)},
+        {'scans.pose': np.eye(4, dtype=np.float32)[None]},
+    ],
+    ids=['inf', 'nan', 'fraction', 'table', 'number', 'negative', 'unsigned', 'three', 'float32'],
+)
+def test_stamps_and_poses_of_a_window_are_checked(saved, arrays):
+    changed(saved, arrays=arrays)
+    for read in (load_map, load_moments, window_stamps_ns):
+        with pytest.raises(FileFormatError, match=r'map\.npz: damaged'):
+            read(saved)
+
+
+@pytest.mark.parametrize(
+    'points',
+    [
+        np.ones((5, 7), bool),
+        np.ones((5, 3), np.int64),
+        np.zeros((5, 3), np.float16),
+        np.full((5, 3), np.nan),
+        np.array(3.0),
+    ],
+    ids=['booleans', 'integers', 'float16', 'nan', 'number'],
+)
+def test_points_of_a_window_are_checked(saved, points):
+    """They were believed, and failed when the window was aligned."""
+    changed(saved, arrays={'scan0.points': points})
+    for read in (load_map, load_moments):
+        with pytest.raises(FileFormatError, match='points of scan 0'):
+            read(saved)
+
+
+@pytest.mark.parametrize(
+    ('name', 'value'),
+    [
+        ('voxel_size_m', 10**400),
+        ('level', 10**400),
+        ('origin_m', [10**400, 0, 0]),
+        ('columns', 5),
+        ('kind', 'x' * 1_000_000),
+    ],
+)
+def test_attributes_that_no_map_has_are_refused_in_a_short_line(saved, name, value):
+    changed(saved, attributes={name: value})
+    for read in (load_map, load_moments):
+        with pytest.raises(FileFormatError, match=r'map\.npz') as caught:
+            read(saved)
+        assert len(str(caught.value)) <= MAX_LINE
+
+
+def test_a_changed_map_of_the_same_content_is_read(saved):
+    """The helper above writes valid files."""
+    digest = load_map(saved)[0].digest()
+    changed(saved)
+    surfel_map, scans = load_map(saved)
+    assert surfel_map.digest() == digest
+    assert window_stamps_ns(saved) == [scan.stamp_ns for scan in scans] == [5]
+
+
+@pytest.mark.parametrize('error', [OverflowError('x'), MemoryError(), AttributeError('a\nb')])
+def test_any_exception_of_a_parser_becomes_an_error_of_its_reader(error):
+    expected = pytest.raises(FileFormatError, match=f'a.npz: damaged: {type(error).__name__}')
+    with expected as caught, refusing('a.npz', FileFormatError):
+        raise error
+    assert caught.value.__cause__ is error
+    assert '\n' not in str(caught.value)
+
+
+def test_a_long_line_keeps_its_ends():
+    line = one_line('begin\n' + 'x' * 10_000_000 + '\x1b[31mend')
+    assert len(line) <= MAX_LINE
+    assert line.startswith('begin\\n')
+    assert line.endswith('\\x1b[31mend')
+    assert '10000014 characters' in line
+
+
+@pytest.fixture
+def laz(tmp_path):
+    """Return the path of a LAZ file of 100 points, and its content."""
+    laspy = pytest.importorskip('laspy')
+    data = laspy.LasData(laspy.LasHeader(point_format=3, version='1.4'))
+    data.x = data.y = data.z = np.arange(100.0)
+    path = tmp_path / 'a.laz'
+    data.write(str(path))
+    return path, bytearray(path.read_bytes())
+
+
+def start_of_points(content):
+    return struct.unpack_from('<I', content, 96)[0]
+
+
+@pytest.mark.parametrize('number', [2**32 - 1, 2**28, 1000])
+def test_a_laz_that_states_other_chunks_is_refused(laz, number):
+    """Lazrs allocated 69 GB for 2^32 chunks and ended the process by SIGABRT."""
+    path, content = laz
+    (table,) = struct.unpack_from('<q', content, start_of_points(content))
+    struct.pack_into('<I', content, table + 4, number)
+    path.write_bytes(content)
+    read = (
+        'import sys\nfrom surfel_mapper.errors import FileFormatError\n'
+        'from surfel_mapper.files.scan_files import read_scan\n'
+        'try: read_scan(sys.argv[1])\n'
+        'except FileFormatError as error: print(error)\n'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', read, str(path)],
+        capture_output=True, text=True, timeout=TIMEOUT_S, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert f'{number} chunks of points at byte {table} of {len(content)}' in done.stdout
+
+
+def test_a_laz_of_large_chunks_is_read(laz):
+    """Decoders of many threads allocate a chunk of the size stated, here 110 GB."""
+    path, content = laz
+    place = content.index(b'laszip encoded') + 64
+    assert struct.unpack_from('<I', content, place) == (50_000,)
+    struct.pack_into('<I', content, place, 3_271_607_120)
+    path.write_bytes(content)
+    points, _ = read_scan(path)
+    np.testing.assert_allclose(points[:, 0], np.arange(100.0), atol=0.005)
+
+
+@pytest.mark.parametrize(
+    ('at', 'code', 'number', 'problem'),
+    [
+        (131, '<d', 0.0, 'units'),
+        (139, '<d', np.nan, 'units'),
+        (155, '<d', np.inf, 'offsets'),
+        (247, '<Q', 0, '0 points'),
+        (96, '<I', 300, r'points from byte 300|items of 0 bytes in points'),
+        (96, '<I', 2**31, r'points from byte 2147483648|at byte 0 of|in points of'),
+    ],
+    ids=['unit', 'nan', 'offset', 'count', 'begin', 'end'],
+)
+@pytest.mark.parametrize('suffix', ['.las', '.laz'])
+def test_numbers_in_the_header_of_las_that_cannot_be_are_refused(
+    laz, tmp_path, suffix, at, code, number, problem
+):
+    """Points of nan, points all in one place, or no points, were taken for the content."""
+    laspy = pytest.importorskip('laspy')
+    path = tmp_path / f'b{suffix}'
+    laspy.read(str(laz[0])).write(str(path))
+    content = bytearray(path.read_bytes())
+    struct.pack_into(code, content, at, number)
+    path.write_bytes(content)
+    with pytest.raises(FileFormatError, match=problem):
+        read_scan(path)
+
+
+def test_a_jpeg_of_a_thousand_scans_is_refused_before_decoding():
+    """Each scan of 23 bytes passes over all pixels: 76 kB took over a minute."""
+    stream = io.BytesIO()
+    Image.new('RGB', (2000, 2000)).save(stream, 'JPEG', progressive=True)
+    content = stream.getvalue()
+    message = SimpleNamespace(header=None, format='rgb8; jpeg compressed bgr8', data=content)
+    assert unpacked(message, 'color', exact=False).width == 2000
+    last = content[content.rfind(b'\xff\xda') : -2]
+    message.data = content[:-2] + 1000 * last + content[-2:]
+    start_s = time.thread_time()
+    with pytest.raises(CloudFormatError, match='a JPEG of 1010 scans, expected at most 32'):
+        unpacked(message, 'color', exact=False)
+    assert time.thread_time() - start_s < 0.1
+
+
+def test_names_of_frames_are_limited():
+    """10,000 frames are kept, and 128 are counted: names of 10 MB would fill the memory."""
+    columns = dict.fromkeys('xyz', np.zeros(1, np.float32))
+    for size, is_valid in ((MAX_FRAME_NAME, True), (MAX_FRAME_NAME + 1, False)):
+        raw = cloud_bytes(from_columns(columns), stamp_ns=1, frame_id='f' * size)
+        pose = pose_bytes('odom', 'f' * size)
+        if is_valid:
+            assert parse_cloud(raw).header.frame_id == 'f' * size
+            assert raw_poses('odometry', pose, 'base_link', 'odom')[0].child == 'f' * size
+            continue
+        with pytest.raises(CloudFormatError, match=r'frame .* of 257 characters'):
+            parse_cloud(raw)
+        with pytest.raises(PoseError, match=r'frame .* of 257 characters'):
+            raw_poses('odometry', pose, 'base_link', 'odom')
+
+
+def test_drops_of_frames_with_endless_names_are_counted_together():
+    counters = Counters()
+    for number in range(3):
+        counters.drop('bad_cloud', f'{number}' * 1_000_000)
+    assert counters.dropped_by_frame == {OTHERS: {'bad_cloud': 3}}
+
+
+def pose_bytes(parent, child):
+    """Return the first part of a nav_msgs/Odometry, up to its pose."""
+    from surfel_mapper.messages.cdr import MessageWriter, write_header
+
+    writer = MessageWriter()
+    write_header(writer, 1, parent)
+    writer.string(child)
+    writer.numbers('d', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
+    return writer.join()
