@@ -9,8 +9,7 @@ always use and an upper bound of three quarters of the memory of the machine. Th
 variable SURFEL_MAPPER_MAX_BYTES replaces it by one number for inputs of any size. Time is
 processor time of the thread, so that a busy machine refuses nothing.
 
-``refusing`` makes any exception of a parser an error of its reader. ``read_small_file`` reads
-files that people write, such as settings.
+``read_small_file`` reads files that people write, such as settings.
 """
 
 from __future__ import annotations
@@ -24,8 +23,6 @@ from pathlib import Path
 import stat
 import time
 from typing import BinaryIO
-
-from surfel_mapper.errors import SurfelMapperError
 
 FLOOR_BYTES = 64 << 20
 """Memory that reading any input may take: one unpacked chunk, one image of 16 Mpixel."""
@@ -147,32 +144,6 @@ class Budget:
                 f'{self.name}: reading took over {self.max_seconds:.1f} s of processor time, the '
                 'limit for an input of this size; is it damaged?'
             )
-
-
-@contextmanager
-def refusing(name: str | Path, error: Callable[[str], Exception]) -> Iterator[None]:
-    """
-    Turn every exception of a with-block that parses input into the error of its reader.
-
-    Each reader has one around all that it does: which exceptions libraries raise for damaged
-    content is not known in advance (TokenError, OverflowError and MemoryError were missed).
-
-    Parameters
-    ----------
-    name : str or Path
-        File or topic, named in errors.
-    error : callable of str to Exception
-        Class of the errors of the reader.
-
-    """
-    try:
-        yield
-    except SurfelMapperError:
-        raise
-    except OSError as found:
-        raise error(f'{name}: cannot be read: {found.strerror or found}') from found
-    except Exception as found:  # MemoryError too
-        raise error(f'{name}: damaged: {type(found).__name__}: {found}') from found
 
 
 def limit_for(size: int, ratio: int = BYTES_PER_BYTE, floor: int = FLOOR_BYTES) -> int:

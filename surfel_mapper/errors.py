@@ -21,10 +21,16 @@ Exceptions of this package.
       ClusterError         workers or a scheduler that cannot be reached, or die repeatedly
       DependencyError      an optional package is missing; says how to install it     (ImportError)
 
-A caller that wants to continue with the next scan catches SurfelMapperError.
+A caller that wants to continue with the next scan catches SurfelMapperError. ``refusing`` makes
+any exception of a parser an error of its reader.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 import logging
+from pathlib import Path
 
 MAX_LINE = 4000
 """Limit of a message, characters; a name in a damaged file may have megabytes."""
@@ -125,3 +131,29 @@ class DependencyError(SurfelMapperError, ImportError):
 
     def __str__(self) -> str:
         return '\n'.join(map(one_line, str(self.args[0]).split('\n')))
+
+
+@contextmanager
+def refusing(name: str | Path, error: Callable[[str], Exception]) -> Iterator[None]:
+    """
+    Turn every exception of a with-block that parses input into the error of its reader.
+
+    Each reader has one around all that it does: which exceptions libraries raise for damaged
+    content is not known in advance (TokenError, OverflowError and MemoryError were missed).
+
+    Parameters
+    ----------
+    name : str or Path
+        File or topic, named in errors.
+    error : callable of str to Exception
+        Class of the errors of the reader.
+
+    """
+    try:
+        yield
+    except SurfelMapperError:
+        raise
+    except OSError as found:
+        raise error(f'{name}: cannot be read: {found.strerror or found}') from found
+    except Exception as found:  # MemoryError too
+        raise error(f'{name}: damaged: {type(found).__name__}: {found}') from found

@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import refusing
-from surfel_mapper.errors import ConfigError, FileFormatError, MapError
+from surfel_mapper.errors import ConfigError, FileFormatError, MapError, refusing
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.layout import MAX_MAP_COUNT

@@ -30,8 +30,8 @@ import zipfile
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular, refusing
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.budget import Budget, BYTES_PER_BYTE, FLOOR_BYTES, open_regular
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.files.atomic import replace_file
 
 FORMAT = 'surfel_mapper state'

@@ -19,9 +19,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import refusing
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import FileFormatError, MapLimitError
+from surfel_mapper.errors import FileFormatError, MapLimitError, refusing
 from surfel_mapper.files.state import load_state, save_state
 from surfel_mapper.tsdf.blocks import block_index, block_keys, BlockMap, Blocks
 

@@ -18,7 +18,6 @@ import numpy as np
 from PIL import Image
 import pytest
 
-from surfel_mapper.budget import refusing
 from surfel_mapper.counters import Counters, OTHERS
 from surfel_mapper.errors import (
     CloudFormatError,
@@ -26,6 +25,7 @@ from surfel_mapper.errors import (
     MAX_LINE,
     one_line,
     PoseError,
+    refusing,
 )
 from surfel_mapper.files.map_state import load_map, load_moments, save_map, window_stamps_ns
 from surfel_mapper.files.scan_files import read_scan
