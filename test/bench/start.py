@@ -5,8 +5,8 @@ Processor time of the node until ready, first scan mapped, surfels, all kernels:
 
 The node is ready when it subscribes; the first scan is mapped when it is in the map and counted;
 surfels are published (``~/changed``, ``~/normals``) once their kernels are compiled, in a warm
-start from the first scan on. Clouds are those of a lidar of 10 Hz during all that, dropped the
-ones that were not mapped.
+start from the first scan on. Clouds are those of a lidar of 10 Hz during all that, by the defaults
+of the middleware; dropped are those that were not mapped, lost on the way or in the node.
 
 Cold is a start without compiled kernels, as after an installation by pip or colcon, which compiles
 the modules of Python. Without those either it is bare: a link to the sources, run for the first
