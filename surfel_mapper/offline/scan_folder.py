@@ -36,6 +36,9 @@ if TYPE_CHECKING:
 SENSOR = 'sensor'
 """The frame of the scans, if frames.base_to_sensor is set."""
 
+SURFEL_COLUMNS = {'planarity', 'num_points'}
+"""Columns by which surfels that were written before are recognised."""
+
 PERIOD_NS = 100_000_000
 """Period of scans that have no time: 10 Hz."""
 
@@ -59,7 +62,7 @@ class ScanFolder:
     Raises
     ------
     BagError
-        If poses cannot be assigned to the scans.
+        If poses cannot be assigned to the scans, or the points are surfels of a map.
 
     """
 
@@ -80,7 +83,13 @@ class ScanFolder:
             poses = PosePath(self.dataset.poses_path or self.path, None, self.dataset.trajectory)
         self.poses = poses
         self.stamps = self._stamps()
-        choice = choose_for_folder(request, config, poses is not None, self.first_scan())
+        first = self.first_scan()
+        if first is not None and first.columns.keys() >= SURFEL_COLUMNS:
+            raise BagError(
+                f'{self.path}: surfels of a map, expected scans; merge, extract, evaluate and '
+                'view take them, and map.load begins with map.npz'
+            )
+        choice = choose_for_folder(request, config, poses is not None, first)
         self.config, self.pose_reason = choice.config, choice.reason
         self.span: Span = part(
             str(self.path),

@@ -124,6 +124,15 @@ def test_a_single_scan_with_times_is_mapped_as_at_rest(tmp_path, capsys):
     assert (summary['scans']['mapped'], summary['points'], summary['deskewed']) == (1, 100, True)
 
 
+@pytest.mark.parametrize('verb', ['info', 'replay'])
+def test_surfels_of_a_map_are_not_taken_for_a_scan(tmp_path, capsys, verb):
+    folder = write_scans(tmp_path / 'still')
+    assert main(['replay', str(folder), '--output', str(tmp_path / 'out')]) == 0
+    for path in (tmp_path / 'out', tmp_path / 'out' / 'map.ply'):
+        assert main([verb, str(path)]) == 1
+        assert f'{path}: surfels of a map, expected scans' in capsys.readouterr().err
+
+
 def test_scans_with_times_of_their_points_are_deskewed(tmp_path):
     still = write_scans(tmp_path / 'still')
     equal = write_scans(tmp_path / 'equal', np.zeros(100))
