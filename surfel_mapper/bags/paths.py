@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import lru_cache
+import os
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def stated_counts(path: Path) -> dict[str, int]:
             str(row['topic_metadata']['name']): int(row['message_count'])
             for row in information['topics_with_message_count']
         }
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise damaged_metadata(path / METADATA, error) from error
 
 
@@ -120,7 +121,7 @@ def listed_files(directory: Path, information: Mapping[str, Any]) -> list[Path]:
             f'{directory / METADATA}: relative_file_paths is {names!r}, expected a list of names'
         )
     files = [directory / Path(name).name for name in names]
-    missing = [file.name for file in files if not file.is_file()]
+    missing = [file.name for file in files if not os.path.isfile(file)]
     if missing:
         raise BagError(f'{directory}: {", ".join(missing)} of its {METADATA} is missing')
     foreign = [file.name for file in files if not is_storage(file)]

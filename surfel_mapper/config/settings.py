@@ -245,9 +245,12 @@ def checked_item(
     if isinstance(number, bool) or not isinstance(number, (int, float) if kind is float else int):
         wanted = 'a number' if kind is float else 'a whole number'
         raise ConfigError(f'{name}: {value!r}, expected {wanted}')
+    try:
+        number = kind(number)
+    except (OverflowError, ValueError) as error:  # of hundreds of digits; inf as a whole number
+        raise ConfigError(f'{name}: a number out of the range of floats') from error
     if not takes_text and not math.isfinite(number):
         raise ConfigError(f'{name}: {number}, expected a finite number')
-    number = kind(number)
     if not declared.low <= number <= declared.high:  # false for nan
         bounds = f'[{plain(declared.low)}, {plain(declared.high)}]'
         raise ConfigError(f'{name}: {plain(number)}, expected a value in {bounds}')

@@ -74,6 +74,10 @@ def parse_yaml(text: str, *, as_text: bool = False, max_nodes: int = MAX_NODES) 
         raise ValueError(f'{error.problem or error.context}{place(error.problem_mark)}') from error
     except yaml.YAMLError as error:
         raise ValueError('characters that YAML does not allow') from error
+    except ValueError:
+        raise
+    except Exception as error:  # PyYAML's for a tag whose value is none of it: !!bool maybe
+        raise ValueError(f'a value that its tag does not allow: {error!r}') from error
 
 
 def check_nodes(events: Iterable[Any], max_nodes: int, *, as_text: bool) -> None:

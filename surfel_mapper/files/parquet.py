@@ -142,7 +142,7 @@ def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
 
 def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, SurfelMap, Any]:
     """Return the moments in a file, an empty map of its kind, and the digest that it states."""
-    arrow, parquet = import_pyarrow()
+    _, parquet = import_pyarrow()
     try:
         with open_regular(path) as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
@@ -163,7 +163,7 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except (arrow.ArrowException, ValueError, LookupError, TypeError) as error:
+    except Exception as error:  # of pyarrow, and of attributes of any size and type
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
     return moments, surfel_map, attributes.get('digest')
 

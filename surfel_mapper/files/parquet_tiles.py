@@ -294,7 +294,7 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
 
     Passing the footer, if known, takes a quarter of the time.
     """
-    arrow, parquet = import_pyarrow()
+    _, parquet = import_pyarrow()
     try:
         with (
             open_regular(path) as file,
@@ -307,5 +307,5 @@ def _opened(path: str | Path, footer: Any = None) -> Iterator[tuple[Any, dict[st
         raise
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except (arrow.ArrowException, ValueError, LookupError, TypeError, AttributeError) as error:
+    except Exception as error:  # of pyarrow, and of attributes of any size and type
         raise FileFormatError(f'{path}: damaged, or of another program: {error}') from error

@@ -211,7 +211,9 @@ def nuscenes_poses(tables: Path, files: Sequence[Path]) -> list[Floats]:
                 raise FileFormatError(f'{tables}: no entry for {file.name}')
             T_map_ego = wxyz_pose(ego[row['ego_pose_token']])
             poses.append(T_map_ego @ wxyz_pose(mounts[row['calibrated_sensor_token']]))
-    except (KeyError, TypeError, ValueError) as error:
+    except FileFormatError:
+        raise
+    except Exception as error:  # of rows of any shape, with numbers of any size
         raise FileFormatError(
             f'{tables.parent}: its tables are not those of nuScenes: '
             f'{type(error).__name__}: {error}'

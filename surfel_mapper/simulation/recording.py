@@ -22,7 +22,7 @@ import numpy as np
 
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.budget import read_small_file
-from surfel_mapper.errors import ConfigError, FileFormatError
+from surfel_mapper.errors import ConfigError, FileFormatError, refusing
 from surfel_mapper.messages.pointcloud2 import CloudBytes, Field
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.scan import Scan
@@ -147,16 +147,15 @@ def load_simulation(path: str | Path) -> Simulation:
     """
     world = World.load(Path(path) / WORLD_FILE)
     file = Path(path) / SIMULATION_FILE
-    try:
+    with refusing(file, FileFormatError):
         found = json.loads(read_small_file(file))
-        lidar, drive = Lidar(**_tuples(found['lidar'])), Drive(**_tuples(found['drive']))
-        return Simulation(
-            world, lidar, drive, num_scans=found['num_scans'], rolling=found['rolling']
-        )
-    except OSError as error:
-        raise FileFormatError(f'{file}: cannot be read: {error.strerror}') from error
-    except (KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
-        raise FileFormatError(f'{file}: {type(error).__name__} {error}') from error
+        try:
+            lidar, drive = Lidar(**_tuples(found['lidar'])), Drive(**_tuples(found['drive']))
+            return Simulation(
+                world, lidar, drive, num_scans=found['num_scans'], rolling=found['rolling']
+            )
+        except ConfigError as error:
+            raise FileFormatError(f'{file}: {error}') from error
 
 
 def _write_description(simulation: Simulation, directory: Path) -> None:

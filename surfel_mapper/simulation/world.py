@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import read_small_file
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, refusing
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.circuit import circuit_primitives, Corners
 from surfel_mapper.simulation.kernels import raycast, surfaces
@@ -312,12 +312,12 @@ class World:
             If the file cannot be read or does not hold a world.
 
         """
-        try:
-            return cls.from_mapping(json.loads(read_small_file(path)))
-        except OSError as error:
-            raise FileFormatError(f'{path}: cannot be read: {error.strerror}') from error
-        except ValueError as error:
-            raise FileFormatError(f'{path}: {error}') from error
+        with refusing(path, FileFormatError):
+            content = json.loads(read_small_file(path))
+            try:
+                return cls.from_mapping(content)
+            except FileFormatError as error:
+                raise FileFormatError(f'{path}: {error}') from error
 
     def _normals(self, places: FloatArray, surface: IntArray) -> FloatArray:
         """Return the (N, 3) outward normals of surfaces at positions on or near them."""

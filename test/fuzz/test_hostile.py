@@ -18,9 +18,13 @@ import numpy as np
 from PIL import Image
 import pytest
 
+from surfel_mapper.bags.paths import files_of, stated_counts
+from surfel_mapper.config import load_config
 from surfel_mapper.counters import Counters, OTHERS
 from surfel_mapper.errors import (
+    BagError,
     CloudFormatError,
+    ConfigError,
     FileFormatError,
     MAX_LINE,
     one_line,
@@ -35,6 +39,8 @@ from surfel_mapper.messages.cdr import MAX_FRAME_NAME
 from surfel_mapper.messages.compressed_image import unpacked
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_cloud
 from surfel_mapper.messages.poses import raw_poses
+from surfel_mapper.offline.datasets import nuscenes
+from surfel_mapper.simulation.world import World
 
 TIMEOUT_S = 120
 
@@ -314,3 +320,66 @@ def pose_bytes(parent, child):
     writer.string(child)
     writer.numbers('d', 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     return writer.join()
+
+
+@pytest.mark.parametrize(
+    'value',
+    [
+        '!!int ""',
+        '!!float ""',
+        '!!bool maybe',
+        '!!timestamp yesterday',
+        '!!binary "x"',
+        '!!omap [1]',
+        '!!python/object/apply:os.system ["false"]',
+        '9' * 4299,
+    ],
+    ids=['int', 'float', 'bool', 'time', 'binary', 'omap', 'python', 'digits'],
+)
+def test_yaml_tags_of_other_values_are_refused(tmp_path, value):
+    """PyYAML raised IndexError, KeyError and AttributeError; so did settings and metadata.yaml."""
+    path = tmp_path / 'metadata.yaml'
+    path.write_text(f'map: {{voxel_size_m: {value}}}')
+    with pytest.raises(ConfigError):
+        load_config(path)
+    with pytest.raises(BagError, match='not the metadata'):
+        files_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'problem'),
+    [
+        ('topics_with_message_count: [{topic_metadata: {name: /a}, message_count: .inf}]', 'inf'),
+        (f'relative_file_paths: [{"a" * 5000}.mcap]', 'is missing'),
+    ],
+    ids=['count', 'name'],
+)
+def test_metadata_of_impossible_numbers_and_names_is_refused(tmp_path, text, problem):
+    path = tmp_path / 'metadata.yaml'
+    path.write_text(f'rosbag2_bagfile_information: {{{text}}}')
+    with pytest.raises(BagError, match=problem):
+        (stated_counts if 'count' in text else files_of)(tmp_path)
+
+
+def test_json_of_a_world_that_is_nested_too_deeply_is_refused(tmp_path):
+    path = tmp_path / 'world.json'
+    path.write_text('[' * 100_000)
+    with pytest.raises(FileFormatError, match=r'world\.json: damaged: RecursionError'):
+        World.load(path)
+    path.write_text(json.dumps({'format': 'x'}))
+    with pytest.raises(FileFormatError, match=r'world\.json: '):
+        World.load(path)
+
+
+def test_tables_of_nuscenes_with_numbers_of_any_size_are_refused(tmp_path):
+    scan = tmp_path / 'samples' / 'LIDAR_TOP' / 'a__1.pcd.bin'
+    scan.parent.mkdir(parents=True)
+    scan.write_bytes(bytes(20))
+    row = {'token': 'a', 'rotation': [10**400, 0, 0, 0], 'translation': [0, 0, 0]}
+    data = {'filename': scan.name, 'ego_pose_token': 'a', 'calibrated_sensor_token': 'a'}
+    for name, found in (('sample_data', data), ('ego_pose', row), ('calibrated_sensor', row)):
+        path = tmp_path / 'v1.0-mini' / f'{name}.json'
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(json.dumps([found]))
+    with pytest.raises(FileFormatError, match='not those of nuScenes: OverflowError'):
+        nuscenes(tmp_path)
