@@ -46,9 +46,14 @@ def one_line(text: object) -> str:
     if len(string) > MAX_LINE:
         half = MAX_LINE // 2 - 20
         string = f'{string[:half]} ... {len(string)} characters ... {string[-half:]}'
-    if string.isprintable():
-        return string
-    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in string)
+    return escaped(string)
+
+
+def escaped(text: str) -> str:
+    """Return text of any length with control characters escaped."""
+    if text.isprintable():
+        return text
+    return ''.join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 class LineFormatter(logging.Formatter):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import positive_float, positive_int
+from surfel_mapper.cli._output import show_lines
 from surfel_mapper.errors import FileFormatError
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def run(args: argparse.Namespace) -> int:
     else:
         result, lines = maps(args)
     content = {'map': str(args.map), 'truth': str(args.truth), **result}
-    print(json.dumps(content) if args.json else '\n'.join(lines))
+    show_lines(json.dumps(content) if args.json else '\n'.join(lines))
     return 0
 
 

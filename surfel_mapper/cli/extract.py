@@ -17,6 +17,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.cli._output import show_lines
+
 if TYPE_CHECKING:
     from surfel_mapper.models.multi_model import MultiModel
 
@@ -101,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     )
     draw_points(args.output / picture.file_name, picture)
     content = figures(model, evaluate(model, points), len(points))
-    print(json.dumps(content) if args.json else report(content))
+    show_lines(json.dumps(content) if args.json else report(content))
     return 0
 
 

@@ -10,6 +10,8 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from surfel_mapper.cli._output import show_lines
+
 if TYPE_CHECKING:
     from surfel_mapper.offline.filtering import FilteredClouds
 
@@ -77,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps({**asdict(done), 'outputs': [str(path) for path in done.outputs]}))
     else:
-        print(report(done))
+        show_lines(report(done))
     return 0
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import time
 
 from surfel_mapper.cli._arguments import add_workers, positive_int
+from surfel_mapper.cli._output import show_lines
 from surfel_mapper.offline.summary import rounded
 
 SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
@@ -63,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(summary))
         return 0
-    print(
+    show_lines(
         f'{len(args.maps)} maps   points {rounded(tiled.points)}   '
         f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
         f'digest {tiled.digest}\n{tiled.directory}'

@@ -11,9 +11,9 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-import sys
 
 from surfel_mapper.cli._arguments import positive_float, seconds
+from surfel_mapper.cli._output import show_lines
 
 SUMMARY = 'Publish the messages of a bag over DDS at the pace of their record times.'
 
@@ -70,8 +70,8 @@ def run(args: argparse.Namespace) -> int:
             ros_args=args.ros_args,
         )
     for topic, reason in report['skipped'].items():
-        print(f'surfel-mapper play: {topic} skipped: {reason}', file=sys.stderr)
+        show_lines(f'surfel-mapper play: {topic} skipped: {reason}', to_stderr=True)
     counts = '   '.join(f'{topic} {number}' for topic, number in report['published'].items())
     text = f'published in {report["seconds"]:.1f} s: {counts}'
-    print(json.dumps(report) if args.json else text)
+    show_lines(json.dumps(report) if args.json else text)
     return 0

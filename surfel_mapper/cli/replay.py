@@ -17,7 +17,6 @@ import argparse
 import json
 import math
 from pathlib import Path
-import sys
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import (
@@ -30,6 +29,7 @@ from surfel_mapper.cli._arguments import (
     seconds,
     UsageError,
 )
+from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
@@ -184,13 +184,13 @@ def run(args: argparse.Namespace) -> int:
                     raise KeyboardInterrupt from None
                 raise
         summary = result.summary
-        print(json.dumps(summary) if args.json else as_text(summary, result.written))
+        show_lines(json.dumps(summary) if args.json else as_text(summary, result.written))
         if summary['interrupted']:
             return INTERRUPTED
         if stopped():  # while files were written
             raise KeyboardInterrupt
     if uncertain := uncertain_text(summary):
-        print(f'surfel-mapper: {uncertain}', file=sys.stderr)
+        show_lines(f'surfel-mapper: {uncertain}', to_stderr=True)
         return APART
     return CUT if args.strict and summary['cut'] else 0
 

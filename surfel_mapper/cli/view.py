@@ -17,6 +17,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import positive_int, UsageError
+from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._progress import progress
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ def shown(args: argparse.Namespace) -> int:
             min_points=args.min_points,
         )
         for name, sentence in shown.about.items():
-            print(f'{name}: {sentence}', flush=True)
+            show_lines(f'{name}: {sentence}')
         return shown
 
     if args.glb is not None:

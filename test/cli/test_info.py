@@ -110,3 +110,18 @@ def test_frames_are_shown_without_the_slash_of_ros1(tmp_path, capsys):
 
     assert main(['info', str(write_ros1(tmp_path / 'a.bag', entries))]) == 0
     assert f'  /tf: {NUM_SCANS} of {NUM_SCANS}, in the frame odom' in capsys.readouterr().out
+
+
+def test_names_of_columns_cannot_write_to_the_terminal(tmp_path, capsys):
+    """A PLY has its columns' names, and a file its own, from outside."""
+    folder = tmp_path / 'scans\x1b[2J'
+    folder.mkdir()
+    properties = ''.join(f'property float {name}\n' for name in ('x', 'y', 'z', '\x1b[31m'))
+    (folder / '1.ply').write_text(
+        f'ply\nformat ascii 1.0\nelement vertex 1\n{properties}end_header\n1 2 3 4\n'
+    )
+    assert main(['info', str(folder)]) == 0
+    text = capsys.readouterr().out
+    assert 'columns beside x y z: \\x1b[31m' in text
+    assert 'scans\\x1b[2J: scans in files' in text
+    assert '\x1b' not in text
