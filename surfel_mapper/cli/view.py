@@ -90,9 +90,8 @@ def run(args: argparse.Namespace) -> int:
 
 
 def shown(args: argparse.Namespace) -> int:
-    """Open a scene, show everything, and wait if there is a page to serve."""
-    from surfel_mapper.viz.contents import contents, is_shown
-    from surfel_mapper.viz.server import import_rerun
+    """Show a live node, a recording, or the contents of files; return 0."""
+    from surfel_mapper.viz.contents import is_shown
 
     if bool(args.what) == (args.live is not None):
         raise UsageError('expected WHAT to show, or --live')
@@ -112,6 +111,16 @@ def shown(args: argparse.Namespace) -> int:
             show_recording(recordings[0], args, scene)
             finish(scene)
         return 0
+    show_files(args)
+    return 0
+
+
+def show_files(args: argparse.Namespace) -> None:
+    """Read files, show them or write them as glTF, and wait if there is a page to serve."""
+    from surfel_mapper.viz.contents import contents
+    from surfel_mapper.viz.server import import_rerun
+
+    many = len(args.what) > 1
 
     def read() -> list[Content]:
         names = [path.resolve().name if many and path.is_dir() else '' for path in args.what]
@@ -143,14 +152,13 @@ def shown(args: argparse.Namespace) -> int:
         from surfel_mapper.viz.gltf import GltfScene
 
         show_all(GltfScene(args.glb))
-        return 0
+        return
     with opened(args) as scene:
         found_maps = show_all(scene)
         announce(scene)
         if scene.window and found_maps.is_coarse:
             follow(scene, found_maps)
         finish(scene)
-    return 0
 
 
 def opened(args: argparse.Namespace) -> Scene:
