@@ -50,6 +50,10 @@ def replace_file(path: str | Path, *, lasting: bool = True) -> Iterator[BinaryIO
         file = open(temporary, 'x+b')  # noqa: SIM115 - closed before it is renamed
     except OSError as error:
         raise cannot_write(path, error) from error
+    except BaseException:  # without memory for the object: the file has been made
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise
     try:
         with file:
             yield file

@@ -258,6 +258,23 @@ def in_child(testcapi, surfel_map, call, number, allowed):
     return os.waitstatus_to_exitcode(status)
 
 
+def test_an_allocation_that_fails_leaves_no_file_beside_the_one_to_be_written(tmp_path):
+    """Python creates a file before it allocates the object for it."""
+    testcapi = pytest.importorskip('_testcapi', reason='this Python lacks _testcapi')
+    path, failures = tmp_path / 'a', 0
+    atomic.write_json(path, {})
+    for number in range(600):
+        testcapi.set_nomemory(number, number + 1)
+        try:
+            atomic.write_json(path, {'number': 1})
+        except Exception:  # Python turns some into a TypeError or RuntimeError
+            failures += 1
+        finally:
+            testcapi.remove_mem_hooks()
+        assert [*tmp_path.iterdir()] == [path], number
+    assert failures > 20
+
+
 def test_a_replay_that_cannot_write_once_leaves_the_whole_map_or_none(tmp_path):
     bag = recorded.write_rosbag2(tmp_path / 'bag', recorded.drive())
     with pytest.MonkeyPatch.context() as patch:
