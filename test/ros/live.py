@@ -19,12 +19,11 @@ from nav_msgs.msg import Odometry
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2, PointField
 from std_srvs.srv import Trigger
-
-from surfel_mapper.ros.base_node import BaseNode
 
 ROOT = Path(__file__).parents[2]
 TIMEOUT_S = 120.0
@@ -99,10 +98,10 @@ class Process:
 class Peer:
     """A node of the test that publishes and collects messages."""
 
-    def __init__(self, arguments=()):
+    def __init__(self, arguments=(), node_type=Node):
         self._context = rclpy.Context()
         rclpy.init(args=list(arguments), context=self._context)
-        self.node = BaseNode('peer', context=self._context)
+        self.node = node_type('peer', context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._publishers = {}

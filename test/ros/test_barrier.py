@@ -6,8 +6,11 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
-from nav_msgs.srv import LoadMap
 import pytest
+
+pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+
+from nav_msgs.srv import LoadMap
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -17,15 +20,24 @@ from surfel_mapper.errors import BagError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.drops import INTERNAL
 from surfel_mapper.ros import services
-from surfel_mapper.ros.base_node import steady_timer
+from surfel_mapper.ros.base_node import BaseNode, steady_timer
 from surfel_mapper.ros.line_logger import LineLogger
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.services import Services
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
+from test.ros.live import Peer
 
 
 def fail(*_):
     raise MemoryError('no\nroom')
+
+
+@pytest.fixture
+def peer(domain):
+    """Return a node of this process that is guarded as ours is."""
+    peer = Peer(node_type=BaseNode)
+    yield peer
+    peer.close()
 
 
 @pytest.fixture
