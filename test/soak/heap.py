@@ -3,7 +3,7 @@
 """
 The heap of this process by glibc: in use, and freed but kept for later allocations.
 
-Apart, because the layer of a soak calls it inside the node, where nothing of the soak is imported.
+A module of its own: the layer of the soak calls it in the node, without the rest of the soak.
 Resident memory alone does not tell growth from memory that glibc keeps (memory.py).
 """
 

@@ -46,7 +46,7 @@ class ChangedBlocks:
     Parameters
     ----------
     mesher : Mesher
-        What they are for.
+        Makes the mesh of the copied blocks.
 
     """
 
