@@ -97,3 +97,14 @@ def peer(domain):
     peer = Peer()
     yield peer
     peer.close()
+
+
+@pytest.fixture
+def guarded_peer(domain):
+    """Return a node in the process of the test whose callbacks are guarded as those of ours."""
+    from surfel_mapper.ros.base_node import BaseNode
+    from test.ros.live import Peer
+
+    peer = Peer(node_type=BaseNode)
+    yield peer
+    peer.close()

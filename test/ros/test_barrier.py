@@ -33,11 +33,8 @@ def fail(*_):
 
 
 @pytest.fixture
-def peer(domain):
-    """Return a node of this process that is guarded as ours is."""
-    peer = Peer(node_type=BaseNode)
-    yield peer
-    peer.close()
+def peer(guarded_peer):
+    return guarded_peer
 
 
 @pytest.fixture

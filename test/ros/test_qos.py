@@ -15,6 +15,7 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 
+from surfel_mapper.ros.base_node import BaseNode
 from surfel_mapper.ros.context import PROFILE
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
 from test.ros.live import Peer, reliably, START_NS
@@ -23,6 +24,11 @@ from test.ros.ordinary import node_on_defaults, NUMBER, publish
 SIZES = (200_000, 800_000, 2_000_000, 4_000_000, 8_000_000)
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
+
+
+@pytest.fixture
+def peer(guarded_peer):
+    return guarded_peer
 
 
 @pytest.fixture(scope='module')
@@ -161,7 +167,7 @@ def test_no_message_is_lost_or_doubled_when_the_subscription_changes(bench):
 
 @pytest.mark.parametrize('chosen', ['reliable', 'best_effort'])
 def test_a_reliability_set_by_the_user_stays(domain, chosen):
-    peer = Peer(arguments=['--ros-args', *reliably('/chosen', value=chosen)])
+    peer = Peer(['--ros-args', *reliably('/chosen', value=chosen)], BaseNode)
     bench = Bench(peer, 'chosen')
     try:
         bench.subscribe()
@@ -180,7 +186,7 @@ def test_a_reliability_set_by_the_user_stays(domain, chosen):
 
 
 def test_the_depth_set_by_the_user_stays_with_every_new_subscription(domain):
-    peer = Peer(arguments=['--ros-args', '-p', 'qos_overrides./deep.subscription.depth:=7'])
+    peer = Peer(['--ros-args', '-p', 'qos_overrides./deep.subscription.depth:=7'], BaseNode)
     bench = Bench(peer, 'deep')
     try:
         bench.subscribe()

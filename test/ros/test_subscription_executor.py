@@ -69,6 +69,11 @@ def test_malformed_messages_are_counted_and_valid_ones_mapped(start, peer):
     assert '60 bytes that are not a message of odometry' in node.output
 
 
+@pytest.fixture
+def peer(guarded_peer):
+    return guarded_peer
+
+
 class Bench:
     """A subscription executor in the node of a peer, the messages taken, and its failures."""
 
