@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 import logging
 from pathlib import Path
+import time
 from typing import Any
 
 import numpy as np
@@ -45,6 +46,9 @@ class MapReduceResult:
         Shards that were mapped again because they had begun too late.
     interrupted : bool
         Whether shards are missing because it was stopped.
+    map_s, merge_s : float
+        Seconds until all shards were mapped, with the start of the workers, and until they were
+        merged.
 
     """
 
@@ -52,6 +56,8 @@ class MapReduceResult:
     results: list[ShardResult]
     repeated: int
     interrupted: bool
+    map_s: float
+    merge_s: float
 
     @property
     def positions(self) -> npt.NDArray[np.float64]:
@@ -97,14 +103,21 @@ def map_bags(
         If a bag cannot be read, a file cannot be written, or the workers are lost.
 
     """
+    began_s = time.perf_counter()
     with work_directory(directory) as work:
         run = ShardRun(list(shards), executor, work, on_done)
         is_whole = run.all(stopped)
         results = run.ordered()
+        mapped_s = time.perf_counter()
         parts = parts_by_tile(result.parts for result in results)
         tiled = merge_parts(parts, executor, directory, shards[0].config.map.min_points, on_done)
     return MapReduceResult(
-        map=tiled, results=results, repeated=run.repeated, interrupted=not is_whole
+        map=tiled,
+        results=results,
+        repeated=run.repeated,
+        interrupted=not is_whole,
+        map_s=mapped_s - began_s,
+        merge_s=time.perf_counter() - mapped_s,
     )
 
 

@@ -118,11 +118,13 @@ def replay_bags(
             done_s += amount
             progress(round(done_s), round(total_s))
 
+    surveyed_s = time.perf_counter()
     with open_executor(workers, scheduler) as executor:
         jobs, frame = [(each.request, config) for each in found], None
         if is_registered:
             frame = registered(found, config, output, executor, on_done, stopped)
             jobs = [(each.request, each.config) for each in frame.placed]
+        registered_s = time.perf_counter()
         mapped = mapped_together(jobs, recorded_s, executor, output, on_done, stopped)
         num_workers = executor.num_workers
     summary = {
@@ -130,6 +132,12 @@ def replay_bags(
         'bags': [str(request.path) for request in requests],
         'recorded_s': recorded_s,
         'replay_s': time.perf_counter() - began,
+        'wall_s': {
+            'survey': surveyed_s - began,
+            **({} if frame is None else {'register': registered_s - surveyed_s}),
+            'map': mapped.map_s,
+            'merge': mapped.merge_s,
+        },
         'interrupted': mapped.interrupted,
         'cut': [cut for each in found for cut in each.cuts],
         **mapped.counts(),

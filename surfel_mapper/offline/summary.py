@@ -13,24 +13,12 @@ MOST_SURROUNDED = 5
 
 
 def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
-    """
-    Return the summary in a few lines for people.
-
-    The times of the stages are those of the whole replay by scan received, in the thread that
-    maps; ``other`` is the rest of the total, mostly the time to pass scans to a second thread.
-    """
-    from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
-
-    scans, times = summary['scans'], summary['milliseconds']
-    out = f' ({sum(scans["dropped"].values())} dropped: {causes_text(scans["dropped"])})'
+    """Return the summary in a few lines for people."""
+    scans = summary['scans']
+    num_dropped = sum(scans['dropped'].values())
+    out = f' ({num_dropped} dropped: {causes_text(scans["dropped"])})' if num_dropped else ''
     gated = f' ({scans["gated"]} left out by the motion gate)'
     localised = f' ({scans["localised"]} aligned to a frozen map)' if 'localised' in scans else ''
-    slowest = times['total']['p99'] if 'total' in times else 0.0
-    share = 1e3 / max(scans['received'], 1)
-    means = {stage: s for stage, s in in_order(summary['stage_s'], STAGES) if stage != 'total'}
-    means['other'] = summary['replay_s'] - sum(means.values())
-    means['total'] = summary['replay_s']
-    stages = '   '.join(f'{stage} {share * seconds:.1f} ms' for stage, seconds in means.items())
     filters = ''.join(
         f'{name}: {rounded(done["points_in"])} points in, {rounded(done["points_out"])} out, '
         f'{done["milliseconds"]["median"]:.1f} ms a scan\n'
@@ -41,7 +29,6 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     )
     errors = f'{errors_text(summary["pose_errors"])}\n' if 'pose_errors' in summary else ''
     apart = uncertain_text(summary)
-    speed = summary['recorded_s'] / summary['replay_s']
     deskewed = ', deskewed' if summary.get('deskewed') else ''
     poses = (
         f'poses from {summary["poses_from"]}{deskewed}: {summary["poses_reason"]}\n'
@@ -50,14 +37,39 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
     )
     return (
         f'{poses}'
-        f'scans {scans["received"]}{out if scans["dropped"] else ""}'
+        f'scans {scans["received"]}{out}'
         f'{gated if scans["gated"] else ""}{localised}   points {rounded(summary["points"])}   '
         f'surfels {summary["surfels"]}\n'
-        f'{stages} a scan (p99 {slowest:.1f})   {speed:.1f} times real time\n'
+        f'{stages_text(summary)}\n'
         f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
         f'{"   ".join(str(path) for path in written)}'
     )
+
+
+def stages_text(summary: Mapping[str, Any]) -> str:
+    """
+    Return the times of the stages, whose sum is the total, and the speed.
+
+    Each is that of the whole replay by scan received, in the thread that maps; ``other`` is the
+    rest of the total, mostly the time to pass scans to a second thread. Workers map at the same
+    time, so theirs are the stages of the whole, in seconds.
+    """
+    from surfel_mapper.counters import STAGES  # loads numpy, which --help does not need
+
+    of_workers = summary.get('wall_s')
+    stages = of_workers.items() if of_workers else in_order(summary['stage_s'], STAGES)
+    found = {stage: s for stage, s in stages if stage != 'total'}
+    found['other'] = summary['replay_s'] - sum(found.values())
+    found['total'] = summary['replay_s']
+    speed = f'{summary["recorded_s"] / summary["replay_s"]:.1f} times real time'
+    if of_workers:
+        return '   '.join([*(f'{stage} {s:.1f} s' for stage, s in found.items()), speed])
+    share = 1e3 / max(summary['scans']['received'], 1)
+    means = '   '.join(f'{stage} {share * s:.1f} ms' for stage, s in found.items())
+    times = summary['milliseconds']
+    slowest = times['total']['p99'] if 'total' in times else 0.0
+    return f'{means} a scan (p99 {slowest:.1f})   {speed}'
 
 
 def in_order(values: Mapping[str, Any], names: Sequence[str]) -> list[tuple[str, Any]]:
@@ -117,7 +129,7 @@ def errors_text(errors: Mapping[str, Any]) -> str:
 
 def causes_text(counts: Mapping[str, int]) -> str:
     """Return counts of drops by cause in one line: no pose 4, no points 1."""
-    return ', '.join(f'{cause.replace("_", " ")} {count}' for cause, count in counts.items())
+    return ', '.join(f'{cause.replace("_", " ")} {n}' for cause, n in counts.items() if n)
 
 
 def rounded(number: int) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 import json
 from pathlib import Path
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +21,7 @@ from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.trajectory import Trajectory
 from surfel_mapper.geometry import inverse, rotation_angle
 from surfel_mapper.offline.request import Request
+from surfel_mapper.offline.summary import as_text
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
 
 LIDAR = Lidar(beams=32, columns=256, range_noise_m=0.01)
@@ -80,6 +82,15 @@ def test_two_recordings_are_mapped_in_the_frame_of_the_first(placed):
             off = inverse(mine) @ inverse(true[0][0]) @ right
             assert np.linalg.norm(off[:3, 3]) < 0.05
             assert rotation_angle(off) < 0.01
+
+
+def test_the_printed_stages_of_workers_are_parts_of_the_wall_time(placed):
+    (line,) = [text for text in as_text(placed.summary, []).splitlines() if 'real time' in text]
+    printed = dict(re.findall(r'(\w+) (-?[\d.]+) s', line))
+    assert list(printed) == ['survey', 'register', 'map', 'merge', 'other', 'total']
+    *parts, total = map(float, printed.values())
+    assert min(parts) >= 0.0
+    assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding
 
 
 def test_the_map_is_that_of_the_recordings_at_these_poses(placed, tmp_path):

@@ -20,12 +20,11 @@ from surfel_mapper.errors import BagError
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.drops import INTERNAL
 from surfel_mapper.ros import services
-from surfel_mapper.ros.base_node import BaseNode, steady_timer
+from surfel_mapper.ros.base_node import steady_timer
 from surfel_mapper.ros.line_logger import LineLogger
 from surfel_mapper.ros.mapping_thread import MappingThread
 from surfel_mapper.ros.services import Services
 from surfel_mapper.ros.subscription_executor import SubscriptionExecutor
-from test.ros.live import Peer
 
 
 def fail(*_):
