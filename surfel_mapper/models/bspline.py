@@ -21,12 +21,15 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.bspline import (
     add_differences,
     add_equations,
+    clamped_knots,
     evaluate_basis,
     evaluate_field,
-    solve_band,
+    fit_fields,
+    greville_places,
 )
 
 Array = npt.NDArray[np.float64]
@@ -37,8 +40,8 @@ RIDGE = 1e-6
 LSQR_STEPS = 2000
 """Most iterations of LSQR."""
 
-SMALL_SOLVE = 1e6
-"""Our kernel is faster than LAPACK up to this number of multiplications."""
+MOST_AT_ONCE = 2e6
+"""Multiplications of a banded solve, about 1 ms, above which a field is large."""
 
 CACHED_AXES = 4096
 """Cached axes (knots, Greville abscissae): few different sizes occur."""
@@ -57,16 +60,14 @@ def knots(num_cells: int, degree: int) -> Array:
         At most num_cells + 1.
 
     """
-    inner = np.arange(1, num_cells + 2 - degree) / (num_cells + 2 - degree)
-    return np.concatenate([np.zeros(degree + 1), inner, np.ones(degree + 1)])
+    found: Array = clamped_knots(num_cells, degree)
+    return found
 
 
 @lru_cache(CACHED_AXES)
 def greville_cells(num_cells: int, degree: int) -> Array:
     """Return the Greville abscissae along an axis, in cells; cached, read-only."""
-    knot = knots(num_cells, degree)
-    total = sum((knot[k : k + num_cells + 2] for k in range(1, degree + 1)), 0.0)
-    found: Array = np.asarray(total) * ((num_cells + 1) / degree) - 0.5
+    found: Array = greville_places(knots(num_cells, degree), degree, 1.0)
     return found
 
 
@@ -264,15 +265,69 @@ def fit_pspline(
     add_equations(np.column_stack([xy, z]), weight / weight.mean(), start.parts(), band, right)
     add_differences(*start.greville(), smoothing, band)
     band[:, 0] += RIDGE
-    if band.size * reach < SMALL_SOLVE:
-        solve_band(band, right)
-    else:
-        from scipy.linalg import solveh_banded
+    from scipy.linalg import solveh_banded  # seconds to import
 
-        right = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
+    right = solveh_banded(band.T, right, lower=True, check_finite=False, overwrite_ab=True)
     return HeightField(
         start.pitch_m, start.origin, start.degrees, right.reshape(start.control.shape)
     )
+
+
+def is_small(sizes: npt.NDArray[np.int64], degree: int) -> npt.NDArray[np.bool_]:
+    """Return which grids of (K, 2) cells have fields that ``fit_grids`` fits."""
+    number = (sizes + 2).prod(axis=1)
+    found: npt.NDArray[np.bool_] = number * (degree * sizes.min(axis=1)) ** 2 <= MOST_AT_ONCE
+    return found
+
+
+def fit_grids(
+    cells: Cells, chosen: npt.NDArray[np.int64], degree: int, smoothing: float
+) -> tuple[list[HeightField], Array]:
+    """
+    Return small fields that ``fit_pspline`` would fit to the means of their cells.
+
+    Parameters
+    ----------
+    cells : Cells
+        The cells of all patches.
+    chosen : (F,) int64
+        Patches whose fields are asked for; see is_small.
+    degree : int
+        Degree of the splines, reduced along axes with too few cells.
+    smoothing : float
+        Weight of the second differences, for a mean weight of 1.
+
+    Returns
+    -------
+    list of HeightField
+        F fields.
+    (C,) float64, m
+        Mean heights of the cells of these patches, nan for empty cells and other patches.
+
+    """
+    shapes = cells.sizes[chosen] + 2
+    ends = np.cumsum(shapes.prod(axis=1))
+    begin = ends - shapes.prod(axis=1)
+    control = np.empty(int(ends[-1]) if len(ends) else 0)
+    heights = np.full(len(cells.sums), np.nan)
+    numbers = cells.first, cells.sizes
+    rules = degree, smoothing, RIDGE
+    fit_fields(
+        cells.sums, numbers, chosen, cells.pitches, cells.origins, rules, begin, control, heights
+    )
+    parts = zip(
+        cells.pitches[chosen].tolist(),
+        cells.origins[chosen],
+        shapes.tolist(),
+        begin.tolist(),
+        ends.tolist(),
+        strict=True,
+    )
+    found = []
+    for pitch_m, origin, (x, y), low, high in parts:
+        degrees = axis_degree(x - 2, degree), axis_degree(y - 2, degree)
+        found.append(HeightField(pitch_m, origin, degrees, control[low:high].reshape(x, y)))
+    return found, heights
 
 
 def transposed(field: HeightField) -> HeightField:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Height fields of a map that changes: small ones are refitted, large ones only near changes.
+Large height fields of a map that changes are refitted only near changes.
 
 A cell whose mean height changed by less than ``STILL_M`` keeps the height that it was fitted
 with. Control points farther than ``MARGIN`` cells from a change stay as they are: its influence
@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.bspline import fit_pspline, HeightField, initial_field, RIDGE
+from surfel_mapper.models.bspline import HeightField, initial_field, RIDGE
 from surfel_mapper.models.kernels.bspline_incremental import (
     conjugate_gradients,
     equations,
@@ -28,9 +28,6 @@ from surfel_mapper.models.kernels.bspline_incremental import (
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
-
-MOST_AT_ONCE = 2e6
-"""Multiplications of a banded solve, about 1 ms, above which a field is large."""
 
 SMOOTHING = 1e-2
 """Weight of the second differences."""
@@ -44,7 +41,7 @@ MARGIN = 5
 DEGREE = 3
 """Degree of the splines."""
 BLOCK = 16
-"""Large grids start and end at multiples of this number of cells."""
+"""Grids start and end at multiples of this number of cells."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +66,7 @@ def fit_field(
     pitch_m: float, origin: Array, sums: Array, before: FittedField | None
 ) -> FittedField:
     """
-    Return the field that fits the mean heights of cells.
+    Return the field that fits the mean heights of many cells; others see fit_grids.
 
     Parameters
     ----------
@@ -83,17 +80,11 @@ def fit_field(
         The previous field, over cells of the same lattice.
 
     """
-    size = (sums.shape[0] + 2) * (sums.shape[1] + 2)
-    is_large = size * (DEGREE * min(sums.shape[:2])) ** 2 > MOST_AT_ONCE
-    if is_large:
-        origin, sums = in_blocks(pitch_m, origin, sums)
+    origin, sums = in_blocks(pitch_m, origin, sums)
     filled: Mask = sums[..., 3] > 0.0
     means = sums[..., :3] / np.where(filled, sums[..., 3], 1.0)[..., None]
     heights = np.where(filled, means[..., 2], np.nan)
     start = initial_field(pitch_m, origin, means[..., 2], filled, DEGREE)
-    if not is_large:
-        xyz, number = means[filled], sums[..., 3][filled]
-        return FittedField(fit_pspline(start, xyz[:, :2], xyz[:, 2], number, SMOOTHING), heights)
     known = np.zeros(start.control.shape, np.bool_)
     known[1:-1, 1:-1] = touched = filled
     if before is not None:

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from surfel_mapper.models.kernels.grid import find_covered, find_covered_squares
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,3 +87,41 @@ class Grid:
         """Bytes when packed: header, two bits a cell, two bits and three bytes a boundary cell."""
         cuts = int(self.rim.sum())
         return 16 + 2 * -(-self.filled.size // 8) + 3 * cuts + -(-cuts // 4)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cells:
+    """The cells of all patches, one row each; see models/kernels/grid.py."""
+
+    pitches: Array
+    origins: Array
+    sizes: Indices
+    first: Indices
+    sums: Array
+    rim: npt.NDArray[np.bool_]
+    corner: npt.NDArray[np.uint8]
+    cuts: npt.NDArray[np.uint8]
+
+    def of(self, patch: int) -> slice:
+        """Return the rows of a patch."""
+        begin, (x, y) = int(self.first[patch]), self.sizes[patch].tolist()
+        return slice(begin, begin + x * y)
+
+    def grids(self) -> list[Grid]:
+        """Return the coverage of every patch."""
+        filled = self.sums[:, 3] > 0.0
+        rows = zip(self.first.tolist(), self.sizes.tolist(), strict=True)
+        spans = [(low, low + x * y, (x, y)) for low, (x, y) in rows]
+        return [
+            Grid(
+                pitch_m=pitch_m,
+                origin=origin,
+                filled=filled[low:high].reshape(shape),
+                rim=self.rim[low:high].reshape(shape),
+                corner=self.corner[low:high].reshape(shape),
+                cuts=self.cuts[low:high].reshape(*shape, 3),
+            )
+            for pitch_m, origin, (low, high, shape) in zip(
+                self.pitches.tolist(), self.origins, spans, strict=True
+            )
+        ]

@@ -18,8 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.mapping.moments import unpack_keys
-from surfel_mapper.models.bspline import HeightField
-from surfel_mapper.models.bspline_incremental import fit_field, FittedField
+from surfel_mapper.models.bspline import fit_grids, HeightField, is_small
+from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, FittedField, SMOOTHING
+from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.bspline import rms_off_field
 from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.kernels.surfel_classes import FLAT
@@ -122,24 +123,42 @@ class PatchFitter:
         cells = cells_of(
             groups, (origins, frames, pitches, local), 0.5 * self._size_m, snapped=True
         )
+        fields = self._fields(cells, curved, before, stays)
+        shifts = np.einsum('kij,kj->ki', frames, means - origins)
+        cells.origins[:] -= shifts[:, :2]  # published grids are relative to the mean
+        rms_m = rms_across(covariances, frames[:, 2], total)
         found = []
-        for k, known in enumerate(before):
-            field, spline, rms_m = None, None, 0.0
-            shift = frames[k] @ (means[k] - origins[k])
-            if curved[k]:
-                sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-                was = known.fitted if known is not None and stays[k] else None
-                field = fit_field(float(pitches[k]), cells.origins[k].copy(), sums, was)
-                rms_m = self._rms_m(field.field, frames[k], origins[k], rows[k])
-                spline = moved(field.field, shift)
-            cells.origins[k] -= shift[:2]  # published grids are relative to the mean
-            common = (ids[k], int(total[k]), means[k], covariances[k], frames[k])
-            if spline is None:
-                rms_m = rms_across(covariances[k], frames[k, 2], int(total[k]))
-                patch = Plane(*common, rms_m, cells.grid(k))
+        for k, grid in enumerate(cells.grids()):
+            field, common = fields.get(k), (ids[k], int(total[k]), means[k], covariances[k])
+            if field is None:
+                patch = Plane(*common, frames[k], float(rms_m[k]), grid)
             else:
-                patch = Surface(*common, rms_m, cells.grid(k), spline)
+                error_m = self._rms_m(field.field, frames[k], origins[k], rows[k])
+                spline = moved(field.field, shifts[k])
+                patch = Surface(*common, frames[k], error_m, grid, spline)
             found.append((patch, origins[k], field))
+        return found
+
+    def _fields(
+        self,
+        cells: Cells,
+        curved: npt.NDArray[np.bool_],
+        before: list[Tracked | None],
+        stays: npt.NDArray[np.bool_],
+    ) -> dict[int, FittedField]:
+        """Return the fields of curved patches: small ones anew, large ones near changes."""
+        chosen = np.flatnonzero(curved)
+        small = is_small(cells.sizes[chosen], DEGREE)
+        fitted, heights = fit_grids(cells, chosen[small], DEGREE, SMOOTHING)
+        found = {
+            k: FittedField(field, heights[cells.of(k)].reshape(cells.sizes[k]))
+            for k, field in zip(chosen[small].tolist(), fitted, strict=True)
+        }
+        for k in chosen[~small].tolist():
+            known = before[k]
+            sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
+            was = known.fitted if known is not None and stays[k] else None
+            found[k] = fit_field(float(cells.pitches[k]), cells.origins[k].copy(), sums, was)
         return found
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:

@@ -10,14 +10,20 @@ the work.
 from __future__ import annotations
 
 from dataclasses import dataclass
-import math
 
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.bspline import fit_lsqr, fit_pspline, HeightField, initial_field
-from surfel_mapper.models.grid import Grid
+from surfel_mapper.models.bspline import (
+    fit_grids,
+    fit_lsqr,
+    fit_pspline,
+    HeightField,
+    initial_field,
+    is_small,
+)
+from surfel_mapper.models.grid import Cells
 from surfel_mapper.models.kernels.grid import fill_cells, place_grids
 from surfel_mapper.models.kernels.patches import describe_patches
 from surfel_mapper.models.multi_model import Plane, Surface
@@ -66,37 +72,6 @@ class PatchPoints:
     curved: npt.NDArray[np.bool_] | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Cells:
-    """The cells of all patches, one row each; see models/kernels/grid.py."""
-
-    pitches: Array
-    origins: Array
-    sizes: Indices
-    first: Indices
-    sums: Array
-    rim: npt.NDArray[np.bool_]
-    corner: npt.NDArray[np.uint8]
-    cuts: npt.NDArray[np.uint8]
-
-    def of(self, patch: int) -> slice:
-        """Return the rows of a patch."""
-        begin, (x, y) = int(self.first[patch]), self.sizes[patch].tolist()
-        return slice(begin, begin + x * y)
-
-    def grid(self, patch: int) -> Grid:
-        """Return the coverage of a patch."""
-        rows, shape = self.of(patch), tuple(self.sizes[patch].tolist())
-        return Grid(
-            pitch_m=float(self.pitches[patch]),
-            origin=self.origins[patch],
-            filled=(self.sums[rows, 3] > 0.0).reshape(shape),
-            rim=self.rim[rows].reshape(shape),
-            corner=self.corner[rows].reshape(shape),
-            cuts=self.cuts[rows].reshape(*shape, 3),
-        )
-
-
 def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> list[Plane | None]:
     """Return a Plane or Surface for every group, in order; None for multi-valued ones."""
     number, by_paper = len(groups.thickness), is_paper(config)
@@ -122,20 +97,23 @@ def fit_patches(groups: PatchPoints, config: ModelsConfig, viewpoint: Array) -> 
     plane_pitch = PAPER_PLANE_PITCH_VOXELS if by_paper else config.plane_pitch_voxels
     pitches = np.where(curved, SURFACE_PITCH_VOXELS, plane_pitch) * a
     cells = cells_of(groups, (means, frames, pitches, local), a, snapped=not by_paper)
+    splines = splines_of(cells, np.flatnonzero(curved), config)
+    numbers, grids = np.diff(groups.starts), cells.grids()
+    rms_m = rms_across(covariances, frames[:, 2], numbers)
     found: list[Plane | None] = []
     for k in range(number):
-        points = local[groups.starts[k] : groups.starts[k + 1]]
         plane = Plane(
-            id=len(found),
-            num_points=len(points),
+            id=k,
+            num_points=int(numbers[k]),
             mean=means[k],
             covariance=covariances[k],
             R_patch_map=frames[k],
-            rms_m=rms_across(covariances[k], frames[k, 2], len(points)),
-            grid=cells.grid(k),
+            rms_m=float(rms_m[k]),
+            grid=grids[k],
         )
         far_m = max(FAR_VOXELS * a, FAR_THICKNESS * float(groups.thickness[k]))
-        found.append(surface_of(plane, cells, points, config, far_m) if curved[k] else plane)
+        points = local[groups.starts[k] : groups.starts[k + 1]]
+        found.append(surface_of(plane, splines[k], points, far_m) if curved[k] else plane)
     return found
 
 
@@ -176,18 +154,32 @@ def cells_of(
     return cells
 
 
-def surface_of(
-    plane: Plane, cells: Cells, points: Array, config: ModelsConfig, far_m: float
-) -> Surface | None:
+def splines_of(cells: Cells, curved: Indices, config: ModelsConfig) -> dict[int, HeightField]:
+    """Return the splines of the curved patches."""
+    by_lsqr = is_paper(config) or config.solver == 'lsqr'
+    together = is_small(cells.sizes[curved], config.degree) & (not by_lsqr)
+    chosen = curved[together]
+    fields, _ = fit_grids(cells, chosen, config.degree, config.smoothing)
+    found = dict(zip(chosen.tolist(), fields, strict=True))
+    for k in curved[~together].tolist():
+        sums, shape = cells.sums[cells.of(k)], cells.sizes[k]
+        used = sums[:, 3] > 0.0
+        means = np.zeros((len(sums), 3))
+        means[used] = sums[used, :3] / sums[used, 3:]
+        heights, filled = means[:, 2].reshape(shape), used.reshape(shape)
+        pitch_m = float(cells.pitches[k])
+        start = initial_field(pitch_m, cells.origins[k], heights, filled, config.degree)
+        xy, z = means[used, :2], means[used, 2]
+        found[k] = (
+            fit_lsqr(start, xy, z)
+            if by_lsqr
+            else fit_pspline(start, xy, z, sums[used, 3], config.smoothing)
+        )
+    return found
+
+
+def surface_of(plane: Plane, spline: HeightField, points: Array, far_m: float) -> Surface | None:
     """Return the surface of (n, 3) points in a frame; None if it is multi-valued."""
-    sums = cells.sums[cells.of(plane.id)]
-    used = sums[:, 3] > 0.0
-    means = np.zeros((len(sums), 3))
-    means[used] = sums[used, :3] / sums[used, 3:]
-    grid = plane.grid
-    heights = means[:, 2].reshape(grid.filled.shape)
-    start = initial_field(grid.pitch_m, grid.origin, heights, grid.filled, config.degree)
-    spline = fitted(start, means[used], sums[used, 3], config)
     error = points[:, 2] - spline.heights(points[:, :2])
     if np.mean(np.abs(error) > far_m) > FAR_SHARE:
         return None
@@ -198,19 +190,13 @@ def surface_of(
         covariance=plane.covariance,
         R_patch_map=plane.R_patch_map,
         rms_m=float(np.sqrt(np.mean(error**2))),
-        grid=grid,
+        grid=plane.grid,
         spline=spline,
     )
 
 
-def rms_across(covariance: Array, normal: Array, number: int) -> float:
-    """Return the root mean square distance of points from their mean along a direction."""
-    variance = max(float(normal @ covariance @ normal), 0.0)
-    return math.sqrt(variance * (number - 1) / number)
-
-
-def fitted(start: HeightField, means: Array, number: Array, config: ModelsConfig) -> HeightField:
-    """Return the spline that fits the (C, 3) means of cells with (C,) points."""
-    if is_paper(config) or config.solver == 'lsqr':
-        return fit_lsqr(start, means[:, :2], means[:, 2])
-    return fit_pspline(start, means[:, :2], means[:, 2], number, config.smoothing)
+def rms_across(covariances: Array, normals: Array, numbers: Indices) -> Array:
+    """Return the root mean square distances (K,) of points from their means along directions."""
+    variance = np.einsum('ki,kij,kj->k', normals, covariances, normals)
+    found: Array = np.sqrt(np.maximum(variance, 0.0) * (numbers - 1) / numbers)
+    return found

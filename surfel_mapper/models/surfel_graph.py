@@ -255,7 +255,7 @@ class SurfelGraph:
 
     def _around(self, rows: Rows, emptied: Rows, steps: int) -> Rows:
         """Return rows, those of neighbours of emptied voxels, and all within some steps."""
-        if 2 * len(rows) > len(self.key):
+        if 2 * len(rows) > np.count_nonzero(self.key >= 0):
             return np.flatnonzero(self.key >= 0).astype(np.int32)
         found = np.empty(len(self.key), np.int32)
         start = np.concatenate([rows, emptied.ravel()])
@@ -327,7 +327,10 @@ class SurfelGraph:
         find_hosts(rows, self.neighbours, state, self.covariance, rules, self.host, self.level)
         changed = (before != self.host[rows]) | self.is_material[rows]
         flags = np.zeros(len(self.key), np.bool_)
-        flag_components(around, self.neighbours, self.host, self.component, flags)
+        if len(around) == np.count_nonzero(self.key >= 0):
+            flags[self.component[around[self.component[around] >= 0]]] = True
+        else:
+            flag_components(around, self.neighbours, self.host, self.component, flags)
         once = np.concatenate([was, before[changed]])
         components = np.flatnonzero(flags).astype(np.int32)
         return rows[changed], once, self.host[rows[changed]], components
@@ -447,5 +450,7 @@ class RemovedVoxels:
 
 def unique_components(components: list[Rows]) -> Rows:
     """Return the sorted distinct components, without -1."""
-    every = np.unique(np.concatenate(components))
-    return every[every >= 0]
+    every = np.concatenate(components)
+    flags = np.zeros(every.max(initial=-1) + 1, np.bool_)
+    flags[every[every >= 0]] = True
+    return np.flatnonzero(flags).astype(np.int32)

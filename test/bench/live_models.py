@@ -34,7 +34,13 @@ CASES = ((0.5, 22.0), (0.3, 12.0), (0.2, 10.0))
 """Voxel size and radius, m, by which about 5,000 voxels change a scan."""
 
 
-STANDING = ('argoverse2_2xvlp32_sweep', 'ouster_os0_128', 'velodyne_vls128_street')
+STANDING = (
+    'nuscenes_hdl32_1532402927647951.pcd',
+    'rellis3d_os1_64_offroad_000104',
+    'ouster_os0_128',
+    'argoverse2_2xvlp32_sweep',
+    'velodyne_vls128_street',
+)
 STANDING_SIZE_M, STANDING_NOISE_M = 0.5, 0.01
 """Scans of the standing lidars, edge of the voxels, and noise."""
 

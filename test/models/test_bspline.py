@@ -15,8 +15,10 @@ from surfel_mapper.models.bspline import (
     fit_pspline,
     initial_field,
     knots,
+    RIDGE,
 )
-from surfel_mapper.models.kernels.bspline import solve_band
+from surfel_mapper.models.kernels.bspline import fit_fields, solve_band
+from test.kernels.modes import both
 
 SIZES = [1, 2, 3, 4, 5, 30]
 PITCH, ORIGIN = 0.3, np.array([-1.2, 0.6])
@@ -122,6 +124,43 @@ def test_pspline_minimises_its_cost():
     least, rng = cost(field.control), np.random.default_rng(2)
     for _ in range(30):
         assert cost(field.control + 1e-4 * rng.standard_normal(field.control.shape)) > least
+
+
+@both
+def test_small_fields_at_once_equal_lapack(call):
+    rng = np.random.default_rng(4)
+    sizes = np.array([(9, 6), (1, 1), (2, 7), (5, 5), (1, 8)])
+    ends = np.cumsum(sizes.prod(axis=1))
+    first = ends - sizes.prod(axis=1)
+    number = rng.integers(0, 4, ends[-1]).astype(float)  # some cells are empty
+    number[first] = 2.0
+    pitches, origins = rng.uniform(0.2, 0.5, len(sizes)), rng.normal(size=(len(sizes), 2))
+    places = [
+        origin + pitch * (np.argwhere(np.ones(size)) + rng.uniform(0.1, 0.9, (size.prod(), 2)))
+        for origin, pitch, size in zip(origins, pitches, sizes, strict=True)
+    ]
+    means = np.column_stack([np.concatenate(places), rng.normal(size=ends[-1])])
+    sums = np.column_stack([means * number[:, None], number])
+    chosen = np.array([0, 1, 2, 4])
+    counts = (sizes[chosen] + 2).prod(axis=1)
+    begin = np.cumsum(counts) - counts
+    control, heights = np.empty(counts.sum()), np.full(ends[-1], np.nan)
+    rules = 3, 1e-2, RIDGE
+    cells = first, sizes
+    call(fit_fields, sums, cells, chosen, pitches, origins, rules, begin, control, heights)
+    for k, at, num in zip(chosen, begin, counts, strict=True):
+        low, high = first[k], ends[k]
+        used = number[low:high] > 0.0
+        xyz, filled = means[low:high], used.reshape(sizes[k])
+        start = initial_field(pitches[k], origins[k], xyz[:, 2].reshape(sizes[k]), filled, 3)
+        weight = number[low:high][used]
+        expected = fit_pspline(start, xyz[used, :2], xyz[used, 2], weight, 1e-2).control
+        np.testing.assert_allclose(
+            control[at : at + num].reshape(expected.shape), expected, rtol=1e-7, atol=1e-9
+        )
+        expected = np.where(used, xyz[:, 2], np.nan)
+        np.testing.assert_allclose(heights[low:high], expected, rtol=1e-14)
+    assert np.isnan(heights[first[3] : ends[3]]).all()
 
 
 def test_slopes_are_the_derivatives_of_the_heights():
