@@ -17,8 +17,8 @@ a share, the next one at each call. With ``all`` it tries all shares, which take
 from __future__ import annotations
 
 import contextlib
-import errno
-from itertools import count
+from importlib.util import find_spec
+from itertools import count, islice
 import json
 import os
 import signal
@@ -29,11 +29,11 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import FileFormatError, SurfelMapperError
-from surfel_mapper.files import atomic, pcd, ply
+from surfel_mapper.files import atomic
 from surfel_mapper.files.map_state import load_map, save_map
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.offline.replay import replay
 from test.bags import recorded
+from test.fuzz.writers import map_of, Steps, WRITERS, Written
 
 pytestmark = pytest.mark.skipif(not hasattr(os, 'fork'), reason='needs fork')
 
@@ -46,136 +46,38 @@ SHARES = 32
 MOST_CRASHES = 0.01
 """Share of allocations that may end the process: numba does not check those of its dispatcher."""
 
-MOST_KILLS = 20
-"""Steps of a writer at which the process is killed; each takes a fork, of 50 ms."""
+BATCH = 60
+"""Allocations that a process lets fail; a fork takes 50 to 100 ms."""
 
 AFTER_LAST = 50
 """Successes in a row after which an operation is taken to make no more allocations."""
 
 
-class Steps:
-    """Counts the steps of writing a file, and fails at one of them."""
-
-    def __init__(self, monkeypatch, fail_at=None, kill=False):
-        self.done = 0
-        self._fail_at, self._kill = fail_at, kill
-        self._open, self._fsync, self._replace = open, os.fsync, os.replace
-        monkeypatch.setattr(atomic, 'open', self.open, raising=False)
-        monkeypatch.setattr(atomic.os, 'fsync', self.wrapped(os.fsync))
-        monkeypatch.setattr(atomic.os, 'replace', self.wrapped(os.replace))
-
-    def step(self):
-        self.done += 1
-        if self.done - 1 == self._fail_at:
-            if self._kill:
-                os.kill(os.getpid(), signal.SIGKILL)
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    def wrapped(self, function):
-        def call(*args, **kwargs):
-            self.step()
-            return function(*args, **kwargs)
-
-        return call
-
-    def open(self, *args, **kwargs):
-        self.step()
-        return StepFile(self._open(*args, **kwargs), self)
-
-
-class StepFile:
-    """A file whose writes and flushes are steps."""
-
-    def __init__(self, file, steps):
-        self._file = file
-        self._steps = steps
-
-    def write(self, content):
-        self._steps.step()
-        return self._file.write(content)
-
-    def flush(self):
-        self._steps.step()
-        self._file.flush()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        self._file.close()
-
-    def __getattr__(self, name):
-        return getattr(self._file, name)
-
-
-def map_of(seed):
-    surfel_map = SurfelMap(0.5)
-    surfel_map.add(np.random.default_rng(seed).uniform(-2.0, 2.0, (50, 3)))
-    return surfel_map
-
-
-def write_parquet(path, surfel_map):
-    from surfel_mapper.files.parquet import write_map
-
-    write_map(path, surfel_map)
-
-
-WRITERS = {
-    'npz': save_map,
-    'npz packed': lambda path, surfel_map: save_map(path, surfel_map, compress=True),
-    'parquet': write_parquet,
-    'ply': lambda path, surfel_map: ply.write_surfels(path, surfel_map.surfels()),
-    'pcd': lambda path, surfel_map: pcd.write_surfels(path, surfel_map.surfels()),
-    'json': lambda path, surfel_map: atomic.write_json(path, {'digest': surfel_map.digest()}),
-}
-
-
-@pytest.mark.parametrize('kill', [False, True], ids=['full disk', 'killed'])
 @pytest.mark.parametrize('name', WRITERS)
-def test_a_save_that_fails_at_any_step_leaves_the_old_file_or_the_new(tmp_path, name, kill):
+def test_a_save_that_fails_at_any_step_leaves_the_old_file_or_the_new(tmp_path, name):
     if name == 'parquet':
         pytest.importorskip('pyarrow')
-    write, path = WRITERS[name], tmp_path / 'a'
-    old, new = map_of(1), map_of(2)
-    write(path, new)
-    new_bytes = path.read_bytes()
-    write(path, old)
-    old_bytes = path.read_bytes()
-    with pytest.MonkeyPatch.context() as patch:
-        steps = Steps(patch)
-        write(path, old)
-    assert steps.done >= 5
-    stride = 1 if EVERY or not kill else -(-steps.done // MOST_KILLS)
-    for number in range(0, steps.done, stride):
-        failed = attempt(lambda number=number: write(path, new), number, kill)
-        found = path.read_bytes()
-        assert found in (old_bytes, new_bytes), (name, number)
-        assert failed or found == new_bytes, (name, number)  # the sync of the directory may fail
-        write(path, old)
-        left = [file for file in tmp_path.iterdir() if file != path]
-        assert kill or not left, (name, number, left)
-        for file in left:
-            file.unlink()
-
-
-def attempt(write, number, kill):
-    """Write, failing at a step; return whether that raised our error, or killed the process."""
-    if not kill:
+    file = Written(name, tmp_path / 'a')
+    assert file.num_steps >= 5
+    for number in range(file.num_steps):
+        failed = False
         with pytest.MonkeyPatch.context() as patch:
             Steps(patch, number)
             try:
-                write()
+                file.write_new()
             except FileFormatError:
-                return True
-        return False
-    child = os.fork()
-    if not child:
-        Steps(pytest.MonkeyPatch(), number, kill=True)
-        try:
-            write()
-        finally:
-            os._exit(0)
-    return os.WTERMSIG(os.waitpid(child, 0)[1]) == signal.SIGKILL
+                failed = True
+        file.check(failed, number)
+        assert not file.left(), (name, number)
+
+
+def test_a_save_that_is_killed_at_any_step_leaves_the_old_file_or_the_new(tmp_path):
+    command = [sys.executable, '-m', 'test.fuzz.writers', tmp_path, '1' if EVERY else '0']
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert not done.returncode, done.stderr
+    kills = dict(line.rsplit(maxsplit=1) for line in done.stdout.splitlines())
+    assert kills.keys() == set(WRITERS) - ({'parquet'} if find_spec('pyarrow') is None else set())
+    assert min(map(int, kills.values())) >= 5
 
 
 KEPT = {}
@@ -217,13 +119,13 @@ def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, opera
     allowed = {surfel_map.digest(), after.digest()}
     failures = 0
 
-    def run():
-        operation(surfel_map, moments, path)
+    def operate(changed):
+        operation(changed, moments, path)
 
     successes = crashes = 0
     sampled = (*range(30), *(30 + 15 * step for step in range(30)))
-    for number in count() if EVERY else sampled:
-        code = in_child(testcapi, surfel_map, run, number, allowed)
+    numbers = count() if EVERY else sampled
+    for number, code in results(testcapi, surfel_map, operate, numbers, allowed):
         if EVERY and code == -signal.SIGSEGV:
             crashes += 1
             continue
@@ -237,25 +139,51 @@ def test_an_allocation_that_fails_leaves_the_map_before_or_after(tmp_path, opera
     assert crashes <= MOST_CRASHES * failures
 
 
-def in_child(testcapi, surfel_map, call, number, allowed):
-    """Return 0 if a call succeeded, 1 if it raised; 2 for another digest, or a signal negated."""
+def results(testcapi, surfel_map, operate, numbers, allowed):
+    """
+    Let allocations of an operation fail in turn; yield the number of each with the result.
+
+    0: done all the same, 1: raised, 2: the map is neither that of before nor that of after; a
+    negative number: the signal by which a process died. Each process tries a batch, or a part.
+    """
+    numbers, batch = iter(numbers), []
+    while batch := batch + list(islice(numbers, BATCH - len(batch))):
+        codes, exit_code = in_child(testcapi, surfel_map, operate, batch, allowed)
+        if exit_code:
+            codes.append(exit_code)
+        yield from zip(batch, codes, strict=False)
+        batch = batch[len(codes) :]
+
+
+def in_child(testcapi, surfel_map, operate, batch, allowed):
+    """Return the results of a batch, as far as a forked process came, and its exit code."""
+    reading, writing = os.pipe()
     child = os.fork()
     if not child:
         code = 3
         try:
-            failed = 0
-            testcapi.set_nomemory(number, number + 1)
-            try:
-                call()
-            except BaseException:
-                failed = 1
-            finally:
-                testcapi.remove_mem_hooks()
-            code = failed if surfel_map.digest() in allowed else 2
+            for number in batch:
+                os.write(writing, bytes([result(testcapi, surfel_map, operate, number, allowed)]))
+            code = 0
         finally:
             os._exit(code)
-    status = os.waitpid(child, 0)[1]
-    return os.waitstatus_to_exitcode(status)
+    os.close(writing)
+    with open(reading, 'rb') as pipe:
+        found = list(pipe.read())
+    return found, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+
+
+def result(testcapi, surfel_map, operate, number, allowed):
+    """Let an allocation of an operation on a copy of a map fail; see results."""
+    changed, failed = surfel_map.copy(), 0
+    testcapi.set_nomemory(number, number + 1)
+    try:
+        operate(changed)
+    except BaseException:
+        failed = 1
+    finally:
+        testcapi.remove_mem_hooks()
+    return failed if changed.digest() in allowed else 2
 
 
 def test_an_allocation_that_fails_leaves_no_file_beside_the_one_to_be_written(tmp_path):
