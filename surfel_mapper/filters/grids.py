@@ -157,8 +157,9 @@ class ScanVoxels:
         keys, first = np.empty((2, number), np.int64)
         sums: npt.NDArray[np.float64] = np.empty((number, 4))
         rows = np.empty(number if with_rows else 0, np.int32)
+        xyz = np.ascontiguousarray(points.T)  # as decoded; the kernel is compiled for one layout
         found = group_points(
-            points.T, self.size, self.shift, self.base, self.bits, keys, sums, first, rows
+            xyz, self.size, self.shift, self.base, self.bits, keys, sums, first, rows
         )
         sums = sums[:found]
         return keys[:found], sums, PointGroups(rows, first[:found], sums[:, 3])

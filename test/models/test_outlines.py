@@ -116,7 +116,7 @@ def test_hole_is_a_clockwise_ring():
 @pytest.mark.parametrize('flip', [False, True])
 def test_squares_that_touch_at_a_corner_are_two_rings(flip):
     mask = np.eye(2, dtype=bool)
-    assert [area(ring) for ring in rings(mask[::-1] if flip else mask)] == [1.0, 1.0]
+    assert [area(ring) for ring in rings(np.array(mask[::-1] if flip else mask))] == [1.0, 1.0]
 
 
 def test_rings_of_random_masks_enclose_the_covered_area():

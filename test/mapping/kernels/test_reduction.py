@@ -139,9 +139,9 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
 def test_a_scan_that_does_not_fit_leaves_the_table_clean(call, room):
     scratch = scratch_for(room)
     left_out = np.zeros(4, np.int64)
-    points = np.random.default_rng(2).uniform(-9.0, 9.0, (3 * CHUNK, 3))
-    points[: CHUNK + 9] = 0.1  # the first chunk fits
-    asked = (points.T, *AS_THEY_ARE, scratch, left_out)
+    points = np.random.default_rng(2).uniform(-9.0, 9.0, (3, 3 * CHUNK))
+    points[:, : CHUNK + 9] = 0.1  # the first chunk fits
+    asked = (points, *AS_THEY_ARE, scratch, left_out)
     assert call(reduce_points, *asked) == -1
     assert (scratch[0] == -1).all()
 
