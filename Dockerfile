@@ -35,7 +35,7 @@ RUN apt-get update && apt-get install -y --no-install-recommends chromium git ma
 
 FROM python:3.12-slim AS desktop
 COPY . /src
-RUN pip install --no-cache-dir '/src[cluster,formats,las,nurbs]' && rm -rf /src
+RUN pip install --no-cache-dir '/src[cluster,formats,las]' && rm -rf /src
 ENV NUMBA_CACHE_DIR=/var/cache/surfel_mapper
 WORKDIR /data
 ENTRYPOINT ["surfel-mapper"]

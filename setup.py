@@ -47,8 +47,10 @@ FORMATS = [
     'python-neo-lzf>=0.3',  # scans in compressed PCD files
 ]
 
-NURBS = [
-    'rhino3dm>=8.4',  # curved surfaces as NURBS in 3dm files; MIT, wheels for 3.9 to 3.14
+STEP = [
+    # models as STEP; Apache-2.0, Open CASCADE in it LGPL-2.1; 8 has other names, and no wheels for
+    # Python 3.10
+    'cadquery-ocp-novtk>=7.9.3.1,<8',
 ]
 
 CLUSTER = [
@@ -96,7 +98,7 @@ TEST = [
     *FORMATS,
     *CLUSTER,
     *LAS,
-    *NURBS,
+    *STEP,
     *LOOPS,
     *ALIGN,
     *VIEWER,
@@ -166,7 +168,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
-        'nurbs': NURBS,
+        'step': STEP,
         'align': ALIGN,
         'loops': LOOPS,
         'viewer': VIEWER,

@@ -74,7 +74,7 @@ HOMES = {
     'rclpy': ('ros/',),
     'rerun': ('viz/',),
     'rerun_bindings': ('viz/',),
-    'rhino3dm': ('files/model_3dm',),
+    'OCP': ('files/model_step',),
     'trimesh': ('viz/gltf',),
     'rosbags': ('bags/_rosbags',),
     'rosgraph_msgs': ('ros/',),

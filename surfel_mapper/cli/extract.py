@@ -28,7 +28,7 @@ EXAMPLE = 'surfel-mapper extract scan.pcd --voxel-size 0.02 --output models/'
 
 MAPS = ('.npz', '.parquet')
 
-FORMATS = ('json', 'obj', 'parquet', 'dxf', '3dm')
+FORMATS = ('json', 'obj', 'parquet', 'dxf', 'step')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

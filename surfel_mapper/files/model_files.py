@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ, DXF and 3dm.
+Models as files: complete as JSON, a row per primitive as Parquet, geometry as OBJ, DXF and STEP.
 
 OBJ is for viewers, DXF for CAD; each plane and surface is an object of its own there, without
 Gaussians. DXF is that of AutoCAD 2000 and later, in metres, with outlines as closed polylines and
@@ -26,7 +26,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.model_3dm import write_3dm
+from surfel_mapper.files.model_step import write_step
 from surfel_mapper.files.parquet import import_pyarrow
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
@@ -51,7 +51,7 @@ def write_models(
     versions: Mapping[int, int] | None = None,
 ) -> list[Path]:
     """
-    Write models as ``models`` in some formats: json, obj, parquet, dxf, 3dm; return the files.
+    Write models as ``models`` in some formats: json, obj, parquet, dxf, step; return the files.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def write_models(
     model : MultiModel
         The models.
     formats : sequence of str
-        Any of json, obj, parquet, dxf, 3dm.
+        Any of json, obj, parquet, dxf, step.
     versions : mapping of int to int, optional
         Versions of the primitives, by id; written to JSON and Parquet.
 
@@ -69,7 +69,7 @@ def write_models(
     FileFormatError
         If a file cannot be written.
     DependencyError
-        If pyarrow, ezdxf or rhino3dm is needed and not installed.
+        If pyarrow, ezdxf or cadquery-ocp is needed and not installed.
 
     """
     paths = [directory / f'models.{name}' for name in formats]
@@ -80,8 +80,8 @@ def write_models(
             write_parquet(path, model, versions)
         elif name == 'obj':
             write_obj(path, model)
-        elif name == '3dm':
-            write_3dm(path, model)
+        elif name == 'step':
+            write_step(path, model)
         else:
             write_dxf(path, model)
     return paths

@@ -100,7 +100,7 @@ def test_a_stopped_replay_writes_the_scans_so_far(bag, tmp_path):
     [
         ({'formats': ('stl',)}, None, ConfigError, "formats: 'stl', expected some of ply"),
         ({'formats': ('dxf',)}, None, ConfigError, 'layers.models.enabled: true'),
-        ({'formats': ('3dm',)}, None, ConfigError, '3dm is written by the layer models'),
+        ({'formats': ('step',)}, None, ConfigError, 'step is written by the layer models'),
         ({}, {'frames.fixed': 'map'}, BagError, 'none of 6 clouds of /points was mapped'),
     ],
 )

@@ -18,8 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import Config
-from surfel_mapper.files.model_3dm import import_rhino3dm
 from surfel_mapper.files.model_files import import_ezdxf, write_models
+from surfel_mapper.files.model_step import import_ocp
 from surfel_mapper.layers.drawings import Drawing, PointsPicture, Section
 from surfel_mapper.layers.layer import InsertedScan, Layer, Moment, Publication, Surroundings
 from surfel_mapper.layers.models.pictures import drawings_of, panels_of, section_of
@@ -128,15 +128,15 @@ class ModelsLayer(Layer):
 
     @classmethod
     def check_formats(cls, formats: Sequence[str]) -> None:
-        """Raise DependencyError unless ezdxf and rhino3dm are installed, if they are needed."""
+        """Raise DependencyError if ezdxf or cadquery-ocp is needed and not installed."""
         if 'dxf' in formats:
             import_ezdxf()
-        if '3dm' in formats:
-            import_rhino3dm()
+        if 'step' in formats:
+            import_ocp()
 
     def write(self, directory: Path, formats: Sequence[str]) -> list[Path]:
-        """Write models.json and models.obj, and Parquet, DXF and 3dm if asked for."""
-        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf', '3dm') if name in formats)]
+        """Write models.json and models.obj, and Parquet, DXF and STEP if asked for."""
+        wanted = ['json', 'obj', *(name for name in ('parquet', 'dxf', 'step') if name in formats)]
         model = self.models.model.translated(self.around.surfel_map.origin_m)
         return write_models(directory, model, wanted, self.models.versions)
 
