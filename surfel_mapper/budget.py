@@ -30,7 +30,7 @@ FLOOR_BYTES = 64 << 20
 BYTES_PER_BYTE = 20
 """Memory per byte of input above the floor; 16 bytes of a point become 40, 60 of a voxel 200."""
 
-FLOOR_S = 10.0
+FLOOR_S = 5.0
 """Processor time that reading any input may take, s."""
 
 SECONDS_PER_BYTE = 1e-6

@@ -33,6 +33,9 @@ MAX_NORM_ERROR = 1e-3
 MAX_SKEW = 1e-4
 """Tolerance of the orthonormality of a rotation; matrices of float32 are within 1e-6."""
 
+MAX_TRANSLATION_M = 1e9
+"""Limit of a translation: float64 resolves 0.1 um there, and geocentric ones are of 1e7 m."""
+
 SMALL_ANGLE_SQ = 1e-8
 """Squared angle, rad^2, below which two terms of a series are exact to float64."""
 
@@ -122,8 +125,8 @@ def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
     name : str
         Name of the matrix, for the error.
     T_a_b : (4, 4) float
-        Finite, rotation orthonormal within 1e-4 and not mirrored, last row 0 0 0 1. So a
-        transposed transform is refused.
+        Rotation orthonormal within 1e-4 and not mirrored, translation below 1e9 m, last row
+        0 0 0 1. So a transposed transform is refused.
 
     """
     matrix = np.asarray(T_a_b)
@@ -140,10 +143,11 @@ def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
     )
     turn = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
     is_rotation = all(abs(value) <= MAX_SKEW for value in products) and turn > 0.0
-    if not (is_rotation and math.isfinite(x + y + z) and last == [0.0, 0.0, 0.0, 1.0]):
+    is_near = all(abs(value) < MAX_TRANSLATION_M for value in (x, y, z))
+    if not (is_rotation and is_near and last == [0.0, 0.0, 0.0, 1.0]):
         raise ValueError(
             f'{name}: {matrix.tolist()}, expected a rigid transform, rotation and translation '
-            'above a last row 0 0 0 1'
+            f'(below {MAX_TRANSLATION_M:g} m) above a last row 0 0 0 1'
         )
 
 

@@ -93,6 +93,30 @@ def test_dangerous_calls_are_found(source):
     assert dangers(source)
 
 
+IMPORTERS = {
+    '__init__.py': 'public names of this package',
+    'cli/main.py': 'verbs of this package',
+    'filters/__init__.py': 'public names of this package',
+    'filters/registry.py': 'modules in a folder of this package',
+    'layers/registry.py': 'places that code registered',
+    'mapping/surfel_map.py': 'a module of this package',
+    'ros/bond.py': 'one fixed package',
+    'ros/layer_outputs.py': 'types that layers name',
+    'ros/player.py': 'types of a bag, of packages that are looked up before',
+}
+"""Modules that import by a text, and where the text comes from."""
+
+
+def test_only_known_modules_import_by_a_text():
+    found = {
+        path.relative_to(PACKAGE).as_posix()
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
+        if isinstance(node, ast.Call) and name_of(node.func).endswith('import_module')
+    }
+    assert found == {*IMPORTERS}
+
+
 MENDED = {
     'numpy': '1.22',  # CVE-2021-41495, -41496, -33430, -34141
     'scipy': '1.10',  # CVE-2023-25399, -29824

@@ -21,6 +21,9 @@ map; Ctrl-C ended the work.
 """
 
 
+DIGITS = re.compile('[0-9]{1,18}')
+
+
 class UsageError(Exception):
     """Options that do not go together; exit code 2."""
 
@@ -57,9 +60,23 @@ def nearest(word: str, known: list[str]) -> str:
     return f', did you mean {close[0]}?' if close else ''
 
 
+def real(text: str) -> float:
+    """Return a number as files have it; ValueError for others that Python reads."""
+    from surfel_mapper.files import text_table  # loads numpy, which --help does not need
+
+    return text_table.real(text)
+
+
+def whole(text: str) -> int:
+    """Return a whole number; ValueError as for ``real``."""
+    from surfel_mapper.files import text_table
+
+    return text_table.whole(text)
+
+
 def positive_int(text: str) -> int:
     """Return a whole number of one or more."""
-    if not text.isdecimal() or int(text) < 1:
+    if not DIGITS.fullmatch(text) or int(text) < 1:
         raise argparse.ArgumentTypeError(f'{text!r}, expected a whole number of 1 or more')
     return int(text)
 
@@ -67,7 +84,7 @@ def positive_int(text: str) -> int:
 def positive_float(text: str) -> float:
     """Return a finite positive number."""
     try:
-        value = float(text)
+        value = real(text)
     except ValueError:
         value = math.nan
     if not 0.0 < value < math.inf:
@@ -78,7 +95,7 @@ def positive_float(text: str) -> float:
 def seconds(text: str) -> float:
     """Return a finite number of zero or more."""
     try:
-        value = float(text)
+        value = real(text)
     except ValueError:
         value = math.nan
     if not 0.0 <= value < math.inf:

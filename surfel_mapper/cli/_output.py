@@ -3,15 +3,25 @@
 """
 Text on the terminal, without the control characters of names in it.
 
-Names of topics, columns, frames and files come from outside. On its own because no verb imports
-another.
+Names of topics, columns, frames and files come from outside, and may have ends of lines in them.
+On its own because no verb imports another.
 """
 
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 from surfel_mapper.errors import escaped
+
+
+def printable(value: Any) -> Any:
+    """Return plain values as JSON has them, every text in them as one line."""
+    if isinstance(value, dict):
+        return {escaped(str(key)): printable(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [printable(item) for item in value]
+    return escaped(value) if isinstance(value, str) else value
 
 
 def show_lines(text: str, *, to_stderr: bool = False) -> None:

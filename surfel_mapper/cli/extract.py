@@ -17,6 +17,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.cli._arguments import real
 from surfel_mapper.cli._output import show_lines
 
 if TYPE_CHECKING:
@@ -49,28 +50,28 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f'of {", ".join(FORMATS)}; default json obj',
     )
     parser.add_argument(
-        '--voxel-size', type=float, metavar='M', help='default 0.04; half of that of a map'
+        '--voxel-size', type=real, metavar='M', help='default 0.04; half of that of a map'
     )
     parser.add_argument(
         '--profile', default='robust', help="robust, or paper: the paper's rules to the letter"
     )
     parser.add_argument(
         '--noise',
-        type=float,
+        type=real,
         default=0.0,
         metavar='M',
         help='sigma of the range of the sensor (lidar: 0.02)',
     )
     parser.add_argument(
         '--noise-per-range-sq',
-        type=float,
+        type=real,
         default=0.0,
         metavar='S',
         help='sigma that grows with range^2, 1/m (Kinect: 0.001425)',
     )
     parser.add_argument(
         '--viewpoint',
-        type=float,
+        type=real,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
         help='position of the sensor; default: the origin, or above the middle of a map',

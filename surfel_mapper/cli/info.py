@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 from surfel_mapper.cli._arguments import CUT
-from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._progress import progress
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
     if is_scans(args.bag):
         content = folder_content(args.bag)
-        show_lines(json.dumps(content) if args.json else folder_report(content))
+        show_lines(json.dumps(content) if args.json else folder_report(printable(content)))
         return 0
     with BagReader(args.bag) as reader:
         total = reader.topics.num_messages(surveyed_topics(reader))
@@ -73,7 +73,7 @@ def run(args: argparse.Namespace) -> int:
             found = survey(reader, lambda: show(next(read), total))
         made = offers(found)
         content = {**as_mapping(reader, found, made), 'replay': chosen(args.bag)}
-    show_lines(json.dumps(content) if args.json else report(content, made))
+    show_lines(json.dumps(content) if args.json else report(printable(content), made))
     return CUT if args.strict and content['cut'] else 0
 
 

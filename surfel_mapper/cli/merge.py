@@ -15,6 +15,7 @@ import time
 
 from surfel_mapper.cli._arguments import add_workers, positive_int
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.errors import escaped
 from surfel_mapper.offline.summary import rounded
 
 SUMMARY = 'Merge finished maps of one frame into one, tile by tile, exactly.'
@@ -67,6 +68,6 @@ def run(args: argparse.Namespace) -> int:
     show_lines(
         f'{len(args.maps)} maps   points {rounded(tiled.points)}   '
         f'surfels {tiled.surfels}   tiles {tiled.tiles}   {summary["seconds"]:.1f} s\n'
-        f'digest {tiled.digest}\n{tiled.directory}'
+        f'digest {tiled.digest}\n{escaped(str(tiled.directory))}'
     )
     return 0

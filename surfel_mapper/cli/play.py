@@ -14,6 +14,7 @@ from pathlib import Path
 
 from surfel_mapper.cli._arguments import positive_float, seconds
 from surfel_mapper.cli._output import show_lines
+from surfel_mapper.errors import escaped
 
 SUMMARY = 'Publish the messages of a bag over DDS at the pace of their record times.'
 
@@ -70,8 +71,8 @@ def run(args: argparse.Namespace) -> int:
             ros_args=args.ros_args,
         )
     for topic, reason in report['skipped'].items():
-        show_lines(f'surfel-mapper play: {topic} skipped: {reason}', to_stderr=True)
+        show_lines(escaped(f'surfel-mapper play: {topic} skipped: {reason}'), to_stderr=True)
     counts = '   '.join(f'{topic} {number}' for topic, number in report['published'].items())
     text = f'published in {report["seconds"]:.1f} s: {counts}'
-    show_lines(json.dumps(report) if args.json else text)
+    show_lines(json.dumps(report) if args.json else escaped(text))
     return 0

@@ -29,7 +29,7 @@ from surfel_mapper.cli._arguments import (
     seconds,
     UsageError,
 )
-from surfel_mapper.cli._output import show_lines
+from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._progress import progress, stopped_by_interrupt
 from surfel_mapper.errors import MapError
 from surfel_mapper.layers import formats as layer_formats
@@ -184,7 +184,8 @@ def run(args: argparse.Namespace) -> int:
                     raise KeyboardInterrupt from None
                 raise
         summary = result.summary
-        show_lines(json.dumps(summary) if args.json else as_text(summary, result.written))
+        written = printable([str(path) for path in result.written])
+        show_lines(json.dumps(summary) if args.json else as_text(printable(summary), written))
         if summary['interrupted']:
             return INTERRUPTED
         if stopped():  # while files were written

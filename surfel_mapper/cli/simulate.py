@@ -10,8 +10,9 @@ import sys
 import time
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_float, positive_int, UsageError
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.cli._arguments import positive_float, positive_int, real, UsageError, whole
+from surfel_mapper.cli._output import show_lines
+from surfel_mapper.errors import ConfigError, escaped
 from surfel_mapper.offline.summary import rounded
 
 if TYPE_CHECKING:
@@ -39,13 +40,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     length.add_argument(
         '--duration', type=positive_float, metavar='S', help='s, instead of --scans'
     )
-    add('--speed', type=float, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
-    add('--beams', type=int, default=64, metavar='N', help='points a column (%(default)s)')
-    add('--columns', type=int, default=2048, metavar='N', help='points a turn (%(default)s)')
-    add('--rate', type=float, default=10.0, metavar='F', help='turns, Hz (%(default)s)')
-    add('--noise', type=float, default=0.0, metavar='M', help='sigma of range, m (%(default)s)')
-    add('--max-range', type=float, default=100.0, metavar='M', help='m (%(default)s)')
-    add('--seed', type=int, default=0, metavar='N', help='of street and noise (%(default)s)')
+    add('--speed', type=real, default=5.0, metavar='V', help='of the vehicle, m/s (%(default)s)')
+    add('--beams', type=whole, default=64, metavar='N', help='points a column (%(default)s)')
+    add('--columns', type=whole, default=2048, metavar='N', help='points a turn (%(default)s)')
+    add('--rate', type=real, default=10.0, metavar='F', help='turns, Hz (%(default)s)')
+    add('--noise', type=real, default=0.0, metavar='M', help='sigma of range, m (%(default)s)')
+    add('--max-range', type=real, default=100.0, metavar='M', help='m (%(default)s)')
+    add('--seed', type=whole, default=0, metavar='N', help='of street and noise (%(default)s)')
     add('--rolling', action='store_true', help='the vehicle moves while the lidar turns')
     add('--json', action='store_true', help='report as JSON')
 
@@ -89,10 +90,10 @@ def run(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(report))
     else:
-        print(
-            f'{args.output}: scans {report["scans"]}   points {rounded(report["points"])} '
-            f'({rounded(returns)} returns)   {report["distance_m"]:g} m   '
-            f'{report["seconds"]} s'
+        show_lines(
+            f'{escaped(str(args.output))}: scans {report["scans"]}   '
+            f'points {rounded(report["points"])} ({rounded(returns)} returns)   '
+            f'{report["distance_m"]:g} m   {report["seconds"]} s'
         )
     return 0
 

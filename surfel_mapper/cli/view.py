@@ -16,9 +16,10 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_int, UsageError
+from surfel_mapper.cli._arguments import positive_int, real, UsageError
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._progress import progress
+from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.viz.contents import Content
@@ -50,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--color', choices=COLOURS, default='normal', help='of the surfels (normal)')
     add(
         '--at',
-        type=float,
+        type=real,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
         help='place to look at, m in the fixed frame; maps are finest there (end of the '
@@ -145,7 +146,7 @@ def show_files(args: argparse.Namespace) -> None:
             min_points=args.min_points,
         )
         for name, sentence in shown.about.items():
-            show_lines(f'{name}: {sentence}')
+            show_lines(escaped(f'{name}: {sentence}'))
         return shown
 
     if args.glb is not None:

@@ -274,7 +274,7 @@ def read_number(text: str, kind: type) -> bool | int | float | None:
     text = text.strip().lower()
     if kind is bool and text in BOOLEANS:
         return BOOLEANS[text]
-    if '_' in text:  # Python reads 1_000, libpointmatcher and YAML do not
+    if '_' in text or not text.isascii():  # Python reads 1_000 and all digits of Unicode
         return None
     sign = text[:1] if text[:1] in '+-' else ''
     try:

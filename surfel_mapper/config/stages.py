@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 import math
 
-from surfel_mapper.config.settings import setting, Stage
+from surfel_mapper.config.settings import read_number, setting, Stage
 from surfel_mapper.errors import ConfigError
 
 POSE_SOURCES = ('tf', 'odometry', 'pose', 'identity', 'registration')
@@ -97,13 +97,9 @@ class MapConfig(Stage):
         """The origin, x y z in m; () if it is to be found (``auto``) or not set."""
         if self.origin in ('', AUTO):
             return ()
-        try:
-            found = tuple(
-                float(word) for word in self.origin.strip('[]() ').replace(',', ' ').split()
-            )
-        except ValueError:
-            found = ()
-        if len(found) != 3 or not all(abs(value) < MAX_ORIGIN_M for value in found):
+        words = self.origin.strip('[]() ').replace(',', ' ').split()
+        found = tuple(value for word in words if (value := read_number(word, float)) is not None)
+        if not len(words) == len(found) == 3 or any(not abs(v) < MAX_ORIGIN_M for v in found):
             raise ConfigError(
                 f'map.origin: {self.origin!r}, expected nothing, {AUTO}, or a text of x y z in m, '
                 "each below 1e9, such as '400000 5400000 0'"

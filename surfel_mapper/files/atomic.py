@@ -114,7 +114,7 @@ def write_json(path: str | Path, content: Mapping[str, Any]) -> None:
 
 def by_number(file: Path) -> list[Any]:
     """Return a sort key of a file name: scan2 comes before scan10."""
-    return [int(part) if part.isdigit() else part for part in re.split(r'(\d+)', file.name)]
+    return [int(part) if part.isdecimal() else part for part in re.split(r'(\d+)', file.name)]
 
 
 def cannot_write(path: str | Path, error: OSError) -> FileFormatError:

@@ -212,7 +212,7 @@ def map_errors(path: str | Path) -> Iterator[None]:
 
 
 def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
-    """Return the number of scans of the window; raise ValueError if their stamps are invalid."""
+    """Return the number of scans of the window; raise ValueError for wrong stamps or arrays."""
     stamps, poses = arrays['scans.stamp_ns'], arrays['scans.pose']
     if stamps.dtype != np.int64 or stamps.ndim != 1 or (stamps < 0).any():
         raise ValueError(
@@ -220,6 +220,11 @@ def _num_scans(arrays: dict[str, npt.NDArray[Any]]) -> int:
         )
     if poses.dtype != np.float64 or poses.shape != (len(stamps), 4, 4):
         raise ValueError(f'poses of scans: {poses.dtype} {poses.shape} for {len(stamps)} scans')
+    prefixes = ['map', *(f'scan{number}' for number in range(len(stamps)))]
+    known = {f'{prefix}.{name}' for prefix in prefixes for name in (*NAMES, 'points')}
+    unknown = sorted({*arrays} - known - {'scans.stamp_ns', 'scans.pose'})
+    if unknown or 'map.points' in arrays:
+        raise ValueError(f'unknown arrays {unknown or ["map.points"]}')
     return len(stamps)
 
 

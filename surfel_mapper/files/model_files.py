@@ -28,6 +28,7 @@ from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.model_step import write_step
 from surfel_mapper.files.parquet import import_pyarrow
+from surfel_mapper.files.text_table import real, whole
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
 from surfel_mapper.models.shapes import shape_of
@@ -265,9 +266,9 @@ def read_obj(path: str | Path) -> Mesh:
                     budget.check_time()
                 kind, *words = line.split() or [b'']
                 if kind == b'v':
-                    vertices.extend(map(float, words[:3]))
+                    vertices.extend(map(real, words[:3]))
                 elif kind == b'f':  # a/b/c: vertex, texture, normal; below zero: from the end
-                    corners = [int(word.partition(b'/')[0]) for word in words]
+                    corners = [whole(word.partition(b'/')[0]) for word in words]
                     corners = [c - 1 if c > 0 else len(vertices) // 3 + c for c in corners]
                     for second, third in itertools.pairwise(corners[1:]):
                         triangles.extend((corners[0], second, third))

@@ -47,6 +47,7 @@ INDEX = ('i', 'j', 'k')
 SUMS = ('sum_x', 'sum_y', 'sum_z')
 PRODUCTS = ('sum_xx', 'sum_xy', 'sum_xz', 'sum_yy', 'sum_yz', 'sum_zz')
 VIEWS = ('view_x', 'view_y', 'view_z')
+DERIVED = ('x', 'y', 'z', 'nx', 'ny', 'nz', 'planarity', 'curvature')
 
 Columns = dict[str, npt.NDArray[Any]]
 
@@ -148,6 +149,9 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
             names = moment_names(surfel_map)
+            unknown = {*content.schema_arrow.names} - {*names, *DERIVED}
+            if unknown:
+                raise ValueError(f'unknown columns {sorted(unknown)}')
             check_size(content, names, path, os.fstat(file.fileno()).st_size)
             parts = moment_arrays(content.metadata.num_rows, surfel_map)
             filled = 0

@@ -27,7 +27,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.text_table import read_table
+from surfel_mapper.files.text_table import read_table, whole
 
 if TYPE_CHECKING:
     from surfel_mapper.mapping.surfels import Surfels
@@ -251,7 +251,7 @@ def read_faces_header(path: str | Path, file: BinaryIO) -> tuple[np.dtype[Any] |
         layout = np.dtype(
             [('count', order + TYPES[of_count]), ('corners', order + TYPES[of_corner], (3,))]
         )
-        number = int(count)
+        number = whole(count)
     except (ValueError, KeyError, StopIteration) as error:
         raise FileFormatError(f'{path}: faces that are no list of vertices') from error
     if kind != 'list' or 'property' in [line[0] for line in others if line] or number < 0:
@@ -294,7 +294,7 @@ def read_header(path: str | Path, file: BinaryIO) -> tuple[int, np.dtype[Any], b
         after = [i for i, line in enumerate(others) if line[0] == 'element']
         properties = others[: after[0]] if after else others
         layout = np.dtype([(name, ORDERS[encoding] + TYPES[kind]) for _, kind, name in properties])
-        number = int(count)
+        number = whole(count)
     except (ValueError, KeyError) as error:
         raise FileFormatError(
             f'{path}: not a PLY whose first element has scalar properties only'

@@ -204,6 +204,8 @@ def read_archive(
 ) -> tuple[dict[str, npt.NDArray[Any]], dict[str, Any]]:
     """Return arrays and attributes; raise any exception if the content is inconsistent."""
     members = {info.filename: info for info in archive.infolist()}
+    if len(members) < len(archive.infolist()):
+        raise FileFormatError(f'{path}: damaged: a member occurs twice')
     if MANIFEST not in members:
         raise FileFormatError(f'{path}: no {MANIFEST} inside, expected a state of surfel_mapper')
     budget.take(MEMBER_BYTES * len(members), f'{len(members)} members')

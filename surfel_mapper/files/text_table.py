@@ -6,7 +6,7 @@ Tables of numbers in text, as ASCII PLY and PCD have them, read in pieces within
 Every word of a text is an object of 34 bytes or more. Split as a whole, a file of one-digit
 numbers takes 40 times its size; split by pieces, its table of numbers and little more.
 
-On its own because both formats read their points with it.
+On its own because both formats read their points with it, and others single numbers.
 """
 
 from __future__ import annotations
@@ -68,6 +68,8 @@ def read_table(
     words: list[bytes] = []
     extra = 0
     for piece in pieces_of(path, file, budget):
+        if b'_' in piece:  # Python reads 1_0
+            raise FileFormatError(f'{path}: a _ among the numbers')
         words += piece.split()
         rows = min(len(words) // width, count - filled)
         try:
@@ -87,6 +89,24 @@ def read_table(
             f'{path}: {found} numbers, expected {count * width} for {count} points; truncated?'
         )
     return table
+
+
+def real(text: str | bytes) -> float:
+    """Return a number in text; ValueError for 1_0 and digits beyond ASCII, which Python reads."""
+    return float(plain(text))
+
+
+def whole(text: str | bytes) -> int:
+    """Return a whole number in text; ValueError as for ``real``."""
+    return int(plain(text))
+
+
+def plain(text: str | bytes) -> str:
+    """Return text in which Python finds the numbers that other languages do, or ValueError."""
+    found = text if isinstance(text, str) else text.decode('latin-1')
+    if '_' in found or not found.isascii():
+        raise ValueError(f'{found!r} is no number')
+    return found
 
 
 def num_numbers(layout: np.dtype[Any]) -> int:

@@ -30,6 +30,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.text_table import plain, real
 from surfel_mapper.geometry import (
     as_numbers,
     as_path,
@@ -448,7 +449,7 @@ def check_pose(where: str, values: list[float]) -> None:
 def floats(texts: Sequence[str], where: str) -> list[float]:
     """Return finite numbers from text."""
     try:
-        values = [float(text) for text in texts]
+        values = [real(text) for text in texts]
     except ValueError as error:
         raise FileFormatError(f'{where}: {error}, expected a number') from error
     if not np.isfinite(values).all():
@@ -459,8 +460,8 @@ def floats(texts: Sequence[str], where: str) -> list[float]:
 def nanoseconds(text: str, where: str, unit: str = '') -> int:
     """Return a time rounded to nanoseconds."""
     try:
-        number = Decimal(text.strip())
-    except InvalidOperation as error:
+        number = Decimal(plain(text.strip()))
+    except (InvalidOperation, ValueError) as error:
         raise FileFormatError(f'{where}: {text!r} is no time') from error
     if unit and unit not in UNITS_NS:
         raise FileFormatError(f'{where}: unit {unit!r}, expected one of {", ".join(UNITS_NS)}')

@@ -214,6 +214,8 @@ def load_tsdf(path: str | Path, config: TsdfConfig) -> BlockMap:
 def checked(blocks: BlockMap, arrays: dict[str, npt.NDArray[Any]]) -> Blocks:
     """Return the content of a file; raise ValueError if it is impossible."""
     count = len(arrays['index'])
+    if unknown := sorted({*arrays} - {*ARRAYS}):
+        raise ValueError(f'unknown arrays {unknown}')
     for name, dtype in ARRAYS.items():
         array, channel = arrays[name], getattr(blocks, name, None)
         shape: tuple[int, ...] = (count, 3) if name == 'index' else (count,)

@@ -19,6 +19,7 @@ import atexit
 from collections.abc import Iterable
 import hashlib
 import logging
+import os
 from pathlib import Path
 import re
 import shutil
@@ -102,7 +103,10 @@ def _discard_stale(directory: Path, digests: dict[str, str]) -> None:
         for file in directory.glob('*.nb[ci]'):  # hashing.find_row-100.py311.nbi
             if file.name.partition('.')[0] not in unchanged:
                 file.unlink(missing_ok=True)  # another process may do the same
-        stamps.write_text(''.join(f'{digest}  {name}\n' for name, digest in digests.items()))
+        text = ''.join(f'{digest}  {name}\n' for name, digest in digests.items())
+        written = stamps.with_suffix(f'.{os.getpid()}')  # several processes may start at once
+        written.write_text(text)
+        written.replace(stamps)
     except OSError as error:
         _log.warning('%s: kernels may be compiled at every start: %s', stamps, error)
 

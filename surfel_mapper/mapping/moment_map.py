@@ -149,7 +149,7 @@ class MomentMap:
         Raises
         ------
         MapError
-            If their voxel size differs.
+            If their voxel size differs, or no points can have these moments.
         NotInMapError
             If a voxel holds fewer points, or equally many with other sums. Nothing is changed.
             Moments that were never added are detected unless every one of their voxels holds
@@ -157,6 +157,8 @@ class MomentMap:
 
         """
         self._check_lattice(moments)
+        if not moments.is_reduced:
+            check_possible(moments)
         missing, rows, fallen = self._table.remove(moments, self.version + 1, min_points)
         if missing >= 0:
             index = moments.voxel_index[missing].tolist()
@@ -287,12 +289,12 @@ class MomentMap:
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
-        return self._table.find(key)
+        return self._table.find(np.ascontiguousarray(key, np.int64))
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the voxel keys of rows (K,), -1 for empty rows."""
-        counts, keys = (self._table.values(rows, name) for name in (layout.COUNT, layout.KEY))
-        return np.where(counts > 0, keys, -1)
+        key = self._table.values(self._table.checked(rows), layout.KEY)
+        return np.where(self._table.values(rows, layout.COUNT) > 0, key, -1)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
         """

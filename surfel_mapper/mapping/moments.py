@@ -32,6 +32,16 @@ HASHED_ARRAYS = ('key', 'count', 'total', 'product', 'view')
 """The arrays of ScanMoments in the order in which a digest hashes them."""
 
 
+ARRAYS = (
+    ('key', (), (np.int64,)),
+    ('count', (), (np.int32, np.int64)),
+    ('total', (3,), (np.int32, np.int64)),
+    ('product', (6,), (np.int64,)),
+    ('view', (3,), (np.int16, np.int64)),
+)
+"""Name, shape of a row and types of the arrays of ScanMoments."""
+
+
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ScanMoments:
     """
@@ -221,8 +231,25 @@ def joined_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
     return replace(parts[0], **arrays)
 
 
+def check_arrays(moments: ScanMoments) -> None:
+    """Raise MapError unless the arrays have the shapes and types that the kernels read."""
+    channels = len(moments.channel_names)
+    for name, width, types in (*ARRAYS, ('channels', (channels,), (np.int64,))):
+        array = getattr(moments, name)
+        shape = (len(moments), *width)
+        if not (isinstance(array, np.ndarray) and array.shape == shape and array.dtype in types):
+            found = f'{getattr(array, "dtype", type(array).__name__)} {np.shape(array)}'
+            expected = ' or '.join(each.__name__ for each in types)
+            raise MapError(f'{name} of the moments: {found}, expected {expected} {shape}')
+
+
 def check_possible(moments: ScanMoments) -> None:
-    """Raise MapError if no points of a voxel can have these moments."""
+    """Raise MapError if a voxel occurs twice, or no points of it can have its moments."""
+    check_arrays(moments)
+    if not (moments.key[1:] > moments.key[:-1]).all():  # as the moments of a map are sorted
+        in_order = np.sort(moments.key)
+        if (in_order[1:] == in_order[:-1]).any():
+            raise MapError('a voxel occurs twice in the moments')
     key, count, total, product, view = moments.arrays
     row = first_impossible(key, count, total, product, view, moments.view_is_sum, moments.level)
     if row >= 0:

@@ -118,7 +118,7 @@ class Reducer:
         ------
         ValueError
             If shapes or types are wrong, the pose is not a rigid transform, the origin is not
-            finite, or a column is missing.
+            finite, a limit of the range is negative or nan, or a column is missing.
         MapLimitError
             If a voxel gets more than 2^23 points of one scan.
 
@@ -135,7 +135,13 @@ class Reducer:
             if self._columns
             else None
         )
-        range_sq = np.array([min_range_m**2, max_range_m**2])
+        limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m))
+        if limits.shape != (2,) or not (limits >= 0.0).all():  # false for nan
+            raise ValueError(
+                f'min_range_m {min_range_m!r}, max_range_m {max_range_m!r}, expected zero or more'
+            )
+        with np.errstate(over='ignore'):
+            range_sq = limits * limits
         scale = (1 << BITS) / self.voxel_size_m
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
         try:

@@ -245,11 +245,12 @@ class SurfelMap(MomentMap):
         return len(self._table.changed_after(-1, as_whole('min_points', min_points)))
 
     def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
-        """Return the surfels of rows (K,) that ``find`` returned."""
-        return self._derive(rows)
+        """Return the surfels of rows (K,) that ``find`` returned; IndexError for others."""
+        return self._derive(self._table.checked(rows))
 
     def covariances_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
         """Return the covariances of rows (K,): (K, 6), xx xy xz yy yz zz, m^2."""
+        rows = self._table.checked(rows)
         found = np.empty((len(rows), 6))
         bits = layout.BITS + self.level
         derive_covariances(self._table.rows.array, rows, self.voxel_size_m, bits, found)

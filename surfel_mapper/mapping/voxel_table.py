@@ -162,6 +162,19 @@ class VoxelTable:
             self._channels.array[rows.astype(np.intp)] -= moments.channels
         return int(missing), rows, fallen[:num_fallen]
 
+    def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
+        """Return rows (K,) as the kernels take them; IndexError if the table does not have one."""
+        found = np.asarray(rows)
+        if found.ndim != 1 or found.dtype.kind != 'i':
+            raise IndexError(f'rows: {found.dtype} {found.shape}, expected those of find')
+        last = len(self.rows.array) - 1
+        if len(found) and not 0 <= found.min() <= found.max() <= last:
+            raise IndexError(
+                f'rows {found.min()} to {found.max()}, expected 0 to {last}; find returns -1 for '
+                'voxels that are not in the map'
+            )
+        return found.astype(np.int32, copy=False)
+
     def values(self, chosen: npt.NDArray[Any], column: int) -> npt.NDArray[np.int64]:
         """
         Return a column of some rows, (K,).

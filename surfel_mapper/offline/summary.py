@@ -5,14 +5,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 MOST_SURROUNDED = 5
 """Scans that may seem to be surrounded by what moves along, before a replay says so."""
 
 
-def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
+def as_text(summary: Mapping[str, Any], written: Sequence[str]) -> str:
     """Return the summary in a few lines for people."""
     scans = summary['scans']
     num_dropped = sum(scans['dropped'].values())
@@ -43,7 +42,7 @@ def as_text(summary: Mapping[str, Any], written: Sequence[Path]) -> str:
         f'{stages_text(summary)}\n'
         f'{filters}{aligned}{errors}{f"{apart}{chr(10)}" if apart else ""}'
         f'digest {summary["digest"]}\n'
-        f'{"   ".join(str(path) for path in written)}'
+        f'{"   ".join(written)}'
     )
 
 

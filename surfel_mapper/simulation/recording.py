@@ -23,6 +23,7 @@ import numpy as np
 from surfel_mapper.bags.writer import BagWriter
 from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import ConfigError, FileFormatError, refusing
+from surfel_mapper.files.atomic import write_json
 from surfel_mapper.messages.pointcloud2 import CloudBytes, Field
 from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.scan import Scan
@@ -167,8 +168,7 @@ def _write_description(simulation: Simulation, directory: Path) -> None:
         'num_scans': simulation.num_scans,
         'rolling': simulation.rolling,
     }
-    text = json.dumps(description, indent=1) + '\n'
-    (directory / SIMULATION_FILE).write_text(text, encoding='utf-8')
+    write_json(directory / SIMULATION_FILE, description)
 
 
 def _tuples(values: dict[str, Any]) -> dict[str, Any]:

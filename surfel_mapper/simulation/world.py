@@ -24,6 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import read_small_file
 from surfel_mapper.errors import FileFormatError, refusing
+from surfel_mapper.files.atomic import write_json
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.simulation.circuit import circuit_primitives, Corners
 from surfel_mapper.simulation.kernels import raycast, surfaces
@@ -298,8 +299,8 @@ class World:
             raise FileFormatError(f'not a world: {error}') from error
 
     def save(self, path: str | Path) -> None:
-        """Write the world to a JSON file."""
-        Path(path).write_text(json.dumps(self.to_mapping(), indent=1) + '\n', encoding='utf-8')
+        """Write the world to a JSON file, atomically."""
+        write_json(path, self.to_mapping())
 
     @classmethod
     def load(cls, path: str | Path) -> World:

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Search for inputs that cost too much, in a process that ends with it: ``test.fuzz`` starts these.
+Search for inputs that cost too much, each in a process of its own: ``test.fuzz`` starts these.
 
 Not instrumented, so that the times are those of users. Inputs are seeds, those that atheris found,
 and mutations of both. Prints a line of JSON.
@@ -9,6 +9,8 @@ and mutations of both. Prints a line of JSON.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import itertools
 import json
 import logging
 from pathlib import Path
@@ -19,6 +21,7 @@ import warnings
 
 import numpy as np
 
+from test.fuzz.children import each
 from test.fuzz.harnesses import HARNESSES
 from test.fuzz.mutations import mutations
 from test.fuzz.oracle import checked_cost, Cost
@@ -27,23 +30,23 @@ BATCH = 1000
 """Mutations of a seed of the random numbers."""
 
 
-def main(name: str, corpus: str, seconds: str) -> int:
-    """Measure inputs for a time; return 1 if one costs too much, or raises."""
+def main(folder: str, seconds: str, *names: str) -> None:
+    """Measure inputs of the harnesses of names, from the corpora in ``folder/NAME`` on."""
     logging.disable(logging.CRITICAL)
     warnings.simplefilter('ignore')
     np.seterr(all='ignore')
-    inputs = [path.read_bytes() for path in sorted(Path(corpus).iterdir())]
-    one_input = HARNESSES[name].one_input
-    one_input(inputs[0])  # imports and compiled kernels are not counted
-    worst, number, end_s = Cost(0, 0.0, 0.0, 0.0), 0, time.monotonic() + float(seconds)
-    seed = int(end_s)
-    while time.monotonic() < end_s:
-        seed += 1
-        for data in mutations(inputs, BATCH, seed) if number else inputs:
+    findings = tempfile.gettempdir()
+
+    def measure(name: str) -> None:
+        inputs = [path.read_bytes() for path in sorted(Path(folder, name).iterdir())]
+        one_input = HARNESSES[name].one_input
+        one_input(inputs[0])  # imports and compiled kernels are not counted
+        worst, number, end_s = Cost(0, 0.0, 0.0, 0.0), 0, time.monotonic() + float(seconds)
+        for data in endless(inputs, int(end_s)):
             try:
                 found = checked_cost(name, one_input, data)
-            except Exception:
-                path = Path(tempfile.gettempdir(), f'{name}-expensive-{seed}')
+            except BaseException:
+                path = Path(findings, f'{name}-expensive-{int(end_s)}')
                 path.write_bytes(data)
                 print(f'{name}: {path}', file=sys.stderr)
                 raise
@@ -51,9 +54,18 @@ def main(name: str, corpus: str, seconds: str) -> int:
             number += 1
             if time.monotonic() > end_s:
                 break
-    print(json.dumps({'name': name, 'inputs': number, **worst._asdict()}))
-    return 0
+        print(json.dumps({'inputs': number, **worst._asdict()}))
+
+    each(list(names), measure, Path(folder), 'measure')
+
+
+def endless(inputs: list[bytes], seed: int) -> Iterator[bytes]:
+    """Yield inputs, then mutations of them without end."""
+    yield from inputs
+    while True:
+        seed += 1
+        yield from itertools.islice(mutations(inputs, BATCH, seed), len(inputs), None)
 
 
 if __name__ == '__main__':
-    sys.exit(main(*sys.argv[1:]))
+    main(*sys.argv[1:])

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-One search with atheris, in a process that ends with it: ``test.fuzz`` starts these.
+Searches with atheris, each in a process of its own: ``test.fuzz`` starts these.
 
 The readers are instrumented as they are imported, so that the search sees which branches an
 input takes; the kernels are not, since numba compiles them.
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+from pathlib import Path
 import pkgutil
 import sys
 import tempfile
@@ -18,14 +19,15 @@ import tempfile
 import atheris
 
 import surfel_mapper
+from test.fuzz.children import each
 
 MOST_MB = 2048
 SLOWEST_S = 60
 """Time after which an input counts as a hang, s; far above any valid one on a busy machine."""
 
 
-def main(name: str, corpus: str, seconds: str) -> None:
-    """Search from a corpus on with the harness of a name."""
+def main(folder: str, seconds: str, *names: str) -> None:
+    """Search with the harnesses of names, from the corpora in ``folder/NAME`` on."""
     for module in pkgutil.walk_packages(surfel_mapper.__path__, 'surfel_mapper.'):
         if '.kernels.' in module.name:
             importlib.import_module(module.name)
@@ -35,20 +37,25 @@ def main(name: str, corpus: str, seconds: str) -> None:
     ):
         from test.fuzz.harnesses import HARNESSES
     logging.disable(logging.CRITICAL)
-    harness = HARNESSES[name]
-    for seed in harness.corpus():
-        harness.one_input(seed)  # kernels that compile are no hang
-    arguments = [
-        sys.argv[0],
-        corpus,
-        f'-max_total_time={seconds}',
-        f'-timeout={SLOWEST_S}',
-        f'-rss_limit_mb={MOST_MB}',
-        '-max_len=65536',
-        f'-artifact_prefix={tempfile.gettempdir()}/{name}-',
-    ]
-    atheris.Setup(arguments, harness.one_input)
-    atheris.Fuzz()
+    findings = tempfile.gettempdir()
+
+    def search(name: str) -> None:
+        harness = HARNESSES[name]
+        for seed in harness.corpus():
+            harness.one_input(seed)  # kernels that compile are no hang
+        arguments = [
+            'atheris',
+            str(Path(folder, name)),
+            f'-max_total_time={round(float(seconds))}',
+            f'-timeout={SLOWEST_S}',
+            f'-rss_limit_mb={MOST_MB}',
+            '-max_len=65536',
+            f'-artifact_prefix={findings}/{name}-',
+        ]
+        atheris.Setup(arguments, harness.one_input)
+        atheris.Fuzz()
+
+    each(list(names), search, Path(folder), 'search')
 
 
 if __name__ == '__main__':

@@ -423,7 +423,7 @@ def test_chunks_of_empty_messages_are_refused_before_the_index_fills_memory(tmp_
     with pytest.raises(BagError, match=r'a\.mcap: index of \d+ messages: needs'):
         BagReader(path)
     assert resident('VmHWM') - before < 300 << 20  # was 3.5 GB
-    assert time.thread_time() - start_s < 15.0  # 3 s; was 128 s
+    assert time.thread_time() - start_s < budget.FLOOR_S  # as the reader ends itself; was 128 s
 
 
 def indexed_mcap(chunks, stated, index=None):

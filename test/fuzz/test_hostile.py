@@ -4,9 +4,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import hashlib
 import io
 import json
+from pathlib import Path
 import struct
 import subprocess
 import sys
@@ -17,22 +19,28 @@ import zipfile
 import numpy as np
 from PIL import Image
 import pytest
+import yaml
 
 from surfel_mapper.bags.paths import files_of, stated_counts
-from surfel_mapper.config import load_config
+from surfel_mapper.cli.main import main
+from surfel_mapper.config import Config, load_config, parse_yaml, TsdfConfig
 from surfel_mapper.counters import Counters, OTHERS
 from surfel_mapper.errors import (
     BagError,
     CloudFormatError,
     ConfigError,
     FileFormatError,
+    MapError,
     MAX_LINE,
     one_line,
     PoseError,
     refusing,
 )
+from surfel_mapper.files.atomic import by_number
 from surfel_mapper.files.map_state import load_map, load_moments, save_map, window_stamps_ns
 from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.trajectory import read_trajectory
+from surfel_mapper.files.tsdf_state import load_tsdf
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.cdr import MAX_FRAME_NAME
@@ -41,6 +49,7 @@ from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_
 from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.datasets import nuscenes
 from surfel_mapper.simulation.world import World
+from test.fuzz import corpus
 
 TIMEOUT_S = 120
 
@@ -383,3 +392,198 @@ def test_tables_of_nuscenes_with_numbers_of_any_size_are_refused(tmp_path):
         path.write_text(json.dumps([found]))
     with pytest.raises(FileFormatError, match='not those of nuScenes: OverflowError'):
         nuscenes(tmp_path)
+
+
+@pytest.mark.parametrize('name', ['map.other', 'scan1.key', 'map.points', 'x'])
+def test_arrays_that_no_map_has_are_refused(saved, name):
+    changed(saved, arrays={name: np.zeros(3)})
+    for read in (load_map, load_moments, window_stamps_ns):
+        with pytest.raises(FileFormatError, match=rf"unknown arrays \['{name}'\]"):
+            read(saved)
+
+
+def test_arrays_that_no_distance_field_has_are_refused(tmp_path):
+    path = tmp_path / 'tsdf.npz'
+    path.write_bytes(corpus.tsdf())
+    load_tsdf(path, TsdfConfig())
+    changed(path, arrays={'other': np.zeros(3)})
+    with pytest.raises(FileFormatError, match=r"unknown arrays \['other'\]"):
+        load_tsdf(path, TsdfConfig())
+
+
+def test_two_members_of_one_name_are_refused(saved):
+    with zipfile.ZipFile(saved, 'a') as archive, pytest.warns(UserWarning, match='Duplicate'):
+        archive.writestr('map.key.npy', b'')
+    with pytest.raises(FileFormatError, match='a member occurs twice'):
+        load_map(saved)
+
+
+def test_columns_that_no_map_has_are_refused(tmp_path):
+    parquet = pytest.importorskip('pyarrow.parquet')
+    from surfel_mapper.files.parquet import read_map, read_moments
+
+    path = tmp_path / 'map.parquet'
+    path.write_bytes(corpus.parquet()[0])
+    table = parquet.read_table(path)
+    parquet.write_table(table.append_column('other', table['i']), path)
+    for read in (read_map, read_moments):
+        with pytest.raises(FileFormatError, match=r"unknown columns \['other'\]"):
+            read(path)
+
+
+@pytest.mark.parametrize('far_m', [1e300, -2e9, np.nan, np.inf])
+def test_poses_beyond_any_place_are_refused(saved, far_m):
+    """1e300 m passed as a rigid transform."""
+    pose = np.eye(4)
+    pose[1, 3] = far_m
+    changed(saved, arrays={'scans.pose': pose[None]})
+    with pytest.raises(FileFormatError, match='expected a rigid transform'):
+        load_map(saved)
+    with pytest.raises(ValueError, match='expected a rigid transform'):
+        SurfelMap(0.5).reduce(np.zeros((5, 3)), pose)
+
+
+@pytest.mark.parametrize(
+    ('name', 'text'),
+    [
+        ('a.pcd', '{head}SIZE 4 4 4\nTYPE F F F\nPOINTS 1_0\nDATA ascii\n' + '1 2 3\n' * 10),
+        ('a.pcd', '{head}SIZE 4 4 4\nTYPE F F F\nPOINTS 1\nDATA ascii\n1 2 3_0\n'),
+        ('a.ply', '{head}element vertex 1_0\n{xyz}' + '1 2 3\n' * 10),
+        ('a.ply', '{head}element vertex 1\n{xyz}1 2 3_0\n'),
+        ('a.ply', '{head}element vertex \u0661\n{xyz}1 2 3\n'),
+    ],
+)
+def test_numbers_that_only_python_reads_are_no_numbers(tmp_path, name, text):
+    """Python's int and float read 1_0 as ten."""
+    path = tmp_path / name
+    head = 'FIELDS x y z\n' if name == 'a.pcd' else 'ply\nformat ascii 1.0\n'
+    xyz = ''.join(f'property float {axis}\n' for axis in 'xyz') + 'end_header\n'
+    path.write_text(text.replace('{head}', head).replace('{xyz}', xyz), encoding='utf-8')
+    with pytest.raises(FileFormatError):
+        read_scan(path)
+
+
+@pytest.mark.parametrize(
+    'pose', ['1.0 1_0 0 0 0 0 0 1', '1_0.0 1 0 0 0 0 0 1', '\u0661 1 0 0 0 0 0 1']
+)
+def test_poses_of_numbers_that_only_python_reads_are_refused(tmp_path, pose):
+    path = tmp_path / 'a.tum'
+    path.write_text(f'{pose}\n', encoding='utf-8')
+    with pytest.raises(FileFormatError, match=r'a\.tum'):
+        read_trajectory(path)
+
+
+def test_settings_of_numbers_that_only_python_reads_are_refused(capsys):
+    for origin in ('1_0 0 0', '\u0661 0 0', '1 2', '1 2 3 4', '1 2 x'):
+        with pytest.raises(ConfigError, match=r'map\.origin'):
+            Config.from_mapping({'map.origin': origin})
+    for arguments in (
+        ['replay', 'a', '--every', '1_0'],
+        ['simulate', 'street', '--speed', '1_0'],
+        ['simulate', 'street', '--seed', '1_0'],
+    ):
+        with pytest.raises(SystemExit):
+            main(arguments)
+        assert '1_0' in capsys.readouterr().err
+
+
+def test_metadata_of_too_many_files_is_refused_before_a_path_is_made(tmp_path):
+    """It took 1.4 s for 50,000."""
+    names = ''.join(f'    - a{number}.mcap\n' for number in range(50_000))
+    text = f'rosbag2_bagfile_information:\n  relative_file_paths:\n{names}'
+    (tmp_path / 'metadata.yaml').write_text(text)
+    with pytest.raises(BagError, match='50000 files, expected at most 10000'):
+        files_of(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ('text', 'problem'),
+    [
+        ('a: {b: &x {c: 1}, d: *x}', None),
+        ('a: *x', 'unknown alias'),
+        ('? [1]\n: 2', 'no text'),
+        ('a: 1\n---\nb: 2', 'more than one document'),
+        ('&x [*x]', 'inside of an anchored node'),
+        ('', None),
+    ],
+)
+def test_yaml_as_text_equals_that_of_pyyaml_or_is_refused(text, problem):
+    if problem is None:
+        assert parse_yaml(text, as_text=True) == yaml.load(text, yaml.BaseLoader)
+        return
+    with pytest.raises(ValueError, match=problem):
+        parse_yaml(text, as_text=True)
+
+
+def test_names_of_files_with_digits_of_unicode_are_sorted():
+    """str.isdigit holds for superscripts, which int refuses."""
+    names = [Path(name) for name in ('1\u00b2', '\u00b2', '10', '2', '\u0661')]
+    assert [path.name for path in sorted(names, key=by_number)] == [
+        '\u0661',
+        '1\u00b2',
+        '2',
+        '10',
+        '\u00b2',
+    ]
+
+
+def test_names_with_an_end_of_line_stay_on_their_line(tmp_path, capsys):
+    folder = tmp_path / 'a\nforged: line'
+    folder.mkdir()
+    np.zeros((3, 4), np.float32).tofile(folder / '1.bin')
+    assert main(['info', str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert r'a\nforged: line: scans in files' in lines[0]
+    assert not any(line.startswith('forged') for line in lines)
+
+
+def taken(count):
+    """Return changes of moments by name, each of which no map may take."""
+    wide, twice = np.zeros((count, 7), np.int64), np.zeros(count, np.int64)
+    return {
+        'key': [np.zeros((1, count), np.int64), np.zeros(count - 1, np.int64), twice, None],
+        'count': [np.zeros(count), np.ones(3, np.int32), -np.ones(count, np.int32)],
+        'total': [np.zeros((2, 3), np.int32), np.zeros(count, np.int32), wide],
+        'product': [wide, np.zeros((count, 6), '>i8'), np.zeros((count, 6), np.uint64)],
+        'view': [np.zeros((count, 3)), np.zeros((1, 3), np.int16), wide],
+        'channels': [np.zeros((2, 0), np.int64), np.zeros((count, 1), np.int64)],
+    }
+
+
+def test_moments_of_other_shapes_and_types_are_refused_before_a_kernel_reads_them():
+    """Short arrays were read past their end, negative counts removed, and a voxel added twice."""
+    surfel_map = SurfelMap(0.5)
+    moments = surfel_map.add(np.random.default_rng(0).normal(size=(500, 3)))
+    digest = surfel_map.digest()
+    for name, arrays in taken(len(moments)).items():
+        for array in arrays:
+            wrong = replace(moments, **{name: array})
+            for change in (surfel_map.insert, surfel_map.remove):
+                with pytest.raises((MapError, TypeError)):
+                    change(wrong)
+    doubled = replace(moments.select(np.repeat(np.arange(len(moments)), 2)))
+    with pytest.raises(MapError, match='a voxel occurs twice'):
+        surfel_map.insert(doubled)
+    assert surfel_map.digest() == digest
+
+
+@pytest.mark.parametrize('rows', [[-1], [10**6], [2**31 - 1], [0.5], [[0]], ['x']])
+def test_rows_beyond_the_table_are_refused(rows):
+    """They were read from other memory."""
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.zeros((5, 3)))
+    for read in (surfel_map.surfels_of, surfel_map.covariances_of, surfel_map.keys_of):
+        with pytest.raises(IndexError, match='rows'):
+            read(np.array(rows))
+
+
+@pytest.mark.parametrize('value', [np.nan, -1.0, -np.inf, 'x', None, 1j, [1, 2]])
+@pytest.mark.parametrize('name', ['min_range_m', 'max_range_m'])
+def test_ranges_that_are_no_numbers_are_refused(name, value):
+    with pytest.raises(ValueError, match='min_range_m'):
+        SurfelMap(0.5).reduce(np.zeros((5, 3)), **{name: value})
+
+
+def test_ranges_whose_square_is_infinite_are_no_limit():
+    moments = SurfelMap(0.5).reduce(np.ones((5, 3)), max_range_m=1e200)
+    assert moments.num_points == 5

@@ -23,6 +23,7 @@ import pytest
 from surfel_mapper.files import atomic, pcd, ply
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.simulation.world import World
 
 MOST_KILLS = 20
 """Steps of a writer at which it is killed unless each is tried."""
@@ -101,6 +102,9 @@ WRITERS = {
     'parquet': write_parquet,
     'ply': lambda path, surfel_map: ply.write_surfels(path, surfel_map.surfels()),
     'pcd': lambda path, surfel_map: pcd.write_surfels(path, surfel_map.surfels()),
+    'world': lambda path, surfel_map: World(
+        [], (*surfel_map.surfels().position[0], 0.0, 0.0, 0.0, 1.0)
+    ).save(path),
     'json': lambda path, surfel_map: atomic.write_json(path, {'digest': surfel_map.digest()}),
 }
 

@@ -5,6 +5,8 @@
 from __future__ import annotations
 
 import json
+import os
+import sys
 
 import pytest
 
@@ -194,3 +196,21 @@ def test_a_type_of_a_bag_imports_no_module_from_the_working_directory(
     with pytest.raises(DependencyError, match='evil_msgs'):
         message_type('evil_msgs/msg/Thing')
     assert not ran.exists()
+
+
+def test_packages_of_messages_are_those_of_the_ament_index(domain, tmp_path, monkeypatch):
+    """Listed as having interfaces: a package that is only installed, or a folder, is not."""
+    for name in ('odd_msgs', 'plain_package'):
+        (tmp_path / name / 'msg').mkdir(parents=True)
+        (tmp_path / name / '__init__.py').write_text('')
+        (tmp_path / name / 'msg' / '__init__.py').write_text('class Thing: ...\n')
+    index = tmp_path / 'share' / 'ament_index' / 'resource_index'
+    for kind, name in (('rosidl_interfaces', 'odd_msgs'), ('packages', 'plain_package')):
+        (index / kind).mkdir(parents=True)
+        (index / kind / name).touch()
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.setenv('AMENT_PREFIX_PATH', f'{os.pathsep}{tmp_path}')
+    assert message_type('odd_msgs/msg/Thing').__module__ == 'odd_msgs.msg'
+    with pytest.raises(DependencyError, match='no package plain_package of messages'):
+        message_type('plain_package/msg/Thing')
+    assert 'plain_package' not in sys.modules
