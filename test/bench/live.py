@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 import json
 import os
 from pathlib import Path
@@ -35,6 +36,7 @@ from test.bench.live_publisher import NUM_SCANS
 from test.bench.options import Options
 from test.bench.report import Row
 from test.bench.street import Street
+from test.ros.domain import domain_of_our_own
 
 ROOT = Path(__file__).parents[2]
 RATE_HZ = 20.0
@@ -58,25 +60,27 @@ CPU_TICKS = os.sysconf('SC_CLK_TCK')
 
 def run(options: Options) -> list[Row]:
     """Return rows of latencies and rates; none without ROS."""
-    try:
-        import rclpy  # noqa: F401
-    except ImportError:
-        print('no rclpy: the node is not measured', file=sys.stderr)
-        return []
-    street = Street(options)
-    street.prepare(NUM_SCANS)
-    isolate()
     scale = options.scans / 100  # --quick takes a quarter of the time
-    rows: list[Row] = list(transport(options, min(scale, 1.0)))
-    for size_m in options.voxel_sizes_m:
-        rows += rates(options, street, size_m, scale)
+    rows: list[Row] = []
+    with street_over_dds(options) as street:
+        if street:
+            rows += transport(options, min(scale, 1.0))
+            for size_m in options.voxel_sizes_m:
+                rows += rates(options, street, size_m, scale)
     return rows
 
 
-def isolate() -> None:
-    """Keep ROS traffic on this machine, in a ROS domain for this run."""
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
+@contextmanager
+def street_over_dds(options: Options) -> Iterator[Street | None]:
+    """Prepare the scans and a ROS domain for a with-block; None without ROS, which is printed."""
+    if find_spec('rclpy') is None:
+        print('no rclpy: the node is not measured', file=sys.stderr)
+        yield None
+        return
+    street = Street(options)
+    street.prepare(NUM_SCANS)
+    with domain_of_our_own():
+        yield street
 
 
 def rates(options: Options, street: Street, size_m: float, scale: float) -> Iterator[Row]:

@@ -15,25 +15,22 @@ A row at 20 Hz lasts a minute, with ``--scans 1000`` ten.
 from __future__ import annotations
 
 from collections.abc import Iterator
-import sys
 
 from test.bench.live import (
     BUDGET_VOXEL_M,
     BURST,
     BURST_HZ,
-    isolate,
     LATENCY_BUDGET_MS,
     listening,
     measure,
     Node,
     publish,
     RATE_HZ,
+    street_over_dds,
     transport,
 )
-from test.bench.live_publisher import NUM_SCANS
 from test.bench.options import Options
 from test.bench.report import Row
-from test.bench.street import Street
 
 SECONDS, SECONDS_FAST = 60.0, 15.0
 FAST_HZ = 40.0
@@ -42,17 +39,12 @@ BUDGETS = {f'budget_{name}': value for name, value in {**LATENCY_BUDGET_MS, 'dro
 
 def run(options: Options) -> list[Row]:
     """Return a row for every rate, by defaults and with the profile; none without ROS."""
-    try:
-        import rclpy  # noqa: F401
-    except ImportError:
-        print('no rclpy: the node is not measured', file=sys.stderr)
-        return []
-    street = Street(options)
-    street.prepare(NUM_SCANS)
-    isolate()
     scale = options.scans / 100
-    mount = list(street.simulation.drive.base_to_sensor)
-    return [*transport(options, min(scale, 1.0)), *rows(options, mount, scale)]
+    with street_over_dds(options) as street:
+        if not street:
+            return []
+        mount = list(street.simulation.drive.base_to_sensor)
+        return [*transport(options, min(scale, 1.0)), *rows(options, mount, scale)]
 
 
 def rows(options: Options, mount: list[float], scale: float) -> Iterator[Row]:

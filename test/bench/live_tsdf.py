@@ -14,13 +14,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-import sys
 from typing import Any
 
 import yaml
 
-from test.bench.live import isolate, latencies, listening, Node, publish
-from test.bench.live_publisher import NUM_SCANS
+from test.bench.live import latencies, listening, Node, publish, street_over_dds
 from test.bench.options import Options
 from test.bench.report import Row
 from test.bench.street import Street
@@ -34,22 +32,17 @@ MESSAGES = {'mesh': 'Marker', 'mesh_tiles': 'MarkerArray'}
 
 def live_rows(options: Options) -> Iterator[Row]:
     """Yield the rows; none without ROS."""
-    try:
-        import rclpy  # noqa: F401
-    except ImportError:
-        print('no rclpy: the node is not measured', file=sys.stderr)
-        return
-    street = Street(options)
-    street.prepare(NUM_SCANS)
-    isolate()
     seconds = SECONDS * min(options.scans / 100, 1.0)
-    none = measured(options, street, seconds, has_field=False, reader='')
-    yield none
-    field = measured(options, street, seconds, has_field=True, reader='')
-    yield {**field, 'more_than': none['case'], 'more_ms': beyond(field, none)}
-    for reader in MESSAGES:
-        row = measured(options, street, seconds, has_field=True, reader=reader)
-        yield {**row, 'more_than': field['case'], 'more_ms': beyond(row, field)}
+    with street_over_dds(options) as street:
+        if not street:
+            return
+        none = measured(options, street, seconds, has_field=False, reader='')
+        yield none
+        field = measured(options, street, seconds, has_field=True, reader='')
+        yield {**field, 'more_than': none['case'], 'more_ms': beyond(field, none)}
+        for reader in MESSAGES:
+            row = measured(options, street, seconds, has_field=True, reader=reader)
+            yield {**row, 'more_than': field['case'], 'more_ms': beyond(row, field)}
 
 
 def beyond(row: Row, other: Row) -> float:

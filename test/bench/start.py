@@ -17,15 +17,12 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 import tempfile
 import time
 
-from test.bench.live import isolate, Node, start_lidar, TIMEOUT_S
-from test.bench.live_publisher import NUM_SCANS
+from test.bench.live import Node, start_lidar, street_over_dds, TIMEOUT_S
 from test.bench.options import Options
 from test.bench.report import Row
-from test.bench.street import Street
 
 RATE_HZ, SECONDS = 10.0, {'bare': 40.0, 'cold': 40.0, 'warm': 5.0}
 
@@ -39,18 +36,12 @@ STARTS = (
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for a cold start and one for a warm start; none without ROS."""
-    try:
-        import rclpy  # noqa: F401
-    except ImportError:
-        print('no rclpy: the node is not measured', file=sys.stderr)
-        return []
-    street = Street(options)
-    street.prepare(NUM_SCANS)
-    isolate()
-    mount = list(street.simulation.drive.base_to_sensor)
+    """Return a row for each start, bare, cold and warm; none without ROS."""
     rows: list[Row] = []
-    with tempfile.TemporaryDirectory() as cache:
+    with street_over_dds(options) as street, tempfile.TemporaryDirectory() as cache:
+        if not street:
+            return []
+        mount = list(street.simulation.drive.base_to_sensor)
         for way, kernels, budgets in STARTS:
             caches = {'NUMBA_CACHE_DIR': f'{cache}/{kernels}', 'PYTHONPYCACHEPREFIX': cache}
             row = start(options, mount, caches, way)

@@ -6,36 +6,19 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 import fcntl
-import itertools
-import os
-import socket
 import sys
 
 import pytest
 
+from test.ros.domain import domain_of_our_own
 from test.ros.prefork import load, Prefork
-
-
-@contextmanager
-def domain_of_our_own():
-    """Reserve a ROS domain that no other run of these tests uses, in a with-block."""
-    for number in itertools.chain(range(os.getpid() % 100, 100), range(100)):
-        with socket.socket(socket.AF_UNIX) as claim:
-            try:
-                claim.bind(f'\0surfel_mapper-tests-in-domain-{number + 1}')
-            except OSError:  # taken; released when its process ends
-                continue
-            yield number + 1
-            return
 
 
 @pytest.fixture(scope='session')
 def domain(tmp_path_factory):
     """Keep the ROS traffic of this test run on this machine and in its own domain."""
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
-    with domain_of_our_own() as number, pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_DOMAIN_ID', str(number))
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    with domain_of_our_own(), pytest.MonkeyPatch.context() as patch:
         patch.setenv('ROS_LOG_DIR', str(tmp_path_factory.mktemp('ros_log')))
         yield
 

@@ -18,7 +18,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 import json
 import math
-import os
 from pathlib import Path
 import random
 import sys
@@ -47,7 +46,7 @@ from test.bench.options import Options
 from test.bench.report import Row
 from test.bench.street import Street
 from test.fuzz.mutations import cut, flip, overwrite, randomise
-from test.ros.conftest import domain_of_our_own
+from test.ros.domain import domain_of_our_own
 from test.ros.live import Peer, Process, stamp
 from test.soak.core import BASE, CONFIG, there_and_back, TURN_M
 from test.soak.faults import FAULT_SHARE, RATE_HZ, serialised
@@ -520,8 +519,7 @@ def block(drive: FaultyNode, num_scans: int, seconds: float) -> Row:
 
 if __name__ == '__main__':
     length = Options(scans=300, beams=32, columns=256)
-    with domain_of_our_own() as domain:
-        os.environ |= {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+    with domain_of_our_own():
         for row in run(10**9, length, 60.0 * float(sys.argv[1])):
             print(json.dumps(row), flush=True)
     print('every cloud counted, the map equals an offline replay of its scans')
