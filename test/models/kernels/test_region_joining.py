@@ -10,18 +10,26 @@ import pytest
 from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.joining import join_patches, layers, single_regions, touching_regions
+from surfel_mapper.models.kernels import region_joining
 from surfel_mapper.models.kernels.region_joining import (
     describe_regions,
     join_layers,
     join_pair,
     join_smooth,
 )
-from test.kernels.modes import both
+from test.kernels.modes import both, interpreted
 
 SIZE_M = 0.05
 VIEW = np.array([4.0, 0.2, 6.0])
 CYLINDER, FLOOR, WALL = range(3)
 SURFACES = np.repeat([CYLINDER, FLOOR, WALL], [6, 3, 2])
+
+
+@pytest.fixture(autouse=True)
+def heap_of_the_interpreter(request, monkeypatch):
+    """Interpret what an interpreted kernel does with its heap: numba warns of lists of Python."""
+    if 'call' in request.fixturenames and request.getfixturevalue('call') is interpreted:
+        monkeypatch.setattr(region_joining, 'push', region_joining.push.py_func)
 
 
 def scene(sigma_m):
