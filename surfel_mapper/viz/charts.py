@@ -113,14 +113,20 @@ def lines(x: Array, series: Mapping[str, Array], x_label: str, y_label: str) -> 
 
 def histogram(values: Array, low: float, high: float, x_label: str, y_label: str) -> str:
     """Return a histogram of NUM_BINS bars from low to high; non-finite values are left out."""
+    from matplotlib.collections import PolyCollection
+
     finite = values[np.isfinite(values)]
     if not len(finite):
         return NO_DATA
     clipped = np.clip(finite, low, high)
     counts, edges = np.histogram(clipped, bins=NUM_BINS, range=(low, high))
+    left, right, bottom, top = edges[:-1], edges[1:], np.zeros(NUM_BINS), counts
+    corners = [(left, bottom), (left, top), (right, top), (right, bottom)]
+    bars = list(np.transpose(corners, (2, 0, 1)))
     with _axes(HEIGHT, with_numbers=True) as (figure, axes):
-        axes.bar(edges[:-1], counts, np.diff(edges), align='edge', color=BAR)
-        axes.set(xlim=(low, high), xlabel=x_label, ylabel=y_label)
+        # half the time of NUM_BINS single bars
+        axes.add_collection(PolyCollection(bars, color=BAR, linewidth=0.0))
+        axes.set(xlim=(low, high), ylim=(0.0, 1.05 * counts.max()), xlabel=x_label, ylabel=y_label)
         _label_numbers(axes)
         return _svg(figure, f'{y_label} by {x_label}')
 

@@ -63,12 +63,19 @@ def new_page(browser):
     return page
 
 
+@pytest.fixture(scope='module')
+def written(tmp_path_factory):
+    """Return the path of a report of a plane, not to be changed."""
+    folder = tmp_path_factory.mktemp('report')
+    report(folder, plane(30))
+    return folder / 'report.html'
+
+
 @pytest.fixture
-def opened(browser, tmp_path):
+def opened(browser, written):
     """Return a page that shows a report, and its console messages, errors and requests."""
-    report(tmp_path, plane(30))
     complaints, page = [], new_page(browser)
-    address = (tmp_path / 'report.html').as_uri()
+    address = written.as_uri()
     page.on('console', lambda message: complaints.append(message.text))
     page.on('pageerror', lambda error: complaints.append(str(error)))
     page.on('request', lambda asked: asked.url == address or complaints.append(asked.url))
@@ -227,11 +234,10 @@ def test_the_bar_has_the_length_that_it_states(opened):
     assert 24.0 < width <= 120.0
 
 
-def test_the_whole_map_is_in_view_on_a_telephone(browser, tmp_path):
-    report(tmp_path, plane(30))
+def test_the_whole_map_is_in_view_on_a_telephone(browser, written):
     page = browser.new_page(viewport={'width': 390, 'height': 844})
     page.set_default_timeout(1000 * WAIT_S)
-    page.goto((tmp_path / 'report.html').as_uri())
+    page.goto(written.as_uri())
     image = picture_when(page, lambda image: num_coloured(image) > 2000)
     found = np.nonzero(np.ptp(image, axis=2) > 0.1)
     assert len(found[0]) > 2000
@@ -288,10 +294,9 @@ INJECTED = (
 
 
 @pytest.mark.parametrize('injected', INJECTED)
-def test_the_policy_blocks_what_is_injected_into_the_page(browser, tmp_path, injected):
-    report(tmp_path, plane(30))
+def test_the_policy_blocks_what_is_injected_into_the_page(browser, written, tmp_path, injected):
     path = tmp_path / 'report.html'
-    text = path.read_text(encoding='utf-8')
+    text = written.read_text(encoding='utf-8')
     path.write_text(text.replace('<h1>', f'{injected}<h1>', 1), encoding='utf-8')
     complaints, page = [], new_page(browser)
     page.on('console', lambda message: complaints.append(message.text))
