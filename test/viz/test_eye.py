@@ -21,14 +21,20 @@ from surfel_mapper.viz.server import free_port, rerun_program
 from surfel_mapper.viz.show import show_contents, Shown
 from test.viz.test_show import ground_map
 
-experimental = pytest.importorskip('rerun.experimental', reason='rerun is not installed')
-
 WAIT_S = 60.0
 
-pytestmark = pytest.mark.skipif(
-    not hasattr(getattr(experimental, 'ViewerClient', None), 'get_blueprint'),
-    reason='this rerun cannot say where its eye is',
-)
+
+@pytest.fixture(autouse=True, scope='module')
+def needs_a_viewer_that_tells_its_eye():
+    experimental = pytest.importorskip('rerun.experimental', reason='rerun is not installed')
+    if not hasattr(getattr(experimental, 'ViewerClient', None), 'get_blueprint'):
+        pytest.skip('this rerun cannot say where its eye is')
+
+
+def connected(port):
+    from rerun.experimental import ViewerClient
+
+    return ViewerClient.connect(address(port))
 
 
 @contextmanager
@@ -40,7 +46,7 @@ def window(port):
     ) as process:
         try:
             until(lambda: is_open(process, port))
-            yield experimental.ViewerClient.connect(address(port)), process
+            yield connected(port), process
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
@@ -54,7 +60,7 @@ def is_open(process, port):
     if process.poll() is not None:
         pytest.skip('rerun draws nothing here: no Vulkan, not even that of a processor')
     try:
-        experimental.ViewerClient.connect(address(port)).get_state()
+        connected(port).get_state()
     except (ConnectionError, RuntimeError):
         return False
     return True

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 import json
 import struct
 import sys
@@ -18,7 +19,9 @@ from surfel_mapper.viz.discs import CORNERS, DrawnDiscs, shaded
 from test.viz.test_mesh import sphere
 from test.viz.test_show import ground, ground_map, UTM
 
-pytest.importorskip('trimesh', reason='trimesh is not installed (extra gltf)')
+pytestmark = pytest.mark.skipif(
+    find_spec('trimesh') is None, reason='trimesh is not installed (extra gltf)'
+)
 
 TYPES = {5120: 'i1', 5121: 'u1', 5123: '<u2', 5125: '<u4', 5126: '<f4'}
 WIDTHS = {'SCALAR': 1, 'VEC3': 3, 'VEC4': 4}
