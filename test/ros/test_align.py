@@ -18,10 +18,16 @@ from surfel_mapper.config import Config
 from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
+from test.alignment.circuit import circuit, gap
+from test.alignment.circuit import drifted as drifted_circuit
 from test.alignment.street import drifted, relative_errors, street_scans
-from test.ros.live import cloud, LATCHED, odometry
+from test.ros.live import cloud, LATCHED, odometry, START_NS
 
 NUM_SCANS = 4
+
+BLOCK = ((0.0, 0.0), (40.0, 0.0), (40.0, 30.0), (0.0, 30.0), (0.0, 0.0), (36.0, 0.0))
+"""Corners of a drive around a block, and along the first street again."""
+
 SETTINGS = {
     'pose.source': 'odometry',
     'frames.base': 'lidar',
@@ -120,20 +126,60 @@ def test_map_to_odom_is_published_with_every_scan(start, peer):
     assert transform.header.stamp == sent[-1][0].header.stamp
 
 
-def test_align_closes_loops_if_their_points_are_kept(start, peer, tmp_path):
-    settings = {'loops.enabled': True, 'loops.directory': str(tmp_path), 'window.max_scans': 0}
+def around_the_block():
+    """Return clouds of a drive that returns, poses of odometry that drifts, and true poses."""
+    seen = circuit(BLOCK)
+    odometric = drifted_circuit(seen.poses, 0.1)
+    found = []
+    for number, (points, pose) in enumerate(zip(seen.scans, odometric, strict=True)):
+        stamp_ns = START_NS + number * 100_000_000
+        message = odometry(stamp_ns, pose[:3, 3], child='lidar')
+        orientation = message.pose.pose.orientation
+        orientation.x, orientation.y, orientation.z, orientation.w = q_xyzw(pose).tolist()
+        found.append((cloud(stamp_ns, points[::2]), message))
+    return found, odometric, seen.poses
+
+
+def test_a_loop_moves_the_map_and_the_odometry_goes_on(start, peer, tmp_path):
+    settings = {
+        'loops.enabled': True,
+        'loops.directory': str(tmp_path),
+        'loops.recognise_distance_m': 10.0,
+        'window.max_scans': 0,
+        'window.keep_points': False,
+    }
     extra = [item for k, v in settings.items() for item in ('-p', f'{k}:={v}')]
     node = start('node', *ARGUMENTS, *extra)
+    peer.diagnosis({'scans.mapped': 0})
     paths = peer.collect(Path, '/surfel_mapper/path', LATCHED)
-    sent = driven(peer)
-    peer.diagnosis({'scans.mapped': NUM_SCANS})
+    peer.advertise('/odom', '/points', depth=1000)
+    messages, odometric, true = around_the_block()
+    before = len(messages) - 3
 
-    answer = peer.call('align')
+    def send(first, last):
+        for number in range(first, last):
+            points, pose = messages[number]
+            peer.publish('/odom', pose)
+            peer.publish('/points', points)
+            if number % 8 == 7 or number + 1 == last:  # the node keeps 20 clouds
+                peer.diagnosis({'scans.mapped': number + 1})
+
+    send(0, before)
+    closed = peer.call('align')
     peer.spin_until(lambda: paths)
+    send(before, len(messages))
+    again = peer.call('align')
+    peer.spin_until(lambda: len(paths) == 2)
 
-    assert answer.success, answer.message
-    loops, _, window = answer.message.partition('; ')
-    assert loops == 'no loops found'  # four scans in a row: only the window moves
-    assert window == str(aligned_twin(sent)[1])
-    assert len(paths[-1].poses) == NUM_SCANS
+    assert closed.success, closed.message
+    assert again.success, again.message
+    corrected, after = (np.array([pose_of(p.pose) for p in path.poses]) for path in paths)
+    assert len(corrected) == before
+    assert gap(corrected, true, 5, before - 5) < 0.3 < 2.0 < gap(odometric, true, 5, before - 5)
+    # scans after the jump continue from the corrected place by the steps of the odometry
+    assert len(after) == len(messages)
+    step = np.linalg.inv(odometric[before - 1]) @ odometric[-1]
+    found = np.linalg.inv(after[before - 1]) @ after[-1]
+    np.testing.assert_allclose(found, step, rtol=0, atol=0.02)
+    assert gap(after, true, 5, len(true) - 1) < 0.4
     assert 'Traceback' not in node.output
