@@ -26,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.alignment.kernels.steps import move_pose, solve_step
+from surfel_mapper.alignment.moving_along import moving_along
 from surfel_mapper.alignment.surfel_planes import PlaneLevels, SurfelPlanes
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import compose, inverse, rotation_angle, Transform
@@ -54,7 +55,7 @@ SEARCH_STEP_DEG = 7.5
 """Step of the heading search, deg."""
 
 SEARCH_CELLS = 3000
-"""Maximum number of cells that the heading search uses."""
+"""Maximum number of cells that the heading search, and the search for what moves along, use."""
 
 SEARCH_STARTS = 4
 """Number of best places of the search from which the whole scan is aligned."""
@@ -100,6 +101,9 @@ class RegistrationResult:
         0 if there is none, or if the first start fitted and no search was needed.
     is_found : bool
         The place was found by a search and differs from that of the first start.
+    moving_along : float
+        Share of the cells that move along with the sensor and were left out; of the others there
+        are ``num_cells``.
 
     """
 
@@ -114,6 +118,7 @@ class RegistrationResult:
     radius_m: float
     rival: float = 0.0
     is_found: bool = False
+    moving_along: float = 0.0
 
     @property
     def support(self) -> float:
@@ -139,11 +144,16 @@ class Registration:
         self._voxel_size_m = voxel_size_m
         self._reducer = Reducer(config.cell_m or 0.5 * voxel_size_m)
 
+    @property
+    def cell_m(self) -> float:
+        """Edge of the cells that a scan is reduced to, m."""
+        return self.config.cell_m or 0.5 * self._voxel_size_m
+
     def cells(
         self, points: npt.ArrayLike, min_range_m: float = 0.0, max_range_m: float = math.inf
     ) -> npt.NDArray[np.float64]:
         """Return the mean of the points (N, 3) of a scan in each cell, (K, 3) float64, m."""
-        size_m = self.config.cell_m or 0.5 * self._voxel_size_m
+        size_m = self.cell_m
         if size_m != self._reducer.voxel_size_m:
             self._reducer = Reducer(size_m)
         moments = self._reducer.reduce(points, min_range_m=min_range_m, max_range_m=max_range_m)
@@ -158,6 +168,7 @@ class Registration:
         deviation_m: float,
         expected_support: float = 0.0,
         is_lost: bool = False,
+        before: npt.NDArray[np.float64] | None = None,
     ) -> RegistrationResult:
         """
         Return the pose of a scan on a map.
@@ -179,9 +190,16 @@ class Registration:
         is_lost : bool
             The starts are guesses: they are all tried, and of places that fit about equally well
             each is a rival of the best, however far it is.
+        before : (B, 3) float64, m, optional
+            Cells of the scan at the second start, if the motion from there to the first start is
+            large and certain. If it tells that many cells move along, the others decide.
 
         """
         levels = PlaneLevels(self.config, surfel_map, cells, starts)
+        if before is not None:
+            standing = self._standing(cells, before, levels, starts, deviation_m)
+            if standing is not None:
+                return standing
         found = self._descend(cells, levels, starts[0], deviation_m)
         is_usual = found.converged and found.support >= expected_support and self.fits(found)
         if is_lost or not is_usual:
@@ -195,6 +213,29 @@ class Registration:
             is_found = not is_near(found.T_map_sensor, first, self._voxel_size_m)
             found = replace(found, is_found=is_found)
         return found
+
+    def _standing(
+        self,
+        cells: npt.NDArray[np.float64],
+        before: npt.NDArray[np.float64],
+        levels: PlaneLevels,
+        starts: Sequence[Transform],
+        deviation_m: float,
+    ) -> RegistrationResult | None:
+        """Align what stands still; None if little moves along, or the rest does not fit."""
+        motion_m = compose(inverse(starts[1]), starts[0])[:3, 3]
+
+        def moves(some: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+            normals = levels.planes(0).normals(some, starts[0]) @ starts[0][:3, :3]
+            return moving_along(some, before, motion_m, normals, self.cell_m)
+
+        if not moves(thinned(cells, SEARCH_CELLS)).any():
+            return None
+        moving = moves(cells)
+        found = self._descend(np.ascontiguousarray(cells[~moving]), levels, starts[0], deviation_m)
+        if not (found.converged and self.fits(found)):
+            return None
+        return replace(found, moving_along=float(moving.mean()))
 
     def _chosen(
         self, places: Sequence[RegistrationResult], starts: Sequence[Transform], is_lost: bool

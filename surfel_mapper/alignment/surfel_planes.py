@@ -31,15 +31,19 @@ import numpy.typing as npt
 from surfel_mapper.alignment.kernels.planes import continuation_keys, fill_planes
 from surfel_mapper.alignment.kernels.registration import (
     cell_keys,
+    NORMAL,
     number_rows,
     PLANE,
     sum_equations,
+    VARIANCE,
 )
 from surfel_mapper.config import RegistrationConfig
 from surfel_mapper.geometry import Transform
 from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
+
+NORMALS = slice(NORMAL, NORMAL + 3)
 
 NOISE_IN_PLANE = 3.0
 """Upper bound of the variance across a ring of a lidar, along the beam, in variances of a
@@ -141,6 +145,15 @@ class SurfelPlanes:
             new = self._map.surfels_of(known[num_known:num_now])
             self._planes = np.concatenate([self._planes, self._as_planes(new)])
         return found
+
+    def normals(
+        self, cells: npt.NDArray[np.float64], T_map_sensor: Transform
+    ) -> npt.NDArray[np.float64]:
+        """Return the unit normal (K, 3), in the map, of the plane that each cell hits, or NaN."""
+        place = self.place(cells, T_map_sensor)
+        is_usable = np.isfinite(self._planes[:, VARIANCE, None])
+        known = np.where(is_usable, self._planes[:, NORMALS], np.nan)
+        return np.concatenate([known, np.full((1, 3), np.nan)])[place]
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
         """

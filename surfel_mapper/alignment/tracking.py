@@ -48,6 +48,9 @@ FIRST_SUPPORT = 0.35
 """Minimum support before there are recent scans: real scans of a hall that a hand turned by 90 deg
 fit the scan before to 0.5."""
 
+MAX_DECELERATION = 10.0
+"""Deceleration of a vehicle that brakes as hard as it can, m/s^2."""
+
 FLOOR_NOISES = 3.0
 """Minimum expected deviation, in standard deviations of a range."""
 
@@ -88,6 +91,7 @@ class Tracker:
         self.pose = T_fixed_body
         self.twist: npt.NDArray[np.float64] = np.zeros(6)
         self._stamp_ns: int | None = None
+        self._cells: npt.NDArray[np.float64] | None = None
         self._clear_history()
 
     def begin(self, stamp_ns: int, twist: npt.NDArray[np.float64]) -> None:
@@ -160,7 +164,11 @@ class Tracker:
         if self._stamp_ns is not None:
             starts.append(compose(T_map_fixed, self.pose))
         expected = self.expected_support
-        found = self._registration.align(cells, surfel_map, starts, self.deviation_m, expected)
+        before = self._cells if self._surely_moves(stamp_ns) else None
+        self._cells = cells
+        found = self._registration.align(
+            cells, surfel_map, starts, self.deviation_m, expected, before=before
+        )
         is_usual = bool(self._supports) and found.support >= expected > 0.0
         is_steady = found.converged or is_usual
         is_ambiguous = found.rival > 0.0
@@ -183,6 +191,14 @@ class Tracker:
         self._supports.append(found.support)
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
         return found
+
+    def _surely_moves(self, stamp_ns: int) -> bool:
+        """Return whether the body moves on by a cell at least: it cannot have stopped."""
+        if self._stamp_ns is None:
+            return False
+        since_s = (stamp_ns - self._stamp_ns) / 1e9
+        least_m = max(self._registration.cell_m, MAX_DECELERATION * since_s**2)
+        return float(np.linalg.norm(self.twist[:3])) * since_s >= least_m
 
     @property
     def expected_support(self) -> float:

@@ -39,8 +39,9 @@ from surfel_mapper.scan import PointTimes, Scan
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
-STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'surrounded')
-"""States of tracking; surrounded: most of what is seen seems to move along."""
+STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'accompanied', 'surrounded')
+"""States of tracking; accompanied: much of what is seen moves along, and the rest decides;
+surrounded: most of it seems to, and the pose may be wrong."""
 
 MAX_STEP_S = 10.0
 """Longest time between two scans that counts for a state, s; more is a gap of the recording."""
@@ -400,7 +401,9 @@ class RegisteredPoses:
             states.append('unconfirmed' if self._part.has_place else 'lost')
             states += ['ambiguous'] if 'ambiguous' in self._part.reason else []
         elif placed and placed[-1].registration is not None:
-            states += ['degenerate'] if len(placed[-1].registration.degenerate) else []
+            found = placed[-1].registration
+            states += ['degenerate'] if len(found.degenerate) else []
+            states += ['accompanied'] if found.moving_along else []
         self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:

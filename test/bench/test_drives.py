@@ -66,8 +66,8 @@ def test_sequences_in_which_ours_is_better_are_counted():
     assert total(rows) == {'sequence': 'all', 'ours is': 'better than both on 2 of 3'}
 
 
-def test_ten_sequences_are_tracked():
-    assert len(tracking.THINNED) + len(tracking.scenarios()) == 10
+def test_eleven_sequences_are_tracked():
+    assert len(tracking.THINNED) + len(tracking.scenarios()) == 11
 
 
 def test_progress_that_a_peer_prints_does_not_disturb_its_figures(tmp_path):
