@@ -77,7 +77,7 @@ def moving_along(
     order = np.argsort(known)
     rows = order[np.searchsorted(known, keys, sorter=order).clip(max=len(known) - 1)]
     off_m = np.abs((cells - before[rows]) @ direction)
-    found = may_move & (known[rows] == keys) & (off_m < SAME_PLACE * cell_m)
+    found: npt.NDArray[np.bool_] = may_move & (known[rows] == keys) & (off_m < SAME_PLACE * cell_m)
     if found.mean() < MUCH:
         return nothing
     others = np.flatnonzero(may_move & ~found)

@@ -153,7 +153,8 @@ class SurfelPlanes:
         place = self.place(cells, T_map_sensor)
         is_usable = np.isfinite(self._planes[:, VARIANCE, None])
         known = np.where(is_usable, self._planes[:, NORMALS], np.nan)
-        return np.concatenate([known, np.full((1, 3), np.nan)])[place]
+        found: npt.NDArray[np.float64] = np.concatenate([known, np.full((1, 3), np.nan)])[place]
+        return found
 
     def _as_planes(self, surfels: Surfels) -> npt.NDArray[np.float64]:
         """
