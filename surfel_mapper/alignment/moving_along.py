@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 STRIDES = np.array([1, 1 << 20, 1 << 40])
 """Numbers of the cells along the axes, up to 2^19 cells from the body, in one integer."""
@@ -82,6 +81,8 @@ def moving_along(
         return nothing
     others = np.flatnonzero(may_move & ~found)
     if len(others):
+        from scipy.spatial import cKDTree  # which maps without such company do not need
+
         away_m, _ = cKDTree(cells[found]).query(cells[others], distance_upper_bound=EDGE * cell_m)
         found[others[np.isfinite(away_m)]] = True
     return found

@@ -1,6 +1,6 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""What was at the same place in the scan before moves along, unless motion leaves it in place."""
+"""Cells that move along: at the same place as in the scan before, against the motion."""
 
 from __future__ import annotations
 
