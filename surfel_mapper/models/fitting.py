@@ -69,7 +69,7 @@ Indices = npt.NDArray[np.int64]
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
 
-COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0), 0.12
+COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0, 16.0, 32.0), 0.05
 """Coarser voxels for sparse points, and the share of points on no patch from which they help."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
@@ -172,9 +172,14 @@ def fit_points(
         config,
         view,
     )
-    found = grow_sparse(thinned, voxels, found, config, view)
+    joined = grow_sparse(thinned, voxels, found, config, view)
     laps.append(perf_counter())
-    return fit_owners(thinned, voxels, found, config, view)
+    fitted = owner_patches(joined, config, view)
+    lost = np.array([patch is None for patch in fitted], np.bool_)
+    if lost.any() and joined is not found:
+        joined = separated(voxels, joined, found, lost)
+        fitted = owner_patches(joined, config, view)
+    return owner_models(thinned, voxels, joined, fitted, config)
 
 
 def grow_sparse(
@@ -216,10 +221,24 @@ def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:
     return blocks
 
 
-def fit_owners(
-    thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
-) -> MultiModel:
-    """Fit patches to the points that they own, and Gaussians to groups of the others."""
+def separated(
+    voxels: VoxelPoints, joined: Grown, before: Grown, lost: npt.NDArray[np.bool_]
+) -> Grown:
+    """Return joined patches, the lost ones (K,) as they were before; these are multi-valued."""
+    number = len(joined.normals)
+    again = np.append(lost, np.False_)[np.maximum(joined.owner, -1)]
+    earlier = np.where(before.owner >= 0, before.owner + number, before.owner)
+    owner = np.where(again, earlier, joined.owner)
+    used, index = np.unique(np.maximum(owner, -1), return_inverse=True)
+    shift = int(used[0] < 0)
+    owner = np.where(owner < 0, owner, index - shift).astype(np.int32)
+    normals = np.concatenate([joined.normals, before.normals])[used[shift:]]
+    curved = np.concatenate([joined.curved, before.curved])[used[shift:]]
+    return grown(owner, owner_table(voxels, owner), normals, curved, joined.tolerance_m)
+
+
+def owner_patches(found: Grown, config: ModelsConfig, view: Array) -> list[Plane | None]:
+    """Fit patches to the points that they own; None for multi-valued ones."""
     number = len(found.normals)
     starts = np.searchsorted(found.owners, np.arange(number + 1))
     first = int(starts[0])
@@ -233,7 +252,18 @@ def fit_owners(
         thickness=thickness(middle, config, view),
         curved=found.curved,
     )
-    patches = fit_patches(points, config, view) if number else []
+    return fit_patches(points, config, view) if number else []
+
+
+def owner_models(
+    thinned: Thinned,
+    voxels: VoxelPoints,
+    found: Grown,
+    patches: list[Plane | None],
+    config: ModelsConfig,
+) -> MultiModel:
+    """Return patches, and Gaussians of groups of the points that have none."""
+    number = len(patches)
     order = [k for k, p in enumerate(patches) if p is not None and not isinstance(p, Surface)]
     num_planes = len(order)
     order += [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]

@@ -13,9 +13,10 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.models.fitting import thin
+from surfel_mapper.models.fitting import separated, thin
+from surfel_mapper.models.growth import grown, owner_table
 from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
-from test.bench import tabletop
+from test.bench import scan_planes, tabletop
 from test.models.scenes import (
     A,
     BALL,
@@ -230,6 +231,44 @@ def test_rings_of_a_lidar_on_a_floor_are_one_plane():
     counts = np.bincount(model.labels)
     assert counts.max() > 0.9 * counts.sum()
     assert abs(model.patches[int(counts.argmax())].normal[2]) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ('name', 'share', 'residual_mm'),
+    [('velodyne_vls128_street', 0.9, 500.0), ('ouster_os0_128', 0.87, 250.0)],
+)
+def test_most_points_of_real_scans_are_on_patches(data_folder, name, share, residual_mm):
+    (file,) = (data_folder / 'data' / 'scans').glob(f'{name}.*')
+    points = np.asarray(read_scan(file)[0], np.float32).reshape(-1, 3)
+    points = points[np.isfinite(points).all(axis=1) & points.any(axis=1)]
+    model = fit(points, ModelsConfig(voxel_size_m=0.3))
+    patch = np.where(model.labels < len(model.patches), model.labels, -1)
+    found = scan_planes.figures(points, patch)
+    assert found['covered'] > share
+    assert found['residual_mm'] < residual_mm
+
+
+def test_lost_patches_are_separated_into_their_pieces():
+    rng = np.random.default_rng(3)
+    cloud = rng.uniform(0.0, 1.0, (600, 3))
+    thinned = thin(cloud, 0.25)
+    voxels = thinned.by_voxel()
+    x = voxels.points[:, 0]
+    pieces = np.select([x < 0.3, x < 0.5, x < 0.7], [0, 1, 2], -3).astype(np.int32)
+    joined = np.select([x < 0.5, x < 0.7], [1, 0], -3).astype(np.int32)
+    normals, curved = np.eye(3), np.array([True, False, True])
+    before = grown(pieces, owner_table(voxels, pieces), normals, curved, 0.1)
+    after = grown(joined, owner_table(voxels, joined), -normals[:2], curved[1:], 0.1)
+    found = separated(voxels, after, before, np.array([False, True]))
+    np.testing.assert_array_equal(
+        found.owner, np.select([x < 0.3, x < 0.5, x < 0.7], [1, 2, 0], -3)
+    )
+    np.testing.assert_array_equal(found.normals, [-normals[0], normals[0], normals[1]])
+    np.testing.assert_array_equal(found.curved, [False, True, False])
+    for owner in np.unique(found.owner):
+        own, every = found.means[found.owners == owner], voxels.points[found.owner == owner]
+        assert (own >= every.min(axis=0)).all()
+        assert (own <= every.max(axis=0)).all()
 
 
 def test_an_organised_cloud_has_labels_for_all_its_points():
