@@ -196,7 +196,8 @@ def design(
         unit = 1.0 / width_m if axis == along else unit
     rows = firsts[0][:, :, None] * field.control.shape[1] + firsts[1][:, None, :]
     weights = parts[0][:, :, None] * parts[1][:, None, :]
-    return rows.reshape(len(xy), -1), weights.reshape(len(xy), -1), unit
+    shape = len(xy), (field.degrees[0] + 1) * (field.degrees[1] + 1)
+    return rows.reshape(shape), weights.reshape(shape), unit
 
 
 def initial_field(

@@ -54,6 +54,7 @@ from surfel_mapper.models.kernels.voxel_means import (
 from surfel_mapper.models.kernels.voxel_points import gather_voxels
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.patches import fit_patches, PatchPoints
+from surfel_mapper.models.seams import with_smooth_seams
 from surfel_mapper.models.segmentation import (
     Clusters,
     is_paper,
@@ -268,6 +269,12 @@ def owner_models(
     num_planes = len(order)
     order += [k for k, patch in enumerate(patches) if isinstance(patch, Surface)]
     kept = [replace(patch, id=i) for i, k in enumerate(order) if (patch := patches[k]) is not None]
+    starts = np.searchsorted(found.owners, np.arange(number + 1))
+    surfaces = with_smooth_seams(
+        [patch for patch in kept if isinstance(patch, Surface)],
+        [found.means[starts[k] : starts[k + 1]] for k in order[num_planes:]],
+        config,
+    )
     ids = np.full(number, -1, np.int64)
     ids[order] = np.arange(len(order))
     # multi-valued surfaces and free groups are Gaussians; groups are negative owners
@@ -284,7 +291,7 @@ def owner_models(
     mean, covariance = group_moments(found.means[is_free], which, counts)
     return MultiModel(
         planes=kept[:num_planes],
-        surfaces=[patch for patch in kept if isinstance(patch, Surface)],
+        surfaces=surfaces,
         gaussians=Gaussians(len(kept) + np.arange(len(names)), counts, mean, covariance),
         labels=labels,
         voxel_size_m=config.voxel_size_m,
