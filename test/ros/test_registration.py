@@ -31,8 +31,7 @@ SETTINGS = {'pose.source': 'registration', 'registration.noise_m': 0.005}
 def arguments(**more):
     settings = {**SETTINGS, **{name.replace('__', '.'): value for name, value in more.items()}}
     parameters = (item for name, value in settings.items() for item in ('-p', f'{name}:={value}'))
-    reliable = 'qos_overrides./points.subscription.reliability:=reliable'
-    return ['--ros-args', *parameters, '-p', reliable]
+    return ['--ros-args', *parameters]
 
 
 def clouds(numbers):
