@@ -67,7 +67,7 @@ def main(path, num_scans='150'):
         points = points @ pose[:3, :3].T + pose[:3, 3]
         frames.append(frame(surfel_map.surfels(min_points=3), points, poses))
     pages = {'save_all': True, 'append_images': frames[1:], 'duration': FRAME_MS, 'loop': 0}
-    frames[0].save(path, **pages, quality=QUALITY, method=6)
+    frames[0].save(path, **pages, quality=QUALITY)
     print(f'{path}: {len(frames)} frames, {len(surfel_map.surfels(min_points=3)):,} surfels')
 
 

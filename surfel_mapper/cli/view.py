@@ -10,7 +10,9 @@ only. A bag or folder of scans is mapped while it is shown, and nothing is writt
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 import os
 from pathlib import Path
 import sys
@@ -110,7 +112,8 @@ def shown(args: argparse.Namespace) -> int:
         with opened(args) as scene:
             announce(scene)
             show_recording(recordings[0], args, scene)
-            finish(scene)
+            with ended_by_interrupt(scene):
+                scene.wait()
         return 0
     show_files(args)
     return 0
@@ -128,38 +131,42 @@ def show_files(args: argparse.Namespace) -> None:
         pairs = zip(args.what, names, strict=True)
         return [each for path, name in pairs for each in contents(path, name)]
 
-    with ThreadPoolExecutor(1) as reader:  # a large map takes as long to read as rerun to import
+    with ThreadPoolExecutor(1) as reader:  # a large map takes longer to read than rerun to start
         reading = reader.submit(read)
-        from surfel_mapper.viz.show import show_contents
+        if args.glb is not None:
+            from surfel_mapper.viz.gltf import GltfScene
 
-        if args.glb is None:
-            import_rerun()
-        found = reading.result()
+            show_all(GltfScene(args.glb), reading.result(), args)
+            return
+        import_rerun()
+        if args.rrd is not None or reading.done():
+            reading.result()  # if it is refused, nothing is opened and no file overwritten
+        with opened(args) as scene:
+            announce(scene)
+            with ended_by_interrupt(scene):
+                found_maps = show_all(scene, reading.result(), args)
+                if scene.window and found_maps.is_coarse:
+                    follow(scene, found_maps)
+                scene.wait()
 
-    def show_all(scene: Scene | GltfScene) -> Shown:
-        shown = show_contents(
-            scene,
-            found,
-            colouring=args.color,
-            place=args.at,
-            most_discs=args.discs,
-            min_points=args.min_points,
-        )
-        for name, sentence in shown.about.items():
-            show_lines(escaped(f'{name}: {sentence}'))
-        return shown
 
-    if args.glb is not None:
-        from surfel_mapper.viz.gltf import GltfScene
+def show_all(
+    scene: Scene | GltfScene, found: Sequence[Content], args: argparse.Namespace
+) -> Shown:
+    """Show contents as the arguments ask for, and print a sentence about each."""
+    from surfel_mapper.viz.show import show_contents
 
-        show_all(GltfScene(args.glb))
-        return
-    with opened(args) as scene:
-        found_maps = show_all(scene)
-        announce(scene)
-        if scene.window and found_maps.is_coarse:
-            follow(scene, found_maps)
-        finish(scene)
+    shown = show_contents(
+        scene,
+        found,
+        colouring=args.color,
+        place=args.at,
+        most_discs=args.discs,
+        min_points=args.min_points,
+    )
+    for name, sentence in shown.about.items():
+        show_lines(escaped(f'{name}: {sentence}'))
+    return shown
 
 
 def opened(args: argparse.Namespace) -> Scene:
@@ -181,23 +188,23 @@ def announce(scene: Scene) -> None:
         webbrowser.open(scene.address)
 
 
-def finish(scene: Scene) -> None:
-    """Serve the page until it ends or Ctrl-C."""
+@contextmanager
+def ended_by_interrupt(scene: Scene) -> Iterator[None]:
+    """Take Ctrl-C as the end of a page or window; of a file it leaves a part, and is raised."""
     try:
-        scene.wait()
+        yield
     except KeyboardInterrupt:
+        if not (scene.address or scene.window):
+            raise
         print(file=sys.stderr)
 
 
 def follow(scene: Scene, shown: Shown) -> None:
-    """Give the place looked at in a window the full detail, until it closes or Ctrl-C."""
+    """Give the place looked at in a window the full detail, until it closes."""
     from surfel_mapper.viz.eye import followed
 
-    try:
-        print('the detail follows the eye until the window closes, or Ctrl-C', file=sys.stderr)
-        followed(scene, shown)
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
+    print('the detail follows the eye until the window closes, or Ctrl-C', file=sys.stderr)
+    followed(scene, shown)
 
 
 def show_live(args: argparse.Namespace) -> None:

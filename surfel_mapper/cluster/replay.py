@@ -262,7 +262,7 @@ def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResul
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     title = (
         f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
-        f'{tiled.surfels} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
+        f'{tiled.surfels:,} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
     )
     draw_map(tiled.drawn, picture, title, origin_m=summary['origin_m'])
     write_report(page, title, summary, tiled.sample, picture=picture, drawn=tiled.drawn)

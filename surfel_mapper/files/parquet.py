@@ -13,6 +13,7 @@ columns by name. Reading and writing are one module because they share the names
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+import itertools
 import json
 import os
 from pathlib import Path
@@ -28,6 +29,7 @@ from surfel_mapper.files.map_state import checked_moments, NO_ORIGIN
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import check_possible, digest_of, pack_keys, ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from surfel_mapper.threads import share, usable_cores
 
 KIND, VERSION = 'surfel_mapper surfels', 1
 
@@ -143,25 +145,19 @@ def read_moments(path: str | Path) -> tuple[ScanMoments, SurfelMap]:
 
 def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, SurfelMap, Any]:
     """Return the moments in a file, an empty map of its kind, and the digest that it states."""
-    _, parquet = import_pyarrow()
+    arrow, parquet = import_pyarrow()
     try:
-        with open_regular(path) as file, parquet.ParquetFile(file, **FOOTER_LIMITS) as content:
+        with open_regular(path) as opened:
+            file = arrow.PythonFile(opened, 'r')
+            content = parquet.ParquetFile(file, **FOOTER_LIMITS)
             attributes = read_attributes(path, content.schema_arrow.metadata or {})
             surfel_map = map_of(attributes, voxel_size_m, path)
             names = moment_names(surfel_map)
             unknown = {*content.schema_arrow.names} - {*names, *DERIVED}
             if unknown:
                 raise ValueError(f'unknown columns {sorted(unknown)}')
-            check_size(content, names, path, os.fstat(file.fileno()).st_size)
-            parts = moment_arrays(content.metadata.num_rows, surfel_map)
-            filled = 0
-            for batch in content.iter_batches(ROWS_READ, columns=list(names)):
-                columns = {name: int64_column(batch, name) for name in names}
-                rows = slice(filled, filled + len(columns['i']))
-                fill_rows(parts, rows, columns, surfel_map)
-                filled = rows.stop
-            if filled != len(parts['key']):
-                raise ValueError(f'{filled} rows, {len(parts["key"])} in the footer')
+            check_size(content, names, path, os.fstat(opened.fileno()).st_size)
+            parts = read_rows(file, content.metadata, surfel_map)
             moments = checked_moments(parts, surfel_map, 'rows')
     except FileFormatError:
         raise
@@ -170,6 +166,36 @@ def _read(path: str | Path, voxel_size_m: float | None) -> tuple[ScanMoments, Su
     except Exception as error:  # of pyarrow, and of attributes of any size and type
         raise FileFormatError(f'{path}: damaged, or not what write_map wrote: {error}') from error
     return moments, surfel_map, attributes.get('digest')
+
+
+def read_rows(file: Any, footer: Any, surfel_map: SurfelMap) -> Columns:
+    """
+    Return the arrays of the moments in a file, whose groups of rows are read by threads.
+
+    All threads read by one PythonFile, which locks itself: they share the place in the file.
+    """
+    _, parquet = import_pyarrow()
+    names = moment_names(surfel_map)
+    sizes = [footer.row_group(group).num_rows for group in range(footer.num_row_groups)]
+    ends = list(itertools.accumulate(sizes))
+    parts = moment_arrays(footer.num_rows, surfel_map)
+    if sum(sizes) != footer.num_rows or min(sizes, default=0) < 0:
+        raise ValueError(f'{sum(sizes)} rows, {footer.num_rows} in the footer')
+
+    def read(groups: slice) -> None:
+        content = parquet.ParquetFile(file, metadata=footer, **FOOTER_LIMITS)
+        for group in range(groups.start, groups.stop):
+            filled = ends[group] - sizes[group]
+            for batch in content.iter_batches(ROWS_READ, row_groups=[group], columns=list(names)):
+                columns = {name: int64_column(batch, name) for name in names}
+                rows = slice(filled, filled + len(columns['i']))
+                fill_rows(parts, rows, columns, surfel_map)
+                filled = rows.stop
+            if filled != ends[group]:
+                raise ValueError(f'{filled} rows to group {group}, expected {ends[group]}')
+
+    share(read, len(sizes), usable_cores())
+    return parts
 
 
 def check_size(

@@ -48,6 +48,9 @@ OBJECT_BYTES = 10
 MEMBER_BYTES = 1000
 """Memory of the entry of a member in the directory of the archive."""
 
+READERS = 2
+"""Threads that read arrays: getting new memory from the system takes most of the time."""
+
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
 
@@ -231,9 +234,9 @@ def read_archive(
     arrays: dict[str, npt.NDArray[Any]] = {}
 
     def read_arrays() -> Iterator[npt.NDArray[Any]]:
-        """Yield the arrays; each is read while the one before is hashed."""
-        with ThreadPoolExecutor(1) as reader:
-            reading = [reader.submit(read_array, archive, info) for info in infos]
+        """Yield the arrays; the next ones are read while one is hashed."""
+        with ThreadPoolExecutor(READERS) as readers:
+            reading = [readers.submit(read_array, archive, info) for info in infos]
             for entry, future in zip(manifest['arrays'], reading, strict=True):
                 arrays[entry['name']] = future.result()
                 yield arrays[entry['name']]
@@ -296,24 +299,25 @@ def read_array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> npt.NDArray[A
 
 def read_stored(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> memoryview:
     """
-    Return a member that is not compressed, in one read.
+    Return a member that is not compressed, read at its place in the file, by any thread.
 
     zipfile copies it twice and adds it up for a second check, beside the hash of the content.
     """
-    file = archive.fp
-    assert file is not None, 'the archive is open'
-    file.seek(info.header_offset)
-    header = file.read(LOCAL_HEADER.size)
+    assert archive.fp is not None, 'the archive is open'
+    file = archive.fp.fileno()
+    header = os.pread(file, LOCAL_HEADER.size, info.header_offset)
     if len(header) < LOCAL_HEADER.size:
         raise EOFError(f'{info.filename}: its header is missing')
     magic, name_bytes, extra_bytes = LOCAL_HEADER.unpack(header)
     if magic != LOCAL_MAGIC:
         raise ValueError(f'{info.filename}: no header of a member where the directory states it')
-    file.seek(name_bytes + extra_bytes, os.SEEK_CUR)
+    offset = info.header_offset + len(header) + name_bytes + extra_bytes
     content = np.empty(info.file_size, np.uint8).data
-    found = file.readinto(content)  # type: ignore[attr-defined]  # of a file in binary mode
-    if found < len(content):
-        raise EOFError(f'{info.filename}: {len(content) - found} bytes missing')
+    filled = 0
+    while found := os.preadv(file, [content[filled:]], offset + filled):
+        filled += found
+    if filled < len(content):
+        raise EOFError(f'{info.filename}: {len(content) - filled} bytes missing')
     return content
 
 

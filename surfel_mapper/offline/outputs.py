@@ -285,7 +285,7 @@ def write_files(
     title = (
         f'{Path(summary["bag"]).resolve().name}: {summary["scans"]["mapped"]} scans, '
         f'{rounded(summary["points"])} points, '
-        f'{len(surfels)} surfels in voxels of {mapper.map.voxel_size_m:g} m'
+        f'{len(surfels):,} surfels in voxels of {mapper.map.voxel_size_m:g} m'
     )
     origin_m = mapper.map.origin_m
     draw_map(surfels, picture, title, trajectory=trajectory.positions, origin_m=origin_m)

@@ -32,6 +32,10 @@ MAX_WAIT_S = 0.2
 """A signal that arrives just before a wait does not end it; this bounds the delay."""
 
 
+UNINTERRUPTED = ('__del__', '_adjust_thread_count')
+"""Functions that an interrupt does not enter: finalizers, and a pool's start of a thread."""
+
+
 class Signals:
     """In a with-block, SIGINT and SIGTERM raise KeyboardInterrupt, once."""
 
@@ -75,10 +79,15 @@ class Signals:
 
 
 def swallows(frame: FrameType | None) -> bool:
-    """Whether an exception raised in a frame is lost: in a finalizer or a callback of LLVM."""
+    """
+    Whether an exception raised in a frame is lost or does harm.
+
+    It is lost in a finalizer or a callback of LLVM. In a pool that starts a thread it leaves one
+    that the pool does not know, for which the process would wait forever at its end.
+    """
     while frame is not None:
         code = frame.f_code
-        if code.co_name == '__del__' or '/llvmlite/' in code.co_filename:
+        if code.co_name in UNINTERRUPTED or '/llvmlite/' in code.co_filename:
             return True
         frame = frame.f_back
     return False

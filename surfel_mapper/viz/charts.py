@@ -138,7 +138,7 @@ def named_bars(counts: Mapping[str, int]) -> str:
     with _axes(ROW_HEIGHT * len(counts) + 10) as (figure, axes):
         rows = np.arange(len(counts))
         bars = axes.barh(rows, list(counts.values()), 0.65, color=BAR)
-        axes.bar_label(bars, labels=[str(count) for count in counts.values()], padding=4)
+        axes.bar_label(bars, labels=[f'{count:,}' for count in counts.values()], padding=4)
         axes.set_yticks(rows, [*counts])
         axes.set_ylim(len(counts) - 0.5, -0.5)
         axes.set_xlim(0.0, 1.15 * max(*counts.values(), 1))

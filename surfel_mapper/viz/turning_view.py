@@ -82,7 +82,7 @@ def turning_view(
     colours = ''.join(f'<option>{n}</option>' for n in ('normal', 'planarity', 'height', 'slope'))
     return (
         '<h2>The map</h2><div class="view" id="view">'
-        '<canvas id="surfels" tabindex="0" role="img" aria-describedby="help" '
+        '<canvas id="surfels" tabindex="0" role="application" aria-describedby="help" '
         'aria-label="The map in three dimensions"></canvas>'
         f'<div id="picture" hidden>{fallback}</div>'
         f'<div class="tools">{choice}'

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 import os
 import signal
 import threading
@@ -148,3 +149,23 @@ def test_interrupts_are_checked_before_every_wait():
 
     with pytest.raises(KeyboardInterrupt):
         TaskQueue().run(check)
+
+
+class SignalledSemaphore:
+    """Stands in for the count of a pool's idle threads: none is idle, and SIGTERM arrives."""
+
+    def acquire(self, timeout):
+        signal.raise_signal(signal.SIGTERM)
+        return False
+
+    def release(self):
+        pass
+
+
+def test_an_interrupt_while_a_pool_starts_a_thread_comes_after_it():
+    pool = ThreadPoolExecutor(1)
+    pool._idle_semaphore = SignalledSemaphore()
+    with Signals(), pytest.raises(KeyboardInterrupt):
+        act_and_wait(lambda: pool.submit(int, '7'))
+    pool.shutdown()
+    assert [thread.is_alive() for thread in pool._threads] == [False]
