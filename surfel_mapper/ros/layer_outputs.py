@@ -98,6 +98,11 @@ class LayerOutputs:
             self._node.destroy_timer(timer)
         self._timers.clear()
 
+    def close(self) -> None:
+        """End the threads that publish; called after the end of the mapping thread."""
+        for topic in self._topics:
+            topic.close()
+
     def _now(self) -> Moment:
         """Return stamp, frame and place of the newest scan; before the first, of an empty map."""
         return self._moment if self._moment.frame_id else Moment(frame_id=self._mapper.map_frame)
@@ -140,6 +145,7 @@ class LayerTopic:
         if publication.in_background:
             self._background = ThreadPoolExecutor(1, 'publishing', initializer=yield_to_others)
         self._pending: Future[None] | None = None
+        self._is_closed = False
         is_told = not self.has_rate or publication.all_messages is not None
         matched = self._on_matched if is_told else None
         self._publisher = node.create_publisher(
@@ -191,6 +197,12 @@ class LayerTopic:
         """Mark the content as not published yet."""
         self._published = None
 
+    def close(self) -> None:
+        """End the thread that publishes, if any; of a set, the message under way is sent."""
+        self._is_closed = True
+        if self._background is not None:
+            self._background.shutdown(cancel_futures=True)
+
     def _is_read(self) -> bool:
         return bool(self._publisher.get_subscription_count())
 
@@ -233,6 +245,8 @@ class LayerTopic:
         """Publish messages, each when readers have the one before, or after a second."""
         try:
             for number, message in enumerate(messages):
+                if self._is_closed:
+                    return
                 if number:
                     self._publisher.wait_for_all_acked(PATIENCE)
                 publish_serialized(self._publisher, message)

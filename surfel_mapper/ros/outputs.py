@@ -150,6 +150,10 @@ class Outputs:
         self._timers.clear()
         self._layers.stop_timers()
 
+    def close(self) -> None:
+        """End the threads that publish, before their publishers are destroyed."""
+        self._layers.close()
+
     def _poster(self, publisher: Any, publish: Callable[[], object]) -> Callable[[], None]:
         """Return a timer callback that posts ``publish`` if the map has changed and is read."""
         is_latched_for_all = publisher is self._normals

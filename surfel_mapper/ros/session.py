@@ -138,6 +138,7 @@ class Session:
         if self._compiler.ident is not None:
             self._compiler.join()
         self.thread.stop()
+        self.outputs.close()
         if self._viewer is not None:
             self._viewer.close()
         log = self._node.get_logger()

@@ -107,9 +107,14 @@ class Peer:
         self._publishers = {}
 
     def close(self):
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.shutdown()
+        """Stop waiting, then destroy what was waited for, then its context, each in any case."""
+        try:
+            self._executor.shutdown()  # its wait set uses the handles of the node
+        finally:
+            try:
+                self.node.destroy_node()
+            finally:
+                self._context.shutdown()
 
     def spin_until(self, condition, timeout_s=TIMEOUT_S, what=lambda: 'timed out'):
         end = time.monotonic() + timeout_s
