@@ -9,10 +9,15 @@ scan. Times are processor time (cpu_ms), as the machine may be shared, and clock
 
 Then whole real scans, not cut, again and again with 1 cm of noise, as a lidar that stands sees
 them: every voxel changes, few patches grow. Without SURFEL_MAPPER_TEST_DATA there are none.
+
+The last row is that of ids in a window of ten scans, a metre apart: of the patches of which at
+least half of the voxels are on patches a metre on, the share whose voxels mostly have the same id
+then (``kept``), and that of patches reported as merged into another (``merged``).
 """
 
 from __future__ import annotations
 
+from collections import deque
 from time import perf_counter, process_time
 from typing import Any
 
@@ -45,6 +50,10 @@ STANDING_SIZE_M, STANDING_NOISE_M = 0.5, 0.01
 """Scans of the standing lidars, edge of the voxels, and noise."""
 
 
+WINDOW, METRE, METRES = 10, 2, 14
+"""Scans in the window for ids, number of scans a metre, and metres."""
+
+
 def run() -> list[Row]:
     """Return a row for every voxel size of the street and for every whole scan."""
     scans = street_scans()
@@ -53,7 +62,40 @@ def run() -> list[Row]:
         for name, points in real_scans():
             if name in STANDING:
                 rows.append(case(name, repeated(points), STANDING_SIZE_M, np.inf))
+        rows.append(ids_over_time())
     return rows
+
+
+def ids_over_time() -> Row:
+    """Return the row of ids."""
+    surfel_map, held = SurfelMap(STANDING_SIZE_M), deque()
+    models = LiveModels(ModelsLayerConfig(noise_m=0.01), surfel_map)
+    before: dict[tuple[int, ...], int] = {}
+    known = kept = merged = 0
+    for number, (points, origin) in enumerate(street_scans(METRE, WINDOW + METRES)):
+        held.append(surfel_map.add(points, origin=origin))
+        if len(held) > WINDOW:
+            surfel_map.remove(held.popleft())
+        update = models.update()
+        now = patches_of_voxels(models)
+        gone = {one for one, _ in update.merged}
+        for patch in set(before.values()) if number > WINDOW else ():
+            voxels = [voxel for voxel, label in before.items() if label == patch]
+            ids = [now[voxel] for voxel in voxels if voxel in now]
+            if len(ids) >= max(2, 0.5 * len(voxels)):
+                known += 1
+                kept += max(set(ids), key=ids.count) == patch
+                merged += patch in gone
+        before = now
+    share = {'kept': kept / known, 'merged': merged / known}
+    return {'cloud': 'street, live, ids', 'who': 'surfel_mapper', 'patches': known, **share}
+
+
+def patches_of_voxels(models: LiveModels) -> dict[tuple[int, ...], int]:
+    """Return the id of the patch of each voxel that has one, by its index."""
+    labels, voxels = models.model.labels, models.surfels.voxel_index
+    is_patch = np.isin(labels, [patch.id for patch in models.model.patches])
+    return dict(zip(map(tuple, voxels[is_patch].tolist()), labels[is_patch].tolist(), strict=True))
 
 
 def repeated(
@@ -67,12 +109,14 @@ def repeated(
     ]
 
 
-def street_scans() -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
+def street_scans(
+    step: int = 3, num_scans: int = SCANS
+) -> list[tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]]:
     """Return points in the frame of the map and the sensor position, for every scan."""
     lidar = Lidar(beams=64, columns=1024, range_noise_m=0.01)
     simulation = Simulation(World.street(seed=1, length_m=200.0), lidar)
     found = []
-    for number in range(0, 3 * SCANS, 3):
+    for number in range(0, step * num_scans, step):
         scan = simulation.scan(number)
         points = scan.points[np.isfinite(scan.points).all(axis=1)].astype(np.float64)
         T_odom_sensor = simulation.drive.T_odom_sensor(scan.stamp_ns)
