@@ -13,6 +13,8 @@ Limits: voxel indices within 21 signed bits an axis (524 km each way at 0.5 m), 
 scan in a voxel, 2^31 points of the map in a voxel.
 
 Points are reduced to moments and surfels derived from them in ``SurfelMap`` (surfel_map.py).
+
+(One module because it is one class: all of it changes or reads the same table of voxels.)
 """
 
 from __future__ import annotations
@@ -28,14 +30,19 @@ from surfel_mapper.geometry import as_numbers
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import (
+    check_arrays,
     check_possible,
     digest_of,
     pack_keys,
     ScanMoments,
     shifted_moments,
     unpack_keys,
+    whole_keys,
 )
 from surfel_mapper.mapping.voxel_table import ChangeLog, VoxelTable
+
+MAX_LEVEL = 15
+"""Highest level: a voxel can hold 2^31 / 4^15 = 2 points, of the next no point."""
 
 APART = 1e-3
 """Rounding of the distance of two origins, voxels: their coordinates have at most 16 digits."""
@@ -63,8 +70,8 @@ class MomentMap:
     def __init__(
         self, voxel_size_m: float, columns: tuple[str, ...], level: int, origin_m: npt.ArrayLike
     ) -> None:
-        if level not in range(layout.INDEX_BITS):
-            raise ValueError(f'level: {level}, expected 0 to {layout.INDEX_BITS - 1}')
+        if level not in range(MAX_LEVEL + 1):
+            raise ValueError(f'level: {level}, expected 0 to {MAX_LEVEL}')
         self.voxel_size_m = voxel_size_m
         self.level = operator.index(level)
         self.origin_m = origin_m
@@ -122,9 +129,9 @@ class MomentMap:
 
         """
         self._check_lattice(moments)
+        self._check_counts(moments)  # before the sums, which overflow beyond its limit
         if not moments.is_reduced:
             check_possible(moments)
-        self._check_counts(moments)
         self.version += 1
         rows = self._table.add(moments, self.version)
         self._changes.add(self.version, rows, self._table.num_voxels)
@@ -289,11 +296,12 @@ class MomentMap:
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
-        return self._table.find(np.ascontiguousarray(key, np.int64))
+        return self._table.find(whole_keys(key))
 
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the voxel keys of rows (K,), -1 for empty rows."""
-        key = self._table.values(self._table.checked(rows), layout.KEY)
+        rows = self._table.checked(rows)
+        key = self._table.values(rows, layout.KEY)
         return np.where(self._table.values(rows, layout.COUNT) > 0, key, -1)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
@@ -329,6 +337,8 @@ class MomentMap:
                 f'moments of voxel size {moments.voxel_size_m:g} m, level {moments.level}; '
                 f'this map has {self.voxel_size_m:g} m, level {self.level}'
             )
+        if not moments.is_reduced:
+            check_arrays(moments)
         if moments.channel_names != self._channel_names:
             raise MapError(
                 f'moments with the channels {moments.channel_names}; '

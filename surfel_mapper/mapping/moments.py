@@ -154,6 +154,14 @@ def point_keys(
     return keys
 
 
+def whole_keys(key: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Return voxel keys (K,) as the kernels take them; TypeError for other arrays."""
+    found = np.asarray(key)
+    if found.ndim != 1 or (found.size and found.dtype.kind not in 'iu'):
+        raise TypeError(f'keys: {found.dtype} {found.shape}, expected int64 (K,)')
+    return np.ascontiguousarray(found, np.int64)
+
+
 def pack_keys(voxel_index: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     """Return the keys (K,) int64 of voxel indices (K, 3), each in [-2^20, 2^20)."""
     shifted = voxel_index.astype(np.int64) + INDEX_OFFSET
@@ -245,7 +253,6 @@ def check_arrays(moments: ScanMoments) -> None:
 
 def check_possible(moments: ScanMoments) -> None:
     """Raise MapError if a voxel occurs twice, or no points of it can have its moments."""
-    check_arrays(moments)
     if not (moments.key[1:] > moments.key[:-1]).all():  # as the moments of a map are sorted
         in_order = np.sort(moments.key)
         if (in_order[1:] == in_order[:-1]).any():

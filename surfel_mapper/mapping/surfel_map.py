@@ -30,7 +30,7 @@ from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.coarsening import coarse_moments
 from surfel_mapper.mapping.kernels.surfels import derive_covariances
-from surfel_mapper.mapping.moment_map import MomentMap
+from surfel_mapper.mapping.moment_map import MAX_LEVEL, MomentMap
 from surfel_mapper.mapping.moments import (
     looks_like_millimetres,
     MILLIMETRES,
@@ -96,7 +96,7 @@ class SurfelMap(MomentMap):
     ------
     ValueError
         If the voxel size is not positive and finite, a column cannot be summed, threads is less
-        than 1, the level is negative or beyond 20, or the origin is not finite.
+        than 1, the level is negative or beyond 15, or the origin is not finite.
 
     """
 
@@ -294,19 +294,20 @@ class SurfelMap(MomentMap):
         ----------
         level : int
             1 doubles the edge of a voxel; 0 copies the map. The level of the result, that of
-            this map and ``level`` together, is at most 20.
+            this map and ``level`` together, is at most 15: a voxel holds 2 points then.
         within : two (3,) int, optional
             Lowest and highest voxel index to include; by default all voxels.
 
         Raises
         ------
         ValueError
-            If the level is negative, or that of the result would be beyond 20.
+            If the level is negative, or that of the result would be beyond 15, or ``within`` is
+            not two voxels.
         MapLimitError
             If a voxel would hold more than 2^31 / 4^level points.
 
         """
-        highest = layout.INDEX_BITS - 1 - self.level
+        highest = MAX_LEVEL - self.level
         if not 0 <= as_whole('level', level) <= highest:
             raise ValueError(
                 f'level: {level}, expected 0 to {highest} for a map of level {self.level}'
@@ -317,7 +318,9 @@ class SurfelMap(MomentMap):
             level=self.level + level,
             origin_m=self.origin_m,
         )
-        if within:
+        if within is not None:
+            if np.shape(within) != (2, 3) or np.asarray(within).dtype.kind != 'i':
+                raise ValueError(f'within: {within!r}, expected two voxel indices, i j k')
             fine = self._moments_of(self._table.find(self._table.keys_in_box(*within)))
         else:
             fine = self._moments_of(self._table.changed_after(-1, 1))

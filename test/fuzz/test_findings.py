@@ -35,6 +35,7 @@ from surfel_mapper.errors import (
     ConfigError,
     FileFormatError,
     MapError,
+    MapLimitError,
     PoseError,
     SurfelMapperError,
 )
@@ -387,10 +388,37 @@ def test_a_transposed_pose_is_refused():
 
 
 def test_a_level_that_cannot_be_reached_is_refused_with_those_that_can():
-    coarse = SurfelMap(0.5).coarsen(18)
-    with pytest.raises(ValueError, match='level: 3, expected 0 to 2 for a map of level 18'):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.zeros((2, 3)))
+    coarse = surfel_map.coarsen(13)
+    with pytest.raises(ValueError, match='level: 3, expected 0 to 2 for a map of level 13'):
         coarse.coarsen(3)
-    assert coarse.coarsen(2).level == 20
+    assert coarse.coarsen(2).level == 15
+    assert coarse.coarsen(2).num_points == 2
+    with pytest.raises(ValueError, match='level: 16, expected 0 to 15'):
+        SurfelMap(0.5, level=16)
+
+
+@pytest.mark.parametrize('level', [8, 14, 15])
+def test_a_level_at_which_sums_would_overflow_is_refused_with_the_number_of_points(level):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.full((200_000, 3), 0.01))
+    with pytest.raises(MapLimitError, match='a voxel would hold 200000 points'):
+        surfel_map.coarsen(level)
+
+
+@pytest.mark.parametrize(
+    'within', ['ab', (None, None), ((0, 0), (1, 1)), ((np.nan,) * 3, (1.0,) * 3), ()]
+)
+def test_a_box_that_is_not_two_voxels_is_refused(within):
+    with pytest.raises(ValueError, match='expected two voxel indices'):
+        SurfelMap(0.5).coarsen(1, within)
+
+
+@pytest.mark.parametrize('keys', [[0.5], [[0]], None, 'x'])
+def test_keys_that_are_no_integers_are_refused(keys):
+    with pytest.raises(TypeError, match='keys: '):
+        SurfelMap(0.5).find(keys)
 
 
 def mcap_of_empty_messages(num_chunks, num_messages):
