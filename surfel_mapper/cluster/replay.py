@@ -99,11 +99,7 @@ def replay_bags(
 
     """
     began = time.perf_counter()
-    if config.map.origin == AUTO:
-        raise ConfigError(
-            'map.origin: auto, expected x y z with several recordings or workers: parts of a map '
-            'would find different ones'
-        )
+    check_origin(config)
     if workers is not None and scheduler is None:
         start_forkserver()  # they load their modules while this process loads its own
     found = surveyed(requests, config)
@@ -150,6 +146,15 @@ def replay_bags(
     return ShelfResult(
         mapped=mapped, summary=summary, written=write_overview(output, summary, mapped)
     )
+
+
+def check_origin(config: Config) -> None:
+    """Raise ConfigError if parts of a map would choose their origins themselves."""
+    if config.map.origin == AUTO:
+        raise ConfigError(
+            'map.origin: auto, expected x y z with several recordings or workers: parts of a map '
+            'would find different ones'
+        )
 
 
 def mapped_together(
