@@ -86,6 +86,7 @@ class BagReader:
         self.is_ros1 = is_ros1(self.path) and not self.path.is_dir()
         self.cuts: list[str] = []
         self._skipped: dict[Path, int] = {}
+        self._latched: set[str] | None = None
         self._decoders: dict[str, tuple[Typestore, str]] = {}
         self._storages: list[tuple[Path, BagFile]] = []
         with ExitStack() as files:
@@ -117,7 +118,7 @@ class BagReader:
 
     def is_latched(self, name: str) -> bool:
         """Return whether a topic is latched: late subscribers get its last messages."""
-        return any(is_latched(c) for c in self._connections() if c.topic == name)
+        return name in self._latched_topics()
 
     def messages(
         self,
@@ -208,6 +209,12 @@ class BagReader:
             size = path.stat().st_size
             self.cuts.append(f'{path}: the compressed file is cut off at byte {size}')
         return target
+
+    def _latched_topics(self) -> set[str]:
+        """Return the latched topics, found once: a bag may have 65,535."""
+        if self._latched is None:
+            self._latched = {c.topic for c in self._connections() if is_latched(c)}
+        return self._latched
 
     def _connections(self) -> Iterator[Connection]:
         """Yield the connections of all files; without those whose names are damaged."""

@@ -15,7 +15,6 @@ would compress better than the budget allows is written uncompressed.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 import hashlib
 import io
 import json
@@ -234,12 +233,10 @@ def read_archive(
     arrays: dict[str, npt.NDArray[Any]] = {}
 
     def read_arrays() -> Iterator[npt.NDArray[Any]]:
-        """Yield the arrays; the next ones are read while one is hashed."""
-        with ThreadPoolExecutor(READERS) as readers:
-            reading = [readers.submit(read_array, archive, info) for info in infos]
-            for entry, future in zip(manifest['arrays'], reading, strict=True):
-                arrays[entry['name']] = future.result()
-                yield arrays[entry['name']]
+        """Yield the arrays; not read by a thread, which may die without a word if memory ends."""
+        for entry, info in zip(manifest['arrays'], infos, strict=True):
+            arrays[entry['name']] = read_array(archive, info)
+            yield arrays[entry['name']]
 
     found = content_sha256(manifest, read_arrays())
     if found != manifest['sha256'] or members:

@@ -12,6 +12,7 @@ from pathlib import Path
 import struct
 import subprocess
 import sys
+import threading
 import time
 from types import SimpleNamespace
 import zipfile
@@ -21,6 +22,7 @@ from PIL import Image
 import pytest
 import yaml
 
+from surfel_mapper.bags import reader as bag_reader
 from surfel_mapper.bags.paths import files_of, stated_counts
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config, load_config, parse_yaml, TsdfConfig
@@ -50,6 +52,7 @@ from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.datasets import nuscenes
 from surfel_mapper.simulation.world import World
 from test.fuzz import corpus
+from test.fuzz.structures import record, text
 
 TIMEOUT_S = 120
 
@@ -587,3 +590,29 @@ def test_ranges_that_are_no_numbers_are_refused(name, value):
 def test_ranges_whose_square_is_infinite_are_no_limit():
     moments = SurfelMap(0.5).reduce(np.ones((5, 3)), max_range_m=1e200)
     assert moments.num_points == 5
+
+
+def test_names_of_topics_are_checked_a_few_times_however_many_there_are(tmp_path, monkeypatch):
+    """Each was compared with all others to know if it is latched: 65,535 took hours."""
+    names = range(1000)
+    channels = b''.join(
+        record(4, struct.pack('<HH', n, 1) + text(b'/t%d' % n) + text(b'cdr') + bytes(4))
+        for n in names
+    )
+    schema = record(3, struct.pack('<H', 1) + text(b'a/msg/A') + text(b'ros2msg') + text(b''))
+    message = record(5, struct.pack('<HIQQ', 1, 0, 5, 5))
+    path = tmp_path / 'a.mcap'
+    head = b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b''))
+    path.write_bytes(head + schema + channels + message)
+    calls = []
+    monkeypatch.setattr(bag_reader, 'has_legal_names', lambda c: not calls.append(c))
+    with bag_reader.BagReader(path) as reader:
+        assert len([*reader.topics]) == len(names)
+        assert not any(reader.is_latched(topic.name) for topic in reader.topics)
+    assert 0 < len(calls) < 10 * len(names)
+
+
+def test_a_state_is_read_without_threads(saved, monkeypatch):
+    """A thread that could not allocate ended without a word, and the reader waited for it."""
+    monkeypatch.setattr(threading.Thread, 'start', lambda self: pytest.fail('a thread'))
+    load_map(saved)
