@@ -12,8 +12,8 @@ by scipy.
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
-import sys
 
 import numpy as np
 
@@ -25,6 +25,9 @@ from surfel_mapper.simulation import Lidar, Simulation, World
 
 def main() -> None:
     """Fuse ten scans, write the mesh, and query the field."""
+    parser = argparse.ArgumentParser(description=str(__doc__).strip().partition('\n')[0])
+    parser.add_argument('mesh', type=Path, help='PLY file to write')
+    path = parser.parse_args().mesh
     simulation = Simulation(World.street(seed=1, length_m=60.0), Lidar(beams=32, columns=720))
     field = DistanceField(
         TsdfConfig(voxel_size_m=0.2, truncation_m=0.6, max_range_m=20.0, distance='to_plane')
@@ -35,7 +38,7 @@ def main() -> None:
         field.add(simulation.scan(number).points, pose, stamp_ns=stamp_ns)
 
     mesh = field.mesh()
-    write_mesh(Path(sys.argv[1]), mesh)
+    write_mesh(path, mesh)
     print(f'{len(mesh)} triangles of {len(field)} blocks')
 
     place = pose[:3, 3]
