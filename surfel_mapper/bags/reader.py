@@ -87,7 +87,7 @@ class BagReader:
         self.cuts: list[str] = []
         self._skipped: dict[Path, int] = {}
         self._latched: set[str] | None = None
-        self._decoders: dict[str, tuple[Typestore, str]] = {}
+        self._decoders: dict[str, tuple[Typestore, str] | Exception] = {}
         self._storages: list[tuple[Path, BagFile]] = []
         with ExitStack() as files:
             self._open(files_of(self.path), files)
@@ -315,8 +315,14 @@ class BagReader:
     def _decoder(self, type_: str) -> tuple[Typestore, str]:
         """Return the type store that decodes a type, and its name there."""
         if type_ not in self._decoders:
-            self._decoders[type_] = self._new_decoder(type_)
-        return self._decoders[type_]
+            try:
+                self._decoders[type_] = self._new_decoder(type_)
+            except Exception as error:  # of a definition, which is parsed once
+                self._decoders[type_] = error
+        found = self._decoders[type_]
+        if isinstance(found, Exception):
+            raise found
+        return found
 
     def _new_decoder(self, type_: str) -> tuple[Typestore, str]:
         """Return a decoder from rosbags' own definitions, or for ROS 1 from those in the bag."""

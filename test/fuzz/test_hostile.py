@@ -51,6 +51,7 @@ from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns, parse_
 from surfel_mapper.messages.poses import raw_poses
 from surfel_mapper.offline.datasets import nuscenes
 from surfel_mapper.simulation.world import World
+from test.bags.recorded import drive, ROS1, write_ros1
 from test.fuzz import corpus
 from test.fuzz.structures import record, text
 
@@ -616,3 +617,24 @@ def test_a_state_is_read_without_threads(saved, monkeypatch):
     """A thread that could not allocate ended without a word, and the reader waited for it."""
     monkeypatch.setattr(threading.Thread, 'start', lambda self: pytest.fail('a thread'))
     load_map(saved)
+
+
+@pytest.mark.parametrize('definition', [b'string x\n' * 100_000, b'string x\n' * 2])
+def test_definitions_of_ros1_are_parsed_once_and_up_to_a_size(tmp_path, monkeypatch, definition):
+    """Each message parsed one that is wrong again, 5 s for 900 kB; so did 5 kB of bz2."""
+    entries = drive(store=ROS1)
+    path = write_ros1(tmp_path / 'a.bag', entries)
+    parsed = []
+    types = bag_reader.ros1_types
+
+    def counted(connection):
+        parsed.append(connection)
+        wrong = SimpleNamespace(data=definition.decode())
+        return types(SimpleNamespace(msgdef=wrong, msgtype=connection.msgtype))
+
+    monkeypatch.setattr(bag_reader, 'ros1_types', counted)
+    with bag_reader.BagReader(path) as reader:
+        for message in reader.messages(['/odom']):
+            with pytest.raises(BagError, match='no nav_msgs/msg/Odometry: '):
+                reader.decode(message)
+    assert len(parsed) == 1
