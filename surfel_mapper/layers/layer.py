@@ -69,6 +69,8 @@ class InsertedScan:
         Points that entered the map.
     evictions : tuple of Eviction
         The scans that left the window because of it.
+    cleared : (E, 3) int32
+        Voxels that layers cleared after it; none until they are asked.
 
     """
 
@@ -77,6 +79,7 @@ class InsertedScan:
     keys: npt.NDArray[np.int64]
     num_points: int
     evictions: tuple[Eviction, ...]
+    cleared: npt.NDArray[np.int32] = field(default_factory=lambda: NO_VOXELS)
 
     def at(self, T_map_sensor: npt.NDArray[np.float64]) -> InsertedScan:
         """Return the scan at another pose, to which an alignment has moved it."""

@@ -11,6 +11,7 @@ beside this one or a part below. The module is long because every stage and ever
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 import logging
 
@@ -232,6 +233,7 @@ class Inserter:
             return None
         cleared = self.layers.voxels_to_clear(inserted, laps)
         if len(cleared):
+            inserted = replace(inserted, cleared=cleared)
             cleared = self.drop_voxels(cleared, config.map.min_points)
         alignment = self._align_when_due(config)
         if alignment is not None:

@@ -473,7 +473,9 @@ class BlockMap(BlockArrays):
         self.touch(rows, 0)
         self.head[rows, STAMP] = blocks.stamp_ns
 
-    def clear_region(self, contains: Callable[[npt.NDArray[np.float64]], Any]) -> None:
+    def clear_region(
+        self, contains: Callable[[npt.NDArray[np.float64]], Any], rows: Int64 | None = None
+    ) -> None:
         """
         Set the voxels whose centres are in a region to unknown; remove blocks that become empty.
 
@@ -481,11 +483,13 @@ class BlockMap(BlockArrays):
         ----------
         contains : callable
             Takes (P, 3) points in the map frame, m; returns which are in the region, (P,) bool.
+        rows : (R,) int64, optional
+            The blocks that the region can meet; all if not given.
 
         """
         side, size_m = self.config.voxels_per_side, self.config.voxel_size_m
         local = np.indices((side, side, side)).reshape(3, -1)[::-1].T
-        rows = self.rows()
+        rows = self.rows() if rows is None else rows
         for first in range(0, len(rows), PART):
             part = rows[first : first + PART]
             centers = (self.index(part)[:, None] * side + local + 0.5).astype(np.float64) * size_m

@@ -125,6 +125,24 @@ def test_voxels_of_a_box_that_moved_are_cleared_and_the_room_stays(with_clearing
     assert updates[-1].milliseconds['dynamic'] > 0.0
 
 
+TSDF = {'enabled': True, 'carve': False, 'voxel_size_m': 0.1}
+
+
+def test_the_distance_field_forgets_what_is_cleared():
+    settings = {f'layers.tsdf.{name}': value for name, value in TSDF.items()}
+    where_box_was, on_walls = [], []
+    for clears in (False, True):
+        mapper, _ = driven(**settings, **{'dynamic.clear': clears})
+        vertices = mapper.tsdf.mesh().vertices
+        _, _, box = scan_of(SCANS - 10)
+        inner = (np.abs(vertices) < ROOM_M - 2 * SIZE_M).all(axis=1)
+        where_box_was.append(int((inner & (vertices[:, 0] < box[0])).sum()))
+        on_walls.append(int((~inner).sum()))
+    assert where_box_was[0] > 200
+    assert where_box_was[1] < 0.1 * where_box_was[0]
+    assert on_walls[1] > 0.99 * on_walls[0]
+
+
 def test_rays_that_met_nothing_clear_and_missing_ones_do_not():
     without, _ = driven(np.inf)
     clearing, _ = driven(np.inf, **{'dynamic.clear': True})

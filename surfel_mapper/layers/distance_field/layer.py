@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +47,7 @@ from surfel_mapper.layers.sensor_models import (
     SensorModels,
     two_beams,
 )
+from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.messages.grids import occupancy_grid
 from surfel_mapper.messages.pointcloud2 import cloud_bytes, from_columns
@@ -130,6 +132,8 @@ class TsdfLayer(Layer):
             If ``sensor_frame`` is not connected with the frame of a scan.
 
         """
+        if len(inserted.cleared):
+            self._clear_voxels(inserted.cleared)
         if not self.config.tsdf.when_final:
             return [self.insert(inserted.scan, inserted.T_map_sensor)]
         self._waiting[inserted.scan.stamp_ns] = inserted.scan
@@ -191,6 +195,29 @@ class TsdfLayer(Layer):
         """Return the surface; blocks that have not changed since the last call cost little."""
         self._mesher.update()
         return self._mesher.mesh()
+
+    def _clear_voxels(self, voxel_index: npt.NDArray[np.int32]) -> None:
+        """
+        Set what lies in voxels (E, 3) of the map to unknown, as their surfels are gone.
+
+        Also what lies within a voxel of the field around them: surfaces in their faces.
+        """
+        size_m, config = self.around.surfel_map.voxel_size_m, self.config.tsdf
+        margin_m, block_m = config.voxel_size_m, config.voxels_per_side * config.voxel_size_m
+        first = np.floor((voxel_index * size_m - margin_m) / block_m).astype(np.int64)
+        last = np.floor(((voxel_index + 1) * size_m + margin_m) / block_m).astype(np.int64)
+        steps = np.indices((int((last - first).max()) + 1,) * 3).reshape(3, -1).T
+        rows = self.blocks.find(np.unique((first[:, None] + steps).reshape(-1, 3), axis=0))
+        keys = pack_keys(voxel_index)
+
+        def contains(points: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+            found = np.zeros(len(points), np.bool_)
+            for margins_m in itertools.product((-margin_m, margin_m), repeat=3):
+                index = np.floor((points + margins_m) / size_m).astype(np.int32)
+                found |= np.isin(pack_keys(index), keys)
+            return found
+
+        self.blocks.clear_region(contains, rows[rows >= 0])
 
     def clear_region(self, contains: Contains) -> None:
         """Set the voxels in a region to unknown, those of the archive too."""
