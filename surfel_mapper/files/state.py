@@ -47,9 +47,6 @@ OBJECT_BYTES = 10
 MEMBER_BYTES = 1000
 """Memory of the entry of a member in the directory of the archive."""
 
-READERS = 2
-"""Threads that read arrays: getting new memory from the system takes most of the time."""
-
 NPY_HEADER_BYTES = 12000
 """Upper bound of the header that numpy writes before an array."""
 

@@ -70,7 +70,7 @@ Indices = npt.NDArray[np.int64]
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
 
-COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0, 16.0, 32.0), 0.05
+COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0, 16.0), 0.05
 """Coarser voxels for sparse points, and the share of points on no patch from which they help."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
