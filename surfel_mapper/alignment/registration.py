@@ -232,6 +232,8 @@ class Registration:
         if not moves(thinned(cells, SEARCH_CELLS)).any():
             return None
         moving = moves(cells)
+        if moving.all():  # nothing stands
+            return None
         found = self._descend(np.ascontiguousarray(cells[~moving]), levels, starts[0], deviation_m)
         if not (found.converged and self.fits(found)):
             return None
