@@ -121,3 +121,17 @@ def data_folder() -> Path:
     if not folder:
         pytest.skip('SURFEL_MAPPER_TEST_DATA is not set: no real data')
     return Path(folder)
+
+
+@pytest.fixture
+def undrawn(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """
+    Let replays leave out map.png and report.html, except in tests with the mark ``drawn``.
+
+    They are nine tenths of the time of a replay of a few scans, .5 s.
+    """
+    if request.node.get_closest_marker('drawn') is None:
+        from surfel_mapper.viz import picture, report
+
+        monkeypatch.setattr(picture, 'draw_map', lambda *_, **__: None)
+        monkeypatch.setattr(report, 'write_report', lambda *_, **__: None)

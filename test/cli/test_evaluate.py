@@ -11,6 +11,8 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files.ply import write_points
 from surfel_mapper.simulation import load_simulation
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 FORMATS = 'ply,pcd,parquet,npz'
 
 

@@ -12,6 +12,8 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.filters.registry import all_filters
 from test.bags.recorded import drive, write_rosbag2
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 
 def listed(capsys, *arguments):
     assert main(['filters', *arguments]) == 0

@@ -20,6 +20,8 @@ from test.bags.recorded import (
     write_rosbag2,
 )
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 
 @pytest.mark.parametrize('write', [write_rosbag2, write_ros1])
 def test_topics_and_poses_are_printed(tmp_path, capsys, write):

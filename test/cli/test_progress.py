@@ -25,6 +25,8 @@ from surfel_mapper.files.parquet import read_map
 from surfel_mapper.viz import picture
 from test.bags.recorded import drive, Entries, PERIOD_NS, START_NS, write_rosbag2
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 MANY = 5000
 WAIT_S = 300.0
 WITH_MANY_LINES = """
@@ -67,6 +69,7 @@ def test_the_first_interrupt_is_reported_and_the_second_interrupts():
     assert signal.getsignal(signal.SIGINT) is before
 
 
+@pytest.mark.drawn
 def test_ctrl_c_while_files_are_written_leaves_all_of_them(tmp_path, monkeypatch, capsys):
     draw, pressed = picture.draw_map, []
 

@@ -14,6 +14,8 @@ import pytest
 from surfel_mapper.cli.main import main
 from test.bags.recorded import cut, drive, NUM_SCANS, write_rosbag2
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 FILES = {'map.npz', 'map.ply', 'map.png', 'report.html', 'summary.json', 'trajectory.tum'}
 PNG_MAGIC = b'\x89PNG\r\n\x1a\n'
 
@@ -33,6 +35,7 @@ def summary_of(output):
     return json.loads((output / 'summary.json').read_text())
 
 
+@pytest.mark.drawn
 def test_a_replay_writes_map_picture_and_summary(bag, tmp_path, capsys):
     output = tmp_path / 'a' / 'b'
 
@@ -157,6 +160,7 @@ def test_an_output_without_permission_is_refused_before_the_work(tmp_path, capsy
     assert 'no permission to write in' in capsys.readouterr().err
 
 
+@pytest.mark.drawn
 def test_poses_are_held_against_the_truth_in_summary_and_report(bag, tmp_path, capsys):
     first, second = tmp_path / 'first', tmp_path / 'second'
     track = tmp_path / 'track.tum'

@@ -16,6 +16,8 @@ from surfel_mapper.geometry import pose_matrix, q_xyzw
 from surfel_mapper.simulation.recording import cloud_bytes
 from test.alignment.street import drifted, relative_errors, street_scans
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 NUM_SCANS = 8
 
 

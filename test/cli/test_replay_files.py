@@ -28,6 +28,8 @@ from test.bags.recorded import (
 )
 from test.cli.small_disk import run_on_small_disk
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 ALL = 'ply,pcd,parquet,npz,bag'
 
 
@@ -102,6 +104,7 @@ def test_the_poses_are_where_the_sensor_was(output):
     np.testing.assert_array_equal(found.xyz, expected)
 
 
+@pytest.mark.drawn
 def test_a_second_replay_replaces_all(bag, output, tmp_path):
     shutil.copytree(output, tmp_path / 'again')
     arguments = ['--formats', ALL, '--output', str(tmp_path / 'again'), '--duration', '0.3']

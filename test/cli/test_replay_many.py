@@ -18,6 +18,8 @@ from test.bags.recorded import cut
 from test.cli.small_disk import run_on_small_disk
 from test.cluster.bags import written
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 FILES = {'map', 'map.png', 'report.html', 'summary.json'}
 TF = ['--pose-topic', '/tf']
 
@@ -51,6 +53,7 @@ def summary_of(output):
     return json.loads((output / 'summary.json').read_text())
 
 
+@pytest.mark.drawn
 def test_several_bags_become_one_map_in_tiles(bags, both, alone, tmp_path, capsys):
     assert main(['replay', *bags, '--output', str(tmp_path), *TF]) == 0
 
@@ -65,6 +68,7 @@ def test_several_bags_become_one_map_in_tiles(bags, both, alone, tmp_path, capsy
     assert str(tmp_path / 'report.html') in printed
 
 
+@pytest.mark.drawn
 def test_ctrl_c_leaves_the_map_of_the_shards_that_are_done(
     bags, alone, tmp_path, monkeypatch, capsys
 ):

@@ -17,6 +17,8 @@ from test.alignment.test_registration import map_of, ROOM, TRUE
 from test.bags.recorded import Entries, PERIOD_NS, START_NS, write_rosbag2
 from test.pipeline.test_registered_poses import in_hall, pose_at, scan_at
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 NUM_SCANS = 5
 REGISTRATION = 'pose: {source: registration}\nregistration: {noise_m: 0.005}\n'
 
@@ -144,6 +146,7 @@ def test_a_folder_of_real_scans_as_others_write_it_is_registered(data_folder, tm
     assert np.abs(np.diff(steps_m)).max() < 0.05
 
 
+@pytest.mark.drawn
 def test_scans_without_a_certain_place_become_a_map_of_their_own(tmp_path, capsys):
     entries = Entries()
     scans = [scan_at(number) for number in range(4)]

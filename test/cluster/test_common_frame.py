@@ -24,6 +24,8 @@ from surfel_mapper.offline.request import Request
 from surfel_mapper.offline.summary import as_text
 from surfel_mapper.simulation import Drive, Lidar, Simulation, World
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 LIDAR = Lidar(beams=32, columns=256, range_noise_m=0.01)
 NUM_SCANS = 12
 

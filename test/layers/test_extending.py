@@ -19,6 +19,8 @@ from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from test.bags import recorded
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 PAGE = Path(__file__).parents[2] / 'docs' / 'extending.md'
 SWITCH = {'layers.heights.enabled': True, 'pose.source': 'identity'}
 POINTS = np.array([[0.1, 0.1, 3.0], [0.2, 0.2, -1.0], [0.7, 0.1, 2.0], [np.nan, 0.0, -9.0]])

@@ -16,6 +16,8 @@ from surfel_mapper.offline.ouster_pcap import OusterPcap
 from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.request import Request
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 START_NS, PERIOD_NS = 1_700_000_000_000_000_000, 100_000_000
 NUM_SCANS, BEAMS, COLUMNS = 3, 64, 512
 LOST, MISSED = 16, 100

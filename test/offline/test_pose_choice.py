@@ -29,6 +29,8 @@ from test.bags.recorded import (
     write_rosbag2,
 )
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 MOUNTED = {'frames.base_to_sensor': (*MOUNT_M, 0.0, 0.0, 0.0, 1.0)}
 
 

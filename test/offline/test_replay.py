@@ -27,6 +27,8 @@ from surfel_mapper.offline.summary import as_text
 from surfel_mapper.viz import viewer
 from test.bags.recorded import drive, NUM_SCANS, START_NS, write_rosbag2
 
+pytestmark = pytest.mark.usefixtures('undrawn')
+
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory):
