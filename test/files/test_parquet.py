@@ -3,13 +3,16 @@
 """A map comes back from Parquet exactly, pyarrow reads its rows, damage is refused."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 
 from surfel_mapper import SurfelMap
 from surfel_mapper.errors import FileFormatError
+from surfel_mapper.files import parquet
 from surfel_mapper.files.parquet import METADATA, read_map, write_map
+from surfel_mapper.files.parquet_tiles import write_tile
 
 pa = pytest.importorskip('pyarrow')
 pq = pytest.importorskip('pyarrow.parquet')
@@ -41,6 +44,21 @@ def test_a_coarse_map_and_an_empty_one_come_back(tmp_path):
         found = read_map(tmp_path / 'map.parquet')
         assert found.digest() == surfel_map.digest()
         assert (found.voxel_size_m, found.level) == (surfel_map.voxel_size_m, surfel_map.level)
+
+
+def test_threads_read_groups_of_rows_of_one_file(tmp_path, monkeypatch):
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.arange(256)[:, None] * [0.5, 0.0, 0.0])
+    path = tmp_path / 'tile.parquet'
+    write_tile(path, surfel_map)  # 8 groups of rows
+    monkeypatch.setattr(parquet, 'usable_cores', lambda: 4)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        found = {read_map(path).digest() for _ in range(200)}
+    finally:
+        sys.setswitchinterval(interval)
+    assert found == {surfel_map.digest()}
 
 
 def test_pyarrow_reads_the_surfels_as_the_map_has_them(tmp_path):
