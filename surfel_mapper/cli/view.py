@@ -194,7 +194,7 @@ def ended_by_interrupt(scene: Scene) -> Iterator[None]:
     try:
         yield
     except KeyboardInterrupt:
-        if not (scene.address or scene.window):
+        if not scene.is_watched:
             raise
         print(file=sys.stderr)
 

@@ -49,6 +49,8 @@ class GltfScene:
 
     """
 
+    is_watched = False
+
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         if self.path.suffix != '.glb':

@@ -141,6 +141,11 @@ class Scene:
         if self._server is not None:
             end_group(self._server)
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether a window or page shows things as they come, so that coarse ones go first."""
+        return bool(self.address or self.window)
+
     def wait(self) -> None:
         """Return when the server of the page ends; at once if there is none."""
         if self._server is not None:

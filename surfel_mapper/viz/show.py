@@ -10,7 +10,7 @@ place near the first content that lies far from zero: float32, in which rerun dr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -84,11 +84,11 @@ def show_contents(
         scene.colouring = Colouring.over(colouring, parts)
     box = box_of([part.position for part in parts] + [each.position for each in clouds])
     scene.look(*box, looked_at)
-    about = {}
-    for each_map, found in zip(tiled, tiles, strict=True):
-        for path, discs in found.items():
-            scene.discs(path, discs, static=True)
-        about[each_map.name] = each_map.about()
+    if scene.is_watched:  # a first picture, while the rest is on its way
+        log([each.coarsest() for each in tiled], scene)
+        scene.flush()
+    log(tiles, scene)
+    about = {each.name: each.about() for each in tiled}
     for each in clouds:
         about[each.name] = show_cloud(scene, each)
     for other in contents:
@@ -136,13 +136,10 @@ class Shown:
             In the frame of the scene.
 
         """
-        found: dict[str, DrawnDiscs] = {}
-        for each in self._tiled:
-            found.update(each.refine(np.asarray(place, np.float64)))
-        for path, discs in found.items():
-            scene.discs(path, discs, static=True)
+        found = [each.refine(np.asarray(place, np.float64)) for each in self._tiled]
+        log(found, scene)
         scene.flush()
-        return len(found)
+        return sum(map(len, found))
 
 
 class RefinedMap:
@@ -175,11 +172,22 @@ class RefinedMap:
         level = whole.choose(place - self._shift, self._most_discs)
         tiles = whole.nearest_first(np.flatnonzero(level != self.level), place - self._shift)
         self.level = level
-        found = {}
-        for tile, surfels in zip(tiles, whole.all_surfels(level, tiles), strict=True):
+        return self._discs(tiles)
+
+    def coarsest(self) -> dict[str, DrawnDiscs]:
+        """Return the discs of all tiles at the last level, by path, for a first picture."""
+        return self._discs(np.arange(len(self._whole)), len(self._whole.counts) - 1)
+
+    def _discs(
+        self, tiles: npt.NDArray[np.int64], level: int | None = None
+    ) -> dict[str, DrawnDiscs]:
+        """Return the discs of tiles by path, at one level or each at its own."""
+        whole, found = self._whole, {}
+        levels = self.level if level is None else np.full_like(self.level, level)
+        for tile, surfels in zip(tiles, whole.all_surfels(levels, tiles), strict=True):
             i, j = whole.tiles[tile]
-            discs = with_age(surfels, self._shown, int(level[tile]))
-            values = {**discs.values, 'level': np.full(len(discs), level[tile])}
+            discs = with_age(surfels, self._shown, int(levels[tile]))
+            values = {**discs.values, 'level': np.full(len(discs), levels[tile])}
             name = f'tile_{i}_{j}'.replace('-', 'm')
             found[f'map/{self.name}/{name}'] = DrawnDiscs(
                 discs.position + self._shift, discs.normal, discs.radius_m, values
@@ -194,6 +202,13 @@ class RefinedMap:
             drawn = counts[self.level, np.arange(len(self._whole))].sum()
             about += f', shown as {drawn:,} on levels {self.level.min()} to {self.level.max()}'
         return about
+
+
+def log(tiles: Sequence[Mapping[str, DrawnDiscs]], scene: Scene | GltfScene) -> None:
+    """Show tiles of maps, each in place of its earlier discs."""
+    for found in tiles:
+        for path, discs in found.items():
+            scene.discs(path, discs, static=True)
 
 
 def with_age(surfels: Surfels, shown: ExactMap, level: int) -> DrawnDiscs:
