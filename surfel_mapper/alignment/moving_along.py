@@ -8,7 +8,8 @@ the same place in the scan before, although its surface should have moved on acr
 along, and so do the edges of what it belongs to. Ground and walls along the way look the same from
 scan to scan too, but their normals are across the motion: they say nothing against it.
 
-This needs a motion that is known before, from the scans before, and that cannot have ended since.
+This needs a motion that is known before, from the scans before, and that cannot have ended since
+by braking; if a collision ended it, the registration finds that the scan fits better at rest.
 Vehicles that move along from the first scan on are not distinguished from the world; see
 pipeline/surroundings.py.
 
@@ -72,11 +73,7 @@ def moving_along(
         return nothing
     direction = motion_m / np.linalg.norm(motion_m)
     may_move = ~(np.abs(normals @ direction) < ACROSS)  # without a surfel too
-    keys, known = (np.floor(each / cell_m).astype(np.int64) @ STRIDES for each in (cells, before))
-    order = np.argsort(known)
-    rows = order[np.searchsorted(known, keys, sorter=order).clip(max=len(known) - 1)]
-    off_m = np.abs((cells - before[rows]) @ direction)
-    found: npt.NDArray[np.bool_] = may_move & (known[rows] == keys) & (off_m < SAME_PLACE * cell_m)
+    found: npt.NDArray[np.bool_] = may_move & at_same_place(cells, before, direction, cell_m)
     if found.mean() < MUCH:
         return nothing
     others = np.flatnonzero(may_move & ~found)
@@ -86,3 +83,37 @@ def moving_along(
         away_m, _ = cKDTree(cells[found]).query(cells[others], distance_upper_bound=EDGE * cell_m)
         found[others[np.isfinite(away_m)]] = True
     return found
+
+
+def staying(
+    cells: npt.NDArray[np.float64],
+    before: npt.NDArray[np.float64],
+    motion_m: npt.NDArray[np.float64],
+    normals: npt.NDArray[np.float64],
+    cell_m: float,
+) -> float:
+    """
+    Return the share of the cells with a surface across the motion that are where they were.
+
+    The arguments are those of ``moving_along``. It is 0 without such cells.
+    """
+    direction = motion_m / np.linalg.norm(motion_m)
+    tells = np.abs(normals @ direction) >= ACROSS
+    if not (tells.any() and len(before)):
+        return 0.0
+    return float(at_same_place(cells[tells], before, direction, cell_m).mean())
+
+
+def at_same_place(
+    cells: npt.NDArray[np.float64],
+    before: npt.NDArray[np.float64],
+    direction: npt.NDArray[np.float64],
+    cell_m: float,
+) -> npt.NDArray[np.bool_]:
+    """Return which cells (K, 3) equal one of (B, 3) before, along a unit vector, (K,) bool."""
+    keys, known = (np.floor(each / cell_m).astype(np.int64) @ STRIDES for each in (cells, before))
+    order = np.argsort(known)
+    rows = order[np.searchsorted(known, keys, sorter=order).clip(max=len(known) - 1)]
+    off_m = np.abs((cells - before[rows]) @ direction)
+    same: npt.NDArray[np.bool_] = (known[rows] == keys) & (off_m < SAME_PLACE * cell_m)
+    return same

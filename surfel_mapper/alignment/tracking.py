@@ -20,7 +20,11 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.alignment.registration import Registration, RegistrationResult
+from surfel_mapper.alignment.registration import (
+    determines,
+    Registration,
+    RegistrationResult,
+)
 from surfel_mapper.errors import AlignmentError
 from surfel_mapper.geometry import (
     compose,
@@ -50,6 +54,10 @@ fit the scan before to 0.5."""
 
 MAX_DECELERATION = 10.0
 """Deceleration of a vehicle that brakes as hard as it can, m/s^2."""
+
+LONGEST_UNTOLD_S = 5.0
+"""Time for which the velocity alone may tell the motion while much of a scan moves along, s:
+the stretches among nine trucks are shorter, and errors reach 1 m in them."""
 
 FLOOR_NOISES = 3.0
 """Minimum expected deviation, in standard deviations of a range."""
@@ -109,6 +117,7 @@ class Tracker:
     def _clear_history(self) -> None:
         self._deviations: deque[float] = deque(maxlen=REMEMBERED)
         self._supports: deque[float] = deque(maxlen=REMEMBERED)
+        self._told_ns: int | None = None
 
     @property
     def is_new(self) -> bool:
@@ -156,8 +165,10 @@ class Tracker:
         ------
         AlignmentError
             If the scan does not fit the map, fits it at two places about equally well, needs a
-            motion faster than ``registration.max_speed_m_s``, or fits too poorly to be accepted
-            at once (see ``doubtful``). The predicted velocity is halved then.
+            motion faster than ``registration.max_speed_m_s``, fits too poorly to be accepted at
+            once (see ``doubtful``), or if much of it moves along and for LONGEST_UNTOLD_S
+            nothing else has told the motion. The predicted velocity is halved
+            then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
@@ -175,6 +186,7 @@ class Tracker:
         self.num_ambiguous += is_ambiguous and is_steady
         pose = compose(inverse(T_map_fixed), found.T_map_sensor)
         refusal = self._refusal(found, is_steady, self.speed_m_s(pose, stamp_ns))
+        refusal = refusal or self._untold(found, starts, stamp_ns)
         self.doubtful = None
         is_poor = bool(self._supports) and found.support < POOR_SUPPORT * expected
         is_poor = is_poor and found.fit < CLEAR_FIT  # a new place has a small overlap, but fits
@@ -190,6 +202,8 @@ class Tracker:
             raise AlignmentError(refusal)
         self._supports.append(found.support)
         self.advance(pose, stamp_ns, math.sqrt(float((cells**2).sum()) / max(len(cells), 1)))
+        if found.has_stopped:
+            self.twist = np.zeros(6)
         return found
 
     def _surely_moves(self, stamp_ns: int) -> bool:
@@ -243,6 +257,19 @@ class Tracker:
                 f'{config.max_speed_m_s:g} (registration.max_speed_m_s)'
             )
         return ''
+
+    def _untold(self, found: RegistrationResult, starts: list[Transform], stamp_ns: int) -> str:
+        """Return since when nothing has told the motion, as a reason; empty if not for long."""
+        is_told = not found.moving_along or determines(found, starts)
+        if is_told or self._told_ns is None:
+            self._told_ns = stamp_ns
+        since_s = (stamp_ns - self._told_ns) / 1e9
+        if since_s <= LONGEST_UNTOLD_S:
+            return ''
+        return (
+            f'{found.moving_along:.0%} of it moves along, and for {since_s:.1f} s nothing that '
+            'stands has told the motion'
+        )
 
     def advance(self, T_fixed_body: Transform, stamp_ns: int, reach_m: float = 0.0) -> None:
         """

@@ -39,9 +39,17 @@ from surfel_mapper.scan import PointTimes, Scan
 MOST_PARTS = 20
 """Number of parts whose maps are kept; of more, the oldest are forgotten."""
 
-STATES = ('lost', 'unconfirmed', 'ambiguous', 'degenerate', 'accompanied', 'surrounded')
+STATES = (
+    'lost',
+    'unconfirmed',
+    'ambiguous',
+    'degenerate',
+    'accompanied',
+    'surrounded',
+    'stopped',
+)
 """States of tracking; accompanied: much of what is seen moves along, and the rest decides;
-surrounded: most of it seems to, and the pose may be wrong."""
+surrounded: most of it seems to, and the pose may be wrong; stopped: harder than by braking."""
 
 MAX_STEP_S = 10.0
 """Longest time between two scans that counts for a state, s; more is a gap of the recording."""
@@ -355,6 +363,12 @@ class RegisteredPoses:
     ) -> Prepared:
         """Return a scan at the pose of the track, and count its registration."""
         if registration is not None:
+            if registration.has_stopped:
+                self._drops.warn(
+                    'stopped',
+                    f'scan at {prepared.scan.stamp_ns / 1e9:.6f} s: the sensor seems to have '
+                    'stopped harder than by braking (a collision, or a repeated scan)',
+                )
             self._num_aligned += 1
             self._num_degenerate += len(registration.degenerate) > 0
             self._fits.append(registration.fit)
@@ -404,6 +418,7 @@ class RegisteredPoses:
             found = placed[-1].registration
             states += ['degenerate'] if len(found.degenerate) else []
             states += ['accompanied'] if found.moving_along else []
+            states += ['stopped'] if found.has_stopped else []
         self._states.add(stamp_ns, states)
 
     def _cells(self, scan: Scan) -> npt.NDArray[np.float64]:

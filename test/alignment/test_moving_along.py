@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.alignment.moving_along import moving_along
+from surfel_mapper.alignment.moving_along import moving_along, staying
 
 CELL_M = 0.25
 MOTION_M = np.array([0.8, 0.0, 0.0])
@@ -64,3 +64,13 @@ def test_the_edge_of_what_moves_along_does_too():
 def test_nothing_moves_along_without_a_scan_before():
     assert not found(REAR, np.empty((0, 3)), AHEAD).any()
     assert not len(found(np.empty((0, 3)), REAR, AHEAD))
+
+
+def test_the_share_that_stays_counts_surfaces_across_the_motion_alone():
+    cells = np.concatenate([REAR, REAR + 2.0 * AHEAD, FLOOR])
+    before = np.concatenate([REAR, REAR + 2.8 * AHEAD, FLOOR])
+    normals = np.concatenate([np.tile(AHEAD, (2 * len(REAR), 1)), np.tile(UP, (len(FLOOR), 1))])
+    share = staying(cells, before, MOTION_M, normals, CELL_M)
+    assert share == 0.5
+    assert staying(FLOOR, FLOOR, MOTION_M, np.tile(UP, (len(FLOOR), 1)), CELL_M) == 0.0
+    assert staying(REAR, REAR[:0], MOTION_M, np.tile(AHEAD, (len(REAR), 1)), CELL_M) == 0.0
