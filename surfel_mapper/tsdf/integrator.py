@@ -284,12 +284,12 @@ class Integrator:
         return replace(image, label=label, mask=mask)
 
     def _images(self, image: RangeImage) -> tuple[npt.NDArray[Any], ...]:
-        """Return ranges, cosines, colours, labels and mask; missing ones have no rows."""
+        """Return ranges in pairs, cosines, colours, labels, mask; missing ones have no rows."""
         mask, label = image.mask, image.label
         rows, (left, right) = kernels.BORDER
         edges = [rows, (left, right - image.sensor.wraps)]
         return (
-            np.pad(image.range_m, edges),
+            paired(np.pad(image.range_m, edges)),
             NO_COSINE if image.cosine is None else np.pad(image.cosine, edges),
             NO_COLOR if image.color is None else image.color,
             NO_LABEL if label is None else label,
@@ -308,6 +308,14 @@ class Integrator:
             config.skip_extra_channels,
             stamp_ns,
         )
+
+
+def paired(range_m: Float32) -> Int64:
+    """Return each pixel and its right neighbour in one number, so that both are read at once."""
+    pairs = np.zeros((*range_m.shape, 2), np.float32)
+    pairs[..., 0] = range_m
+    pairs.reshape(-1, 2)[:-1, 1] = range_m.ravel()[1:]
+    return pairs.view(np.int64)[..., 0]
 
 
 def image_settings(config: TsdfConfig, image: RangeImage) -> Float32:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from surfel_mapper.errors import CloudFormatError, ConfigError
-from surfel_mapper.kernels.projection import OUTSIDE, project
+from surfel_mapper.kernels.projection import LIDAR_TABLE, OUTSIDE, project
+from surfel_mapper.tsdf.integrator import paired
 from surfel_mapper.tsdf.kernels import lookup as kernels
 from surfel_mapper.tsdf.range_image import from_depth, from_points, from_ranges
 from surfel_mapper.tsdf.sensors import CameraModel, LidarModel
@@ -201,9 +202,10 @@ def looked_up(image, u, v, method, allowed):
     found[kernels.MAX_DIFFERENCE] = allowed
     u, v = np.asarray(u, np.float32), np.asarray(v, np.float32)
     place, value = np.empty(len(u), np.int32), np.empty(len(u), np.float32)
-    pixels = np.empty((4, len(u)), np.float32)
+    upper, lower = np.empty(len(u), np.int64), np.empty(len(u), np.int64)
     kernels.locate(np.ones(len(u), np.float32), u, v, padded.shape[1], found, place)
-    kernels.gather(padded.ravel(), padded.shape[1], place, pixels)
+    kernels.gather(paired(padded).ravel(), padded.shape[1], place, upper, lower)
+    pixels = upper.view(np.float32), lower.view(np.float32)
     kernels.mix(*pixels, u, v, method, found, value)
     return value
 
@@ -223,6 +225,15 @@ def test_pixels_are_mixed_where_they_differ_little():
     # Beyond the last row or column, and above the first, only the nearest pixel is left.
     edges = looked_up(image, [1.9, 1.4, -0.4, 0.2], [0.9, 0.9, 0.0, -0.4], kernels.ADAPTIVE, 3.5)
     np.testing.assert_allclose(edges, [0.0, -4.0, -1.0, -1.0])
+
+
+@pytest.mark.parametrize('last', [3.0, 12.0, 70.0])
+def test_the_gap_at_a_voxel_is_that_of_the_rows_about_it(last):
+    gaps = np.random.default_rng(1).uniform(0.001, 0.01, 63).astype(np.float32)
+    v = np.random.default_rng(2).uniform(-1.0, last, 512).astype(np.float32)
+    found = np.empty_like(v)
+    kernels.row_gaps(LIDAR_TABLE, gaps, v, found)
+    np.testing.assert_array_equal(found, gaps[np.clip(v.astype(int), 0, 62)])
 
 
 def test_a_pixel_that_says_nothing_is_never_mixed():

@@ -23,6 +23,7 @@ voxels about their points take distances that were summed point by point (point_
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.projection import project
 from surfel_mapper.tsdf.kernels.channels import (
     apply_mask,
@@ -69,6 +70,9 @@ INSIDE = 3
 """Observed voxels behind a surface; set if any was fused."""
 NUM_FOUND = 4
 
+FLOATS_PER_LINE = 16
+"""float32 numbers in a line of the cache."""
+
 JUMP = np.int32(2**31 - 1)
 """Change of a block whose triangles differ in number."""
 
@@ -86,8 +90,9 @@ def integrate_blocks(
     offsets   (3, N) float32 m, from the first voxel to every voxel, x fastest
     field     (R, 2, N) float32, distance and weight of all blocks
     sensor    (kind, parameters, elevations, gaps), see kernels/projection.py and row_gaps
-    images    (range_m, cosine, color, label, mask): range_m and cosine with their BORDER; see
-              subtract, fuse_color, vote_labels, apply_mask; missing images have no rows
+    images    (pairs, cosine, color, label, mask): pairs, as gather takes them, and cosine with
+              their BORDER; see subtract, fuse_color, vote_labels, apply_mask; missing images have
+              no rows
     sums      (S, N, 3) float32, distances of thin objects, see kernels/point_fusion.py
     settings  (NUM_SETTINGS,) float32
     modes     (interpolation, power): weights fall by depth^-(2 power)
@@ -97,30 +102,34 @@ def integrate_blocks(
     found     (K, NUM_FOUND) int64, out: see OBSERVED, MOVED, SOLID, INSIDE
     """
     num_voxels = offsets.shape[1]
-    scratch = np.empty((15, num_voxels), np.float32)
+    scratch = np.empty((11, num_voxels), np.float32)
     x, y, z, distance = scratch[0], scratch[1], scratch[2], scratch[3]
     u, v, signed, weight = scratch[4], scratch[5], scratch[6], scratch[7]
-    pixels, value, fused, merged = scratch[8:12], scratch[12], scratch[13], scratch[14]
+    value, fused, summed = scratch[8], scratch[9], scratch[10]
+    upper, lower = np.empty(num_voxels, np.int64), np.empty(num_voxels, np.int64)
     place = np.empty(num_voxels, np.int32)
     mixed, label = np.empty(num_voxels, np.uint8), np.empty(num_voxels, np.int32)
     kind, parameters, elevations, gaps = sensor
-    image, cosine, color_image, label_image, mask = images
+    pairs, cosine, color_image, label_image, mask = images
+    stride = pairs.shape[1]
     color, votes, stamps, semantics, extra_labels, skip_extra, stamp = channels
     rows, corners, rates, slots = blocks
     tau, most, overflow = settings[TAU], settings[MAX_WEIGHT], 0
     for b in range(len(rows)):
         row, rate = rows[b], rates[b]
+        if b + 1 < len(rows):
+            prefetch_block(field.ravel(), field[0].size * rows[b + 1], field[0].size)
         shift(offsets[0], corners[b, 0], x)
         shift(offsets[1], corners[b, 1], y)
         shift(offsets[2], corners[b, 2], z)
         project(x, y, z, kind, parameters, elevations, distance, u, v)
-        locate(distance, u, v, image.shape[1], settings, place)
-        gather(image.ravel(), image.shape[1], place, pixels)
-        mix(pixels[0], pixels[1], pixels[2], pixels[3], u, v, modes[0], settings, value)
+        locate(distance, u, v, stride, settings, place)
+        gather(pairs.ravel(), stride, place, upper, lower)
+        mix(upper.view(np.float32), lower.view(np.float32), u, v, modes[0], settings, value)
         if settings[MAX_OFFSET] > _ZERO and has_single(value):
             row_gaps(kind, gaps, v, weight)
             drop_far(x, y, u, v, distance, weight, settings, value)
-        slant(cosine, image.shape[1], place, u, v, weight)
+        slant(cosine, stride, place, u, v, weight)
         subtract(value, distance, weight, settings, signed)
         count = count_observed(signed)
         if count > 0 and mask.shape[0] > 0:
@@ -131,8 +140,10 @@ def integrate_blocks(
             vote_labels(label_image, tau, u, v, mixed, signed, label)
             if len(extra_labels) > 0:
                 count -= keep_labels(extra_labels, tau, label, signed)
-        merged[:] = signed
+        merged = signed
         if slots[b] >= 0:
+            merged = summed
+            merged[:] = signed
             replace_summed(sums[slots[b]], tau, signed, merged)
             count = count_observed(merged)
         found[b, OBSERVED] = count
@@ -157,6 +168,13 @@ def integrate_blocks(
         replace(fused, weight, most, mean, total)
         found[b, SOLID], found[b, INSIDE] = count_solid(mean, total, tau)
     return overflow
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def prefetch_block(flat, first, size):
+    """Prefetch the field of a block while the one before is fused."""
+    for n in range(first, first + size, FLOATS_PER_LINE):
+        prefetch(flat, n)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

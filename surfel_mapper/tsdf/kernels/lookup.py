@@ -11,7 +11,7 @@ mean unknown, replaces tests of bounds.
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.projection import LIDAR_TABLE
+from surfel_mapper.kernels.projection import LIDAR_TABLE, MOST_CORRECTED
 
 # Settings of an integration, float32.
 TAU = 0
@@ -68,25 +68,26 @@ def locate(distance, u, v, stride, settings, place):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def gather(image, stride, place, pixels):
+def gather(pairs, stride, place, upper, lower):
     """
-    Fetch the four pixels about every voxel.
+    Fetch the four pixels about every voxel, two at a time.
 
-    image   (P,) float32
-    pixels  (4, N) float32, out: upper left and right, lower left and right
+    pairs         (P,) int64: each pixel and its right neighbour, two float32
+    upper, lower  (N,) int64, out: pairs
     """
     for n in range(len(place)):
         first = np.int64(place[n])
-        pixels[0, n], pixels[1, n] = image[first], image[first + 1]
-        pixels[2, n], pixels[3, n] = image[first + stride], image[first + stride + 1]
+        upper[n], lower[n] = pairs[first], pairs[first + stride]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def mix(q00, q10, q01, q11, u, v, method, settings, value):
+def mix(above, under, u, v, method, settings, value):
     """
     Find the range at every voxel: interpolated, or that of the nearest pixel.
 
-    value  (N,) float32, out: range if interpolated; -range if of the nearest pixel; 0 if unknown
+    above, under  (2 N,) float32, left and right pixel of every voxel in turn
+    value         (N,) float32, out: range if interpolated; -range if of the nearest pixel; 0 if
+                  unknown
     """
     reach, ratio = settings[MAX_RANGE], settings[MAX_DIFFERENCE_RATIO]
     allowed = _LARGE if method == BILINEAR else settings[MAX_DIFFERENCE]
@@ -95,12 +96,13 @@ def mix(q00, q10, q01, q11, u, v, method, settings, value):
     for n in range(len(value)):
         right, below = u[n] + _ONE, v[n] + _ONE
         du, dv = right - np.float32(np.int32(right)), below - np.float32(np.int32(below))
-        low = min(min(q00[n], q10[n]), min(q01[n], q11[n]))
-        high = max(max(q00[n], q10[n]), max(q01[n], q11[n]))
-        upper = q00[n] + du * (q10[n] - q00[n])
-        lower = q01[n] + du * (q11[n] - q01[n])
-        upper_near = q00[n] if du < _HALF else q10[n]
-        lower_near = q01[n] if du < _HALF else q11[n]
+        q00, q10, q01, q11 = above[2 * n], above[2 * n + 1], under[2 * n], under[2 * n + 1]
+        low = min(min(q00, q10), min(q01, q11))
+        high = max(max(q00, q10), max(q01, q11))
+        upper = q00 + du * (q10 - q00)
+        lower = q01 + du * (q11 - q01)
+        upper_near = q00 if du < _HALF else q10
+        lower_near = q01 if du < _HALF else q11
         nearest = upper_near if dv < _HALF else lower_near
         alike = (high - low <= allowed) | (high - low <= ratio * low)
         # Clearing pixels are not interpolated with measurements.
@@ -113,15 +115,32 @@ def row_gaps(kind, gaps, v, gap):
     """
     Find the angle between the rows about every voxel, (N,) float32 rad, out.
 
+    If the voxels are between few rows, they are gone through row by row in loops that are
+    vectorised; that is faster than a look-up of each.
+
     gaps  (rows - 1,) float32 rad, between each row and the next; not used for cameras
     """
     if kind != LIDAR_TABLE:
         for n in range(len(v)):
             gap[n] = gaps[0]
         return
-    last = np.int32(len(gaps) - 1)
+    end = np.int32(len(gaps) - 1)
+    low, high = end, np.int32(0)
     for n in range(len(v)):
-        gap[n] = gaps[np.int64(min(max(np.int32(v[n]), np.int32(0)), last))]
+        row = np.int32(v[n])
+        low = min(low, row)
+        high = max(high, row)
+    first, last = np.int64(max(low, np.int32(0))), np.int64(min(high, end))
+    if last - first > MOST_CORRECTED:
+        for n in range(len(v)):
+            gap[n] = gaps[min(max(np.int64(v[n]), first), last)]
+        return
+    for n in range(len(v)):
+        gap[n] = gaps[first]
+    for row in range(first + 1, last + 1):
+        start, wide = np.float32(row), gaps[row]
+        for n in range(len(v)):
+            gap[n] = wide if v[n] >= start else gap[n]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
