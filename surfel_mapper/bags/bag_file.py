@@ -22,7 +22,7 @@ from typing import ClassVar, NamedTuple, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import Budget, open_regular, stated_limit, VARIABLE
 from surfel_mapper.errors import BagError
 
 if TYPE_CHECKING:
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 MESSAGE_BYTES = 100
 """Memory charged for a message in an index: 48 bytes, and as much to sort it."""
+
+MAX_CONNECTIONS, CONNECTION_BYTES = 8192, 2000
+"""Limit of the topics of a file (in ROS 1 a topic has one for each publisher), and memory of one.
+Recordings have some hundreds; each takes 20 us."""
 
 INDEX_COLUMNS = 6
 """Integers of an entry of an index: record time, connection, and four that locate the message."""
@@ -86,6 +90,7 @@ class BagFile(ABC):
         self.skipped_at: list[int] = []
         self.losses: list[str] = []
         self._budget = Budget(path, self.size, BagError)
+        self._described_bytes = 0
         self._by_id: dict[int, Connection] = {}
         self._counts: Counter[int] = Counter()
         self.start_time, self.end_time = 2**63 - 1, 0
@@ -115,6 +120,19 @@ class BagFile(ABC):
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+    def _keep_connection(self, key: int, connection: Connection, size: int) -> None:
+        """Keep a connection whose description has a size, bytes; refuse too many."""
+        if key not in self._by_id:
+            taken = size + CONNECTION_BYTES
+            self._budget.take(taken, f'descriptions of {len(self._by_id) + 1} topics')
+            self._described_bytes += taken
+        self._by_id[key] = connection
+        most = max(MAX_CONNECTIONS, stated_limit() // CONNECTION_BYTES)
+        if len(self._by_id) > most:
+            raise BagError(
+                f'{self.path}: over {most} topics; is it damaged? Otherwise set {VARIABLE}'
+            )
 
     def _note_span(self, first_ns: int, last_ns: int) -> None:
         """Extend the span by the record times of messages."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from array import array
-from collections import deque, OrderedDict
+from collections import Counter, deque, OrderedDict
 from collections.abc import Collection, Iterator, Mapping
 import heapq
 from pathlib import Path
@@ -32,6 +32,7 @@ from zlib import crc32
 
 import numpy as np
 
+from surfel_mapper.bags._rosbags import is_same
 from surfel_mapper.bags.bag_file import (
     BagFile,
     FoundMessage,
@@ -68,6 +69,14 @@ MOST_OF_CHUNK = 0.5
 MAX_MESSAGES, LEAST_BYTES = 100_000, 16
 """Limit of the messages of a small file, and bytes of a file for each further one; the entries in
 the index of a chunk have 16, and finding a message takes 1.5 us."""
+
+MAX_OTHERS, LEAST_OTHER_BYTES = 10_000, 32
+"""Limit of the records of a small file that are no messages, such as the descriptions of topics
+that each chunk repeats, and bytes of a file for each further one; each takes 1 to 10 us."""
+
+MAX_CHUNKS, LEAST_CHUNK_BYTES = 4000, 512
+"""Limit of the chunks of a small file, and bytes of a file for each further one. A chunk takes 40
+us; recorders write them of 768 KiB."""
 
 LOOSE = -1
 """Number of the chunk of messages that are outside of chunks."""
@@ -127,7 +136,9 @@ class ChunkedFile(BagFile):
         self._loose = array('q')
         self._kept: OrderedDict[int, bytes | bytearray] = OrderedDict()
         self._indexes: dict[int, Index] = {}
-        self._num_places = self._num_charged = 0
+        self._num_places = self._num_charged = self._others = self._num_others = 0
+        self._stated_limit = stated_limit()
+        self._searched: set[int] = set()
         self._ever_unpacked: set[int] = set()
         self._sum_unpacked = 0
         super().__init__(path)
@@ -172,7 +183,8 @@ class ChunkedFile(BagFile):
         """
         Append the messages in unpacked records to an index; keep or check connections.
 
-        ``_charge`` is called for each CHECK_EVERY messages. Raises one of DAMAGE at a cut.
+        ``_charge`` is called for each CHECK_EVERY messages, and ``_count_others`` for as many
+        other records, which are counted in ``_others``. Raises one of DAMAGE at a cut.
         """
 
     def _begin_again(self) -> None:
@@ -181,28 +193,43 @@ class ChunkedFile(BagFile):
         self._budget.give_back(sum(map(len, self._kept.values())))
         for found in (self._by_id, self._counts, self._chunks, self._kept, self.skipped_at):
             found.clear()
+        self._searched.clear()
         self._ever_unpacked.clear()
-        self._sum_unpacked = 0
+        self._sum_unpacked = self._num_others = 0
+        self._budget.give_back(self._described_bytes)
+        self._described_bytes = 0
         self.start_time, self.end_time, self.skip_reason = 2**63 - 1, 0, ''
 
     def _survey_chunk(self, chunk: Chunk) -> None:
         """Search a chunk that no index describes; keep its span and counts."""
         number = len(self._chunks)
         self._budget.take(MESSAGE_BYTES, f'{number + 1} chunks')
-        self._chunks.append(chunk)
+        self._add_chunk(chunk)
         index = self._search(number)
         if len(index):
-            ids, counts = np.unique(index[:, 1], return_counts=True)
-            found = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+            found = Counter(index[:, 1].tolist())
             first_ns, last_ns = int(index[:, 0].min()), int(index[:, 0].max())
             self._chunks[number] = chunk._replace(start_ns=first_ns, end_ns=last_ns, counts=found)
             self._note_chunk(self._chunks[number])
-            self._check_number(sum(self._counts.values()))
+            self._check_number(self._counts.total())
         if self._num_places + len(index) <= MAX_MESSAGES:
             self._indexes[number] = index
             self._num_places += len(index)
         else:
             self._budget.give_back(MESSAGE_BYTES * len(index))
+
+    def _add_chunk(self, chunk: Chunk) -> None:
+        """Add a chunk to those of the file; refuse too many."""
+        self._chunks.append(chunk)
+        self._check_number(len(self._chunks), 'chunks', MAX_CHUNKS, LEAST_CHUNK_BYTES)
+
+    def _describe(self, key: int, connection: Connection, size: int) -> None:
+        """Keep a connection; raise ValueError if an earlier description of it differs."""
+        known = self._by_id.get(key)
+        if known is None:
+            self._keep_connection(key, connection, size)
+        elif not is_same(known, connection):
+            raise ValueError(f'connection {key} is described in two ways')
 
     def _note_chunk(self, chunk: Chunk) -> None:
         """Add the messages of a chunk to those of the file."""
@@ -222,7 +249,7 @@ class ChunkedFile(BagFile):
 
         The first chunk with a message of a connection describes it, so few chunks are unpacked.
         """
-        self._check_number(sum(self._counts.values()))
+        self._check_number(self._counts.total())
         left = {key for key, count in self._counts.items() if count}
         if not left <= self._by_id.keys():
             raise ValueError('the index has messages of unknown connections')
@@ -254,10 +281,27 @@ class ChunkedFile(BagFile):
                 self._budget.take(MESSAGE_BYTES * len(index), f'{len(index)} messages')
             else:
                 index = self._search(number)
-            times, found = index[:, 0], len(index)
-            index = index[(times >= start) & (times < stop) & np.isin(index[:, 1], list(wanted))]
-            self._budget.give_back(MESSAGE_BYTES * (found - len(index)))
+            if number == LOOSE or not self._is_within(self._chunks[number], wanted, start, stop):
+                times, found = index[:, 0], len(index)
+                among = np.isin(index[:, 1], list(wanted))
+                index = index[(times >= start) & (times < stop) & among]
+                self._budget.give_back(MESSAGE_BYTES * (found - len(index)))
             return index[np.argsort(index[:, 0], kind='stable')]
+
+    @staticmethod
+    def _is_within(chunk: Chunk, wanted: Collection[int], start: int, stop: int) -> bool:
+        """Return whether all messages of a chunk are wanted and in a span."""
+        is_inside = start <= chunk.start_ns and chunk.end_ns < stop
+        return is_inside and all(connection in wanted for connection in chunk.counts)
+
+    def _count_others(self, number: int) -> None:
+        """Count the records beside messages since the last call, of each chunk once."""
+        count, self._others = self._others, 0
+        if number not in self._searched:
+            self._num_others += count
+            self._check_number(
+                self._num_others, 'records beside messages', MAX_OTHERS, LEAST_OTHER_BYTES
+            )
 
     def _search(self, number: int) -> Index:
         """Return the messages of a chunk in its order, up to the damage if it has some."""
@@ -269,6 +313,8 @@ class ChunkedFile(BagFile):
             if chunk.is_whole:
                 reason = f'no field {error}' if isinstance(error, KeyError) else str(error)
                 self._note_damage(chunk.start, reason, len(numbers) // INDEX_COLUMNS)
+        self._count_others(number)
+        self._searched.add(number)
         index = as_index(numbers)
         self._charge(len(index))
         self._num_charged = 0
@@ -283,12 +329,14 @@ class ChunkedFile(BagFile):
         self._num_charged = count
         self._check_number(count)
 
-    def _check_number(self, count: int) -> None:
-        """Raise BagError if there are more messages than a file of this size may have."""
-        most = max(MAX_MESSAGES, stated_limit() // MESSAGE_BYTES, self.size // LEAST_BYTES)
+    def _check_number(
+        self, count: int, of: str = 'messages', most: int = MAX_MESSAGES, each: int = LEAST_BYTES
+    ) -> None:
+        """Raise BagError if there are more of something than a file of this size may have."""
+        most = max(most, self._stated_limit // MESSAGE_BYTES, self.size // each)
         if count > most:
             raise BagError(
-                f'{self.path}: over {most} messages in {self.size} bytes; is it damaged? '
+                f'{self.path}: over {most} {of} in {self.size} bytes; is it damaged? '
                 f'Otherwise set {VARIABLE}'
             )
 

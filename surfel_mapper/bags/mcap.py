@@ -20,7 +20,7 @@ from collections.abc import Iterator
 import struct
 from zlib import crc32
 
-from surfel_mapper.bags._rosbags import is_same, ros2_connection
+from surfel_mapper.bags._rosbags import ros2_connection
 from surfel_mapper.bags.bag_file import FoundMessage, Index, INDEX_COLUMNS
 from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 from surfel_mapper.bags.runs import (
@@ -59,12 +59,14 @@ class McapFile(ChunkedFile):
     def _survey(self) -> None:
         """Find the chunks through the summary, or else record by record."""
         self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._last: dict[tuple[int, int], bytes] = {}
         try:
             if self._read_summary():
                 return
         except DAMAGE:
             pass
         self._schemas.clear()
+        self._last.clear()
         self._begin_again()
         self._read_records()
 
@@ -114,7 +116,7 @@ class McapFile(ChunkedFile):
         if start_ns > end_ns or end_ns >= 2**63:
             raise ValueError('index of a chunk of no span')
         chunk = Chunk(start, size, True, start_ns, end_ns, {k: n for k, n in counts.items() if n})
-        self._chunks.append(chunk)
+        self._add_chunk(chunk)
         if chunk.counts:
             self._note_chunk(chunk)
 
@@ -135,6 +137,9 @@ class McapFile(ChunkedFile):
             kind, size = RECORD.unpack(head.ljust(RECORD.size, b'\0'))
             end = at + RECORD.size + size
             is_whole = kind > 0 and end <= self.size
+            if kind not in (MESSAGE, CHUNK):
+                self._others += 1
+                self._count_others(LOOSE)
             if is_whole and kind in (DATA_END, FOOTER):
                 self.cut_at = None if self._ends() else self.size
                 return
@@ -198,8 +203,12 @@ class McapFile(ChunkedFile):
             if after > end:
                 raise ValueError(f'the record at byte {at} of its chunk is longer than the chunk')
             if kind != MESSAGE:
-                self._note(kind, bytes(records[start:after]))
+                if kind in (SCHEMA, CHANNEL):
+                    self._note(kind, bytes(records[start:after]))
                 at, run = after, 0
+                self._others += 1
+                if self._others == CHECK_EVERY:
+                    self._count_others(number)
                 continue
             run, last = (run + 1 if length == last else 0), length
             if run > RUN and len(found := self._run(number, records, at, length)):
@@ -225,18 +234,26 @@ class McapFile(ChunkedFile):
 
     def _note(self, kind: int, content: bytes) -> None:
         """Keep a schema or channel; raise ValueError if it differs from an earlier one."""
+        if kind not in (SCHEMA, CHANNEL):
+            return
+        (key,) = struct.unpack_from('<H', content)
+        if self._last.get((kind, key)) == content:  # repeated, as in each chunk
+            return
         if kind == SCHEMA:
-            (key,) = struct.unpack_from('<H', content)
             name, at = text(content, 2)
             encoding, at = text(content, at)
             schema = (name, encoding, text(content, at)[0])
             if self._schemas.setdefault(key, schema) != schema:
                 raise ValueError(f'schema {key} is described in two ways')
-        elif kind == CHANNEL:
-            self._note_channel(content)
+        elif not self._note_channel(content):
+            return
+        if (kind, key) not in self._last:
+            self._budget.take(2 * len(content), f'{len(self._last) + 1} descriptions')
+            self._described_bytes += 2 * len(content)
+        self._last[kind, key] = content
 
-    def _note_channel(self, content: bytes) -> None:
-        """Keep the channel in a record."""
+    def _note_channel(self, content: bytes) -> bool:
+        """Keep the channel in a record; return whether its schema is known."""
         key, schema = struct.unpack_from('<HH', content)
         topic, at = text(content, 4)
         encoding, at = text(content, at)
@@ -245,8 +262,8 @@ class McapFile(ChunkedFile):
         connection = ros2_connection(
             key, topic, name, None, encoding=encoding, qos=qos, definition=(kind, definition)
         )
-        if not is_same(self._by_id.setdefault(key, connection), connection):
-            raise ValueError(f'channel {key} is described in two ways')
+        self._describe(key, connection, len(content))
+        return schema in self._schemas
 
 
 def records_in(content: bytes | bytearray) -> Iterator[tuple[int, int, int]]:

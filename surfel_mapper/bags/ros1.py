@@ -21,7 +21,7 @@ import struct
 
 import numpy as np
 
-from surfel_mapper.bags._rosbags import is_same, ros1_connection
+from surfel_mapper.bags._rosbags import ros1_connection
 from surfel_mapper.bags.bag_file import FoundMessage, Index, INDEX_COLUMNS
 from surfel_mapper.bags.chunked import Chunk, ChunkedFile, DAMAGE, LOOSE, Packed
 from surfel_mapper.bags.runs import (
@@ -83,6 +83,8 @@ class Ros1File(ChunkedFile):
             self._budget.check_time()
             fields, start, size = self._record(at)
             kind = fields['op'][0]
+            self._others += 1
+            self._count_others(LOOSE)
             if kind == CONNECTION:
                 self._note_connection(fields, self._at(start, size))
             elif kind == CHUNK_INFO:
@@ -106,7 +108,7 @@ class Ros1File(ChunkedFile):
         is_whole = data + size <= self.size
         span = nanoseconds(fields['start_time']), nanoseconds(fields['end_time'])
         chunk = Chunk(start, data + size - start, is_whole, *span, counts)
-        self._chunks.append(chunk)
+        self._add_chunk(chunk)
         if counts:
             self._note_chunk(chunk)
 
@@ -119,6 +121,9 @@ class Ros1File(ChunkedFile):
                 fields, start, size = self._record(at)
                 kind = fields['op'][0]
                 is_whole = start + size <= self.size
+                if kind not in (CHUNK, MESSAGE):
+                    self._others += 1
+                    self._count_others(LOOSE)
                 if kind == CHUNK:
                     end = min(start + size, self.size)
                     self._survey_chunk(Chunk(at, end - at, is_whole))
@@ -208,6 +213,9 @@ class Ros1File(ChunkedFile):
         at, data, size = place
         fields = header_fields(bytes(records[at + 4 : data - 4]))
         kind = fields['op'][0]
+        self._others += kind != MESSAGE
+        if self._others == CHECK_EVERY:
+            self._count_others(number)
         if kind == CONNECTION:
             self._note_connection(fields, bytes(records[data : data + size]))
         elif kind == MESSAGE:
@@ -234,8 +242,8 @@ class Ros1File(ChunkedFile):
             definition=content['message_definition'].decode(),
             latching=int(content.get('latching') or 0),
         )
-        if is_new and not is_same(self._by_id.setdefault(key, connection), connection):
-            raise ValueError(f'connection {key} is described in two ways')
+        if is_new:
+            self._describe(key, connection, len(data))
 
 
 def nanoseconds(content: bytes) -> int:

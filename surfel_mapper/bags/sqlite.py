@@ -40,9 +40,6 @@ LEAST_ROW_BYTES = 9
 READ_BYTES, ROW_BYTES = 1 << 16, 1 << 9
 """Size of messages read together, and of one beside its bytes; asking for the time takes 3 us."""
 
-TOPIC_BYTES = 2000
-"""Memory of a topic, beside its texts."""
-
 PLAIN = re.compile(r'\s*CREATE\s+(TABLE|(UNIQUE\s+)?INDEX)\b', re.IGNORECASE)
 """Beginning of the definition of a table or an index, not of a view, trigger or virtual table."""
 
@@ -154,11 +151,9 @@ class SqliteFile(BagFile):
         for key, *texts in self._rows(query):
             if not isinstance(key, int) or not all(isinstance(text, str) for text in texts):
                 raise ValueError(f'topic {key!r} is not described by texts')
-            self._budget.take(TOPIC_BYTES + 4 * sum(map(len, texts)), 'topics')
             topic, type_, encoding, profiles = texts
-            self._by_id[key] = ros2_connection(
-                key, topic, type_, None, encoding=encoding, qos=profiles
-            )
+            connection = ros2_connection(key, topic, type_, None, encoding=encoding, qos=profiles)
+            self._keep_connection(key, connection, 4 * sum(map(len, texts)))
 
     def _count_messages(self) -> None:
         """Count the messages of each topic; raise ValueError if one has no topic or time."""

@@ -167,9 +167,8 @@ class SalvagedSqlite(BagFile):
         topic, type_, encoding, *further = texts
         if topic.startswith('/') and '/' in type_:
             qos = ' '.join(further[:1])
-            self._by_id[rowid] = ros2_connection(
-                rowid, topic, type_, None, encoding=encoding, qos=qos
-            )
+            connection = ros2_connection(rowid, topic, type_, None, encoding=encoding, qos=qos)
+            self._keep_connection(rowid, connection, len(content))
 
     def _check_chain(self, place: tuple[int, ...]) -> None:
         """Raise ValueError if an overflow page of a message is not in the file."""
