@@ -313,17 +313,23 @@ def _cross(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArra
 def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return values as float64; raise ValueError, with their name, if they are not numbers."""
     try:
-        return np.asarray(values, np.float64)
-    except (TypeError, ValueError):
+        if np.iscomplexobj(values):
+            raise TypeError
+        with np.errstate(over='ignore'):  # wider floats become infinite
+            return np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
         shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
         raise ValueError(f'{name}: {shown}, expected numbers') from None
 
 
 def as_whole(name: str, value: object) -> int:
-    """Return a whole number; raise TypeError, with its name, for anything else, also for bool."""
+    """Return a whole number of int64; TypeError for others, also bool, ValueError beyond it."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
         shown = f'a {type(value).__name__}' if isinstance(value, np.ndarray) else repr(value)
         raise TypeError(f'{name}: {shown}, expected a whole number')
+    if not -(2**63) <= value < 2**63:
+        bits = int(value).bit_length()
+        raise ValueError(f'{name}: a number of {bits} bits, expected at most 63 and a sign')
     return int(value)
 
 

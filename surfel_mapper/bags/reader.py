@@ -25,13 +25,12 @@ from surfel_mapper.bags._rosbags import (
     has_legal_names,
     is_cdr,
     is_latched,
-    jazzy_types,
-    ros1_types,
     type_name,
 )
 from surfel_mapper.bags.bag_file import BagFile
 from surfel_mapper.bags.chunked import ChunkedFile
 from surfel_mapper.bags.compression import unpack_file, unpacked_message, ZSTD_MAGIC
+from surfel_mapper.bags.decoders import Decoders
 from surfel_mapper.bags.paths import files_of, is_packed, is_ros1, stated_counts, unpacked_name
 from surfel_mapper.bags.storage import damaged, described, open_storage
 from surfel_mapper.bags.topics import CLOUD, SAME_AS, Topic, Topics
@@ -39,16 +38,10 @@ from surfel_mapper.errors import BagError, DependencyError
 from surfel_mapper.messages.pointcloud2 import parse_cloud
 
 if TYPE_CHECKING:
-    from surfel_mapper.bags._rosbags import Connection, Typestore
+    from surfel_mapper.bags._rosbags import Connection
 
 MAX_NAMES = 12
 """Number of topics named in a message."""
-
-MAX_DEFINED, LEAST_DEFINITION, DEFINED_EACH = 1 << 15, 800, 100
-"""
-Limit of the definitions of ROS 1 that are parsed of a small bag, characters, what each counts at
-least, and bytes of a bag for each further one. Parsing takes 5 ms, and 6 us a character of fields.
-"""
 
 log = logging.getLogger(__name__)
 
@@ -93,15 +86,14 @@ class BagReader:
         self.cuts: list[str] = []
         self._skipped: dict[Path, int] = {}
         self._latched: set[str] | None = None
-        self._by_type: dict[str, Connection] | None = None
-        self._defined = 0
-        self._decoders: dict[str, tuple[Typestore, str] | Exception] = {}
         self._storages: list[tuple[Path, BagFile]] = []
         with ExitStack() as files:
             self._open(files_of(self.path), files)
             self.topics = Topics(self.path, self._indexed_topics())
             if not any(topic.count for topic in self.topics):
                 raise BagError(f'{self.path}: a bag without messages')
+            size = sum(storage.size for _, storage in self._storages)
+            self._decoders = Decoders(self._connections, size, is_ros1=self.is_ros1)
             self._files = files.pop_all()
         for cut in self.cuts:
             log.warning(cut)
@@ -177,7 +169,7 @@ class BagReader:
         if message.type == CLOUD:
             return parse_cloud(message.raw, ros1=self.is_ros1, topic=message.topic)
         try:
-            store, type_ = self._decoder(message.type)
+            store, type_ = self._decoders.find(message.type)
             if self.is_ros1:
                 return store.deserialize_ros1(message.raw, type_)
             return store.deserialize_cdr(message.raw, type_)
@@ -319,34 +311,3 @@ class BagReader:
         if short:
             self.cuts.append(message)
             log.warning(message)
-
-    def _decoder(self, type_: str) -> tuple[Typestore, str]:
-        """Return the type store that decodes a type, and its name there."""
-        if type_ not in self._decoders:
-            try:
-                self._decoders[type_] = self._new_decoder(type_)
-            except Exception as error:  # of a definition, which is parsed once
-                self._decoders[type_] = error
-        found = self._decoders[type_]
-        if isinstance(found, Exception):
-            raise found
-        return found
-
-    def _new_decoder(self, type_: str) -> tuple[Typestore, str]:
-        """Return a decoder from rosbags' own definitions, or for ROS 1 from those in the bag."""
-        if not self.is_ros1:
-            return jazzy_types(), type_
-        found = self._ros1_connections()[type_]
-        size = sum(storage.size for _, storage in self._storages)
-        self._defined += LEAST_DEFINITION + len(found.msgdef.data)
-        if self._defined > MAX_DEFINED + size // DEFINED_EACH:
-            raise ValueError(
-                f'definitions of {self._defined} characters in {size} bytes are too long together'
-            )
-        return ros1_types(found), found.msgtype
-
-    def _ros1_connections(self) -> dict[str, Connection]:
-        """Return a connection of each type, found once: a bag may have thousands of types."""
-        if self._by_type is None:
-            self._by_type = {type_name(c): c for c in reversed([*self._connections()])}
-        return self._by_type

@@ -124,7 +124,9 @@ def save_state(
     }
     manifest['sha256'] = content_sha256(manifest, contiguous.values())
     with replace_file(path, lasting=lasting) as file:
-        size = write_archive(file, manifest, contiguous, zipfile.ZIP_DEFLATED * compress)
+        size = write_archive(
+            file, manifest, contiguous, zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
+        )
         if size * copies > max(FLOOR_BYTES, BYTES_PER_BYTE * file.tell()):
             file.seek(0)
             file.truncate()

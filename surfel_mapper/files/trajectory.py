@@ -229,7 +229,7 @@ def write_tum(
         If the file cannot be written.
 
     """
-    poses = np.asarray(T_fixed_sensor, np.float64).reshape(-1, 4, 4)
+    poses = as_numbers('T_fixed_sensor', T_fixed_sensor).reshape(-1, 4, 4)
     with replace_file(path) as file:
         file.write(TUM_HEADER.encode())
         for stamp, pose in zip(stamp_ns, poses, strict=True):

@@ -127,7 +127,8 @@ def visit_neighbours(
         return
     tree = search_tree(points, threads)
     # squared for comparisons; the bound is exclusive, and its square must not underflow
-    within_sq = max(float(np.nextafter(max_distance_m, math.inf)), 1e-150) ** 2
+    within = max(float(np.nextafter(max_distance_m, math.inf)), 1e-150)
+    within_sq = within * within  # infinite if too large, which ** refuses
     num_leaves = len(tree[-1])
     step = max(AT_ONCE // (number * LEAF), 1)
 

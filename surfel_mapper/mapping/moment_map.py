@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
-from surfel_mapper.geometry import as_numbers
+from surfel_mapper.geometry import as_numbers, as_whole
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import (
@@ -166,7 +166,8 @@ class MomentMap:
         self._check_lattice(moments)
         if not moments.is_reduced:
             check_possible(moments)
-        missing, rows, fallen = self._table.remove(moments, self.version + 1, min_points)
+        least = as_whole('min_points', min_points)
+        missing, rows, fallen = self._table.remove(moments, self.version + 1, least)
         if missing >= 0:
             index = moments.voxel_index[missing].tolist()
             raise NotInMapError(
@@ -291,7 +292,7 @@ class MomentMap:
 
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
         """Return the keys (K,) of the voxels of at least min_points points, in any order."""
-        rows = self._table.changed_after(-1, min_points)
+        rows = self._table.changed_after(-1, as_whole('min_points', min_points))
         return self._table.values(rows, layout.KEY)
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
@@ -310,6 +311,7 @@ class MomentMap:
 
         Rows from before the map was cleared (``cleared_at``, a version) are not included.
         """
+        since = as_whole('since', since)
         changed = self._changes.since(since, self._table.rows.array, 0)
         return self._table.emptied_or_changed_after(since) if changed is None else changed
 

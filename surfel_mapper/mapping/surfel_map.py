@@ -114,7 +114,7 @@ class SurfelMap(MomentMap):
                 f'voxel_size_m: {voxel_size_m!r}, expected a number of metres; settings belong '
                 'to Mapper'
             )
-        if not 0.0 < voxel_size_m < math.inf:
+        if not 0.0 < as_numbers('voxel_size_m', voxel_size_m) < math.inf:
             raise ValueError(f'voxel_size_m: {voxel_size_m}, expected positive and finite')
         if as_whole('threads', threads) < 1:
             raise ValueError(f'threads: {threads}, expected 1 or more')

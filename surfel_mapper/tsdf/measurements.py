@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import PoseError
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.tsdf.kernels import lookup as kernels
 
 logger = logging.getLogger(__name__)
@@ -113,7 +114,10 @@ def checked_pose(T_map_sensor: Float64) -> Float64:
         If it is not finite or not rigid.
 
     """
-    T = np.asarray(T_map_sensor, np.float64)
+    try:
+        T = as_numbers('pose of the sensor', T_map_sensor)
+    except ValueError as error:
+        raise PoseError(str(error)) from None
     if T.shape != (4, 4) or not np.isfinite(T).all():
         raise PoseError(f'pose of the sensor: {T.tolist()}, expected finite (4, 4)')
     R = T[:3, :3]

@@ -15,6 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels import queries as kernels
 
@@ -128,7 +129,7 @@ def states(
 
 def in_voxels(blocks: BlockMap, points: npt.ArrayLike) -> tuple[npt.NDArray[np.float64], int]:
     """Return points in units of voxels, and the bits of a voxel index within a block."""
-    places = np.asarray(points, np.float64)
+    places = as_numbers('points', points)
     if places.ndim != 2 or places.shape[1] != 3:
         raise ValueError(f'points: {places.shape}, expected (P, 3)')
     bits = blocks.config.voxels_per_side.bit_length() - 1

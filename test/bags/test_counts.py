@@ -13,7 +13,7 @@ import struct
 
 import pytest
 
-from surfel_mapper.bags import bag_file, chunked, mcap, reader
+from surfel_mapper.bags import bag_file, chunked, decoders, mcap
 from surfel_mapper.bags.reader import BagReader
 from surfel_mapper.bags.runs import CHECK_EVERY
 from surfel_mapper.errors import BagError
@@ -174,9 +174,9 @@ def test_many_types_of_ros1_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
     """Each type takes milliseconds, and was searched for among all of them."""
     number = 100
     parsed, names = [], []
-    types, type_name = reader.ros1_types, reader.type_name
-    monkeypatch.setattr(reader, 'ros1_types', lambda c: parsed.append(c) or types(c))
-    monkeypatch.setattr(reader, 'type_name', lambda c: names.append(c) or type_name(c))
+    types, type_name = decoders.ros1_types, decoders.type_name
+    monkeypatch.setattr(decoders, 'ros1_types', lambda c: parsed.append(c) or types(c))
+    monkeypatch.setattr(decoders, 'type_name', lambda c: names.append(c) or type_name(c))
     path = tmp_path / 'a.bag'
     parts = [connection(n, b'a/A%d' % n) + message1(n) for n in range(number)]
     path.write_bytes(bag1(chunk1(b''.join(parts))))
@@ -188,8 +188,8 @@ def test_many_types_of_ros1_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
             except BagError as error:
                 errors.append(str(error))
     assert all('too long together' in error for error in errors)
-    most = (reader.MAX_DEFINED + path.stat().st_size // reader.DEFINED_EACH) // (
-        reader.LEAST_DEFINITION
+    most = (decoders.MAX_DEFINED + path.stat().st_size // decoders.BYTES_EACH) // (
+        decoders.LEAST_DEFINITION
     )
     assert most - 2 <= len(parsed) <= most
     assert len(errors) == number - len(parsed)

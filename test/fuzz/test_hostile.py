@@ -22,6 +22,7 @@ from PIL import Image
 import pytest
 import yaml
 
+from surfel_mapper.bags import decoders
 from surfel_mapper.bags import reader as bag_reader
 from surfel_mapper.bags.paths import files_of, stated_counts
 from surfel_mapper.cli.main import main
@@ -625,14 +626,14 @@ def test_definitions_of_ros1_are_parsed_once_and_up_to_a_size(tmp_path, monkeypa
     entries = drive(store=ROS1)
     path = write_ros1(tmp_path / 'a.bag', entries)
     parsed = []
-    types = bag_reader.ros1_types
+    types = decoders.ros1_types
 
     def counted(connection):
         parsed.append(connection)
         wrong = SimpleNamespace(data=definition.decode())
         return types(SimpleNamespace(msgdef=wrong, msgtype=connection.msgtype))
 
-    monkeypatch.setattr(bag_reader, 'ros1_types', counted)
+    monkeypatch.setattr(decoders, 'ros1_types', counted)
     with bag_reader.BagReader(path) as reader:
         for message in reader.messages(['/odom']):
             with pytest.raises(BagError, match='no nav_msgs/msg/Odometry: '):

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
+from surfel_mapper.geometry import as_whole
 from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
@@ -104,10 +105,12 @@ class DistanceField:
         if sensor is None:
             by_points = PointIntegrator(self.blocks)
             return by_points.integrate(
-                points, T_map_sensor, stamp_ns, colors=colors, labels=labels
+                points, T_map_sensor, as_whole('stamp_ns', stamp_ns), colors=colors, labels=labels
             )
         image = from_points(sensor, points, colors=colors, labels=labels)
-        return Integrator(self.blocks).integrate(image, T_map_sensor, stamp_ns)
+        return Integrator(self.blocks).integrate(
+            image, T_map_sensor, as_whole('stamp_ns', stamp_ns)
+        )
 
     def add_depth(
         self,
@@ -144,7 +147,9 @@ class DistanceField:
 
         """
         image = from_depth(camera, depth).with_images(color=color, label=label)
-        return Integrator(self.blocks).integrate(image, T_map_camera, stamp_ns)
+        return Integrator(self.blocks).integrate(
+            image, T_map_camera, as_whole('stamp_ns', stamp_ns)
+        )
 
     def sample(self, points: npt.ArrayLike) -> npt.NDArray[np.float32]:
         """Return the signed distances at (P, 3) points, map frame, (P,) m; nan if unknown."""

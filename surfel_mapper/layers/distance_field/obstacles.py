@@ -18,6 +18,7 @@ import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
 from surfel_mapper.errors import MapLimitError
+from surfel_mapper.geometry import as_numbers
 from surfel_mapper.layers.costs.traversability import CostGrid, OBSTACLE
 from surfel_mapper.layers.costs.traversability import UNKNOWN as UNSEEN
 from surfel_mapper.tsdf.blocks import BlockMap
@@ -25,6 +26,9 @@ from surfel_mapper.tsdf.queries import OCCUPIED, states, UNKNOWN
 
 MAX_VOXELS = 1 << 27
 """Limit of the voxels in a box: their distances take 0.5 GB, computing them four times that."""
+
+MAX_INDEX = 1 << 31
+"""Limit of the index of a voxel; those of blocks are int32."""
 
 COSTS = np.array([UNSEEN, 0, OBSTACLE], np.int8)
 """Occupancy grid values of unknown, free and occupied voxels."""
@@ -193,7 +197,7 @@ def obstacle_distances(
     Raises
     ------
     ValueError
-        If a corner is not (3,) or low is not below high.
+        If a corner is not (3,), beyond the indices of voxels, or low is not below high.
     MapLimitError
         If the box has more than MAX_VOXELS.
 
@@ -201,9 +205,9 @@ def obstacle_distances(
     size_m = blocks.config.voxel_size_m
     low, high = extent(blocks, blocks.index(blocks.rows()))
     if low_m is not None:
-        low = np.floor(np.asarray(low_m, np.float64) / size_m).astype(np.int64)
+        low = np.floor(in_voxels('low_m', low_m, size_m)).astype(np.int64)
     if high_m is not None:
-        high = np.ceil(np.asarray(high_m, np.float64) / size_m).astype(np.int64)
+        high = np.ceil(in_voxels('high_m', high_m, size_m)).astype(np.int64)
     if low.shape != (3,) or high.shape != (3,) or (low > high).any():
         raise ValueError(f'box from {low * size_m} to {high * size_m} m, expected low below high')
     found = box_states(blocks, low, high)
@@ -241,6 +245,14 @@ def box_states(
         centers = (places.reshape(-1, 3) + 0.5) * blocks.config.voxel_size_m
         found[plane] = states(blocks, centers).reshape(shape[1:])
     return found
+
+
+def in_voxels(name: str, place: npt.ArrayLike, size_m: float) -> npt.NDArray[np.float64]:
+    """Return a place in units of voxels; raise ValueError if no voxel has it."""
+    found = as_numbers(name, place)
+    if not (np.abs(found) < MAX_INDEX * size_m).all():  # false for nan
+        raise ValueError(f'{name}: {found.tolist()}, expected within {MAX_INDEX * size_m:g} m')
+    return found / size_m
 
 
 def checked_size(size: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

@@ -1,0 +1,129 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Numbers that no argument of the public functions can hold are refused as such.
+
+Python's integers have no limit, so that one of 2^70 fails in a kernel and one of 2^1025 where it
+becomes a float: with an OverflowError, or an error of the compiler that has pages. Callers catch
+ValueError, TypeError and the errors of this package.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from surfel_mapper import (
+    diff,
+    DistanceField,
+    estimate_normals,
+    MapMirror,
+    show,
+    SurfelMap,
+    Trajectory,
+)
+from surfel_mapper.config import TsdfConfig
+from surfel_mapper.errors import SurfelMapperError
+from surfel_mapper.files.trajectory import write_tum
+
+POINTS = np.random.default_rng(0).uniform(-2.0, 2.0, (300, 3))
+
+HOSTILE = (
+    *(sign * size for size in (2**1025, 10**30, 2**64) for sign in (1, -1)),
+    *(float('nan'), float('inf'), -1e308, np.longdouble('1e4000'), np.uint64(2**64 - 1)),
+    *('x', '٣', b'1', 1j, {}, object(), np.datetime64('NaT'), np.array([2**70], object)),
+    *([2**1025], [[2**1025] * 3], [[1, 2], [3]], (2**1025,) * 3, np.full((3, 3), 2**70, object)),
+)
+"""Values that are no such argument; where one is legal, the call succeeds."""
+
+
+def surfel_map():
+    made = SurfelMap(0.5)
+    made.add(POINTS)
+    return made
+
+
+def field():
+    made = DistanceField()
+    made.add(POINTS, np.eye(4))
+    return made
+
+
+CALLS = {
+    'SurfelMap(voxel_size_m)': lambda v: SurfelMap(v),
+    'SurfelMap(origin_m)': lambda v: SurfelMap(0.5, origin_m=v),
+    'SurfelMap(level)': lambda v: SurfelMap(0.5, level=v),
+    'SurfelMap(threads)': lambda v: SurfelMap(0.5, threads=v),
+    'MapMirror': lambda v: MapMirror(v),
+    'add(points)': lambda v: surfel_map().add(v),
+    'add(origin)': lambda v: surfel_map().add(POINTS, origin=v),
+    'add(T_map_sensor)': lambda v: surfel_map().add(POINTS, v),
+    'reduce(min_range_m)': lambda v: surfel_map().reduce(POINTS, min_range_m=v),
+    'surfels(min_points)': lambda v: surfel_map().surfels(v),
+    'surfels(at_most)': lambda v: surfel_map().surfels(5, v),
+    'num_surfels': lambda v: surfel_map().num_surfels(v),
+    'surfels_changed(since)': lambda v: surfel_map().surfels_changed(v),
+    'surfels_changed(min_points)': lambda v: surfel_map().surfels_changed(0, v),
+    'rows_changed': lambda v: surfel_map().rows_changed(v),
+    'keys': lambda v: surfel_map().keys(v),
+    'index': lambda v: surfel_map().index(v),
+    'coarsen': lambda v: surfel_map().coarsen(v),
+    'at_origin': lambda v: surfel_map().at_origin(v),
+    'remove(min_points)': lambda v: SurfelMap(0.5).remove(SurfelMap(0.5).moments(), v),
+    'diff(min_points)': lambda v: diff(surfel_map(), surfel_map(), min_points=v),
+    'show(min_points)': lambda v: show(surfel_map(), min_points=v),
+    'estimate_normals(points)': lambda v: estimate_normals(v),
+    'estimate_normals(max_distance_m)': lambda v: estimate_normals(POINTS, max_distance_m=v),
+    'estimate_normals(viewpoint)': lambda v: estimate_normals(POINTS, viewpoint=v),
+    'DistanceField.add(T_map_sensor)': lambda v: DistanceField().add(POINTS, v),
+    'DistanceField.add(stamp_ns)': lambda v: DistanceField().add(
+        POINTS[:0], np.eye(4), stamp_ns=v
+    ),
+    'DistanceField.sample': lambda v: DistanceField().sample(v),
+    'DistanceField.states': lambda v: DistanceField().states(v),
+    'obstacle_distances(low_m)': lambda v: field().obstacle_distances(low_m=v),
+    'obstacle_distances(high_m)': lambda v: field().obstacle_distances(high_m=v),
+    'Trajectory.from_matrices': lambda v: Trajectory.from_matrices(v),
+}
+
+
+@pytest.mark.parametrize('name', CALLS)
+def test_hostile_arguments_are_refused_or_used(name):
+    refused = 0
+    for value in HOSTILE:
+        try:
+            CALLS[name](value)
+        except (SurfelMapperError, ValueError, TypeError):
+            refused += 1
+    assert refused >= 8
+
+
+def test_complex_numbers_are_refused():
+    """Their imaginary part was left out, with a warning."""
+    with pytest.raises(ValueError, match='origin: a list, expected numbers'):
+        SurfelMap(0.5).reduce(POINTS, origin=[1j, 0.0, 0.0])
+
+
+def test_whole_numbers_beyond_64_bits_are_named():
+    for call in (SurfelMap.surfels, SurfelMap.keys, SurfelMap.num_surfels):
+        with pytest.raises(ValueError, match='min_points: a number of 100 bits, expected'):
+            call(SurfelMap(0.5), 10**30)
+    with pytest.raises(ValueError, match='voxel_size_m: a int, expected numbers'):
+        SurfelMap(2**1025)
+
+
+def test_a_distance_whose_square_is_infinite_is_no_limit():
+    expected = estimate_normals(POINTS)
+    np.testing.assert_array_equal(estimate_normals(POINTS, max_distance_m=1e308), expected)
+
+
+def test_any_true_value_compresses_a_distance_field(tmp_path):
+    """The number was taken for a method of packing."""
+    field().save(tmp_path / 'a.npz', compress=7)
+    assert len(DistanceField.load(tmp_path / 'a.npz', TsdfConfig())) == len(field())
+
+
+def test_poses_that_are_no_numbers_are_not_written(tmp_path):
+    with pytest.raises(ValueError, match='T_fixed_sensor'):
+        write_tum(tmp_path / 'a.txt', [1], [[[2**1025] * 4] * 4])
+    assert not [*tmp_path.iterdir()]
