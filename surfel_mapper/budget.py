@@ -201,7 +201,7 @@ def read_small_file(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
 
 def open_regular(path: str | Path) -> BinaryIO:
     """
-    Return a file opened for reading, whose size is what can be read of it.
+    Return a file opened for reading, of which as many bytes can be read as its size states.
 
     Of devices and pipes it is not: /dev/zero has no end, and a pipe without a writer blocks.
 
