@@ -47,7 +47,7 @@ class Decoders:
         self._found: dict[str, tuple[Typestore, str] | Exception] = {}
 
     def find(self, type_: str) -> tuple[Typestore, str]:
-        """Return the type store of a type, and its name there; raise the error of its definition."""
+        """Return the type store of a type, and its name there, or raise the error of its text."""
         if type_ not in self._found:
             try:
                 self._found[type_] = self._new(type_)

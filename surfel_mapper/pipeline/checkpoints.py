@@ -111,12 +111,15 @@ def load_start(mapper: Mapper) -> None:
 def _load_latest(mapper: Mapper) -> None:
     output = mapper.config.output
     saved = checkpoint_paths(output)[0].with_name(f'{output.map_name}.npz')
-    found = [path for path in (saved, *checkpoint_paths(output)) if path.is_file()]
-    for path in sorted(found, key=lambda path: path.stat().st_mtime_ns, reverse=True):
+    found = [path for path in checkpoint_paths(output) if path.is_file()]
+    if saved.is_file():  # names give the order of checkpoints: a clock may be set back
+        saved_ns = saved.stat().st_mtime_ns
+        found.insert(sum(path.stat().st_mtime_ns > saved_ns for path in found), saved)
+    for path in found:
         try:
             load_mapper(path, mapper)
-        except (FileFormatError, MapError) as error:
-            _log.warning('map.load latest: %s; an older one is tried', error)
+        except (FileFormatError, MapError, OSError, MemoryError) as error:
+            _log.warning('map.load latest: %s; an older one is tried', error or repr(error))
             continue
         _log.info('map.load latest: starts from %s, digest %s', path, mapper.map.digest())
         return

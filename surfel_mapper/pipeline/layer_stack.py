@@ -134,7 +134,8 @@ class LayerStack:
     def finish(self) -> None:
         """Finish all layers, at the end of a recording."""
         for layer in self:
-            layer.finish()
+            with self._drops.guarded(f'finishing layer {layer.name}'):
+                layer.finish()
 
     def warm_up(self) -> None:
         """Compile the kernels of all layers."""
@@ -142,14 +143,17 @@ class LayerStack:
             layer.warm_up()
 
     def reconfigure(self, config: Config) -> None:
-        """Give all layers new settings."""
-        for layer in self:
+        """Give all layers new settings, also those that are switched off until the next clear."""
+        for layer in self.by_name.values():
             with self._drops.guarded(f'reconfiguring layer {layer.name}'):
                 layer.reconfigure(config)
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return the figures of the layers that have any, by name."""
-        found = {layer.name: layer.summary() for layer in self}
+        found = {}
+        for layer in self:
+            with self._drops.guarded(f'figures of layer {layer.name}'):
+                found[layer.name] = layer.summary()
         return {name: figures for name, figures in found.items() if figures}
 
     def _count_failure(self, layer: Layer, inserted: InsertedScan, error: Exception) -> None:

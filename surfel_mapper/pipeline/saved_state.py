@@ -11,16 +11,22 @@ because a map is often wanted without its layers, which are larger.
 from __future__ import annotations
 
 from collections.abc import Iterator
+import logging
 from pathlib import Path
 
 from surfel_mapper.files.map_state import FILE, load_map, save_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.pipeline.mapper import Mapper
 
+_log = logging.getLogger(__name__)
+
 
 def save_mapper(path: Path, mapper: Mapper, *, with_window: bool = True) -> str:
     """
     Write map, window and layers of a mapper; return the digest of the map.
+
+    A layer that is switched off may be inconsistent: its file is not written, and an older one is
+    removed, since it belongs to another map.
 
     Parameters
     ----------
@@ -38,7 +44,12 @@ def save_mapper(path: Path, mapper: Mapper, *, with_window: bool = True) -> str:
 
     """
     for file, layer in layer_files(path, mapper):
-        layer.save(file)
+        reason = mapper.counters.layers_off.get(layer.name)
+        if reason is None:
+            layer.save(file)
+        else:
+            file.unlink(missing_ok=True)
+            _log.warning('%s: not written: layer %s is off: %s', file, layer.name, reason)
     return save_map(path, mapper.map, mapper.window if with_window else ())
 
 
