@@ -98,6 +98,79 @@ def test_the_checkpoint_before_is_used_if_the_newest_is_damaged(tmp_path, clock,
     assert ('an older one is tried' in caplog.text) == (damage == 'cut')
 
 
+@pytest.mark.parametrize('age_s', [-3600, 3600])
+def test_the_newest_checkpoint_is_used_whatever_the_clock_was(tmp_path, clock, age_s):
+    """A robot without a battery for its clock saves after a restart at an earlier time."""
+    mapper = mapper_in(tmp_path)
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    for stamp_s in (1.0, 2.0):
+        drive(mapper, stamp_s)
+        clock.now_s += 10.0
+        saving.save_if_due()
+    at_s = before.stat().st_mtime + age_s
+    os.utime(newest, (at_s, at_s))
+    after = mapper_in(tmp_path, map__load='latest')
+    load_start(after)
+    assert after.map.digest() == mapper.map.digest()
+
+
+def hostile_checkpoints(path):
+    """Replace a checkpoint by each thing that is none; yield after each."""
+    content = path.read_bytes()
+    for changed in (b'', b'PK', content[:-100], content[:200] + b'x' + content[201:], b'0' * 9999):
+        path.write_bytes(changed)
+        yield changed[:9]
+    path.unlink()
+    path.symlink_to(path)
+    yield 'a link to itself'
+    path.unlink()
+    path.symlink_to('/dev/zero')
+    yield 'a device'
+    path.unlink()
+    os.mkfifo(path)
+    yield 'a pipe'
+    path.unlink()
+    path.mkdir()
+    yield 'a directory'
+
+
+def test_whatever_the_newest_checkpoint_is_the_one_before_is_used(tmp_path, clock):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    digests = []
+    for stamp_s in (1.0, 2.0):
+        drive(mapper, stamp_s)
+        clock.now_s += 10.0
+        saving.save_if_due()
+        digests.append(mapper.map.digest())
+    for name in hostile_checkpoints(newest):
+        after = mapper_in(tmp_path, map__load='latest')
+        load_start(after)
+        assert after.map.digest() == digests[0], name
+
+
+def test_a_checkpoint_for_which_there_is_no_memory_is_passed_over(tmp_path, clock, monkeypatch):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, _) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    for stamp_s in (1.0, 2.0):
+        drive(mapper, stamp_s)
+        clock.now_s += 10.0
+        saving.save_if_due()
+    load, tried = checkpoints.load_mapper, []
+
+    def scarce(path, *args):
+        tried.append(path)
+        if path == newest:
+            raise MemoryError
+        return load(path, *args)
+
+    monkeypatch.setattr(checkpoints, 'load_mapper', scarce)
+    after = mapper_in(tmp_path, map__load='latest')
+    load_start(after)
+    assert tried == [*checkpoint_paths(mapper.config.output)]
+    assert after.map.num_voxels
+
+
 def test_latest_without_any_map_starts_empty(tmp_path, caplog):
     mapper = mapper_in(tmp_path, map__load='latest')
     with caplog.at_level(logging.WARNING):

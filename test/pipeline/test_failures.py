@@ -15,12 +15,14 @@ import pytest
 
 from surfel_mapper import layers
 from surfel_mapper.errors import CloudFormatError, MapError
+from surfel_mapper.files.map_state import load_map
 from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline import inserter
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.reduction import Reduction
+from surfel_mapper.pipeline.saved_state import save_mapper
 from test.pipeline.made_scans import add_pose, assert_counts_add_up, insert, mapper_with, scan_at
 
 ERRORS = [MemoryError(), ZeroDivisionError('division by zero')]
@@ -142,6 +144,62 @@ def test_a_layer_that_fails_three_times_in_a_row_is_switched_off(fragile, caplog
     (update,) = drive(mapper, 9.0)
     assert update.fragile == 1
     assert 'layers_off' not in mapper.summary()
+
+
+def switched_off(fragile, mapper):
+    fragile.error = RuntimeError('broken')
+    drive(mapper, 1.0, 2.0, 3.0)
+    fragile.error = None
+    assert 'fragile' in mapper.counters.layers_off
+
+
+def test_a_layer_that_is_off_takes_new_settings_until_it_is_on_again(fragile, monkeypatch):
+    """It kept those of the time when it failed."""
+    taken = []
+    monkeypatch.setattr(fragile, 'reconfigure', lambda self, config: taken.append(config))
+    mapper = mapper_with()
+    switched_off(fragile, mapper)
+    changed = mapper_with(window__max_scans=7).config
+    mapper.reconfigure(changed)
+    assert taken == [changed]
+
+
+@pytest.mark.parametrize('name', ['finish', 'summary'])
+def test_a_layer_that_fails_at_the_end_does_not_cost_the_map(fragile, monkeypatch, name):
+    """A replay ended there, before it wrote the map."""
+
+    def broken(self):
+        raise MemoryError
+
+    monkeypatch.setattr(fragile, name, broken)
+    mapper = mapper_with()
+    drive(mapper, 1.0)
+    mapper.finish_layers()
+    assert 'fragile' not in mapper.summary()
+    assert mapper.counters.messages_ignored == {'internal_error': 1}
+
+
+def test_a_layer_that_is_off_does_not_keep_the_map_from_being_saved(
+    fragile, monkeypatch, tmp_path, caplog
+):
+    def save(self, path):
+        assert not self.is_broken, 'a state that cannot be written'
+        path.write_bytes(b'a state')
+
+    monkeypatch.setattr(fragile, 'save', save)
+    monkeypatch.setattr(fragile, 'is_broken', False, raising=False)
+    mapper, path = mapper_with(), tmp_path / 'map.npz'
+    drive(mapper, 0.5)
+    save_mapper(path, mapper)
+    file = tmp_path / 'map.fragile.npz'
+    assert file.is_file()
+
+    fragile.is_broken = True
+    switched_off(fragile, mapper)
+    assert save_mapper(path, mapper) == mapper.map.digest()
+    assert load_map(path)[0].digest() == mapper.map.digest()
+    assert not file.exists()  # it belonged to the map before
+    assert 'layer fragile is off: ' in caplog.text
 
 
 def test_scans_that_a_layer_cannot_use_do_not_switch_it_off(fragile):
