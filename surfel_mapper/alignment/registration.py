@@ -120,8 +120,8 @@ class RegistrationResult:
         Share of the cells that move along with the sensor and were left out; of the others there
         are ``num_cells``.
     has_stopped : bool
-        The standing cells do not tell the motion, and the whole scan fits clearly better at another,
-        harder to reach than by braking: a collision, or a repeated cloud.
+        The standing cells do not tell the motion, and the whole scan fits clearly better at one
+        that ends harder than by braking: a collision, or a repeated cloud.
 
     """
 

@@ -167,8 +167,7 @@ class Tracker:
             If the scan does not fit the map, fits it at two places about equally well, needs a
             motion faster than ``registration.max_speed_m_s``, fits too poorly to be accepted at
             once (see ``doubtful``), or if much of it moves along and for LONGEST_UNTOLD_S
-            nothing else has told the motion. The predicted velocity is halved
-            then.
+            nothing else has told the motion. The predicted velocity is halved then.
 
         """
         starts = [compose(T_map_fixed, self.predict(stamp_ns))]
