@@ -221,17 +221,14 @@ def by_size(patch: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
 def table_plane(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
     """Return the plane, of 300 through three points each, that most points lie on."""
     rng, sample = np.random.default_rng(0), points[::20]
-    best, most = (np.array([0.0, 0.0, 1.0]), 0.0), -1
-    for a, b, c in points[rng.integers(len(points), size=(300, 3))]:
-        normal = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(normal))
-        if length < 1e-6:
-            continue
-        normal = normal / length
-        near = int((np.abs((sample - a) @ normal) < NEAR_M).sum())
-        if near > most:
-            best, most = (normal, -float(normal @ a)), near
-    return best
+    a, b, c = points[rng.integers(len(points), size=(300, 3))].swapaxes(0, 1)
+    normals = np.cross(b - a, c - a)
+    lengths = np.linalg.norm(normals, axis=1)
+    normals = normals[lengths >= 1e-6] / lengths[lengths >= 1e-6, None]
+    offsets = -(normals * a[lengths >= 1e-6]).sum(axis=1)
+    near = (np.abs(sample @ normals.T + offsets) < NEAR_M).sum(axis=0)
+    best = int(near.argmax())
+    return normals[best], float(offsets[best])
 
 
 def mean_row(name: str, size_m: float, found: Sequence[dict[str, float]]) -> Row:
