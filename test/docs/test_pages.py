@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from importlib import import_module
 import re
 
@@ -64,24 +65,73 @@ def test_links_lead_to_files_and_headings():
     assert broken == []
 
 
+def reference():
+    """Return the full names that the reference describes."""
+    names = set()
+    for name, members in re.findall(
+        r'^::: (\S+)\n((?:    .*\n)*)', everything('docs/api/*.md') + '\n', re.MULTILINE
+    ):
+        listed = re.findall(r'^        - (\w+)$', members, re.MULTILINE)
+        names.update(f'{name}.{member}' for member in listed)
+        if not listed:
+            names.add(name)
+    return names
+
+
+def imported(text):
+    """Yield the full names that a text imports from the package, or uses of its modules."""
+    for module, names in re.findall(r'from (surfel_mapper[\w.]*) import (\([^)]*\)|.*)', text):
+        for name in re.findall(r'\w+', names):
+            yield f'{module}.{name}'
+            for used in set(re.findall(rf'\b{name}\.(\w+)', text)):
+                yield f'{module}.{name}.{used}'
+
+
+def room(name):
+    """Return the part of the package that a name belongs to."""
+    return name.split('.')[1]
+
+
 def test_the_reference_has_every_public_name():
-    pages = re.findall(r'^::: (\S+)', everything('docs/api/*.md'), re.MULTILINE)
-    described = {line.rpartition('.')[2] for line in pages}
+    described = {name.rpartition('.')[2] for name in reference()}
     assert set(surfel_mapper.__all__) - {'__version__'} <= described
 
 
 def test_the_reference_has_every_name_that_pages_and_examples_import():
-    described = set(re.findall(r'^::: (\S+)', everything('docs/api/*.md'), re.MULTILINE))
-    described.add('surfel_mapper.config')  # by the page of settings
+    described = reference()
     missing = set()
     texts = everything('docs/*.md', 'docs/tutorials/*.md', 'examples/*.py', 'README.md')
     for module, names in re.findall(r'from (surfel_mapper\.[\w.]+) import ([\w, ]+)', texts):
+        if module == 'surfel_mapper.config':
+            continue  # by the page of settings
         for name in names.split(','):
             thing = getattr(import_module(module), name.strip())
             home = getattr(thing, '__module__', module)  # constants do not carry it
-            if not {module, home, f'{home}.{name.strip()}'} & described:
-                missing.add(f'{home}.{name.strip()}')
+            full = f'{home}.{getattr(thing, "__name__", name.strip())}'
+            if full not in described:
+                missing.add(full)
     assert missing == set()
+
+
+def test_the_reference_has_only_names_that_other_parts_or_pages_use():
+    """Names are handed on, used beyond their part, or types in a part's signatures."""
+    public, parts = set(), defaultdict(str)
+    for path in (ROOT / 'surfel_mapper').rglob('*.py'):
+        own = '' if path.name == '__init__.py' else room('.'.join(path.relative_to(ROOT).parts))
+        text = path.read_text(encoding='utf-8')
+        public.update(name for name in imported(text) if room(name) != own)
+        parts[own] += text
+    public.update(
+        imported(everything('docs/*.md', 'docs/tutorials/*.md', 'examples/*.py', 'README.md'))
+    )
+    whole = [name for name in reference() if (ROOT / f'{name.replace(".", "/")}.py').is_file()]
+    assert whole == [], 'list the members of a module that are public'
+    private = []
+    for name in reference() - public:
+        own = name.rpartition('.')[2]
+        if not re.search(rf'(->|: )[^\n#]*\b{own}\b', parts[room(name)]):
+            private.append(name)
+    assert private == []
 
 
 def test_the_readme_is_at_most_200_lines():
