@@ -129,10 +129,21 @@ def load():
         config = Config.from_mapping({'pose.source': 'odometry', **settings, **ONE_THREAD})
         Mapper(config).warm_up()
         outputs.warm_up(config)
+    load_type_supports()
     if threading.active_count() > 1:
         raise RuntimeError(f'threads do not survive a fork: {threading.enumerate()}')
     gc.collect()
     gc.freeze()
+
+
+def load_type_supports():
+    """Load what rclpy otherwise loads with the first message of a type, .1 s in each node."""
+    from rclpy.type_support import check_for_type_support
+
+    for name in [name for name in sys.modules if name.endswith(('.msg', '.srv'))]:
+        for kind in vars(sys.modules[name]).values():
+            if hasattr(type(kind), '__import_type_support__'):
+                check_for_type_support(kind)
 
 
 def serve(requests):
