@@ -40,7 +40,7 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
     chunk_keys = np.empty(CHUNK, np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     run_rows = np.empty(CHUNK, np.int32)
-    num_rows = 0
+    num_rows = num_first = 0
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
@@ -52,7 +52,11 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
         num_rows = find_run_rows(
             chunk_keys, starts, num_runs, table, keys, sums, num_rows, run_rows
         )
-        add_runs(x, y, z, starts, num_runs, run_rows, start, sums, first)
+        add_runs(x, y, z, starts, num_runs, run_rows, sums)
+        for run in range(num_runs):
+            # rows are numbered as they appear; a branch would be mispredicted at new voxels
+            first[num_first] = start + starts[run]
+            num_first += run_rows[run] == num_first
         if len(rows) > 0:
             for run in range(num_runs):
                 rows[start + starts[run] : start + starts[run + 1]] = run_rows[run]
@@ -74,7 +78,7 @@ def find_keys(x, y, z, size, shift, base, bits, keys):
 
 
 @njit(cache=True, nogil=True)
-def add_runs(x, y, z, starts, num_runs, run_rows, start, sums, first):
+def add_runs(x, y, z, starts, num_runs, run_rows, sums):
     """
     Add the runs of a chunk to the sums of their voxels, point by point in order.
 
@@ -84,8 +88,6 @@ def add_runs(x, y, z, starts, num_runs, run_rows, start, sums, first):
         row = np.uint32(run_rows[run])
         begin, end = np.uint32(starts[run]), np.uint32(starts[run + 1])
         sx, sy, sz, count = sums[row, 0], sums[row, 1], sums[row, 2], sums[row, 3]
-        if count == 0.0:
-            first[row] = start + begin
         for i in range(begin, end):
             sx += np.float64(x[i])
             sy += np.float64(y[i])

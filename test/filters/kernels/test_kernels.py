@@ -23,6 +23,7 @@ from surfel_mapper.filters.kernels.limits import (
 from surfel_mapper.filters.kernels.sampling import choose
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
 from surfel_mapper.filters.shapes import PAIRS
+from surfel_mapper.kernels.grouping import CHUNK
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.kernels.voxel_grid import group_points, ROWS
 from test.kernels.modes import both, compiled, printed_alike
@@ -87,6 +88,19 @@ def test_the_table_of_voxels_grows_with_them(number):
     np.testing.assert_array_equal(rows, np.tile(np.arange(number), 2))
     np.testing.assert_array_equal(sums[:found, 0], 2.0 * order + 1.0)
     np.testing.assert_array_equal(sums[:found, 3], 2.0)
+
+
+@both
+def test_points_alone_in_their_voxels_are_the_first_ones(call):
+    number = CHUNK + 3  # arrays as long as there are voxels, over two chunks
+    xyz = np.zeros((3, number))
+    xyz[0] = np.arange(number) + 0.5
+    ones, zeros, bits = np.ones(3), np.zeros(3), np.array([12, 1, 1])
+    keys, first = np.empty((2, number), np.int64)
+    sums, rows = np.empty((number, 4)), np.empty(0, np.int32)
+    assert call(group_points, xyz, ones, zeros, zeros, bits, keys, sums, first, rows) == number
+    np.testing.assert_array_equal(first, np.arange(number))
+    np.testing.assert_array_equal(sums[:, 0], xyz[0])
 
 
 @both
