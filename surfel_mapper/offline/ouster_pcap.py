@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import DependencyError, FileFormatError
 from surfel_mapper.files.trajectory import Trajectory
+from surfel_mapper.offline.pcap_packets import check_capture
 
 SUFFIX = '.pcap'
 
@@ -48,7 +49,8 @@ class OusterPcap:
     DependencyError
         If ouster-sdk is not installed.
     FileFormatError
-        If it is no capture, has no metadata, no scan, or several lidars.
+        If it is no capture, has no metadata, no scan, or several lidars, or ouster-sdk must not
+        read it, see pcap_packets.py.
 
     """
 
@@ -58,6 +60,7 @@ class OusterPcap:
 
     def __init__(self, path: Path) -> None:
         core, pcap = import_sdk(path)
+        check_capture(path)
         try:
             self._frames = pcap.PcapFrameSetSource(str(path), index=True)
         except Exception as error:  # the package states no types of its errors
