@@ -46,9 +46,8 @@ class MapReduceResult:
         Shards that were mapped again because they had begun too late.
     interrupted : bool
         Whether shards are missing because it was stopped.
-    map_s, merge_s : float
-        Seconds until all shards were mapped, with the start of the workers, and until they were
-        merged.
+    merge_s : float
+        Seconds in which they were merged.
 
     """
 
@@ -56,7 +55,6 @@ class MapReduceResult:
     results: list[ShardResult]
     repeated: int
     interrupted: bool
-    map_s: float
     merge_s: float
 
     @property
@@ -103,7 +101,6 @@ def map_bags(
         If a bag cannot be read, a file cannot be written, or the workers are lost.
 
     """
-    began_s = time.perf_counter()
     with work_directory(directory) as work:
         run = ShardRun(list(shards), executor, work, on_done)
         is_whole = run.all(stopped)
@@ -116,7 +113,6 @@ def map_bags(
         results=results,
         repeated=run.repeated,
         interrupted=not is_whole,
-        map_s=mapped_s - began_s,
         merge_s=time.perf_counter() - mapped_s,
     )
 

@@ -116,23 +116,28 @@ def replay_bags(
 
     surveyed_s = time.perf_counter()
     with open_executor(workers, scheduler) as executor:
+        started_s = time.perf_counter()
         jobs, frame = [(each.request, config) for each in found], None
         if is_registered:
             frame = registered(found, config, output, executor, on_done, stopped)
             jobs = [(each.request, each.config) for each in frame.placed]
         registered_s = time.perf_counter()
         mapped = mapped_together(jobs, recorded_s, executor, output, on_done, stopped)
+        mapped_s = time.perf_counter()
         num_workers = executor.num_workers
+    ended_s = time.perf_counter()
     summary = {
         'bag': str(requests[0].path) if len(requests) == 1 else f'{len(requests)} bags',
         'bags': [str(request.path) for request in requests],
         'recorded_s': recorded_s,
-        'replay_s': time.perf_counter() - began,
+        'replay_s': ended_s - began,
         'wall_s': {
             'survey': surveyed_s - began,
-            **({} if frame is None else {'register': registered_s - surveyed_s}),
-            'map': mapped.map_s,
+            'start': started_s - surveyed_s,
+            **({} if frame is None else {'register': registered_s - started_s}),
+            'map': mapped_s - registered_s - mapped.merge_s,
             'merge': mapped.merge_s,
+            'stop': ended_s - mapped_s,
         },
         'interrupted': mapped.interrupted,
         'cut': [cut for each in found for cut in each.cuts],
