@@ -141,7 +141,7 @@ def load_type_supports():
     from rclpy.type_support import check_for_type_support
 
     for name in [name for name in sys.modules if name.endswith(('.msg', '.srv'))]:
-        for kind in vars(sys.modules[name]).values():
+        for kind in list(vars(sys.modules[name]).values()):
             if hasattr(type(kind), '__import_type_support__'):
                 check_for_type_support(kind)
 
