@@ -35,7 +35,7 @@ LINT_STAMP := $(LINT)/.ready
 # ouster-sdk pins a rosbags that is too old for bags/: pip would complain at each installation.
 OUSTER := $(CURDIR)/$(VENV)/ouster
 
-.PHONY: demo test boundscheck versions bench soak fuzz lint format docs dist notebooks settings clean
+.PHONY: demo test boundscheck versions bench ratios soak fuzz lint format docs dist notebooks settings clean
 
 # The environment of the tests does too, and the one of the demo becomes it later.
 demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it live over DDS and from the bag, compare
@@ -70,6 +70,9 @@ versions:  ## one bag, one digest, on every Python of PYTHONS that is there
 
 bench: $(STAMP)  ## milliseconds a scan
 	$(BIN)/python -m test.bench
+
+ratios: $(STAMP)  ## ratios to plain numpy that fell by more than 15 % since the last release
+	$(BIN)/python -m test.bench --quick --only real --since test/bench/release.txt
 
 soak: $(STAMP)  ## a million scans: does memory grow, do times, does the map drift?
 	$(BIN)/python -m test.soak

@@ -17,6 +17,7 @@ from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
 from test.bench.options import cache_directory, Options
 from test.bench.report import Row, table
+from test.bench.since import earlier_ratios, fallen, ratios
 
 BENCHES = (
     'mapping',
@@ -75,6 +76,12 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         '--cache', type=Path, default=cache_directory(), metavar='DIR', help='default: %(default)s'
     )
+    result.add_argument(
+        '--since',
+        type=Path,
+        metavar='FILE',
+        help='output of an earlier run: print the ratios that fell by more than 15 %% since',
+    )
     return result
 
 
@@ -114,13 +121,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     args = parser().parse_args(arguments)
     if args.scans is not None and args.scans < 1:
         parser().error(f'--scans: {args.scans}, expected one or more')
+    names = args.only or BENCHES
+    try:
+        before = earlier_ratios(args.since, names) if args.since else {}
+    except (OSError, ValueError) as error:
+        parser().error(f'--since: {error}')
     keep_freed_memory()  # as node and replay do
     machine, chosen = facts(), options(args)
     print(', '.join(f'{name} {value}' for name, value in machine.items()))
     print(f'window {chosen.window}, {chosen.scans} scans timed, {chosen.num_points} points\n')
-    for row in run(args.only or BENCHES, chosen):
-        settings = {'window': chosen.window, 'points': chosen.num_points}
-        print(json.dumps({**settings, **row, **machine}))
+    settings = {'window': chosen.window, 'points': chosen.num_points}
+    rows = [{**settings, **row, **machine} for row in run(names, chosen)]
+    for row in rows:
+        print(json.dumps(row))
+    if args.since:
+        lines = list(fallen(ratios(rows), before)) or ['none']
+        print(f'\nratios that fell by more than 15 % since {args.since}:', *lines, sep='\n')
     return 0
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from test.bench import __main__ as bench
-from test.bench import accuracy, decode, filters, real, scaling
+from test.bench import accuracy, compare, decode, filters, real, scaling
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
@@ -95,7 +95,8 @@ def test_normals_and_outliers_are_timed_beside_those_of_peers(options, monkeypat
 
 def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_path):
     monkeypatch.delenv('SURFEL_MAPPER_TEST_DATA', raising=False)
-    assert bench.run(['real'], options) == []
+    street = ['simulated street', 'simulated street']
+    assert [row['scan'] for row in bench.run(['real'], options)] == street
 
     name, file = list(real.SCANS.items())[-1]
     folder = tmp_path / 'data' / 'scans'
@@ -108,7 +109,9 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
     rows = bench.run(['real'], options)
 
     assert [(row['scan'], row['voxel_m']) for row in rows] == [
-        (scan, size_m) for size_m in (0.5, 0.2) for scan in (name, 'geometric mean')
+        (scan, size_m)
+        for size_m in (0.5, 0.2)
+        for scan in (name, 'geometric mean', 'simulated street')
     ]
     assert rows[0]['points'] == (np.isfinite(points).all(1) & points[:, :3].any(1)).sum()
     assert all(row['x_numpy'] > 0.0 for row in rows)
@@ -256,6 +259,42 @@ def test_a_number_of_scans_that_is_not_positive_is_refused(capsys):
         bench.main(['--scans', '0'])
     assert exit_info.value.code == 2
     assert '--scans: 0, expected one or more' in capsys.readouterr().err
+
+
+def test_ratios_that_fell_since_an_earlier_run_are_printed(options, monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(bench, 'options', lambda _: options)
+    monkeypatch.setattr(compare, 'run', lambda _: [dict(row) for row in rows])
+    rows = [
+        {'voxel_m': 0.5, 'who': 'numpy', 'x_ours': 10.0, 'less': None},
+        {'voxel_m': 0.2, 'who': 'numpy', 'x_ours': 12.0, 'less': None},
+        {'voxel_m': 0.2, 'who': 'Open3D', 'x_ours': 3.0, 'less': 'no normals'},
+    ]
+    assert bench.main(['--only', 'compare']) == 0
+    earlier = tmp_path / 'earlier.txt'
+    earlier.write_text(capsys.readouterr().out)
+    rows[0]['x_ours'] = 8.6  # a fall of 14 %
+    rows[1]['x_ours'] = 10.1  # of 16 %
+    del rows[2]
+
+    assert bench.main(['--only', 'compare', '--since', str(earlier)]) == 0
+
+    printed = capsys.readouterr().out.splitlines()
+    assert printed[-3] == f'ratios that fell by more than 15 % since {earlier}:'
+    assert printed[-2].split(': ') == [
+        f'compare numpy voxel_m 0.2 window {WINDOW} x_ours',
+        '12 before, 10.1 now',
+    ]
+    assert printed[-1].startswith('compare Open3D voxel_m 0.2')
+    assert printed[-1].endswith(': 3 before, not measured now')
+
+
+def test_an_earlier_run_without_ratios_of_the_benches_is_refused(tmp_path, capsys):
+    earlier = tmp_path / 'earlier.txt'
+    earlier.write_text('a table\n{"bench": "real", "x_numpy": 2.0}\n')
+    with pytest.raises(SystemExit) as exit_info:
+        bench.main(['--only', 'compare', '--since', str(earlier)])
+    assert exit_info.value.code == 2
+    assert f'--since: {earlier}: no ratio of compare' in capsys.readouterr().err
 
 
 def test_spread_is_of_the_times_given():
