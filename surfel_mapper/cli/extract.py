@@ -114,19 +114,22 @@ def read(
     """Return points (N, 3), size of voxels, viewpoint (3,) and the origin (3,) of the map, m."""
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.errors import FileFormatError
-    from surfel_mapper.files import map_state, parquet
+    from surfel_mapper.files import map_state, parquet, parquet_tiles
     from surfel_mapper.files.scan_files import read_scan, SUFFIXES
     from surfel_mapper.models.fitting import above, surfel_points
 
     args.cloud = map_in(args.cloud)
-    if args.cloud.suffix not in (*MAPS, *SUFFIXES):
+    is_tiles = args.cloud.is_dir()
+    if not is_tiles and args.cloud.suffix not in (*MAPS, *SUFFIXES):
         raise FileFormatError(
             f'{args.cloud}: expected a cloud ending in {", ".join(SUFFIXES)}, or a map ending in '
             f'{", ".join(MAPS)}'
         )
     origin_m: npt.NDArray[np.float64] = np.zeros(3)
-    if args.cloud.suffix in MAPS:
-        if args.cloud.suffix == '.npz':
+    if is_tiles or args.cloud.suffix in MAPS:
+        if is_tiles:
+            surfel_map = parquet_tiles.read_tiles(args.cloud)
+        elif args.cloud.suffix == '.npz':
             surfel_map, _ = map_state.load_map(args.cloud)
         else:
             surfel_map = parquet.read_map(args.cloud)
@@ -149,15 +152,21 @@ def read(
 
 
 def map_in(path: Path) -> Path:
-    """Return the exact map in an output directory of a replay; another path as it is."""
+    """Return the exact map in an output directory, a file or tiles; another path as it is."""
     from surfel_mapper.errors import FileFormatError
+    from surfel_mapper.files.parquet_tiles import dataset_in
 
     if not path.is_dir():
         return path
     for name in ('map.npz', 'map.parquet'):
         if (path / name).is_file():
             return path / name
-    raise FileFormatError(f'{path}: no map.npz or map.parquet in this directory')
+    tiles = dataset_in(path)
+    if tiles is None:
+        raise FileFormatError(
+            f'{path}: no map.npz, map.parquet or map/tile_i=*/tile_j=*/ in this directory'
+        )
+    return tiles
 
 
 def figures(model: MultiModel, found: Any, num_points: int) -> dict[str, Any]:

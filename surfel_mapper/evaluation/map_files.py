@@ -19,7 +19,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files import map_state, parquet, pcd, ply
-from surfel_mapper.files.parquet_tiles import dataset_digest, tiles_in
+from surfel_mapper.files.parquet_tiles import dataset_digest, dataset_in, tiles_in
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
 Floats = npt.NDArray[np.float64]
@@ -79,9 +79,9 @@ def load_discs(path: str | Path, min_points: int) -> Discs:
     found = Path(path)
     if not found.is_dir():
         return load_file(found, min_points)
-    for directory in (found / 'map', found):
-        if tiles_in(directory):
-            return load_tiles(directory, min_points)
+    tiles = dataset_in(found)
+    if tiles is not None:
+        return load_tiles(tiles, min_points)
     for name in IN_DIRECTORY:
         if (found / name).is_file():
             return load_file(found / name, min_points)

@@ -26,7 +26,7 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.budget import open_regular
-from surfel_mapper.errors import FileFormatError
+from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files.atomic import make_directory, replace_file
 from surfel_mapper.files.parquet import (
     attributes_of,
@@ -43,6 +43,7 @@ from surfel_mapper.files.parquet import (
     moment_names,
     PRODUCTS,
     read_attributes,
+    read_map,
     SUMS,
     VIEWS,
 )
@@ -95,6 +96,39 @@ def tiles_in(directory: str | Path) -> dict[Tile, Path]:
         match = TILE_PATH.fullmatch(path.relative_to(directory).as_posix())
         if match:
             found[Tile(int(match[1]), int(match[2]))] = path
+    return found
+
+
+def dataset_in(directory: str | Path) -> Path | None:
+    """Return the dataset of tiles that a directory is, or has as ``map``; None without one."""
+    both = (Path(directory) / 'map', Path(directory))
+    return next((each for each in both if tiles_in(each)), None)
+
+
+def read_tiles(directory: str | Path, *, voxel_size_m: float | None = None) -> SurfelMap:
+    """
+    Return the map in a dataset of tiles, whole in memory, exactly as written.
+
+    Raises
+    ------
+    FileFormatError
+        If there are no tiles, or one cannot be read, is damaged, or of another kind or voxel size.
+    DependencyError
+        If pyarrow is not installed.
+
+    """
+    found: SurfelMap | None = None
+    for path in tiles_in(directory).values():
+        tile = read_map(path, voxel_size_m=voxel_size_m)
+        if found is None:
+            found = tile
+            continue
+        try:
+            found.merge(tile)
+        except MapError as error:
+            raise FileFormatError(f'{path}: {error}') from error
+    if found is None:
+        raise FileFormatError(f'{directory}: no tiles of a map in this directory')
     return found
 
 

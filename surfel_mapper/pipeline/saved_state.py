@@ -15,6 +15,7 @@ import logging
 from pathlib import Path
 
 from surfel_mapper.files.map_state import FILE, load_map, save_map
+from surfel_mapper.files.parquet_tiles import dataset_in, read_tiles
 from surfel_mapper.layers import Layer
 from surfel_mapper.pipeline.mapper import Mapper
 
@@ -64,7 +65,7 @@ def load_mapper(
     Parameters
     ----------
     path : str or Path
-        As of load_map.
+        As of load_map, or a dataset of tiles, which has no window.
     mapper : Mapper
         Takes them.
     with_window : bool
@@ -80,9 +81,13 @@ def load_mapper(
         If the map has other columns than are configured.
 
     """
-    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
     size_m = None if any_voxel_size else mapper.config.map.voxel_size_m
-    surfel_map, scans = load_map(path, voxel_size_m=size_m)
+    tiles = dataset_in(path)
+    path = Path(path) / FILE if Path(path).is_dir() else Path(path)
+    if tiles is None or path.is_file():
+        surfel_map, scans = load_map(path, voxel_size_m=size_m)
+    else:
+        surfel_map, scans = read_tiles(tiles, voxel_size_m=size_m), []
     scans = scans if with_window else []
     restores = [layer.load(file) for file, layer in layer_files(path, mapper) if file.exists()]
     mapper.restore(surfel_map, scans)

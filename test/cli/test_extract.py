@@ -55,6 +55,12 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
     offsets = sorted(abs(plane['offset_m']) for plane in planes)
     assert offsets == pytest.approx([0.31, 0.91], abs=0.01)
 
+    pytest.importorskip('pyarrow')
+    tiled, again = str(tmp_path / 'tiled'), tmp_path / 'again'
+    assert main(['merge', str(tmp_path / 'map.npz'), '--output', tiled]) == 0
+    assert main(['extract', tiled, '--output', str(again)]) == 0
+    assert json.loads((again / 'models.json').read_text())['planes'] == planes
+
 
 def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):
     write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))

@@ -11,8 +11,10 @@ from surfel_mapper.files.parquet import read_map, write_map
 from surfel_mapper.files.parquet_tiles import (
     BLOCK_BITS,
     dataset_digest,
+    dataset_in,
     Part,
     read_part,
+    read_tiles,
     split_map,
     Tile,
     TILE_BITS,
@@ -52,6 +54,18 @@ def test_the_digest_of_a_dataset_is_that_of_the_map(tmp_path, monkeypatch, colum
 
     assert len(tiles_in(directory)) > 8
     assert dataset_digest(directory) == surfel_map.digest()
+
+
+@pytest.mark.parametrize('columns', [(), ('intensity',)])
+def test_a_dataset_is_read_as_the_map_it_is(tmp_path, columns):
+    surfel_map = scattered(columns=columns)
+    assert dataset_in(tmp_path) is None
+    directory = dataset(tmp_path, surfel_map)
+
+    assert dataset_in(tmp_path) == dataset_in(directory) == directory
+    assert read_tiles(directory).digest() == surfel_map.digest()
+    with pytest.raises(FileFormatError, match='voxel'):
+        read_tiles(directory, voxel_size_m=0.2)
 
 
 def test_the_tiles_of_a_map_are_squares_and_together_the_map(tmp_path):
@@ -147,12 +161,16 @@ def test_an_empty_map_makes_a_shard_without_tiles(tmp_path):
 def test_a_directory_without_tiles_and_tiles_of_two_maps_are_refused(tmp_path):
     with pytest.raises(FileFormatError, match='no tiles of a map'):
         dataset_digest(tmp_path)
+    with pytest.raises(FileFormatError, match='no tiles of a map'):
+        read_tiles(tmp_path)
     first = dataset(tmp_path, scattered())
     other = SurfelMap(0.2)
     other.add(np.full((3, 3), 900.0))
     write_tile(first / Tile(99, 99).path, other)
     with pytest.raises(FileFormatError, match='tiles of different maps'):
         dataset_digest(first)
+    with pytest.raises(FileFormatError, match='voxel'):
+        read_tiles(first)
 
 
 @pytest.mark.parametrize('damage', ['empty', 'cut', 'other', 'gone'])

@@ -11,6 +11,7 @@ import pytest
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.map_state import load_map
+from surfel_mapper.files.parquet_tiles import read_part, write_shard, write_tile
 from surfel_mapper.pipeline import checkpoints
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
@@ -169,6 +170,17 @@ def test_a_checkpoint_for_which_there_is_no_memory_is_passed_over(tmp_path, cloc
     load_start(after)
     assert tried == [*checkpoint_paths(mapper.config.output)]
     assert after.map.num_voxels
+
+
+def test_a_map_in_tiles_is_a_start_too(tmp_path):
+    pytest.importorskip('pyarrow')
+    mapper = mapper_in(tmp_path)
+    drive(mapper, 1.0, 2.0)
+    for tile, part in write_shard(tmp_path / 'shard.parquet', mapper.map).items():
+        write_tile(tmp_path / 'tiled' / 'map' / tile.path, read_part(part))
+    after = mapper_in(tmp_path, map__load=str(tmp_path / 'tiled'))
+    load_start(after)
+    assert after.map.digest() == mapper.map.digest()
 
 
 def test_latest_without_any_map_starts_empty(tmp_path, caplog):
