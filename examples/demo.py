@@ -19,6 +19,7 @@ import os
 from pathlib import Path
 import re
 import shlex
+import socket
 import subprocess
 import sys
 import time
@@ -34,10 +35,6 @@ def main() -> int:
     args = arguments()
     bag, live, offline = (args.output / name for name in ('street', 'live', 'offline'))
 
-    # Keep the nodes of this demo apart from all others on the network.
-    os.environ['ROS_DOMAIN_ID'] = str(1 + os.getpid() % 100)
-    os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
-
     say('1. A lidar drives through a street, and a bag records it.')
     lidar = ['--scans', args.scans, '--beams', args.beams, '--columns', args.columns]
     call('simulate', 'street', '--output', bag, '--overwrite', '--noise', 0.02, *lidar)
@@ -52,7 +49,10 @@ def main() -> int:
         print_files(offline)
         return 0
     say('2. The node maps the bag while it is played, as it would on a robot.')
-    with node('--params-file', SETTINGS, '-p', f'output.directory:={live}') as running:
+    with (
+        own_domain(),
+        node('--params-file', SETTINGS, '-p', f'output.directory:={live}') as running,
+    ):
         played = play(running, bag)
         mapped = save_map()
 
@@ -109,6 +109,27 @@ def call(*words: object) -> None:
     done = subprocess.run(command(*words))
     if done.returncode:
         sys.exit(done.returncode)
+
+
+@contextmanager
+def own_domain() -> Iterator[None]:
+    """
+    Keep the nodes of this demo apart from all others, in a ROS domain claimed for a with-block.
+
+    The claim is a socket of that name, which ends with the process; tests claim theirs likewise.
+    """
+    for number in [*range(1 + os.getpid() % 100, 101), *range(1, 101)]:
+        with socket.socket(socket.AF_UNIX) as claim:
+            try:
+                claim.bind(f'\0surfel_mapper-ros-domain-{number}')
+            except OSError:  # taken
+                continue
+            os.environ['ROS_DOMAIN_ID'] = str(number)
+            os.environ['ROS_AUTOMATIC_DISCOVERY_RANGE'] = 'LOCALHOST'
+            print(f'ROS domain {number}, on this machine only')
+            yield
+            return
+    sys.exit('ROS domains 1 to 100 are all taken by other runs of the demo and tests.')
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
+import sys
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -84,19 +85,21 @@ def run(args: argparse.Namespace) -> int:
     from surfel_mapper.config import ModelsConfig
     from surfel_mapper.files.atomic import make_directory
     from surfel_mapper.files.model_files import write_models
+    from surfel_mapper.kernels.compiling import before_compiling
     from surfel_mapper.layers.drawings import PointsPicture
     from surfel_mapper.layers.models.pictures import panels_of
     from surfel_mapper.models import evaluate, fit
     from surfel_mapper.viz.drawings import draw_points
 
-    points, voxel_size_m, viewpoint, origin_m = read(args)
-    config = ModelsConfig(
-        voxel_size_m=voxel_size_m,
-        profile=args.profile,
-        noise_m=args.noise,
-        noise_per_range_sq=args.noise_per_range_sq,
-    )
-    model = fit(points, config, viewpoint)
+    with before_compiling(announce):
+        points, voxel_size_m, viewpoint, origin_m = read(args)
+        config = ModelsConfig(
+            voxel_size_m=voxel_size_m,
+            profile=args.profile,
+            noise_m=args.noise,
+            noise_per_range_sq=args.noise_per_range_sq,
+        )
+        model = fit(points, config, viewpoint)
     make_directory(args.output)
     write_models(args.output, model.translated(origin_m), args.formats)
     picture = PointsPicture(
@@ -106,6 +109,16 @@ def run(args: argparse.Namespace) -> int:
     content = figures(model, evaluate(model, points), len(points))
     show_lines(json.dumps(content) if args.json else report(content))
     return 0
+
+
+def announce() -> None:
+    """Say on stderr why the first fit takes long."""
+    print(
+        'surfel-mapper extract: compiles its kernels first, about two minutes of processor time '
+        'once on a machine',
+        file=sys.stderr,
+        flush=True,
+    )
 
 
 def read(

@@ -11,12 +11,12 @@ more, which took a quarter of the time to the first scan.
 Stands alone: kernels of any folder may use it.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 
 from numba import njit
-from numba.core.event import install_recorder
+from numba.core.event import install_listener, install_recorder, Listener
 
 kernel = partial(njit, cache=True, nogil=True, no_cfunc_wrapper=True)
 """Compile a function that Python calls; takes the options of njit."""
@@ -30,3 +30,26 @@ def compilations() -> Iterator[Sequence[object]]:
     """Give a list that grows with each function compiled, not loaded from the cache, meanwhile."""
     with install_recorder('numba:compile') as recorder:
         yield recorder.buffer
+
+
+@contextmanager
+def before_compiling(call: Callable[[], None]) -> Iterator[None]:
+    """Call a function once if something is compiled in a with-block, before it is."""
+    with install_listener('numba:compile', FirstCompilation(call)):
+        yield
+
+
+class FirstCompilation(Listener):
+    """Calls a function at the first compilation it hears of."""
+
+    def __init__(self, call):
+        self._call = call
+
+    def on_start(self, event):
+        """Call it, once."""
+        call, self._call = self._call, None
+        if call is not None:
+            call()
+
+    def on_end(self, event):
+        """Do nothing: the interface of numba asks for it."""

@@ -6,9 +6,11 @@ from __future__ import annotations
 
 import json
 
+import numba
 import numpy as np
 import pytest
 
+from surfel_mapper.cli import extract
 from surfel_mapper.cli.main import main
 from surfel_mapper.files import ply
 from surfel_mapper.files.map_state import save_map
@@ -60,6 +62,22 @@ def test_a_map_becomes_models_of_its_surfels(tmp_path, capsys):
     assert main(['merge', str(tmp_path / 'map.npz'), '--output', tiled]) == 0
     assert main(['extract', tiled, '--output', str(again)]) == 0
     assert json.loads((again / 'models.json').read_text())['planes'] == planes
+
+
+@pytest.mark.skipif(numba.config.DISABLE_JIT, reason='kernels are interpreted in this run')
+def test_compiling_is_announced_once_on_stderr(tmp_path, capsys, monkeypatch):
+    write_cloud(tmp_path / 'none.ply', np.empty((0, 3), np.float32))
+    arguments = ['extract', str(tmp_path / 'none.ply'), '--output', str(tmp_path / 'out')]
+    assert main(arguments) == 0  # whatever is compiled for it
+    capsys.readouterr()
+    assert main(arguments) == 0
+    assert capsys.readouterr().err == ''
+
+    read = extract.read
+    new = numba.njit(lambda value: value)
+    monkeypatch.setattr(extract, 'read', lambda args: read(args)[: new(4)])
+    assert main(arguments) == 0
+    assert capsys.readouterr().err.count('compiles its kernels first') == 1
 
 
 def test_an_empty_cloud_becomes_empty_models(tmp_path, capsys):

@@ -30,6 +30,7 @@ from surfel_mapper.cli.main import main
 from surfel_mapper.files.map_state import save_map
 from surfel_mapper.files.ply import read_points
 from surfel_mapper.mapping.surfel_map import SurfelMap
+from test.ros.domain import domain_of_our_own
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / 'examples'
@@ -67,8 +68,6 @@ def run_process(name, *arguments, folder):
 def test_the_demo_without_ros_leaves_out_the_node_and_says_so(run, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, 'rclpy', None)
     monkeypatch.setenv('PYTHONPATH', str(ROOT))
-    for name in ('ROS_DOMAIN_ID', 'ROS_AUTOMATIC_DISCOVERY_RANGE'):
-        monkeypatch.setenv(name, '1')  # the demo sets them
     out = run('demo.py', '--scans', 4, '--beams', 16, '--columns', 256, folder=tmp_path)
 
     assert 'The live node is left out: ROS 2 is not installed' in out
@@ -76,6 +75,18 @@ def test_the_demo_without_ros_leaves_out_the_node_and_says_so(run, monkeypatch, 
     summary = json.loads((tmp_path / 'demo' / 'offline' / 'summary.json').read_text('utf-8'))
     assert summary['scans']['mapped'] == 4
     assert Image.open(tmp_path / 'demo' / 'offline' / 'map.png').size[0] > 500
+
+
+def test_the_demo_claims_a_domain_that_no_test_holds(capsys):
+    own_domain = runpy.run_path(str(EXAMPLES / 'demo.py'))['own_domain']
+    with domain_of_our_own():  # and the environment as it was, at the end
+        domains = [os.environ['ROS_DOMAIN_ID']]
+        with own_domain():
+            domains.append(os.environ['ROS_DOMAIN_ID'])
+            with own_domain():
+                domains.append(os.environ['ROS_DOMAIN_ID'])
+    assert len(set(domains)) == 3
+    assert f'ROS domain {domains[1]}, on this machine only' in capsys.readouterr().out
 
 
 @pytest.fixture(scope='module')

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.compiling import kernel, part
+from surfel_mapper.kernels.compiling import before_compiling, kernel, part
 
 needs_compiler = pytest.mark.skipif(
     numba.config.DISABLE_JIT, reason='kernels are interpreted in this run'
@@ -53,3 +53,21 @@ def test_a_kernel_is_no_function_of_c():
 
     assert any(name.startswith('_ZN7cpython') for name in names)
     assert not any(name.startswith('cfunc.') for name in names)
+
+
+@needs_compiler
+def test_a_call_comes_once_before_the_first_compilation():
+    @numba.njit
+    def twice(value):
+        return 2 * value
+
+    calls = []
+    with before_compiling(lambda: calls.append(len(twice.overloads))):
+        twice(1)
+        twice(1.0)
+    assert calls == [0]
+    with before_compiling(lambda: calls.append('compiled')):
+        twice(2)
+    assert calls == [0]
+    twice('not heard of')
+    assert len(twice.overloads) == 3

@@ -17,12 +17,13 @@ def domain_of_our_own() -> Iterator[None]:
     """
     Keep ROS traffic on this machine, in a domain that no other run uses, in a with-block.
 
-    A domain is claimed by a socket of its name, which ends with the process.
+    A domain is claimed by a socket of its name, which ends with the process; examples/demo.py
+    claims its own likewise.
     """
     for number in itertools.chain(range(os.getpid() % 100, 100), range(100)):
         with socket.socket(socket.AF_UNIX) as claim:
             try:
-                claim.bind(f'\0surfel_mapper-tests-in-domain-{number + 1}')
+                claim.bind(f'\0surfel_mapper-ros-domain-{number + 1}')
             except OSError:  # taken
                 continue
             own = {
