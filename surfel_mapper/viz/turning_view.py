@@ -52,8 +52,10 @@ def turning_view(
     layers = {name: mesh for name, mesh in layers.items() if len(mesh)}
     shown = within_sight(surfels)
     note = (
-        'Drag or arrows turn, with shift they move; wheel, + and - zoom, 0 resets, F is full '
-        'screen. A click shows the values of a surfel.'
+        '<span class="keys">Drag or arrows turn, with shift they move; wheel, + and - zoom, '
+        '0 resets, F is full screen. A click shows the values of a surfel.</span>'
+        '<span class="touch">A finger turns, two move and zoom; a tap shows the values of a '
+        'surfel.</span>'
     )
     mixed = np.random.default_rng(0).permutation(
         len(shown)

@@ -235,9 +235,10 @@ def test_the_bar_has_the_length_that_it_states(opened):
 
 
 def test_the_whole_map_is_in_view_on_a_telephone(browser, written):
-    page = browser.new_page(viewport={'width': 390, 'height': 844})
+    page = browser.new_page(viewport={'width': 390, 'height': 844}, is_mobile=True, has_touch=True)
     page.set_default_timeout(1000 * WAIT_S)
     page.goto(written.as_uri())
+    assert page.locator('#help').inner_text().startswith('A finger turns')
     image = picture_when(page, lambda image: num_coloured(image) > 2000)
     found = np.nonzero(np.ptp(image, axis=2) > 0.1)
     assert len(found[0]) > 2000
