@@ -169,9 +169,10 @@ def formats(text: str) -> tuple[str, ...]:
 def run(args: argparse.Namespace) -> int:
     """Map one recording or many, and report."""
     if (args.poses_from == 'file') != (args.poses is not None) and args.poses_from is not None:
+        found = 'no --poses' if args.poses is None else f'--poses {args.poses}'
         raise UsageError(
-            f'--poses-from {args.poses_from} and --poses {args.poses}: expected both '
-            'for a file of poses, else no --poses'
+            f'--poses-from {args.poses_from} and {found}: expected both `--poses-from file` and '
+            '`--poses FILE` for a file of poses, else no --poses'
         )
     is_many = len(args.bags) > 1 or args.workers is not None or args.scheduler is not None
     with stopped_by_interrupt() as stopped:
