@@ -8,6 +8,7 @@ Otherwise any client of the node's services could write, or probe for, any file 
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
@@ -98,7 +99,10 @@ def directory_of(output: OutputConfig) -> Path:
 
 def path_inside(directory: Path, url: str) -> Path:
     """Return the full path of a map in a directory; raise ConfigError if it is outside."""
-    parts = urlsplit(url)
+    try:
+        parts = urlsplit(url)
+    except ValueError as error:
+        raise ConfigError(f'map_url: {url!r}: {error}') from error
     if parts.scheme not in ('', 'file') or parts.netloc or '\0' in url:
         raise ConfigError(f'map_url: {url!r}, expected a file in output.directory, {directory}')
     wanted = unquote(parts.path) if parts.scheme else url
@@ -114,4 +118,9 @@ def path_inside(directory: Path, url: str) -> Path:
 
 def is_inside(directory: Path, path: Path) -> bool:
     """Return whether a path is inside a directory, after resolving links and ``..``."""
-    return path.resolve().is_relative_to(directory.resolve())
+    try:
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.resolve(strict=True)  # fails at a link that leads to itself
+        return path.resolve().is_relative_to(directory.resolve())
+    except (OSError, RuntimeError):  # the latter before Python 3.13
+        return False

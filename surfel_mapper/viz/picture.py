@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import ConfigError
+from surfel_mapper.errors import ConfigError, escaped
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.discs import ramp, shaded, sides_m, SPREAD
@@ -341,8 +341,11 @@ def framed(
     if colouring == 'planarity':
         bar = axes_at(ABOVE, left + across + 30, height - ABOVE - BELOW, 25)
         figure.colorbar(ScalarMappable(cmap='viridis'), cax=bar).set_label(colouring)
+    title = escaped(title)  # a name of a file may be no text, or hold dollar signs
     points = 72.0 * (width - 40) / DPI / (LETTER * max(len(title), 1))
-    figure.axes[0].set_title(title, fontsize=min(TITLE_PT, points), x=0.0, ha='left')
+    figure.axes[0].set_title(
+        title, fontsize=min(TITLE_PT, points), x=0.0, ha='left', parse_math=False
+    )
     canvas.draw()
     drawn = np.array(canvas.buffer_rgba())
     return drawn[..., :3], corners

@@ -271,8 +271,19 @@ def test_map_urls_without_a_file_name_are_refused(tmp_path):
     pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
     from surfel_mapper.ros.map_files import path_inside
 
-    for url in ('/', 'file:///', '.', '../../x'):
+    for url in ('/', 'file:///', '.', '../../x', '//[', 'file://[x/y'):
         with pytest.raises(ConfigError, match='map_url'):
+            path_inside(tmp_path, url)
+
+
+def test_a_link_that_leads_to_itself_is_outside_of_the_maps(tmp_path):
+    """Resolving it was an error of Python, which no caller expects."""
+    pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
+    from surfel_mapper.ros.map_files import path_inside
+
+    (tmp_path / 'loop').symlink_to('loop')
+    for url in ('loop/x', 'loop/../y'):
+        with pytest.raises(ConfigError, match='is not inside'):
             path_inside(tmp_path, url)
 
 

@@ -182,6 +182,13 @@ def test_a_single_surfel_is_drawn(tmp_path):
     assert num_pixels(drawn(tmp_path, sheet(0.0, 1.0, 1.0).select(np.array([7]))), YELLOW) > 1000
 
 
+@pytest.mark.parametrize('title', ['caf\udce9.mcap', 'a$x^$.mcap', '$\\frac', 'a\0\x1b[31m'])
+def test_any_name_of_a_file_can_be_the_title(tmp_path, title):
+    """Formulas that are none, and names that are not UTF-8, ended a replay before its report."""
+    draw_map(sheet(0.0, 1.0, 1.0), tmp_path / 'a.png', title)
+    assert Image.open(tmp_path / 'a.png').size > (100, 100)
+
+
 def test_the_same_map_gives_the_same_file(tmp_path):
     draw_map(sheet(0.0, 1.0, 0.5), tmp_path / 'a.png', 'a')
     draw_map(sheet(0.0, 1.0, 0.5), tmp_path / 'b.png', 'a')

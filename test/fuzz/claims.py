@@ -1,0 +1,114 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Tables of docs/faults.md from runs, and the limits of SECURITY.md from the code.
+
+``python -m test.fuzz --seconds 600 > fuzz.log`` and then ``python -m test.fuzz.claims fuzz.log``
+write them: faults and numbers of inputs from the tests, costs from the log
+of one or several runs, the last row of an input counts. The limits that SECURITY.md states are
+compared with the constants of the code; the command lists those that differ, and a test fails.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+import sys
+
+from surfel_mapper import budget
+from surfel_mapper.bags import bag_file, chunked, compression, decoders, paths
+from surfel_mapper.config import yaml_files
+from surfel_mapper.geometry import MAX_TRANSLATION_M
+from surfel_mapper.messages.pointcloud2 import MAX_FIELDS
+from surfel_mapper.offline import pcap_packets
+from surfel_mapper.poses import buffer
+from test.fuzz import oracle
+from test.fuzz.__main__ import HEAD
+from test.fuzz.harnesses import HARNESSES
+from test.ros import fault_table
+
+SECURITY = fault_table.PAGE.parents[1] / 'SECURITY.md'
+
+BEGIN, END = '<!-- begin: costs from runs of test.fuzz -->', '<!-- end: costs -->'
+
+TOTAL = '| inputs of `make fuzz`, by atheris and then measured |'
+
+ROW = re.compile(r'^\| (\w+) \| (\d+) \| (\d+) \|.*\|$', re.MULTILINE)
+
+
+def limits() -> list[str]:
+    """Return the limits of readers as SECURITY.md has to state them."""
+    packets = pcap_packets
+    pixels, columns = (
+        packets.MOST[f'{name}'] for name in ('pixels_per_column', 'columns_per_frame')
+    )
+    return [
+        f'{budget.FLOOR_BYTES >> 20} MiB or {budget.BYTES_PER_BYTE} bytes per byte of\ninput',
+        f'`{budget.VARIABLE}`',
+        f'{MAX_FIELDS:,} at most',
+        f'{budget.FLOOR_BYTES >> 20} MiB or {budget.BYTES_PER_BYTE} times the file, '
+        f'{compression.MAX_UNPACKED_BYTES >> 20} MiB at most',
+        f'all together {compression.FLOOR_BYTES >> 20} MiB '
+        f'(bz2: {compression.SLOW_FLOOR_BYTES >> 20}) or '
+        f'{compression.MAX_FILE_RATIO} times the file',
+        f'({bag_file.MESSAGE_BYTES} bytes each)',
+        f'{chunked.MAX_MESSAGES:,} messages or one per {chunked.LEAST_BYTES} bytes',
+        f'{chunked.MAX_OTHERS:,} other records or one per {chunked.LEAST_OTHER_BYTES}',
+        f'{chunked.MAX_CHUNKS:,} chunks or one per {chunked.LEAST_CHUNK_BYTES}',
+        f'{bag_file.MAX_CONNECTIONS:,} topics',
+        f'{decoders.MAX_DEFINED:,} characters and one per {decoders.BYTES_EACH} bytes',
+        f'and of {decoders.LEAST_DEFINITION} each at least',
+        f'{budget.FLOOR_S:.0f} s or {1e6 * budget.SECONDS_PER_BYTE:.0f} us per byte of processor'
+        ' time',
+        f'nesting of {yaml_files.MAX_DEPTH}; {yaml_files.MAX_NODES:,} nodes '
+        f'(metadata.yaml: {paths.MAX_NODES:,}, and {paths.MAX_FILES:,} files)',
+        f'{packets.MAX_PENDING:,} unfinished fragments; {packets.MAX_PACKETS:,} packets or one '
+        f'per {packets.LEAST_BYTES} bytes; sizes in the metadata: {pixels:,} x {columns:,} pixels',
+        f'rigid transforms within {MAX_TRANSLATION_M:.0e} m'.replace('e+0', 'e'),
+        f'{buffer.MAX_EDGES:,} frames of',
+        f'{buffer.MAX_DEPTH} from a frame to its root',
+        f'within {oracle.MOST_BYTES >> 20} MiB and\n{oracle.MOST_RATIO} bytes per byte, and '
+        f'{oracle.MOST_S} s and {1e9 * oracle.MOST_S_PER_BYTE:.0f} ns per byte of processor time',
+    ]
+
+
+def false_limits() -> list[str]:
+    """Return the limits that SECURITY.md does not state."""
+    text = ' '.join(SECURITY.read_text(encoding='utf-8').split())
+    return [limit for limit in limits() if ' '.join(limit.split()) not in text]
+
+
+def costs() -> dict[str, tuple[int, int]]:
+    """Return the inputs that the page states, by harness: by atheris, and measured."""
+    table = fault_table.PAGE.read_text(encoding='utf-8').partition(BEGIN)[2].partition(END)[0]
+    return {name: (int(tried), int(measured)) for name, tried, measured in ROW.findall(table)}
+
+
+def page_with_costs(text: str, logs: str) -> str:
+    """Return the page with the table of costs, and its total, from the output of runs."""
+    rows = {found[1]: found[0] for found in ROW.finditer(logs)}
+    missing = HARNESSES.keys() - rows.keys()
+    if missing:
+        raise SystemExit(f'no row of {", ".join(sorted(missing))}: broken, or not searched')
+    before, _, rest = text.partition(BEGIN)
+    table = '\n'.join([BEGIN, *HEAD, *(rows[name] for name in HARNESSES), END])
+    text = before + table + rest.partition(END)[2]
+    sums = (sum(int(ROW.match(rows[name])[at]) for name in HARNESSES) for at in (2, 3))
+    total = ' and '.join(f'{number:,}' for number in sums)
+    return re.sub(rf'(?<=^{re.escape(TOTAL)} )[\d, and]+', f'{total} ', text, flags=re.MULTILINE)
+
+
+def main(*logs: str) -> int:
+    """Write the tables; print the limits that SECURITY.md lacks, and return their number."""
+    text = fault_table.page_with(fault_table.table())
+    if logs:
+        text = page_with_costs(text, '\n'.join(Path(log).read_text('utf-8') for log in logs))
+    fault_table.PAGE.write_text(text, encoding='utf-8')
+    false = false_limits()
+    for limit in false:
+        print(f'SECURITY.md does not state: {limit}')
+    return len(false)
+
+
+if __name__ == '__main__':
+    sys.exit(main(*sys.argv[1:]))

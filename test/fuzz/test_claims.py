@@ -1,0 +1,48 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""docs/faults.md and SECURITY.md state the limits and the inputs that the code has."""
+
+from __future__ import annotations
+
+from pathlib import Path
+import re
+
+import pytest
+
+from test.fuzz import claims
+from test.fuzz.harnesses import HARNESSES
+
+FIGURE = re.compile(r'\d[\d,]*')
+
+
+def test_security_states_the_limits_of_the_readers():
+    assert not claims.false_limits()
+
+
+def test_a_changed_limit_is_noticed(monkeypatch):
+    monkeypatch.setattr(claims.chunked, 'MAX_CHUNKS', 4001)
+    assert claims.false_limits() == ['4,001 chunks or one per 512']
+
+
+def test_the_costs_are_of_all_harnesses_and_no_other():
+    assert [*claims.costs()] == [*HARNESSES]
+
+
+def test_the_total_is_that_of_the_table():
+    tried, measured = map(sum, zip(*claims.costs().values(), strict=True))
+    text = claims.fault_table.PAGE.read_text(encoding='utf-8')
+    row = next(line for line in text.splitlines() if line.startswith(claims.TOTAL))
+    assert FIGURE.findall(row[len(claims.TOTAL) :]) == [f'{tried:,}', f'{measured:,}']
+
+
+def test_a_harness_that_broke_leaves_the_page_as_it_is():
+    rows = '\n'.join(f'| {name} | 1 | 2 | 0 | 0.0 | 1 |' for name in [*HARNESSES][1:])
+    with pytest.raises(SystemExit, match=f'no row of {next(iter(HARNESSES))}: broken'):
+        claims.page_with_costs('', rows)
+
+
+def test_tests_that_the_pages_name_exist():
+    root = Path(__file__).parents[2]
+    for page in (claims.SECURITY, claims.fault_table.PAGE):
+        for name in re.findall(r'`(test/[\w/]+\.py)`', page.read_text(encoding='utf-8')):
+            assert (root / name).is_file(), name
