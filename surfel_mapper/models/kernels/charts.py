@@ -16,6 +16,12 @@ from surfel_mapper.kernels.symmetric3 import eigen_frame
 MEANS_ITERATIONS = 20
 """Most iterations of 2-means on normals."""
 
+STEADY_SHARE = 0.5
+"""
+2-means begins with the first axis of the map with this share of the largest variance. The normals
+of a ball vary alike in two directions, and their principal axis turns with every scan.
+"""
+
 FOLD_PERCENTILE = 98.0
 """A surface is folded unless this percentage of normals is near the mean."""
 
@@ -32,19 +38,18 @@ def bisect_normals(normals, side):
     side     (n,) bool, out
     """
     number = len(normals)
-    mean, scatter = np.zeros(3), np.zeros((3, 3))
-    values, axes = np.empty(3), np.empty((3, 3))
+    mean, spread = np.zeros(3), np.zeros(3)
     for i in range(number):
         for j in range(3):
             mean[j] += normals[i, j] / number
     for i in range(number):
         for j in range(3):
-            for k in range(3):
-                scatter[j, k] += (normals[i, j] - mean[j]) * (normals[i, k] - mean[k])
-    eigen_frame(scatter, values, axes)
-    plane = np.empty(4)
-    plane[:3] = axes[2]
-    plane[3] = axes[2, 0] * mean[0] + axes[2, 1] * mean[1] + axes[2, 2] * mean[2]
+            spread[j] += (normals[i, j] - mean[j]) ** 2
+    axis = 0
+    while spread[axis] < STEADY_SHARE * spread.max():
+        axis += 1
+    plane = np.zeros(4)
+    plane[axis], plane[3] = 1.0, mean[axis]
     sums, counts = np.empty((2, 3)), np.empty(2)
     for iteration in range(MEANS_ITERATIONS + 1):
         sums[:] = 0.0
