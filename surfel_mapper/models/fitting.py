@@ -73,6 +73,9 @@ BLOCK_VOXELS = 4.0
 COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0, 16.0), 0.05
 """Coarser voxels for sparse points, and the share of points on no patch from which they help."""
 
+COARSE_TOLERANCE_VOXELS = 0.04
+"""Tolerance of facets in coarser voxels, at least: at 50 m a road sags more than near patches."""
+
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
 
@@ -199,7 +202,8 @@ def grow_sparse(
         before = of_row[coarse.rows]
         after = np.maximum(before, -1)
         extend_planes(coarse, after, curved, (size_m, found.tolerance_m))
-        num = add_facets(coarse, after, len(normals), (size_m, found.tolerance_m), config)
+        facet_m = max(found.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
+        num = add_facets(coarse, after, len(normals), (size_m, facet_m), config)
         table = owner_table(coarse, after)
         index, normals, bent = join_patches(pieces_of(coarse, table, num), view, noise, finest)
         # coarse voxels resolve less: what was curved stays so, unless a larger plane takes it
