@@ -26,24 +26,44 @@ for _ in range(5):
 print((resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before) // 5)
 """
 
+THREADS = """
+import resource, sys, threading
+from surfel_mapper.memory import keep_freed_memory, share_freed_memory
+keep_freed_memory()
+if sys.argv[1] == 'shared':
+    share_freed_memory()
+made = []
+def make():
+    made.extend(bytes([n]) * (1 << 20) for n in range(40))  # 10,240 pages of 4 KiB
+thread = threading.Thread(target=make)
+thread.start()
+thread.join()
+made.clear()
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+make()
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+def faults_of(program, how):
+    """Return the page faults that a program prints."""
+    environment = {k: v for k, v in os.environ.items() if not k.startswith('MALLOC_')}
+    command = [sys.executable, '-c', program, how]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return int(done.stdout)
+
 
 @pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='concerns glibc only')
 def test_blocks_are_used_again_once_memory_is_kept():
-    environment = {k: v for k, v in os.environ.items() if not k.startswith('MALLOC_')}
-    faults = {
-        how: int(
-            subprocess.run(
-                [sys.executable, '-c', FAULTS, how],
-                env=environment,
-                capture_output=True,
-                text=True,
-                check=True,
-            ).stdout
-        )
-        for how in ('kept', 'given back')
-    }
-    assert faults['kept'] < 100
-    assert faults['kept'] < 0.1 * faults['given back']
+    kept, given_back = (faults_of(FAULTS, how) for how in ('kept', 'given back'))
+    assert kept < 100
+    assert kept < 0.1 * given_back
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != 'glibc', reason='concerns glibc only')
+def test_memory_freed_by_one_thread_is_used_by_another_once_it_is_shared():
+    shared, apart = (faults_of(THREADS, how) for how in ('shared', 'apart'))
+    assert shared < 0.1 * apart
 
 
 def test_objects_of_the_block_are_not_visited_by_later_collections():
