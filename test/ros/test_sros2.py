@@ -76,18 +76,10 @@ def test_the_policy_allows_exactly_the_topics_and_services_of_the_node(
 
 @pytest.fixture(scope='module')
 def node(prefork, tmp_path_factory):
-    """
-    Start a node over UDP, where each participant discovers it in .3 to 2 s.
-
-    By shared memory a participant that follows another of the same process, and has its ports,
-    discovered the node after 3 to 80 s.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('FASTDDS_BUILTIN_TRANSPORTS', 'UDPv4')
-        with starting(tmp_path_factory.mktemp('policy'), prefork) as start:
-            running = start('node', *ARGUMENTS, *EVERYTHING)
-            running.wait_for_output('ready:')
-            yield running
+    with starting(tmp_path_factory.mktemp('policy'), prefork) as start:
+        running = start('node', *ARGUMENTS, *EVERYTHING)
+        running.wait_for_output('ready:')
+        yield running
 
 
 def seen_anew(find, needed, wait_s=20.0):
