@@ -52,8 +52,8 @@ def share_freed_memory() -> None:
 
     The blocks of a cloud are allocated by the thread that receives it and freed by the one that
     maps it. With an arena each, memory freed by one is not used again by the other: after two
-    minutes with a backlog now and then the node held 570 MB, with one arena 420. The environment
-    variable MALLOC_ARENA_MAX comes first; without glibc this has no effect.
+    minutes at 20 Hz and 4 MiB the node held 411 MB, with one arena 399. The environment variable
+    MALLOC_ARENA_MAX comes first; without glibc this has no effect.
     """
     mallopt = getattr(ctypes.CDLL(None), 'mallopt', None)
     if mallopt is not None and 'MALLOC_ARENA_MAX' not in os.environ:

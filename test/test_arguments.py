@@ -3,9 +3,9 @@
 """
 Numbers that no argument of the public functions can hold are refused as such.
 
-Python's integers have no limit, so that one of 2^70 fails in a kernel and one of 2^1025 where it
-becomes a float: with an OverflowError, or an error of the compiler that has pages. Callers catch
-ValueError, TypeError and the errors of this package.
+Integers of Python have no limit: 2^70 fails in a kernel, and 2^1025 when it becomes a float, with
+an OverflowError or pages of compiler errors. Callers catch ValueError, TypeError and the errors of
+this package.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ HOSTILE = (
     *('x', '٣', b'1', 1j, {}, object(), np.datetime64('NaT'), np.array([2**70], object)),
     *([2**1025], [[2**1025] * 3], [[1, 2], [3]], (2**1025,) * 3, np.full((3, 3), 2**70, object)),
 )
-"""Values that are no such argument; where one is legal, the call succeeds."""
+"""Wrong values for an argument; a call succeeds if a value is legal for it."""
 
 
 def surfel_map():

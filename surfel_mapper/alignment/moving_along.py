@@ -93,9 +93,9 @@ def staying(
     cell_m: float,
 ) -> float:
     """
-    Return the share of the cells with a surface across the motion that are where they were.
+    Return the share of cells, of those on surfaces across the motion, that kept their place.
 
-    The arguments are those of ``moving_along``. It is 0 without such cells.
+    The arguments are those of ``moving_along``. In [0, 1]; 0 without such cells.
     """
     direction = motion_m / np.linalg.norm(motion_m)
     tells = np.abs(normals @ direction) >= ACROSS
