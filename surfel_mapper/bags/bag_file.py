@@ -90,6 +90,7 @@ class BagFile(ABC):
         self.skipped_at: list[int] = []
         self.losses: list[str] = []
         self._budget = Budget(path, self.size, BagError)
+        self._max_connections = max(MAX_CONNECTIONS, stated_limit() // CONNECTION_BYTES)
         self._described_bytes = 0
         self._by_id: dict[int, Connection] = {}
         self._counts: Counter[int] = Counter()
@@ -128,10 +129,10 @@ class BagFile(ABC):
             self._budget.take(taken, f'descriptions of {len(self._by_id) + 1} topics')
             self._described_bytes += taken
         self._by_id[key] = connection
-        most = max(MAX_CONNECTIONS, stated_limit() // CONNECTION_BYTES)
-        if len(self._by_id) > most:
+        if len(self._by_id) > self._max_connections:
             raise BagError(
-                f'{self.path}: over {most} topics; is it damaged? Otherwise set {VARIABLE}'
+                f'{self.path}: over {self._max_connections} topics; is it damaged? Otherwise set '
+                f'{VARIABLE}'
             )
 
     def _note_span(self, first_ns: int, last_ns: int) -> None:

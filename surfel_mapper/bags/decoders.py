@@ -18,7 +18,7 @@ from surfel_mapper.bags._rosbags import jazzy_types, ros1_types, type_name
 if TYPE_CHECKING:
     from surfel_mapper.bags._rosbags import Connection, Typestore
 
-MAX_DEFINED, LEAST_DEFINITION, BYTES_EACH = 1 << 15, 800, 100
+MAX_DEFINED, LEAST_DEFINITION, BYTES_EACH = 1 << 15, 1600, 100
 """Limit of the definitions that are parsed of a small bag, characters, what each counts at least,
 and bytes of a bag for each further character."""
 
@@ -55,7 +55,7 @@ class Decoders:
                 self._found[type_] = error
         found = self._found[type_]
         if isinstance(found, Exception):
-            raise found
+            raise found.with_traceback(None)  # or it grows by, and keeps, the frames of each call
         return found
 
     def _new(self, type_: str) -> tuple[Typestore, str]:

@@ -35,6 +35,15 @@ LOOPBACK = '127.0.0.1'
 LOSSES = 5
 """A task is given up after this many workers died at it."""
 
+NO_PAGES: dict[str, list[str]] = {
+    'distributed.scheduler.http.routes': [],
+    'distributed.worker.http.routes': [],
+}
+"""
+Settings of a cluster on this machine: its HTTP servers have no page. Dask starts them in any case,
+without keys, and their pages name the tasks and their arguments to every user of the machine.
+"""
+
 POLL_S = 0.02
 """Period of checking for finished tasks and for a stop, s."""
 
@@ -184,10 +193,11 @@ def start_local(workers: int | None, started: ExitStack) -> Any:
         If a worker ends while it starts.
 
     """
+    import dask
     from distributed import Client, LocalCluster
 
     try:
-        with interrupt_held():
+        with interrupt_held(), dask.config.set(NO_PAGES):
             cluster = started.enter_context(
                 LocalCluster(
                     n_workers=workers,
@@ -195,6 +205,7 @@ def start_local(workers: int | None, started: ExitStack) -> Any:
                     host=LOOPBACK,
                     security=temporary_security(),
                     dashboard_address=f'{LOOPBACK}:0',
+                    scheduler_kwargs={'dashboard': False},
                 )
             )
             return started.enter_context(Client(cluster))

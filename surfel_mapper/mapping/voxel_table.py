@@ -13,6 +13,7 @@ every row of the map. It is bounded; a request for older changes looks at all ro
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections import deque
 from dataclasses import replace
 from itertools import takewhile
@@ -38,6 +39,9 @@ from surfel_mapper.mapping.storage import HashTable, Slab
 
 MAX_DEPTH = 24
 """The directory of the hash table has at most 2^24 entries, enough for 6e9 voxels."""
+
+UNDO_BYTES = 64
+"""Memory that undoing takes, bytes a voxel: it is allocated before, and freed for it."""
 
 LEAST = 1 << 18
 """Minimum capacity of the change log, rows; 1 MiB."""
@@ -90,11 +94,13 @@ class VoxelTable:
         MapLimitError
             If there is no memory for the voxels.
 
-        The table is unchanged after any exception, including a failed allocation anywhere.
+        The table is unchanged after any exception, including a failed allocation anywhere, and
+        if there is no memory at all from then on.
 
         """
         arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
         found = np.full(num, -1, np.int32)
+        reserve = np.empty(num * UNDO_BYTES, np.uint8)
         done = 0
         try:
             while done < num:
@@ -115,6 +121,7 @@ class VoxelTable:
                     self._channels.grow(len(self.rows.array))
                 self._channels.array[found.astype(np.intp)] += moments.channels
         except BaseException:
+            del reserve
             self._undo(moments, found, version)
             raise
         return found
@@ -217,9 +224,12 @@ class VoxelTable:
 
     def _undo(self, moments: ScanMoments, found: npt.NDArray[np.int32], version: int) -> None:
         """Subtract the moments that an incomplete ``add`` added; channels are added last."""
-        added = moments.select(slice(int(np.count_nonzero(found >= 0))))
-        if len(added):
-            self.remove(replace(added, channels=np.zeros_like(added.channels)), version)
+        num = bisect_left(found, True, key=lambda row: row < 0)
+        if num:
+            added = moments.select(slice(num))
+            added = replace(added, channels=np.zeros_like(added.channels))
+            object.__setattr__(added, 'rows', found[:num])
+            self.remove(added, version)
 
     def _make_room(self) -> None:
         """Enlarge the array that had no room for a new voxel."""

@@ -194,3 +194,17 @@ def test_many_types_of_ros1_are_parsed_up_to_a_sum(tmp_path, monkeypatch):
     assert most - 2 <= len(parsed) <= most
     assert len(errors) == number - len(parsed)
     assert len(names) <= 3 * number
+
+
+def test_messages_of_an_unreadable_type_leave_nothing_behind(tmp_path):
+    """The error of the type kept the frames of each call, with the message."""
+    path = tmp_path / 'a.bag'
+    records = connection(0, b'a/A') + message1(0) * 100
+    path.write_bytes(bag1(chunk1(records)).replace(b'uint8 b', b'!int8 b'))
+    with BagReader(path) as bag:
+        for found in bag.messages():
+            with pytest.raises(BagError, match='Could not parse'):
+                bag.decode(found)
+        with pytest.raises(Exception, match='Could not parse') as last:
+            bag._decoders.find(found.type)
+        assert len(last.traceback) < 5

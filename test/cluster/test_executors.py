@@ -6,7 +6,9 @@ from importlib.util import find_spec
 from multiprocessing import forkserver
 import os
 from pathlib import Path
+import random
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -140,9 +142,8 @@ def test_local_workers_are_encrypted_and_listen_on_loopback_only(two_workers):
 
     info = two_workers._client.scheduler_info(n_workers=-1)
     workers = info['workers']
-    pids = {os.getpid(), *two_workers._client.run(os.getpid).values()}
     assert all(address.startswith('tls://127.0.0.1:') for address in (info['address'], *workers))
-    assert {address for pid in pids for address in listened(pid)} == {'0100007F'}
+    assert {address for address, _ in listened(two_workers)} == {'0100007F'}
     with pytest.raises(OSError, match=r'127\.0\.0\.1'):
         distributed.Client(info['address'].replace('tls:', 'tcp:'), timeout=2)
     stranger = distributed.Security.temporary()
@@ -151,16 +152,49 @@ def test_local_workers_are_encrypted_and_listen_on_loopback_only(two_workers):
     assert dict(two_workers.run(squared, [3])) == {0: 9}
 
 
-def listened(pid):
-    """Return the addresses at which a process listens, hexadecimal as in /proc/net/tcp."""
-    links = (os.readlink(link) for link in Path(f'/proc/{pid}/fd').iterdir() if link.is_symlink())
-    inodes = {link[8:-1] for link in links if link.startswith('socket:[')}
+@pytest.mark.skipif(not os.path.exists('/proc/net/tcp'), reason='sockets are not shown')
+def test_strangers_get_no_page_and_end_nothing(two_workers):
+    """Dask serves pages over HTTP without keys: of tasks, their arguments, the processes."""
+    paths = '/', '/info/main/workers.html', '/json/counts.json', '/health', '/metrics', '/status'
+    requests = [f'GET {path} HTTP/1.0\r\n\r\n'.encode() for path in paths]
+    noise = random.Random(1).randbytes(70_000)
+    waiting, refused = [], []
+    for _, port in sorted(listened(two_workers)):
+        for sent in (*requests, noise, b'\x16\x03\x01\xff\xff' + noise, bytes(70_000), b''):
+            with socket.create_connection(('127.0.0.1', port)) as stranger:
+                refused.append(is_refused(stranger, sent))
+        waiting += [socket.create_connection(('127.0.0.1', port)) for _ in range(50)]
+    assert refused
+    assert all(refused)
+    assert dict(two_workers.run(squared, range(7))) == {n: n * n for n in range(7)}
+    for stranger in waiting:
+        stranger.close()
+
+
+def is_refused(stranger, sent):
+    """Send bytes; return whether the connection ends, with an error of HTTP or of TLS, or none."""
+    try:
+        stranger.sendall(sent)
+        stranger.shutdown(socket.SHUT_WR)
+        answer = b''.join(iter(lambda: stranger.recv(1 << 16), b''))
+    except ConnectionError:
+        return True
+    return not answer or answer[:12] in (b'HTTP/1.1 400', b'HTTP/1.1 404') or answer[0] == 0x15
+
+
+def listened(executor):
+    """Return address and port of the sockets of a cluster, the former hexadecimal as in /proc."""
+    pids = {os.getpid(), *executor._client.run(os.getpid).values()}
+    links = [link for pid in pids for link in Path(f'/proc/{pid}/fd').iterdir()]
+    names = (os.readlink(link) for link in links if link.is_symlink())
+    inodes = {name[8:-1] for name in names if name.startswith('socket:[')}
     rows = [
         line.split()
         for name in ('tcp', 'tcp6')
         for line in Path('/proc/net', name).read_text().splitlines()[1:]
     ]
-    return {row[1].partition(':')[0] for row in rows if row[3] == '0A' and row[9] in inodes}
+    found = (row[1].split(':') for row in rows if row[3] == '0A' and row[9] in inodes)
+    return {(address, int(port, 16)) for address, port in found}
 
 
 FORKSERVER = """

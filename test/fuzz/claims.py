@@ -57,7 +57,7 @@ def limits() -> list[str]:
         f'{chunked.MAX_CHUNKS:,} chunks or one per {chunked.LEAST_CHUNK_BYTES}',
         f'{bag_file.MAX_CONNECTIONS:,} topics',
         f'{decoders.MAX_DEFINED:,} characters and one per {decoders.BYTES_EACH} bytes',
-        f'and of {decoders.LEAST_DEFINITION} each at least',
+        f'and of {decoders.LEAST_DEFINITION:,} each at least',
         f'{budget.FLOOR_S:.0f} s or {1e6 * budget.SECONDS_PER_BYTE:.0f} us per byte of processor'
         ' time',
         f'nesting of {yaml_files.MAX_DEPTH}; {yaml_files.MAX_NODES:,} nodes '
