@@ -145,8 +145,7 @@ def is_cdr(connection: Connection) -> bool:
 
 def has_legal_names(connection: Connection) -> bool:
     """Return whether topic and type have names without control characters; else it is damage."""
-    names = (connection.topic, connection.msgtype)
-    return all(name.isprintable() for name in names)
+    return connection.topic.isprintable() and connection.msgtype.isprintable()
 
 
 def is_latched(connection: Connection) -> bool:
