@@ -32,10 +32,12 @@ DEMO_STAMP := $(VENV)/.demo-$(KIND)
 DOCS_STAMP := $(VENV)/.docs-$(KIND)
 LINT := $(VENV)-lint
 LINT_STAMP := $(LINT)/.ready
-# ouster-sdk pins a rosbags that is too old for bags/: pip would complain at each installation.
+# Today's ouster-sdk pins a rosbags that is too old for bags/: pip would complain at each
+# installation. The one that the extra `ouster` takes needs an older numpy, hence its environment.
 OUSTER := $(CURDIR)/$(VENV)/ouster
+OUSTER_ENV := $(CURDIR)/$(VENV)-ouster
 
-.PHONY: demo test boundscheck versions bench ratios soak fuzz lint format docs dist notebooks settings clean
+.PHONY: demo test ouster boundscheck versions bench ratios soak fuzz lint format docs dist notebooks settings clean
 
 # The environment of the tests does too, and the one of the demo becomes it later.
 demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it live over DDS and from the bag, compare
@@ -48,6 +50,11 @@ test: $(STAMP)  ## all tests
 	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \
 		--durations=5 $(PYTEST_ARGS)
+
+ouster: $(STAMP) $(OUSTER_ENV)/.ready  ## read the packets of an Ouster lidar with the extra `ouster` alone
+	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
+	SURFEL_MAPPER_OUSTER_PYTHON=$(OUSTER_ENV)/bin/python \
+	$(BIN)/python -m pytest -q test/offline/test_ouster_pcap.py
 
 # Compiled code reads past the end of an array without an error. Compiled with checks it cannot;
 # the cache is a new one, because cached kernels keep the setting they were compiled with. At the
@@ -116,7 +123,7 @@ settings: $(STAMP)  ## write default.yaml and the table of docs/settings.md from
 	$(BIN)/python -m test.settings
 
 clean:  ## remove the environment and everything built
-	rm -rf $(VENV) $(LINT) $(VENV)-versions build install log dist site demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) $(LINT) $(OUSTER_ENV) $(VENV)-versions build install log dist site demo *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find surfel_mapper test -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(STAMP): setup.py pyproject.toml
@@ -126,6 +133,11 @@ $(STAMP): setup.py pyproject.toml
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[$(EXTRAS)]'
 	$(BIN)/python -m pip install -q --disable-pip-version-check --no-deps --upgrade \
 		--target $(OUSTER) 'ouster-sdk>=1,<2' more-itertools
+	touch $@
+
+$(OUSTER_ENV)/.ready: setup.py pyproject.toml
+	$(PYTHON) -m venv $(OUSTER_ENV)
+	$(OUSTER_ENV)/bin/python -m pip install -q --disable-pip-version-check -e '.[ouster]'
 	touch $@
 
 $(DEMO_STAMP): setup.py pyproject.toml

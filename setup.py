@@ -64,6 +64,12 @@ LAS = [
     'laspy[lazrs]>=2.5',  # scans in LAS and LAZ files; lazrs unpacks LAZ
 ]
 
+OUSTER = [
+    # captures of Ouster lidars; BSD-3-Clause, a part under a licence of Ouster's own. Later ones
+    # pin a rosbags older than ours; this one is for Python 3.10 to 3.12, and takes numpy 1.26
+    'ouster-sdk>=0.12,<0.13; python_version < "3.13"',
+]
+
 LOOPS = [
     'map-closures>=2.2',  # recognises places that were seen before; MIT, wheels for 3.10 to 3.14
 ]
@@ -168,6 +174,7 @@ setup(
         'formats': FORMATS,
         'cluster': CLUSTER,
         'las': LAS,
+        'ouster': OUSTER,
         'step': STEP,
         'align': ALIGN,
         'loops': LOOPS,

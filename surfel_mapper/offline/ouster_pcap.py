@@ -3,15 +3,19 @@
 """
 Scans of an Ouster lidar in a capture of its packets, with its metadata beside it, by ouster-sdk.
 
-The profiles of packets differ between firmwares, and ouster-sdk knows all of them. It pins a
-version of rosbags that lacks what bags/ needs, so it cannot be an extra: INSTALL says how both
-live in one environment. On its own because it alone imports ouster-sdk.
+The profiles of packets differ between firmwares, and ouster-sdk knows all of them. Two of its
+interfaces are read: that of 0.12, the last release that does not pin an old rosbags, which the
+extra installs, and that of 1.0, see INSTALL. On its own because it alone imports ouster-sdk.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+import contextlib
+from importlib import metadata
+import io
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +26,10 @@ from surfel_mapper.offline.pcap_packets import check_capture
 
 SUFFIX = '.pcap'
 
-INSTALL = "pip install more-itertools && pip install --no-deps 'ouster-sdk>=1,<2'"
+INSTALL = (
+    "pip install 'surfel_mapper[ouster]'` (Python 3.10 to 3.12), or `pip install more-itertools "
+    "&& pip install --no-deps 'ouster-sdk>=1,<2'"
+)
 
 INTENSITIES = ('SIGNAL', 'REFLECTIVITY')
 """Fields that are the intensity; profiles of low data rate have the second alone."""
@@ -59,22 +66,21 @@ class OusterPcap:
     poses_path: Path | None = None
 
     def __init__(self, path: Path) -> None:
-        core, pcap = import_sdk(path)
+        read = reader_of_sdk(path)
         check_capture(path)
         try:
-            self._frames = pcap.PcapFrameSetSource(str(path), index=True)
+            self._frames = read(str(path))
         except Exception as error:  # the package states no types of its errors
             raise FileFormatError(
                 f'{path}: {error}; expected packets of an Ouster lidar, and its metadata (JSON) '
                 'of the same name beside it'
             ) from error
-        lidars = self._frames.sensor_info
-        if len(lidars) != 1 or not len(self._frames):
+        self.stamps_ns = self._frames.stamps_ns
+        if self._frames.num_lidars != 1 or not self.stamps_ns:
             raise FileFormatError(
-                f'{path}: {len(self._frames)} scans of {len(lidars)} lidars, expected scans of one'
+                f'{path}: {len(self.stamps_ns)} scans of {self._frames.num_lidars} lidars, '
+                'expected scans of one'
             )
-        self._place = core.XYZLutFloat(lidars[0], use_extrinsics=True)
-        self.stamps_ns = [int(at_us) * 1000 for at_us, _ in self._frames.full_index]
         self.files = [path] * len(self.stamps_ns)
 
     def scan(self, number: int) -> tuple[npt.NDArray[np.float32], dict[str, npt.NDArray[Any]]]:
@@ -91,8 +97,8 @@ class OusterPcap:
 
         """
         try:
-            frame = self._frames[number][0]
-            points = np.asarray(self._place(frame)).reshape(-1, 3)
+            frame = self._frames.frame(number)
+            points = np.asarray(self._frames.place(frame)).reshape(-1, 3)
             fields = {name: frame.field(name).ravel() for name in frame.fields}
             is_valid = (np.asarray(frame.status) & 1).astype(bool)
             times_ns = np.asarray(frame.timestamp).astype(np.int64)
@@ -113,13 +119,67 @@ class OusterPcap:
         }
 
 
-def import_sdk(path: Path) -> tuple[Any, Any]:
-    """Return two modules of ouster-sdk, or raise DependencyError with how to install it."""
+class Frames(NamedTuple):
+    """What both interfaces of ouster-sdk give of a capture."""
+
+    num_lidars: int
+    stamps_ns: list[int]
+    frame: Callable[[int], Any]
+    """Returns the columns of the scan of a number."""
+    place: Callable[[Any], npt.NDArray[Any]]
+    """Returns the points of such a scan, m, in the frame of the sensor."""
+
+
+def reader_of_sdk(path: Path) -> Callable[[str], Frames]:
+    """Return what reads captures by the installed ouster-sdk, or raise DependencyError."""
     try:
-        from ouster.sdk import core, pcap
+        version = metadata.version('ouster-sdk')
+        import ouster.sdk  # noqa: F401
     except ImportError as error:
         raise DependencyError(
             f'{path}: ouster-sdk cannot be loaded ({error}). It reads packets of Ouster lidars; '
             f'install it with `{INSTALL}`'
         ) from error
-    return core, pcap
+    for start, read in (('1.', read_by_1_0), ('0.12.', read_by_0_12)):
+        if version.startswith(start):
+            return read
+    raise DependencyError(
+        f'{path}: ouster-sdk is {version}, expected 0.12 or 1; install one with `{INSTALL}`'
+    )
+
+
+def read_by_1_0(path: str) -> Frames:
+    """Return the scans of a capture by the interface of ouster-sdk 1.0."""
+    from ouster.sdk import core, pcap
+
+    source = pcap.PcapFrameSetSource(path, index=True)
+    lidars = source.sensor_info
+    return Frames(
+        len(lidars),
+        [int(at_us) * 1000 for at_us, _ in source.full_index],
+        lambda number: source[number][0],
+        core.XYZLutFloat(lidars[0], use_extrinsics=True),
+    )
+
+
+def read_by_0_12(path: str) -> Frames:
+    """Return the scans of a capture by the interface of 0.12, which prints, and has no stamps."""
+    from ouster.sdk import client, pcap
+
+    client.init_logger('off')
+    with contextlib.redirect_stdout(io.StringIO()):
+        source = pcap.PcapScanSource(path, index=True)
+    arrivals = [first_arrival_ns(frames[0]) for frames in source]
+    return Frames(
+        len(source.metadata),
+        [round(at_ns / 1000) * 1000 for at_ns in arrivals],  # it keeps them as float64, in s
+        lambda number: source[number][0],
+        client.XYZLut(source.metadata[0], use_extrinsics=True),
+    )
+
+
+def first_arrival_ns(frame: Any) -> int:
+    """Return when the first packet of a scan arrived; packets that did not come have 0."""
+    arrivals_ns = np.asarray(frame.packet_timestamp)
+    came = arrivals_ns[arrivals_ns > 0]
+    return int(came.min()) if came.size else 0
