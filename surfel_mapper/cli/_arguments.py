@@ -56,8 +56,9 @@ class Parser(argparse.ArgumentParser):
 
 def nearest(word: str, known: list[str]) -> str:
     """Return a question with the nearest known word; empty if none is near."""
-    close = get_close_matches(word, known, n=1)
-    return f', did you mean {close[0]}?' if close else ''
+    bare = {each.lstrip('-'): each for each in known}  # dashes alone would look alike
+    close = get_close_matches(word.lstrip('-'), bare, n=1)
+    return f', did you mean {bare[close[0]]}?' if close else ''
 
 
 def real(text: str) -> float:

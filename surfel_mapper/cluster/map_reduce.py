@@ -57,10 +57,11 @@ class MapReduceResult:
     interrupted: bool
     merge_s: float
 
-    @property
-    def positions(self) -> npt.NDArray[np.float64]:
-        """Positions of the sensor in the map frame, (P, 3) m."""
-        return np.concatenate([np.empty((0, 3)), *(result.positions for result in self.results)])
+    def trajectory(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """Return stamps (S,), ns, and T_map_sensor (S, 4, 4) of all scans, by ascending stamp."""
+        stamps_ns = np.concatenate([result.stamps_ns for result in self.results])
+        order = np.argsort(stamps_ns, kind='stable')
+        return stamps_ns[order], np.concatenate([result.poses for result in self.results])[order]
 
     def counts(self) -> dict[str, Any]:
         """Return the counts of all shards together, as Counters.summary has them."""

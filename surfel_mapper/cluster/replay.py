@@ -41,7 +41,7 @@ class ShelfResult:
     summary : dict of str
         The content of summary.json.
     written : list of Path
-        The dataset of tiles, picture, report and summary.
+        The dataset of tiles, trajectory, picture, report and summary.
 
     """
 
@@ -262,14 +262,18 @@ def registered(
 
 
 def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResult) -> list[Path]:
-    """Write picture, report and summary of a map in tiles; return all that was written."""
+    """Write trajectory, picture, report and summary of a map in tiles; return what was written."""
     from surfel_mapper.files.atomic import write_json
+    from surfel_mapper.files.trajectory import TRAJECTORY, write_tum
     from surfel_mapper.offline.summary import rounded
     from surfel_mapper.viz.picture import draw_map
     from surfel_mapper.viz.report import write_report
 
     tiled = mapped.map
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
+    stamps_ns, poses = mapped.trajectory()
+    poses[:, :3, 3] += tiled.origin_m
+    write_tum(output / TRAJECTORY, stamps_ns, poses)
     title = (
         f'{Path(summary["bag"]).name}: {rounded(summary["points"])} points, '
         f'{tiled.surfels:,} surfels in voxels of {tiled.voxel_size_m:g} m, {tiled.tiles} tiles'
@@ -277,4 +281,4 @@ def write_overview(output: Path, summary: dict[str, Any], mapped: MapReduceResul
     draw_map(tiled.drawn, picture, title, origin_m=summary['origin_m'])
     write_report(page, title, summary, tiled.sample, picture=picture, drawn=tiled.drawn)
     write_json(figures, summary)
-    return [tiled.directory, picture, page, figures]
+    return [tiled.directory, output / TRAJECTORY, picture, page, figures]

@@ -32,6 +32,7 @@ from surfel_mapper.offline.recording import open_recording
 from surfel_mapper.offline.replay import ALL_SCANS
 from surfel_mapper.offline.request import Request
 from surfel_mapper.pipeline.shard_mapper import is_divisible, ShardMapper, sweep_s
+from surfel_mapper.pipeline.update import Update
 
 SHORTEST_S, LONGEST_S = 5.0, 60.0
 """Bounds of the length of a shard, s: its lead is read twice, its map is held in memory."""
@@ -45,8 +46,8 @@ LEAD_S = 1.0
 LEAD_GROWTH = 8.0
 """Factor by which a lead grows if it was too short."""
 
-POSITIONS = 100
-"""Positions of the sensor that are kept of a shard, for the picture."""
+StampedPose = tuple[int, npt.NDArray[np.float64]]
+"""Stamp, ns, and T_map_sensor of a scan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,8 +98,10 @@ class ShardResult:
         Times that the clock was set back, in its lead too.
     recorded_s, seconds, core_s : float
         Time from its start to its stop, wall time of mapping it, and processor time.
-    positions : (P, 3) float64, m
-        Some positions of the sensor in the map frame.
+    stamps_ns : (S,) int64
+        Stamps of the mapped scans.
+    poses : (S, 4, 4) float64
+        Their T_map_sensor.
     peak_bytes : int
         Peak memory of the process until the end of the shard.
 
@@ -112,7 +115,8 @@ class ShardResult:
     recorded_s: float
     seconds: float
     core_s: float
-    positions: npt.NDArray[np.float64]
+    stamps_ns: npt.NDArray[np.int64]
+    poses: npt.NDArray[np.float64]
     peak_bytes: int
 
 
@@ -199,9 +203,9 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
         mapper = ShardMapper(recording.config)
         recorded_s = recording.recorded_s
         if shard.is_whole:
-            positions = [update.T_map_sensor[:3, 3] for update in recording.replay(mapper)]
+            mapped = [stamped_pose(update) for update in recording.replay(mapper)]
         elif isinstance(recording, BagRecording):
-            start, positions = map_middle(recording, mapper, shard)
+            start, mapped = map_middle(recording, mapper, shard)
             first_ns, last_ns = recording.bounds_ns
             start_ns = first_ns if shard.start_ns is None else shard.start_ns
             recorded_s = ((shard.stop_ns or last_ns) - start_ns) / 1e9
@@ -217,7 +221,8 @@ def map_shard(shard: Shard, path: str) -> ShardResult:
         recorded_s=recorded_s,
         seconds=time.perf_counter() - began,
         core_s=time.process_time() - began_core,
-        positions=np.array(positions).reshape(-1, 3)[:: max(len(positions) // POSITIONS, 1)],
+        stamps_ns=np.array([stamp_ns for stamp_ns, _ in mapped], np.int64),
+        poses=np.array([pose for _, pose in mapped]).reshape(-1, 4, 4),
         peak_bytes=peak_bytes(),
     )
 
@@ -237,12 +242,12 @@ class ShardStart:
 
 def map_middle(
     recording: BagRecording, mapper: ShardMapper, shard: Shard
-) -> tuple[ShardStart, list[npt.NDArray[np.float64]]]:
-    """Map a shard after its lead; return the state at its start, and the positions."""
+) -> tuple[ShardStart, list[StampedPose]]:
+    """Map a shard after its lead; return the state at its start, and the poses of its scans."""
     reader, poses, clouds = recording.reader, recording.poses, set(recording.topics)
     if recording.config.input.kind == 'depth':
         raise BagError(f'{reader.path}: depth images are mapped by one process alone')
-    start, positions = ShardStart(), []
+    start, mapped = ShardStart(), []
     mapper.passes_over = shard.start_ns is not None
     for topic, place in poses.mounts.items():
         base = mapper.config.frames.base
@@ -255,12 +260,17 @@ def map_middle(
             add_poses(reader, mapper, message, poses)
         elif recording.span.holds(message.record_ns):
             add_cloud(reader, mapper, message, poses, 0)
-        positions += [update.T_map_sensor[:3, 3] for update in mapper.insert_ready()]
+        mapped += [stamped_pose(update) for update in mapper.insert_ready()]
     if mapper.passes_over:  # no message was recorded since
         start = ShardStart.of(mapper)
     if shard.stop_ns is None:
         mapper.finish()
-    return start, positions
+    return start, mapped
+
+
+def stamped_pose(update: Update) -> StampedPose:
+    """Return the stamp, ns, and T_map_sensor of a mapped scan."""
+    return update.stamp_ns, update.T_map_sensor
 
 
 def messages_of(recording: BagRecording, shard: Shard) -> Iterator[BagMessage]:

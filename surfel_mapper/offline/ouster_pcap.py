@@ -120,7 +120,7 @@ class OusterPcap:
 
 
 class Frames(NamedTuple):
-    """What both interfaces of ouster-sdk give of a capture."""
+    """Scans of a capture, by either interface of ouster-sdk."""
 
     num_lidars: int
     stamps_ns: list[int]

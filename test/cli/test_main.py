@@ -64,6 +64,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('fly',), "no verb 'fly'; verbs: node, replay"),
         (('replay', 'a', '--ouptut', 'b'), 'no option --ouptut, did you mean --output?'),
         (('replay', 'a', '--poses-from', 'identiy'), ', did you mean identity?'),
+        (('replay', 'a', '--seconds', '3'), 'error: no option --seconds\n'),
         (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
         (('info', 'a', 'b'), 'too many arguments: b'),
         (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),

@@ -20,7 +20,7 @@ from test.cluster.bags import written
 
 pytestmark = pytest.mark.usefixtures('undrawn')
 
-FILES = {'map', 'map.png', 'report.html', 'summary.json'}
+FILES = {'trajectory.tum', 'map', 'map.png', 'report.html', 'summary.json'}
 TF = ['--pose-topic', '/tf']
 
 
@@ -103,7 +103,7 @@ def test_ctrl_c_before_the_first_shard_is_done_leaves_the_earlier_map(
     assert before == {path: path.read_bytes() for path in tmp_path.rglob('*') if path.is_file()}
 
 
-def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys):
+def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys, caplog):
     pytest.importorskip('distributed', reason='dask is not installed (extra cluster)')
     arguments = ['replay', bags[0], '--workers', '2', '--output', str(tmp_path), '--json']
     assert main([*arguments, *TF]) == 0
@@ -113,6 +113,12 @@ def test_workers_make_the_map_of_one_process(bags, alone, tmp_path, capsys):
     assert summary['digest'] == summary_of(alone[0])['digest']
     assert summary['surfels'] == summary_of(alone[0])['surfels']
     assert summary['peak_memory_mb']['mapping'] > 50
+    poses, expected = ((output / 'trajectory.tum').read_text() for output in (tmp_path, alone[0]))
+    assert poses == expected
+
+    assert main(['merge', str(alone[0]), str(tmp_path), '--output', str(tmp_path / 'sum')]) == 0
+    number = summary['scans']['mapped']
+    assert f'{number} of its {number} scans have stamps of scans in {alone[0]}' in caplog.text
 
 
 def test_merging_finished_maps_is_mapping_them_together(alone, both, tmp_path, capsys):
