@@ -32,6 +32,7 @@ from surfel_mapper.files.parquet import (
     attributes_of,
     check_size,
     Columns,
+    encodings,
     fill,
     FOOTER_LIMITS,
     import_pyarrow,
@@ -310,7 +311,7 @@ def _write(
     table = arrow.table(columns)
     schema = table.schema.with_metadata({METADATA: json.dumps(attributes)})
     with parquet.ParquetWriter(
-        file, schema, compression=compression, use_dictionary=False, write_statistics=['i']
+        file, schema, compression=compression, write_statistics=['i'], **encodings(columns)
     ) as writer:
         for rows in groups:
             writer.write_table(table.take(rows), row_group_size=max(len(rows), 1))
