@@ -280,7 +280,7 @@ def started_mapper(config: Config) -> Mapper:
 
     mapper = Mapper(config)
     load_start(mapper)
-    mapper.warm_up()
+    mapper.warm_up(rare=False)
     return mapper
 
 

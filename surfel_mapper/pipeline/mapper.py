@@ -543,11 +543,20 @@ class Mapper:
         self._poses.reconfigure(config)
         self.config = config
 
-    def warm_up(self) -> None:
-        """Compile every kernel that mapping needs, for all types that scans may have."""
-        for steps in self.warm_up_steps():
-            for step in steps:
-                step()
+    def warm_up(self, *, rare: bool = True) -> None:
+        """
+        Compile the kernels that mapping needs.
+
+        Parameters
+        ----------
+        rare : bool
+            Include those for types that scans rarely have: points of the other precision, 65536
+            points in a voxel. They take 8 s; without, the scan that needs them compiles them.
+
+        """
+        first_scan, every_scan, others = self.warm_up_steps()
+        for step in (*first_scan, *every_scan, *(others if rare else ())):
+            step()
 
     def warm_up_steps(self) -> WarmUpSteps:
         """
