@@ -18,8 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import math
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -308,40 +306,3 @@ def _cross(a: npt.NDArray[np.float64], b: npt.NDArray[np.float64]) -> npt.NDArra
     """Return the cross product of two (3,) vectors; np.cross takes 20 times as long."""
     (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
-
-
-def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return values as float64; raise ValueError, with their name, if they are not numbers."""
-    try:
-        if np.iscomplexobj(values):
-            raise TypeError
-        with np.errstate(over='ignore'):  # wider floats become infinite
-            return np.asarray(values, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
-        raise ValueError(f'{name}: {shown}, expected numbers') from None
-
-
-def as_whole(name: str, value: object) -> int:
-    """Return a whole number of int64; TypeError for others, also bool, ValueError beyond it."""
-    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
-        shown = f'a {type(value).__name__}' if isinstance(value, np.ndarray) else repr(value)
-        raise TypeError(f'{name}: {shown}, expected a whole number')
-    if not -(2**63) <= value < 2**63:
-        bits = int(value).bit_length()
-        raise ValueError(f'{name}: a number of {bits} bits, expected at most 63 and a sign')
-    return int(value)
-
-
-def made_array(array: npt.NDArray[Any], dtype: Any, copy: bool | None) -> npt.NDArray[Any]:
-    """Return an array that was computed for np.asarray; raise ValueError if no copy may be."""
-    if copy is False:
-        raise ValueError('the array is computed, so that it cannot be had without a copy')
-    return array if dtype is None else array.astype(dtype)
-
-
-def as_path(path: object, name: str = 'path') -> Path:
-    """Return a path; raise TypeError, with its name, for anything but text and paths."""
-    if not isinstance(path, (str, Path)):
-        raise TypeError(f'{name}: {path!r:.60}, expected a str or Path')
-    return Path(path)

@@ -127,6 +127,10 @@ class Scan:
             raise TypeError(f'frame_id: {self.frame_id!r:.60}, expected the name of a frame')
         if points.dtype not in (np.float32, np.float64):
             raise ValueError(f'points: dtype {points.dtype}, expected float32 or float64')
+        for name, kind in (('times', PointTimes), ('depth', DepthImage)):
+            value = getattr(self, name)
+            if not isinstance(value, (kind, type(None))):
+                raise TypeError(f'{name}: a {type(value).__name__}, expected a {kind.__name__}')
         if self.depth is not None and self.depth.points is not points:
             object.__setattr__(self, 'depth', None)
         if getattr(self.columns, 'num_rows', None) == len(points):

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Numbers that no argument of the public functions can hold are refused as such.
+Numbers and objects that no argument of the public functions can hold are refused as such.
 
 Integers of Python have no limit: 2^70 fails in a kernel, and 2^1025 when it becomes a float, with
 an OverflowError or pages of compiler errors. Callers catch ValueError, TypeError and the errors of
@@ -10,15 +10,23 @@ this package.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from surfel_mapper import (
+    Config,
     diff,
     DistanceField,
     estimate_normals,
     MapMirror,
+    Mapper,
+    replay,
+    Scan,
     show,
+    SlidingWindow,
+    Surfel,
     SurfelMap,
     Trajectory,
 )
@@ -96,6 +104,54 @@ def test_hostile_arguments_are_refused_or_used(name):
         except (SurfelMapperError, ValueError, TypeError):
             refused += 1
     assert refused >= 8
+
+
+KINDS = {
+    'map': lambda v: Config(map=v),
+    'more': lambda v: Config(more=v),
+    'a': lambda v: Config.from_mapping(v),
+    'config': lambda v: DistanceField(v),
+    'blocks': lambda v: DistanceField(blocks=v),
+    'sensor': lambda v: DistanceField().add(POINTS, np.eye(4), sensor=v),
+    'camera': lambda v: DistanceField().add_depth(np.ones((4, 4)), v, np.eye(4)),
+    'path': lambda v: field().save(v),
+    'path ': lambda v: DistanceField.load(v, TsdfConfig()),
+    'config: ': lambda v: DistanceField.load('missing.npz', v),
+    'columns': lambda v: MapMirror(0.5, v),
+    'points': lambda v: MapMirror(0.5).replace(v),
+    'points: ': lambda v: MapMirror(0.5).change(v),
+    'scan': lambda v: Mapper().add_scan(v),
+    'image': lambda v: Mapper().add_image(v),
+    'region': lambda v: Mapper().clear_region(v),
+    'surfel_map': lambda v: Mapper().restore(v, []),
+    'scans': lambda v: Mapper().restore(SurfelMap(0.5), [v]),
+    'config ': lambda v: Mapper().reconfigure(v),
+    'times': lambda v: Scan(points=POINTS, stamp_ns=0, frame_id='a', times=v),
+    'depth': lambda v: Scan(points=POINTS, stamp_ns=0, frame_id='a', depth=v),
+    'surfel_map ': lambda v: SlidingWindow(v),
+    'config  ': lambda v: SlidingWindow(SurfelMap(0.5), v),
+    'scan ': lambda v: SlidingWindow(SurfelMap(0.5)).insert(v),
+    'scans ': lambda v: SlidingWindow(SurfelMap(0.5)).restore(v),
+    'scans  ': lambda v: SlidingWindow(SurfelMap(0.5)).move(v),
+    'columns ': lambda v: SurfelMap(0.5, columns=v),
+    'options': lambda v: replay('missing', options=v),
+    'progress': lambda v: replay('missing', progress=v),
+    'num_points': lambda v: Surfel.from_stats([0.0] * 3, [0.0] * 6, v),
+    ' ScanMoments': lambda v: SurfelMap(0.5).insert(v),
+    ' SurfelMap': lambda v: SurfelMap(0.5).merge(v),
+    'diff': lambda v: diff(v, SurfelMap(0.5)),
+    ' SurfelMap or Surfels': lambda v: show(v),
+}
+"""Calls with an argument of a class, by a name in the error."""
+
+
+@pytest.mark.parametrize('name', KINDS)
+def test_an_object_of_another_class_is_refused_by_name(name):
+    for value in (3.5, object(), SimpleNamespace()):
+        with pytest.raises((SurfelMapperError, TypeError, ValueError)) as refused:
+            KINDS[name](value)
+        assert name.strip(' :') in str(refused.value)
+        assert 'expected' in str(refused.value)
 
 
 def test_complex_numbers_are_refused():

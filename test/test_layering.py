@@ -23,7 +23,7 @@ PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
     {'budget', 'errors'},
-    {'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
+    {'arguments', 'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
     {'files', 'messages'},

@@ -94,6 +94,12 @@ class Config:
 
     def __post_init__(self) -> None:
         """Check the settings of no stage, and conditions on several stages."""
+        for each in dataclasses.fields(self):
+            kind, value = each.default_factory, getattr(self, each.name)
+            if isinstance(kind, type) and not isinstance(value, Mapping if kind is dict else kind):
+                raise ConfigError(
+                    f'{each.name}: a {type(value).__name__}, expected a {kind.__name__}'
+                )
         for declared in settings_of(type(self)):
             checked(declared.name, getattr(self, declared.key), declared)
         if self.deskew.enabled and self.pose.source == 'identity':

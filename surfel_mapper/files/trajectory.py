@@ -27,19 +27,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers, as_path, as_whole, made_array
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.text_table import plain, real
-from surfel_mapper.geometry import (
-    as_numbers,
-    as_path,
-    as_whole,
-    check_rigid,
-    made_array,
-    pose_matrix,
-    q_xyzw,
-)
+from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
 
 logger = logging.getLogger(__name__)
 

@@ -24,10 +24,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.columns import LazyColumns
-from surfel_mapper.geometry import as_numbers
 from surfel_mapper.kernels.selection import compact
 from surfel_mapper.scan import Scan
 

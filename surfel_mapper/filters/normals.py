@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.filters.base import as_scan
 from surfel_mapper.filters.columns import NORMALS
 from surfel_mapper.filters.shapes import SurfaceNormal
-from surfel_mapper.geometry import as_numbers
 
 
 def estimate_normals(

@@ -35,8 +35,9 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
         If a map cannot sum a column.
 
     """
-    unknown = [name for name in columns if name not in CHANNELS]
-    if unknown:
+    is_several = isinstance(columns, (tuple, list))
+    unknown = [name for name in columns if name not in CHANNELS] if is_several else columns
+    if unknown or not is_several:
         raise ValueError(f'columns: {unknown}, expected some of {list(CHANNELS)}')
     return tuple(channel for name in columns for channel in CHANNELS[name])
 

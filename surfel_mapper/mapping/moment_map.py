@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers, as_whole
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
-from surfel_mapper.geometry import as_numbers, as_whole
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
 from surfel_mapper.mapping.moments import (

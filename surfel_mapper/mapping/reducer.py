@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.geometry import as_numbers, check_rigid
+from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.grouping import build_table, CHUNK
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised

@@ -12,12 +12,12 @@ were removed.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-import operator
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_whole
 from surfel_mapper.mapping.point_sums import COLUMNS, NO_POINTS, PointSums, ROUNDING, ROWS
 
 Array = npt.NDArray[np.float64]
@@ -93,7 +93,7 @@ class Surfel:
             beyond 2^53.
 
         """
-        count = operator.index(num_points)
+        count = as_whole('num_points', num_points)
         if not 0 <= count <= MAX_POINTS:
             raise ValueError(f'num_points: {count}, expected 0 to {MAX_POINTS}')
         limit = MAX_COORDINATE_M * max(count, 1)

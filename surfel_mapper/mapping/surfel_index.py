@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.geometry import as_numbers
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.kernels.grouping import build_table
 from surfel_mapper.kernels.layout import BITS
 from surfel_mapper.mapping.kernels.queries import best_around, rows_at

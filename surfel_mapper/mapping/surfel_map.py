@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers, as_path, as_whole
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.geometry import as_numbers, as_path, as_whole
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
 from surfel_mapper.mapping.coarsening import coarse_moments

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import made_array
 from surfel_mapper.errors import DependencyError
-from surfel_mapper.geometry import made_array
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
 from surfel_mapper.threads import share
 

@@ -12,14 +12,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import check_kind
 from surfel_mapper.config import WindowConfig
-from surfel_mapper.errors import MapError
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
 
@@ -112,13 +113,9 @@ class SlidingWindow:
         *,
         max_voxels: int = 0,
     ) -> None:
-        if not isinstance(surfel_map, SurfelMap):
-            raise TypeError(f'a {type(surfel_map).__name__}, expected the SurfelMap of the window')
-        if not isinstance(config, (WindowConfig, type(None))):
-            raise TypeError(
-                f'config: a {type(config).__name__}, expected a WindowConfig: '
-                'WindowConfig(max_scans=100)'
-            )
+        check_kind('surfel_map', surfel_map, SurfelMap)
+        if config is not None:
+            check_kind('config', config, WindowConfig, hint='WindowConfig(max_scans=100)')
         self.config = config or WindowConfig()
         self.max_voxels = max_voxels
         self.max_total_bytes = 0
@@ -172,6 +169,7 @@ class SlidingWindow:
             If the map refuses the scan; nothing is changed.
 
         """
+        check_kind('scan', scan, WindowedScan)
         self._map.insert(scan.moments)
         self._append(scan)
         evicted = []
@@ -194,7 +192,7 @@ class SlidingWindow:
         """
         if self._scans:
             raise ValueError(f'{len(self._scans)} scans in the window, expected none')
-        for scan in scans:
+        for scan in checked_scans(scans):
             self._append(scan)
 
     def drop_voxels(
@@ -251,20 +249,18 @@ class SlidingWindow:
             If the map refuses a scan; nothing is changed.
 
         """
+        check_kind('scans', scans, Mapping)
+        checked_scans(scans.values())
         old = list(self)
         left = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])
         full = self._full(left, min_points)
-        done: list[int] = []
-        try:
+        with ExitStack() as undo:
             for place, scan in scans.items():
                 self._map.insert(scan.moments)
+                undo.callback(self._map.remove, scan.moments)
                 self._map.remove(old[place].moments)
-                done.append(place)
-        except MapError:
-            for place in done:
-                self._map.insert(old[place].moments)
-                self._map.remove(scans[place].moments)
-            raise
+                undo.callback(self._map.insert, old[place].moments)
+            undo.pop_all()
         travelled_m = self._scans[0][1] if self._scans else 0.0
         self._scans.clear()
         self._nbytes, self._travelled_m = 0, travelled_m
@@ -320,6 +316,15 @@ class SlidingWindow:
         }
         reached = (name for name, (value, limit) in limits.items() if 0 < limit < value)
         return next(reached, '')
+
+
+def checked_scans(scans: Iterable[WindowedScan]) -> list[WindowedScan]:
+    """Return scans as a list; raise TypeError for others."""
+    check_kind('scans', scans, Iterable)
+    found = list(scans)
+    for scan in found:
+        check_kind('scans', scan, WindowedScan)
+    return found
 
 
 def without(scan: WindowedScan, keys: npt.NDArray[np.int64]) -> WindowedScan:

@@ -104,6 +104,8 @@ def to_scan(msg: Any, topic: str = 'points') -> Scan:
         invalid.
 
     """
+    if not hasattr(msg, 'header'):
+        raise CloudFormatError(f'{topic}: a {type(msg).__name__}, expected a PointCloud2')
     stamp_ns = checked_stamp_ns(msg.header.stamp, topic)
     frame_id = frame_name(msg.header.frame_id)
     data = checked_data(msg, topic)

@@ -22,6 +22,7 @@ from pathlib import Path
 import time
 from typing import Any, TYPE_CHECKING
 
+from surfel_mapper.arguments import as_path, check_kind
 from surfel_mapper.errors import (
     BagError,
     ConfigError,
@@ -29,7 +30,6 @@ from surfel_mapper.errors import (
     SurfelMapperError,
 )
 from surfel_mapper.files.atomic import make_directory
-from surfel_mapper.geometry import as_path
 from surfel_mapper.offline.summary import causes_text
 
 if TYPE_CHECKING:
@@ -173,6 +173,8 @@ def replay(
     from surfel_mapper.offline.request import Request
     from surfel_mapper.viz.history import History
 
+    check_kind('options', options or ReplayOptions(), ReplayOptions)
+    check_kind('progress', progress, Callable)  # type: ignore[arg-type]
     options = options or ReplayOptions()
     request = path if isinstance(path, Request) else Request(path=as_path(path))
     settings = configured(config, options)

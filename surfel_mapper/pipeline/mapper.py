@@ -25,6 +25,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import check_kind
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
@@ -34,7 +35,7 @@ from surfel_mapper.layers import names as layer_names
 from surfel_mapper.mapping.channels import missing_columns
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.mapping.window import WindowedScan
+from surfel_mapper.mapping.window import checked_scans, WindowedScan
 from surfel_mapper.pipeline import regions
 from surfel_mapper.pipeline.drops import described, Drops, INTERNAL
 from surfel_mapper.pipeline.inserter import Inserter, map_frame
@@ -191,11 +192,7 @@ class Mapper:
         ``input.reset_after_s`` clears the map, if the next message agrees; else the scan is
         dropped. The topic is for the log. Raises TypeError for anything but a Scan.
         """
-        if not isinstance(scan, Scan):
-            raise TypeError(
-                f'a {type(scan).__name__}, expected a Scan: Scan(points=..., stamp_ns=..., '
-                'frame_id=...)'
-            )
+        check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
         self.counters.received += 1
         if topic:
             self._drops.name_topic(scan.frame_id, topic)
@@ -279,6 +276,7 @@ class Mapper:
 
     def add_image(self, image: SceneImage) -> None:
         """Add an image that gives scans colours or labels; see layers.tsdf.color_topic."""
+        check_kind('image', image, SceneImage)
         if self._inserter.images is not None:
             self._inserter.images.add(image)
 
@@ -496,6 +494,7 @@ class Mapper:
             Indices of the surfels (``map.min_points``) that were removed.
 
         """
+        check_kind('region', region, Region)
         voxel_index = self.map.moments().voxel_index
         centers = (voxel_index.astype(np.float64) + 0.5) * self.map.voxel_size_m
         inside = voxel_index[region.contains(centers)]
@@ -512,6 +511,8 @@ class Mapper:
             If it has another voxel size, level, origin or other columns. Nothing has changed then.
 
         """
+        check_kind('surfel_map', surfel_map, SurfelMap)
+        scans = checked_scans(scans)
         for name in ('voxel_size_m', 'level', 'columns'):
             found, expected = getattr(surfel_map, name), getattr(self.map, name)
             if found != expected:
@@ -533,6 +534,7 @@ class Mapper:
             that holds no chain. Nothing has changed then.
 
         """
+        check_kind('config', config, Config)
         old, new = self.config.to_mapping(), config.to_mapping()
         for declared in declarations():
             if not declared.live and old[declared.name] != new[declared.name]:

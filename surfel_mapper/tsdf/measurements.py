@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.errors import PoseError
-from surfel_mapper.geometry import as_numbers
 from surfel_mapper.tsdf.kernels import lookup as kernels
 
 logger = logging.getLogger(__name__)

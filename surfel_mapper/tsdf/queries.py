@@ -15,7 +15,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.geometry import as_numbers
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.kernels import queries as kernels
 

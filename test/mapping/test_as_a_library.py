@@ -268,7 +268,7 @@ MISTAKES = {
     'a length for the map of a window': (
         lambda _: SlidingWindow(10),
         TypeError,
-        'a int, expected the SurfelMap',
+        'surfel_map: a int, expected a SurfelMap',
     ),
     'a length for the settings of a window': (
         lambda m: SlidingWindow(m, 10),

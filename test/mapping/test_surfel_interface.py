@@ -200,7 +200,7 @@ def test_invalid_positions_are_refused(arguments, named):
 
 
 def test_a_number_of_points_that_is_no_whole_number_is_refused():
-    with pytest.raises(TypeError, match='integer'):
+    with pytest.raises(TypeError, match='expected a whole number'):
         Surfel.from_stats(np.zeros(3), np.zeros(6), 3.0)
 
 

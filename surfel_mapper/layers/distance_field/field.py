@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_path, as_whole, check_kind
 from surfel_mapper.config import TsdfConfig
 from surfel_mapper.files.tsdf_state import load_tsdf, save_tsdf
-from surfel_mapper.geometry import as_whole
 from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, ObstacleDistances
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
@@ -27,7 +27,7 @@ from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample, states
 from surfel_mapper.tsdf.range_image import from_depth, from_points
-from surfel_mapper.tsdf.sensors import CameraModel, Sensor
+from surfel_mapper.tsdf.sensors import CameraModel, LidarModel, Sensor
 
 
 class DistanceField:
@@ -53,11 +53,10 @@ class DistanceField:
     def __init__(
         self, config: TsdfConfig | None = None, *, blocks: BlockMap | None = None
     ) -> None:
-        if not isinstance(config, (TsdfConfig, type(None))):
-            raise TypeError(
-                f'config: a {type(config).__name__}, expected a TsdfConfig: '
-                'TsdfConfig(voxel_size_m=0.1)'
-            )
+        if config is not None:
+            check_kind('config', config, TsdfConfig, hint='TsdfConfig(voxel_size_m=0.1)')
+        if blocks is not None:
+            check_kind('blocks', blocks, BlockMap)
         self.blocks = BlockMap(config or TsdfConfig()) if blocks is None else blocks
         self.config = self.blocks.config
         self._mesher = Mesher(self.blocks)
@@ -107,6 +106,7 @@ class DistanceField:
             return by_points.integrate(
                 points, T_map_sensor, as_whole('stamp_ns', stamp_ns), colors=colors, labels=labels
             )
+        check_kind('sensor', sensor, LidarModel, CameraModel)
         image = from_points(sensor, points, colors=colors, labels=labels)
         return Integrator(self.blocks).integrate(
             image, T_map_sensor, as_whole('stamp_ns', stamp_ns)
@@ -146,6 +146,7 @@ class DistanceField:
             As add.
 
         """
+        check_kind('camera', camera, CameraModel)
         image = from_depth(camera, depth).with_images(color=color, label=label)
         return Integrator(self.blocks).integrate(
             image, T_map_camera, as_whole('stamp_ns', stamp_ns)
@@ -232,7 +233,7 @@ class DistanceField:
             If the file cannot be written.
 
         """
-        save_tsdf(path, self.blocks, compress=compress)
+        save_tsdf(as_path(path), self.blocks, compress=compress)
 
     @classmethod
     def load(cls, path: str | Path, config: TsdfConfig) -> DistanceField:
@@ -248,4 +249,5 @@ class DistanceField:
             If it does not fit into max_blocks.
 
         """
-        return cls(blocks=load_tsdf(path, config))
+        check_kind('config', config, TsdfConfig, hint='TsdfConfig(voxel_size_m=0.1)')
+        return cls(blocks=load_tsdf(as_path(path), config))

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import distance_transform_edt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.errors import MapLimitError
-from surfel_mapper.geometry import as_numbers
 from surfel_mapper.layers.costs.traversability import CostGrid, OBSTACLE
 from surfel_mapper.layers.costs.traversability import UNKNOWN as UNSEEN
 from surfel_mapper.tsdf.blocks import BlockMap

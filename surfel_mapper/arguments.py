@@ -1,0 +1,79 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Checks of the arguments of public functions; errors name argument, value and expectation.
+
+Callers catch ValueError, TypeError and the errors of this package; NumPy, kernels and missing
+attributes raise others, or name variables that the caller does not know.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+
+def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
+    """Return values as float64; raise ValueError, with their name, if they are not numbers."""
+    try:
+        if np.iscomplexobj(values):
+            raise TypeError
+        with np.errstate(over='ignore'):  # wider floats become infinite
+            return np.asarray(values, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
+        raise ValueError(f'{name}: {shown}, expected numbers') from None
+
+
+def as_whole(name: str, value: object) -> int:
+    """Return a whole number of int64; TypeError for others, also bool, ValueError beyond it."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, np.integer)):
+        shown = f'a {type(value).__name__}' if isinstance(value, np.ndarray) else repr(value)
+        raise TypeError(f'{name}: {shown}, expected a whole number')
+    if not -(2**63) <= value < 2**63:
+        bits = int(value).bit_length()
+        raise ValueError(f'{name}: a number of {bits} bits, expected at most 63 and a sign')
+    return int(value)
+
+
+def made_array(array: npt.NDArray[Any], dtype: Any, copy: bool | None) -> npt.NDArray[Any]:
+    """Return an array that was computed for np.asarray; raise ValueError if no copy may be."""
+    if copy is False:
+        raise ValueError('the array is computed, so that it cannot be had without a copy')
+    return array if dtype is None else array.astype(dtype)
+
+
+def as_path(path: object, name: str = 'path') -> Path:
+    """Return a path; raise TypeError, with its name, for anything but text and paths."""
+    if not isinstance(path, (str, Path)):
+        raise TypeError(f'{name}: {path!r:.60}, expected a str or Path')
+    return Path(path)
+
+
+def check_kind(name: str, value: object, *kinds: type, hint: str = '') -> None:
+    """
+    Raise TypeError unless a value is an instance of a class: one sentence with name and classes.
+
+    Without it the first attribute that is missing would be named, in a module that the caller
+    does not know.
+
+    Parameters
+    ----------
+    name : str
+        Name of the argument.
+    value : object
+        The argument.
+    kinds : type
+        The classes that are allowed.
+    hint : str
+        How to make one.
+
+    """
+    if not isinstance(value, kinds):
+        names = ' or '.join(kind.__name__ for kind in kinds)
+        raise TypeError(
+            f'{name}: a {type(value).__name__}, expected a {names}{": " if hint else ""}{hint}'
+        )
