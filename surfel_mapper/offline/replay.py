@@ -361,23 +361,28 @@ def shown(viewer: Viewer, path: Path | None) -> Iterator[Callable[[Update], None
     A viewer is another program that may be closed, and rerun raises errors of many types.
     """
     name = 'the viewer' if path is None else str(path)
-    has_failed = False
+    failed: BaseException | None = None
 
     def add(update: Update) -> None:
-        nonlocal has_failed
-        if has_failed:
+        nonlocal failed
+        if failed is not None:
             return
         try:
             viewer.add(update)
         except Exception as error:
-            has_failed = True
+            failed = error
             _log.warning('%s has failed, the replay goes on without it: %s', name, error)
 
-    yield add
     try:
-        viewer.__exit__(None if not has_failed else Exception, None, None)
-    except Exception as error:
-        _log.warning('%s could not be closed: %s', name, error)
+        yield add
+    except BaseException as error:
+        failed = error
+        raise
+    finally:
+        try:
+            viewer.__exit__(failed and type(failed), failed, None)
+        except Exception as error:
+            _log.warning('%s could not be closed: %s', name, error)
 
 
 def normals_bag(directory: Path, mapper: Mapper, files: ExitStack) -> NormalsBag:

@@ -21,6 +21,8 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.errors import escaped
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -126,7 +128,12 @@ def histogram(values: Array, low: float, high: float, x_label: str, y_label: str
     with _axes(HEIGHT, with_numbers=True) as (figure, axes):
         # two thirds of the time of as many single bars
         axes.add_collection(PolyCollection(bars, color=BAR, linewidth=0.0))
-        axes.set(xlim=(low, high), ylim=(0.0, 1.05 * counts.max()), xlabel=x_label, ylabel=y_label)
+        axes.set(
+            xlim=(low, high),
+            ylim=(0.0, 1.05 * counts.max()),
+            xlabel=x_label,
+            ylabel=y_label,
+        )
         _label_numbers(axes)
         return _svg(figure, f'{y_label} by {x_label}')
 
@@ -139,7 +146,7 @@ def named_bars(counts: Mapping[str, int]) -> str:
         rows = np.arange(len(counts))
         bars = axes.barh(rows, list(counts.values()), 0.65, color=BAR)
         axes.bar_label(bars, labels=[f'{count:,}' for count in counts.values()], padding=4)
-        axes.set_yticks(rows, [*counts])
+        axes.set_yticks(rows, [escaped(name) for name in counts])
         axes.set_ylim(len(counts) - 0.5, -0.5)
         axes.set_xlim(0.0, 1.15 * max(*counts.values(), 1))
         axes.set_axisbelow(True)
@@ -199,8 +206,8 @@ def _axes(height: float, *, with_numbers: bool = False) -> Iterator[tuple[Figure
 
 
 def _visible(name: str) -> str:
-    """Return a name that the legend shows; matplotlib hides those that begin with _."""
-    return f'\u200b{name}' if name.startswith('_') else name
+    """Return a name as text that is drawn; matplotlib hides those that begin with _."""
+    return f'\u200b{escaped(name)}' if name.startswith('_') else escaped(name)
 
 
 def _label_numbers(axes: Axes) -> None:
@@ -221,5 +228,5 @@ def _svg(figure: Figure, about: str) -> str:
         text = re.sub(pattern, '', text)
     for color, variable in VARIABLES.items():
         text = text.replace(color, variable)
-    label = escape(about, quote=True)
+    label = escape(escaped(about), quote=True)
     return text.replace('<svg', f'<svg role="img" aria-label="{label}"', 1)

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.errors import FileFormatError
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
 from surfel_mapper.viz.mesh import vertex_normals
+from surfel_mapper.viz.recording_file import RecordingFile
 from surfel_mapper.viz.server import (
     end_group,
     free_port,
@@ -65,13 +65,22 @@ class Scene:
         The server of the page, which ends with the scene.
     window : str, optional
         Address of the window, which can be asked for the place that it looks at.
+    file : RecordingFile, optional
+        The file that is written, which gets its name with the end of the scene.
 
     """
 
     def __init__(
-        self, stream: Any, address: str = '', server: Server | None = None, window: str = ''
+        self,
+        stream: Any,
+        address: str = '',
+        server: Server | None = None,
+        *,
+        window: str = '',
+        file: RecordingFile | None = None,
     ) -> None:
         self.address = address
+        self._file = file
         self.window = window
         self.colouring = Colouring()
         self.origin_m: Array = np.zeros(3)
@@ -84,10 +93,10 @@ class Scene:
     def to_file(cls, path: str | Path) -> Scene:
         """Write to an .rrd file; raises FileFormatError if that is not possible."""
         rerun = import_rerun()
-        check_writable(Path(path))
+        file = RecordingFile(path)
         stream = rerun.RecordingStream('surfel_mapper')
-        stream.save(str(path))
-        return cls(stream)
+        stream.save(file.pipe)
+        return cls(stream, file=file)
 
     @classmethod
     def to_window(cls, port: int | None = None) -> Scene:
@@ -133,13 +142,18 @@ class Scene:
         """Return the scene, which closes at the end of the block."""
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Send what is left and close; the page in a browser ends."""
+    def __exit__(
+        self, kind: object = None, error: BaseException | None = None, _: object = None
+    ) -> None:
+        """Send what is left and close; the page in a browser ends, a file gets its name."""
         with suppress(Exception):  # a window that was closed is no error
-            self.flush()
+            self._stream.flush()
+        with suppress(Exception):
             self._stream.disconnect()
         if self._server is not None:
             end_group(self._server)
+        if self._file is not None:
+            self._file.close(error)
 
     @property
     def is_watched(self) -> bool:
@@ -156,8 +170,10 @@ class Scene:
         return self._server is not None and self._server.poll() is not None
 
     def flush(self) -> None:
-        """Send everything logged so far."""
+        """Send everything logged so far; raises FileFormatError if a file cannot be written."""
         self._stream.flush()
+        if self._file is not None:
+            self._file.check()
 
     def set_stamp(self, stamp_ns: int) -> None:
         """Put what is logged from now on at a time of the time line ``stamp``."""
@@ -290,12 +306,3 @@ class Scene:
     def values(self, path: str, values: Mapping[str, Any]) -> None:
         """Attach values to a path, shown when it is selected."""
         self._stream.log(path, self._rerun.AnyValues(**values), static=True)
-
-
-def check_writable(path: Path) -> None:
-    """Raise FileFormatError for a file that cannot be written; rerun would only log it."""
-    try:
-        with open(path, 'wb'):
-            pass
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be written: {error.strerror}') from error

@@ -108,11 +108,16 @@ class Viewer:
         """Return the viewer, which closes at the end of the block."""
         return self
 
-    def __exit__(self, kind: object, *_: object) -> None:
-        """Log the final map and close."""
-        if kind is None:
-            self.finish()
-        self._scene.__exit__()
+    def __exit__(self, kind: object, error: BaseException | None, _: object) -> None:
+        """Log the final map and close; a file that is incomplete is removed."""
+        try:
+            if kind is None:
+                self.finish()
+        except BaseException as failed:
+            error = failed
+            raise
+        finally:
+            self._scene.__exit__(None, error)
 
     def finish(self) -> None:
         """Show the whole map once more."""

@@ -119,6 +119,13 @@ def test_text_is_escaped_everywhere():
         assert NASTY in ''.join(ElementTree.fromstring(svg).itertext())
 
 
+def test_names_that_are_no_text_are_escaped():
+    """Surrogates come from names of files that are not UTF-8; they ended the report."""
+    one, name = np.ones(3), 'a\ud800\x00\n'
+    for svg in lines(np.arange(3.0), {name: one}, 'x', 'y'), named_bars({name: 1}):
+        assert r'a\ud800\x00\n' in ''.join(ElementTree.fromstring(svg).itertext())
+
+
 def test_a_long_line_is_thinned_to_medians():
     x, y = thinned(np.arange(10_000.0), np.tile([1.0, 1.0, 9.0], 3334)[:10_000])
     assert len(x) == len(y) == POINTS

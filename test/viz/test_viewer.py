@@ -16,6 +16,7 @@ import pytest
 from surfel_mapper.cli.main import main
 from surfel_mapper.config import Config
 from surfel_mapper.errors import FileFormatError
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.scan import Scan
 from surfel_mapper.viz import scene
@@ -125,3 +126,55 @@ def addresses(port):
                 ipv4 = bytes.fromhex(address)[::-1] if name == 'tcp' else None
                 found.add('::' if ipv4 is None else socket.inet_ntoa(ipv4))
     return found
+
+
+FULL = """
+import resource, sys
+from surfel_mapper.cli.main import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='limits the size of files')
+def test_a_recording_for_which_there_is_no_room_is_a_sentence(tmp_path):
+    """It was a traceback."""
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.random.default_rng(0).uniform(-20.0, 20.0, (30_000, 3)))
+    surfel_map.save(tmp_path / 'map.npz')
+    arguments = ['view', tmp_path / 'map.npz', '--rrd', tmp_path / 'map.rrd']
+    done = subprocess.run(
+        [sys.executable, '-c', FULL, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert 'map.rrd: cannot be written: ' in done.stderr
+    assert 'Traceback' not in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ['map.npz']
+
+
+def test_a_recording_is_not_written_to_a_pipe(tmp_path):
+    """Without a reader it blocked for ever."""
+    os.mkfifo(tmp_path / 'pipe')
+    with pytest.raises(FileFormatError, match='not a regular file'):
+        scene.Scene.to_file(tmp_path / 'pipe')
+
+
+def test_a_recording_has_any_name_and_replaces_another_as_a_whole(tmp_path):
+    """Rerun takes no names that are not UTF-8, and overwrote a file at once."""
+    path = tmp_path / os.fsdecode(b'a\xff.rrd')
+    path.write_bytes(b'before')
+    shown = scene.Scene.to_file(path)
+    shown.points('map', np.zeros((10, 3)), 0.1)
+    shown.__exit__(KeyError, KeyError())
+    assert [*tmp_path.iterdir()] == [path]
+    assert path.read_bytes() == b'before'
+    with scene.Scene.to_file(path) as shown:
+        shown.points('map', np.zeros((10, 3)), 0.1)
+        assert path.read_bytes() == b'before'
+    assert [*tmp_path.iterdir()] == [path]
+    path.rename(tmp_path / 'a.rrd')
+    done = rerun('verify', tmp_path / 'a.rrd')
+    assert done.returncode == 0, done.stderr
