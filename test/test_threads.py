@@ -6,6 +6,8 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 import os
+from pathlib import Path
+import subprocess
 import sys
 import threading
 
@@ -13,7 +15,9 @@ import numpy as np
 import pytest
 
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.threads import BACKGROUND_NICE, split, yield_to_others
+from surfel_mapper.threads import BACKGROUND_NICE, real_time_threads, split, yield_to_others
+
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.mark.parametrize('threads', [2, 3])
@@ -53,3 +57,41 @@ def test_background_thread_has_a_lower_priority_than_the_others():
 
     with ThreadPoolExecutor(1, initializer=yield_to_others) as background:
         assert background.submit(nice).result() == min(nice() + BACKGROUND_NICE, 19)
+
+
+def policies():
+    """Return the scheduling of a thread started in the with-block, and of the caller after it."""
+    found = []
+    with real_time_threads():
+        thread = threading.Thread(target=lambda: found.append(os.sched_getscheduler(0)))
+        thread.start()
+        thread.join()
+    return [*found, os.sched_getscheduler(0)]
+
+
+def may_run_in_real_time():
+    """Return whether the system permits this process real-time priority."""
+    test = 'import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))'
+    command = [sys.executable, '-c', test]
+    return not subprocess.run(command, stderr=subprocess.DEVNULL).returncode
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
+def test_threads_get_real_time_priority_if_permitted_and_their_starter_loses_it():
+    expected = os.SCHED_RR if may_run_in_real_time() else os.SCHED_OTHER
+    assert policies() == [expected, os.SCHED_OTHER]
+
+
+WITHOUT_PERMISSION = """
+import os, resource
+from test.test_threads import policies
+resource.setrlimit(resource.RLIMIT_RTPRIO, (0, 0))
+if os.getuid() == 0:
+    os.setuid(65_534)
+assert policies() == [os.SCHED_OTHER, os.SCHED_OTHER]
+"""
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
+def test_threads_stay_ordinary_without_permission():
+    subprocess.run([sys.executable, '-c', WITHOUT_PERMISSION], cwd=ROOT, check=True)

@@ -7,8 +7,8 @@ Signals are handled by us, not by rclpy: rclpy would shut its context down at on
 nothing can be published or sent to /rosout.
 
 By default Fast DDS has half a megabyte of shared memory, and sends larger messages in fragments
-over UDP: of best-effort clouds of 4 MiB at most 3 % arrived, with the profile beside this file
-all. The profile matters to the process that publishes.
+that overwrite each other if they are not taken at once: of best-effort clouds of 4 MiB at most 3 %
+arrived, with the profile beside this file all. The profile matters to the process that publishes.
 """
 
 from __future__ import annotations

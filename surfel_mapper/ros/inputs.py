@@ -169,15 +169,17 @@ class Inputs:
         )
         if 0 < size <= LARGE_BYTES:
             return f'{text}: they arrive faster than they are taken; is the machine overloaded?'
+        remedy = f'put in front of its command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
         if senders and not weak:
+            if self.reliabilities().get(topic) == 'best effort':
+                return f'{text}: their publisher is reliable, but qos_overrides says best_effort'
             return (
-                f'{text}: their publisher is reliable; does qos_overrides say best_effort, or is '
-                'the machine overloaded?'
+                f'{text}: their publisher is reliable, but Fast DDS repeats parts of messages '
+                f'above 0.5 MB, at times too late. If this goes on, {remedy}'
             )
         return (
             f'{text}: {", ".join(weak) or "their publisher"} publishes best effort, and Fast DDS '
-            'loses such messages above 0.5 MB. Make it publish reliable, or put in front of its '
-            f'command: FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}'
+            f'loses such messages above 0.5 MB. Make it publish reliable, or {remedy}'
         )
 
     @property

@@ -22,6 +22,7 @@ from surfel_mapper.memory import keep_freed_memory, share_freed_memory
 from surfel_mapper.ros.context import context, explain, logging_to
 from surfel_mapper.ros.main_thread import Signals
 from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.threads import real_time_threads
 
 
 def run_node(ros_args: Sequence[str], signals: Signals) -> None:
@@ -53,9 +54,14 @@ def run_node(ros_args: Sequence[str], signals: Signals) -> None:
 
 
 def create_node() -> MapperNode:
-    """Create the node; this is where a middleware that cannot enforce security refuses."""
+    """
+    Create the node; the middleware starts its threads, and refuses here if it lacks security.
+
+    Its threads come before all others, so that they receive clouds while scans are mapped.
+    """
     try:
-        return MapperNode()
+        with real_time_threads():
+            return MapperNode()
     except rclpy_implementation.RCLError as error:
         raise ConfigError(f'ROS cannot make the node: {explain(error)}') from error
 

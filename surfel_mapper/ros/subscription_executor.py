@@ -12,7 +12,7 @@ executor.
 
 A subscription is reliable while all publishers of its topic are, and best effort as soon as one is
 not, since a reliable subscription receives nothing from that one. Messages above 0.5 MB need a
-reliable subscription: Fast DDS sends them in UDP fragments, and of the best-effort ones most are
+reliable subscription: Fast DDS sends them in fragments, and of the best-effort ones most are
 lost. The middleware reports publishers that come and go; the subscription is then created again,
 and the earlier one kept until the new one is connected.
 

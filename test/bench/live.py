@@ -64,7 +64,7 @@ def run(options: Options) -> list[Row]:
     rows: list[Row] = []
     with street_over_dds(options) as street:
         if street:
-            rows += transport(options, min(scale, 1.0))
+            rows += transport(options, SECONDS * min(scale, 1.0))
             for size_m in options.voxel_sizes_m:
                 rows += rates(options, street, size_m, scale)
     return rows
@@ -161,7 +161,7 @@ def latencies(stamps: Sequence[int], arrivals: Mapping[int, int]) -> dict[str, A
     }
 
 
-def transport(options: Options, scale: float) -> Iterator[Row]:
+def transport(options: Options, seconds: float) -> Iterator[Row]:
     """Yield the latencies of a subscriber that only takes the clouds, without a node."""
     from nav_msgs.msg import Odometry
     from sensor_msgs.msg import PointCloud2
@@ -176,7 +176,7 @@ def transport(options: Options, scale: float) -> Iterator[Row]:
         with spinning() as (node, listen_until):
             node.create_subscription(PointCloud2, 'points', on_cloud, 20, raw=True)
             node.create_subscription(Odometry, 'odom', lambda _: None, 1000, raw=True)
-            num = round(RATE_HZ * SECONDS * scale)
+            num = round(RATE_HZ * seconds)
             stamps = publish(options, listen_until, RATE_HZ, num, profile=profile)
         yield {'what': what, 'rate_hz': RATE_HZ, **latencies(stamps, arrivals)}
 

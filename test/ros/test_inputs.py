@@ -232,7 +232,7 @@ def test_the_most_silent_of_several_lidars_is_found():
     assert inputs.most_silent[0] == '/front'
 
 
-def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT):
+def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT, reads='reliable'):
     """Return the report about five lost clouds of a size from a publisher of a reliability."""
     publisher = SimpleNamespace(
         node_namespace='/robot',
@@ -240,6 +240,7 @@ def loss(size, reliability=ReliabilityPolicy.BEST_EFFORT):
         qos_profile=QoSProfile(depth=1, reliability=reliability),
     )
     inputs = inputs_of(Config.from_mapping(SETTINGS), [publisher])
+    inputs._subscriptions.reliabilities = lambda: {'/points': reads}
     inputs._on_cloud('/points', bytes(size))
     inputs._on_lost('/points', 5)
     assert inputs.clouds_lost == 5
@@ -277,6 +278,13 @@ def test_the_remedy_for_lost_clouds_depends_on_their_size():
     for size in (0, 4_000_000):
         assert '/robot/lidar publishes best effort' in loss(size)
         assert loss(size).endswith(remedy)
-    for other in (loss(10_000), loss(4_000_000, ReliabilityPolicy.RELIABLE)):
-        assert 'overloaded' in other
-        assert remedy not in other
+    assert 'overloaded' in loss(10_000)
+    assert remedy not in loss(10_000)
+    reliable = loss(4_000_000, ReliabilityPolicy.RELIABLE)
+    assert 'their publisher is reliable' in reliable
+    assert reliable.endswith(remedy)
+
+
+def test_an_override_that_loses_large_clouds_is_named():
+    said = loss(4_000_000, ReliabilityPolicy.RELIABLE, reads='best effort')
+    assert said.endswith('their publisher is reliable, but qos_overrides says best_effort')

@@ -4,6 +4,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+import sys
 import threading
 
 import numpy as np
@@ -20,10 +23,11 @@ from surfel_mapper.messages.pointcloud2 import to_scan
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.ros.context import context
-from surfel_mapper.ros.main import executing
+from surfel_mapper.ros.main import create_node, executing
 from surfel_mapper.ros.node import MapperNode
 from test.ros.driving import ARGUMENTS, arguments, drive, mapped, send
 from test.ros.live import LATCHED, NODE
+from test.test_threads import may_run_in_real_time
 
 MANY = QoSProfile(depth=200, durability=DurabilityPolicy.VOLATILE)
 
@@ -74,3 +78,26 @@ def test_with_cached_kernels_the_first_scan_is_published(start, peer):
     peer.spin_until(lambda: len(changed) == 2)
     updates, _ = mapped(messages)
     assert [each.width for each in changed] == [len(update.changed) for update in updates]
+
+
+def threads_of_fast_dds():
+    """Return the threads of this process that Fast DDS has started, by their names."""
+    tasks = Path('/proc/self/task').iterdir()
+    return {int(task.name) for task in tasks if (task / 'comm').read_text().startswith('dds.')}
+
+
+@pytest.mark.skipif(sys.platform != 'linux', reason='threads have no priority of their own')
+def test_fast_dds_runs_in_real_time_if_permitted_and_the_mapper_does_not(prefork):
+    before = threads_of_fast_dds()
+    with context(ARGUMENTS[ARGUMENTS.index('--ros-args') :]):
+        node = create_node()
+        receiving = threads_of_fast_dds() - before
+        with executing(node):
+            node.start()
+            ours = {thread.native_id for thread in threading.enumerate()}
+            found = {os.sched_getscheduler(thread) for thread in receiving}
+            of_the_mapper = {os.sched_getscheduler(thread) for thread in ours}
+            node.end()
+        node.destroy_node()
+    assert found == {os.SCHED_RR if may_run_in_real_time() else os.SCHED_OTHER}
+    assert of_the_mapper == {os.SCHED_OTHER}
