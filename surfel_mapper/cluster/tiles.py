@@ -29,6 +29,7 @@ import numpy as np
 from surfel_mapper.cluster.executors import Executor
 from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.errors import FileFormatError, MapError, MapLimitError
+from surfel_mapper.files.atomic import sync_directory
 from surfel_mapper.files.map_state import FILE, load_map, window_stamps_ns
 from surfel_mapper.files.parquet_tiles import (
     dataset_digest,
@@ -397,12 +398,24 @@ def stamps_of_map(source: Path) -> set[int]:
 
 
 def take_name(fresh: Path, wanted: Path) -> None:
-    """Rename a finished dataset to the name wanted; an earlier dataset of this name is removed."""
+    """
+    Rename a finished dataset to the name wanted; an earlier dataset of this name is removed.
+
+    If that fails the earlier one has its name again.
+    """
     old = wanted.with_name(f'.{wanted.name}-{secrets.token_hex(8)}.old')
     try:
+        for directory in (*fresh.iterdir(), fresh):  # those of the files are synced with them
+            sync_directory(directory)
         if wanted.exists():
             wanted.rename(old)
-        fresh.rename(wanted)
+        try:
+            fresh.rename(wanted)
+        except BaseException:
+            if old.exists():
+                old.rename(wanted)
+            raise
+        sync_directory(wanted.parent)
     except OSError as error:
         raise FileFormatError(f'{wanted}: cannot be written: {error.strerror}') from error
     shutil.rmtree(old, ignore_errors=True)

@@ -21,6 +21,7 @@ from io import TextIOWrapper
 from itertools import chain
 import logging
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -254,6 +255,7 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         first = next(lines, None)
         if first is None:
             raise FileFormatError(f'{path}: no poses in it, expected a line for each')
+        warn_of_cut(path)
         format_ = format_ or guessed(path, first[1])
         lines = chain([first], lines)
         if format_ == 'kitti':
@@ -306,6 +308,14 @@ def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
     except UnicodeDecodeError as error:
         raise FileFormatError(f'{path}: no text, expected a file of poses') from error
+
+
+def warn_of_cut(path: str | Path) -> None:
+    """Log a warning if the last line of a text has no end: its last number may lack digits."""
+    with open_regular(path) as file:
+        file.seek(-1, os.SEEK_END)
+        if file.read(1) not in b'\r\n':
+            logger.warning('%s: its last line has no end; is the file cut off there?', path)
 
 
 def is_comment(line: str) -> bool:

@@ -3,8 +3,10 @@
 """Shards of a bag, cut anywhere, give the map and the counts of one run."""
 
 from dataclasses import replace
+import errno
 from itertools import pairwise
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +22,7 @@ from surfel_mapper.cluster.shards import (
     SHORTEST_S,
 )
 from surfel_mapper.config import Config
-from surfel_mapper.errors import ConfigError, MapError
+from surfel_mapper.errors import ConfigError, FileFormatError, MapError
 from surfel_mapper.files.parquet_tiles import dataset_digest
 from test.cluster.bags import BAGS, counted, in_one_go, RECORDED_S, shards_of, written
 
@@ -289,3 +291,26 @@ def test_counts_are_taken_from_each_other_at_every_depth():
         'b': {'c': 0, 'd': 1},
         'milliseconds': {'x': {'median': 1.0}},
     }
+
+
+def test_a_dataset_that_cannot_take_its_name_leaves_the_earlier_one(tmp_path, monkeypatch):
+    """It kept a hidden name."""
+    fresh, wanted = tmp_path / 'fresh', tmp_path / 'map'
+    for directory, content in ((fresh, 'new'), (wanted, 'old')):
+        (directory / 'tile_i=0').mkdir(parents=True)
+        (directory / 'tile_i=0' / 'a').write_text(content)
+    rename = Path.rename
+
+    def failing(path, target):
+        if path == fresh:
+            raise OSError(errno.ENOSPC, 'no space')
+        return rename(path, target)
+
+    monkeypatch.setattr(Path, 'rename', failing)
+    with pytest.raises(FileFormatError, match='no space'):
+        tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'old'
+    monkeypatch.undo()
+    tiles.take_name(fresh, wanted)
+    assert (wanted / 'tile_i=0' / 'a').read_text() == 'new'
+    assert [*tmp_path.iterdir()] == [wanted]

@@ -202,3 +202,13 @@ def test_evo_reads_the_trajectory_as_written(tmp_path):
     np.testing.assert_allclose(found.timestamps, stamps / 1e9, rtol=0, atol=1e-6)
     np.testing.assert_allclose(np.array(found.poses_se3), poses, rtol=0, atol=1e-9)
     assert found.check()[0]
+
+
+def test_a_last_number_that_may_lack_digits_is_told(tmp_path, caplog):
+    path = tmp_path / 'a.txt'
+    write_tum(path, [0, 1], [np.eye(4), np.eye(4)])
+    assert len(read_trajectory(path)) == 2
+    assert not caplog.text
+    path.write_bytes(path.read_bytes()[:-2])  # 1.0 becomes 1.
+    assert len(read_trajectory(path)) == 2
+    assert f'{path}: its last line has no end' in caplog.text
