@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Tables of docs/faults.md from runs, and the limits of SECURITY.md from the code.
+Tables of docs/faults.md and SECURITY.md from runs and tests, limits from the code.
 
 ``python -m test.fuzz --seconds 600 > fuzz.log`` and then ``python -m test.fuzz.claims fuzz.log``
-write them: faults and numbers of inputs from the tests, costs from the log
-of one or several runs, the last row of an input counts. The limits that SECURITY.md states are
+write them: faults, findings and numbers of inputs from the tests, costs from the log of one or
+several runs, the last row of an input counts. Logs of ``test.soak``, ``test.soak.faults 10`` and
+``test.soak.node_faults 10`` give the rows of long runs. The limits that SECURITY.md states are
 compared with the constants of the code; the command lists those that differ, and a test fails.
 """
 
@@ -22,7 +23,7 @@ from surfel_mapper.geometry import MAX_TRANSLATION_M
 from surfel_mapper.messages.pointcloud2 import MAX_FIELDS
 from surfel_mapper.offline import pcap_packets
 from surfel_mapper.poses import buffer
-from test.fuzz import oracle
+from test.fuzz import findings_table, oracle
 from test.fuzz.__main__ import HEAD
 from test.fuzz.harnesses import HARNESSES
 from test.ros import fault_table
@@ -32,6 +33,8 @@ SECURITY = fault_table.PAGE.parents[1] / 'SECURITY.md'
 BEGIN, END = '<!-- begin: costs from runs of test.fuzz -->', '<!-- end: costs -->'
 
 TOTAL = '| inputs of `make fuzz`, by atheris and then measured |'
+
+RUN = re.compile(r'^\| `python -m test\.soak.*\|$', re.MULTILINE)
 
 ROW = re.compile(r'^\| (\w+) \| (\d+) \| (\d+) \|.*\|$', re.MULTILINE)
 
@@ -72,6 +75,24 @@ def limits() -> list[str]:
     ]
 
 
+def page_with_runs(text: str, logs: str) -> str:
+    """Return the page with the rows of long runs in logs, in place of earlier rows of theirs."""
+    for row in RUN.findall(logs):
+        command = row.split('|')[1]
+        if f'|{command}|' not in text:
+            raise SystemExit(f'{fault_table.PAGE.name} has no row of{command}')
+        text = re.sub(
+            rf'^\|{re.escape(command)}\|.*$', lambda _, r=row: r, text, flags=re.MULTILINE
+        )
+    return text
+
+
+def security_page() -> str:
+    """Return SECURITY.md with the table of findings."""
+    before, _, rest = SECURITY.read_text(encoding='utf-8').partition(findings_table.BEGIN)
+    return before + findings_table.table() + rest.partition(findings_table.END)[2]
+
+
 def false_limits() -> list[str]:
     """Return the limits that SECURITY.md does not state."""
     text = ' '.join(SECURITY.read_text(encoding='utf-8').split())
@@ -101,9 +122,12 @@ def page_with_costs(text: str, logs: str) -> str:
 def main(*logs: str) -> int:
     """Write the tables; print the limits that SECURITY.md lacks, and return their number."""
     text = fault_table.page_with(fault_table.table())
-    if logs:
-        text = page_with_costs(text, '\n'.join(Path(log).read_text('utf-8') for log in logs))
+    output = '\n'.join(Path(log).read_text('utf-8') for log in logs)
+    text = page_with_runs(text, output)
+    if HEAD[0] in output:
+        text = page_with_costs(text, output)
     fault_table.PAGE.write_text(text, encoding='utf-8')
+    SECURITY.write_text(security_page(), encoding='utf-8')
     false = false_limits()
     for limit in false:
         print(f'SECURITY.md does not state: {limit}')

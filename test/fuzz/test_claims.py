@@ -11,12 +11,17 @@ import pytest
 
 from test.fuzz import claims
 from test.fuzz.harnesses import HARNESSES
+from test.soak.long_run import row_of
 
 FIGURE = re.compile(r'\d[\d,]*')
 
 
 def test_security_states_the_limits_of_the_readers():
     assert not claims.false_limits()
+
+
+def test_security_has_the_table_of_the_findings():
+    assert claims.SECURITY.read_text(encoding='utf-8') == claims.security_page()
 
 
 def test_a_changed_limit_is_noticed(monkeypatch):
@@ -46,3 +51,17 @@ def test_tests_that_the_pages_name_exist():
     for page in (claims.SECURITY, claims.fault_table.PAGE):
         for name in re.findall(r'`(test/[\w/]+\.py)`', page.read_text(encoding='utf-8')):
             assert (root / name).is_file(), name
+
+
+def test_the_row_of_a_long_run_replaces_that_of_its_command():
+    blocks = [{'scans': 10 * n, 'rss_MB': 100.0 + n, 'median_ms': 1.0 * n} for n in (1, 2, 3)]
+    row = row_of('-m test.soak.faults 10', [*blocks, {'clouds_lost': 4}], 'equal')
+    assert row == (
+        '| `python -m test.soak.faults 10` | 30 | all | 4 | 102 to 103 MB (+1.0%) | 1.0 to 3.0 |  '
+        '| equal |'
+    )
+    page = '| `python -m test.soak.faults 10` | old |\n| `python -m test.soak` | other |\n'
+    log = f'{{"scans": 1}}\n{row}\n'
+    assert claims.page_with_runs(page, log) == f'{row}\n| `python -m test.soak` | other |\n'
+    with pytest.raises(SystemExit, match='no row of'):
+        claims.page_with_runs('', log)

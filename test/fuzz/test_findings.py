@@ -56,6 +56,7 @@ from surfel_mapper.simulation.world import World
 from surfel_mapper.viz.contents import contents
 from test.bags import recorded
 from test.fuzz import corpus
+from test.fuzz.findings_table import finding
 from test.fuzz.memory import reset_peak, resident
 
 LAUGHS = 'a0: &a0 [x, x]\n' + ''.join(
@@ -94,6 +95,11 @@ def test_yaml_that_expands_or_is_malformed_is_refused(tmp_path, text):
         ('map: [' + '1, ' * 300_000 + '1]', 'over 20000 nodes in line 1'),
     ],
     ids=['base 60', 'nodes'],
+)
+@finding(
+    'YAML with a number of 300,000 digits of base 60, or as many nodes',
+    before='over 5 minutes',
+    now='refused: below 1 s',
 )
 def test_yaml_that_takes_long_is_refused(tmp_path, text, problem):
     """A number of base 60 takes hours, a node of a list 10 us."""
@@ -323,6 +329,9 @@ XYZ = [Field(name, 4 * place, 7, 1) for place, name in enumerate('xyz')]
     ],
     ids=['all', 'partly', 'z'],
 )
+@finding(
+    'PointCloud2 of 3 MB with 200 overlapping fields', before='5.7 GB', now='refused: below 1 MB'
+)
 def test_fields_that_overlap_are_refused_before_memory_is_allocated(others):
     message = cloud_of([*XYZ, *others], 3000, 1012)
     _, peak = peak_of(lambda: to_scan(message))
@@ -348,6 +357,7 @@ def test_columns_that_are_not_read_are_not_copied():
 
 
 @pytest.mark.parametrize('name', ['/dev/zero', 'pipe', 'large.yaml'])
+@finding('`filters: /dev/zero`, or a pipe', before='ended the node', now='refused: below 10 MB')
 def test_settings_are_read_from_small_regular_files_only(tmp_path, name):
     os.mkfifo(tmp_path / 'pipe')
     (tmp_path / 'large.yaml').write_bytes(b'# ' + bytes(b'x' * (1 << 20)))
@@ -452,6 +462,11 @@ def mcap_of_empty_messages(num_chunks, num_messages):
     return b'\x89MCAP0\r\n' + record(1, text(b'ros2') + text(b'')) + chunk * num_chunks
 
 
+@finding(
+    'mcap of 46 kB, 8 chunks of 60 MB of empty messages, no index',
+    before='3.5 GB, 128 s',
+    now='refused: below 300 MB, 5 s',
+)
 def test_chunks_of_empty_messages_are_refused_before_the_index_fills_memory(tmp_path):
     path = tmp_path / 'a.mcap'
     path.write_bytes(mcap_of_empty_messages(8, 1_900_000))
@@ -530,6 +545,11 @@ def test_more_messages_than_a_file_has_room_for_are_refused(tmp_path):
     assert seconds < 3.0  # .2 s
 
 
+@finding(
+    'mcap with an index, 4 such chunks that overlap in time',
+    before='not tried',
+    now='refused: below 200 MB, 10 s',
+)
 def test_overlapping_chunks_of_an_indexed_mcap_are_not_held_at_once(tmp_path):
     """Rosbags unpacks all chunks of a span into lists of objects: 500 MB for each of these."""
     path = tmp_path / 'a.mcap'
@@ -610,6 +630,11 @@ def test_the_same_chunk_many_times_in_the_index_of_ros1_is_read_once(tmp_path):
     ],
     ids=['view', 'other view', 'computed', 'trigger'],
 )
+@finding(
+    'sqlite3 whose table of messages is a view without end, or computed',
+    before='not tried',
+    now='refused: below 20 MB, 1 s',
+)
 def test_a_database_that_computes_its_rows_is_refused(tmp_path, statements, problem):
     path = tmp_path / 'a.db3'
     path.write_bytes(corpus.sqlite()[0])
@@ -676,6 +701,11 @@ def test_a_small_database_is_read_in_order_of_time(small_database):
 @pytest.mark.parametrize(
     ('name', 'problem'),
     [('messages', 'more messages than a file of'), ('by_time', 'reading took over 0.5 s')],
+)
+@finding(
+    'sqlite3 of 40 kB whose pages lead to each other, 50^8 rows',
+    before='not tried',
+    now='refused: below 20 MB, 3 s',
 )
 def test_a_database_of_rows_without_end_is_refused(small_database, monkeypatch, name, problem):
     """Rosbags counts 50^8 rows."""
@@ -756,6 +786,7 @@ def test_columns_of_a_wrong_type_are_refused_before_they_are_read(parquet_map, k
         read_map(parquet_map)
 
 
+@finding('Parquet of 3,000,000 equal rows', before='all rows unpacked', now='refused: below 64 MB')
 def test_rows_that_repeat_are_refused_before_they_are_read(parquet_map):
     from surfel_mapper.files.parquet import read_map
 
@@ -807,6 +838,11 @@ def png(width, height):
     return SimpleNamespace(header=None, format='mono8; png compressed', data=file.getvalue())
 
 
+@finding(
+    'PNG of 35 kB, 6000 x 6000 pixels, with or without calibration',
+    before='36 million pixels unpacked',
+    now='refused: below 10 MB',
+)
 def test_images_are_refused_by_the_size_in_their_header():
     large = png(6000, 6000)
     assert len(large.data) < 100_000
@@ -948,6 +984,11 @@ def test_counts_in_the_header_of_las_are_compared_with_the_file(
         (lambda c, start, table, record: c.__delitem__(slice(start + 60, None)), 'chunks'),
     ],
     ids=['chunks', 'place', 'items', 'layer', 'count', 'cut'],
+)
+@finding(
+    'LAZ of 643 bytes with 2^32 - 1 chunks, or chunks of one point',
+    before='ended the process; 4.3 GB',
+    now='refused',
 )
 def test_sizes_in_laz_are_compared_with_the_file(tmp_path, change, problem):
     """Its decoder ended the process if it could not get the memory for the chunks stated."""

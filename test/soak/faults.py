@@ -38,6 +38,7 @@ from test.bench.report import Row
 from test.bench.street import Street
 from test.fuzz.mutations import cut, flip, overwrite, randomise
 from test.soak.core import BASE, CONFIG, there_and_back, TURN_M
+from test.soak.long_run import row_of
 
 RATE_HZ = 20.0
 FAULT_SHARE = 0.5
@@ -217,6 +218,9 @@ if __name__ == '__main__':
     import json
     import sys
 
+    rows = []
     for row in run(10**9, Options(scans=300, beams=32, columns=256), 60.0 * float(sys.argv[1])):
+        rows.append(row)
         print(json.dumps(row), flush=True)
-    print('the map equals a new one, the file the map of its time')
+    result = 'the map equals a new one, the file the map of its time'
+    print(row_of(f'-m test.soak.faults {sys.argv[1]}', rows, result))

@@ -51,6 +51,7 @@ from test.ros.live import Peer, Process, stamp
 from test.soak.core import BASE, CONFIG, there_and_back, TURN_M
 from test.soak.faults import FAULT_SHARE, RATE_HZ, serialised
 from test.soak.heap import read_heap
+from test.soak.long_run import row_of
 
 LAYER = 'test.soak.unreliable_layer'
 
@@ -520,6 +521,9 @@ def block(drive: FaultyNode, num_scans: int, seconds: float) -> Row:
 if __name__ == '__main__':
     length = Options(scans=300, beams=32, columns=256)
     with domain_of_our_own():
+        rows = []
         for row in run(10**9, length, 60.0 * float(sys.argv[1])):
+            rows.append(row)
             print(json.dumps(row), flush=True)
-    print('every cloud counted, the map equals an offline replay of its scans')
+    result = 'every cloud counted, the map equals an offline replay of its scans'
+    print(row_of(f'-m test.soak.node_faults {sys.argv[1]}', rows, result))
