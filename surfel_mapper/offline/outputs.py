@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from surfel_mapper.config import Config
+    from surfel_mapper.layers.drawings import Drawing
     from surfel_mapper.pipeline import Mapper, Update
     from surfel_mapper.pipeline.map_part import ApartMap
     from surfel_mapper.viz.history import History
@@ -269,10 +270,11 @@ def write_files(
     from surfel_mapper.viz.report import write_report
     from surfel_mapper.viz.turning_view import most_shown
 
-    meshes, sections = {}, []
+    drawings: list[Drawing] = []
+    sections = []
     for layer in mapper.layers.values():
         layer.write(output, formats)
-        meshes.update(page_meshes(layer.drawings()))
+        drawings += layer.drawings()
         section = layer.section()
         if section is not None:
             drawn = None
@@ -280,6 +282,7 @@ def write_files(
                 drawn = output / section.picture.file_name
                 draw_points(drawn, section.picture)
             sections.append(section_html(section, drawn))
+    meshes = page_meshes(drawings)
     picture, page, figures = (output / n for n in ('map.png', 'report.html', 'summary.json'))
     surfels = mapper.map.surfels(mapper.config.map.min_points)
     title = (

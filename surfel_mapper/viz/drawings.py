@@ -78,18 +78,20 @@ def page_meshes(drawings: Iterable[Drawing]) -> dict[str, Mesh]:
     Return the meshes for a page by the first part of the drawings' names.
 
     Ellipsoids become icosahedra, as many, those of largest weight, as fit beside the meshes: a
-    mesh of more than MAX_TRIANGLES is reduced by merging vertices, which mixes colours.
+    page reduces a mesh of more than its share of MAX_TRIANGLES by merging vertices, which mixes
+    colours.
     """
     groups: dict[str, list[Drawing]] = {}
     for drawing in drawings:
         groups.setdefault(drawing.name.partition('/')[0], []).append(drawing)
-    return {name: page_mesh(group) for name, group in groups.items()}
+    share = MAX_TRIANGLES // max(len(groups), 1)
+    return {name: page_mesh(group, share) for name, group in groups.items()}
 
 
-def page_mesh(drawings: Sequence[Drawing]) -> Mesh:
+def page_mesh(drawings: Sequence[Drawing], max_triangles: int) -> Mesh:
     """Return the meshes among some drawings, and their ellipsoids as icosahedra, as one mesh."""
     parts = [d.mesh for d in drawings if isinstance(d, MeshDrawing) and len(d.mesh)]
-    room = max(MAX_TRIANGLES - sum(map(len, parts)), 0)
+    room = max(max_triangles - sum(map(len, parts)), 0)
     for drawing in drawings:
         if isinstance(drawing, EllipsoidsDrawing):
             mesh = ellipsoids_mesh(drawing, room // len(FACES))

@@ -63,7 +63,7 @@ class GltfScene:
         """State the place of the frame of the map in the fixed frame, (3,) m, in ``extras``."""
         self._scene.metadata['origin_m'] = np.asarray(origin_m, np.float64).tolist()
 
-    def look(self, low: Array, high: Array, place: Array) -> None:
+    def look(self, low: Array, high: Array, place: Array, hidden: Sequence[str] = ()) -> None:
         """Leave the eye to the program that opens the file."""
 
     def discs(self, path: str, discs: DrawnDiscs, *, static: bool = True) -> None:

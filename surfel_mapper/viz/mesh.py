@@ -20,7 +20,8 @@ from surfel_mapper.geometry import face_normals
 from surfel_mapper.tsdf.mesh import Mesh
 
 MAX_TRIANGLES = 24_000
-"""Limit on a page: with 12,000 vertices of 16 bytes and 12 bytes a triangle, 0.6 MB of text."""
+"""Limit of all meshes on a page together: 0.6 to 0.8 MB of text, 12 bytes a triangle, 16 bytes a
+vertex, of which there are 12,000 to 18,000."""
 
 VERTEX = np.dtype([('place', '<u2', 3), ('', '<u2'), ('color', 'u1', 4), ('normal', 'i1', 4)])
 """Vertex format of page/view.js; the fourth components of colour and normal are unused."""
@@ -84,7 +85,10 @@ def merged(mesh: Mesh, cell_m: float) -> Mesh:
 
 
 def mesh_data(
-    mesh: Mesh, low: npt.NDArray[np.float64], size: npt.NDArray[np.float64]
+    mesh: Mesh,
+    low: npt.NDArray[np.float64],
+    size: npt.NDArray[np.float64],
+    max_triangles: int = MAX_TRIANGLES,
 ) -> dict[str, Any]:
     """
     Return the data of a mesh for page/view.js, relative to the middle of the map's box.
@@ -94,7 +98,8 @@ def mesh_data(
     middle, reach = low + 0.5 * size, 0.5 * size + 0.5 * size.max()
     near = np.less_equal(np.abs(mesh.vertices - middle), reach).min(axis=1)
     triangles = mesh.triangles[near[mesh.triangles].min(axis=1)]
-    mesh = reduced(Mesh(vertices=mesh.vertices, triangles=triangles, colors=mesh.colors))
+    near_mesh = Mesh(vertices=mesh.vertices, triangles=triangles, colors=mesh.colors)
+    mesh = reduced(near_mesh, max_triangles)
     used, places = np.unique(mesh.triangles, return_inverse=True)
     packed = np.zeros(len(used), VERTEX)
     within = (mesh.vertices[used] - middle + reach) / (2.0 * reach)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.discs import Colouring, CORNERS, DrawnDiscs
-from surfel_mapper.viz.mesh import vertex_normals
+from surfel_mapper.viz.mesh import GREY, vertex_normals
 from surfel_mapper.viz.recording_file import RecordingFile
 from surfel_mapper.viz.server import (
     end_group,
@@ -186,8 +186,12 @@ class Scene:
             about = self._rerun.AnyValues(origin_m=self.origin_m)
             self._stream.log('map', about, static=True)
 
-    def look(self, low: Array, high: Array, place: Array) -> None:
-        """Look at a place from obliquely above, as far away as a box, (3,) m each, needs."""
+    def look(self, low: Array, high: Array, place: Array, hidden: Sequence[str] = ()) -> None:
+        """
+        Look at a place from obliquely above, as far away as a box, (3,) m each, needs.
+
+        What is at the hidden paths is shown once its eye in the panel is clicked.
+        """
         import rerun.blueprint as blueprint
 
         size = float(np.linalg.norm(high[:2] - low[:2]))
@@ -199,7 +203,13 @@ class Scene:
         name = 'map'
         if self.origin_m.any():
             name = 'map, m from ' + ' '.join(f'{value:.10g}' for value in self.origin_m)
-        view = blueprint.Spatial3DView(origin='/map', name=name, eye_controls=controls)
+        invisible = blueprint.EntityBehavior(visible=False)
+        view = blueprint.Spatial3DView(
+            origin='/map',
+            name=name,
+            eye_controls=controls,
+            overrides=dict.fromkeys(hidden, invisible),
+        )
         self._stream.send_blueprint(
             blueprint.Blueprint(view, blueprint.TimePanel(state='collapsed')),
             make_active=True,
@@ -231,7 +241,7 @@ class Scene:
         self._stream.log(path, self._rerun.Clear(recursive=True), static=static)
 
     def mesh(self, path: str, mesh: Mesh, *, static: bool = False) -> None:
-        """Show a mesh, in its colours if it has any."""
+        """Show a mesh, in its colours or grey: rerun's white is lost on the light background."""
         if not len(mesh):
             self.clear(path, static=static)
             return
@@ -240,6 +250,7 @@ class Scene:
             triangle_indices=mesh.triangles.astype(np.uint32),
             vertex_normals=vertex_normals(mesh),
             vertex_colors=mesh.colors if len(mesh.colors) else None,
+            albedo_factor=None if len(mesh.colors) else GREY,
         )
         self._stream.log(path, shown, static=static)
 

@@ -82,8 +82,11 @@ def show_contents(
     parts += [each.discs for each in clouds if each.discs is not None]
     if any(map(len, parts)):
         scene.colouring = Colouring.over(colouring, parts)
-    box = box_of([part.position for part in parts] + [each.position for each in clouds])
-    scene.look(*box, looked_at)
+    places = [part.position for part in parts] + [each.position for each in clouds]
+    box = box_of(places if any(map(len, places)) else vertices(contents, origin_m))
+    meshes = [f'map/{each.name}' for each in contents if isinstance(each, ShownMesh)]
+    hidden = meshes if any(map(len, parts)) and isinstance(scene, Scene) else []
+    scene.look(*box, looked_at, hidden)
     if scene.is_watched:  # a first picture, while the rest is on its way
         log([each.coarsest() for each in tiled], scene)
         scene.flush()
@@ -93,8 +96,11 @@ def show_contents(
         about[each.name] = show_cloud(scene, each)
     for other in contents:
         if isinstance(other, ShownMesh):
-            scene.mesh(f'map/{other.name}', shifted_mesh(other.mesh, origin_m), static=True)
+            path = f'map/{other.name}'
+            scene.mesh(path, shifted_mesh(other.mesh, origin_m), static=True)
             about[other.name] = f'{len(other.mesh):,} triangles'
+            if path in hidden:  # it would flicker through the discs on the same surfaces
+                about[other.name] += ', hidden: its eye in the panel of the viewer shows them'
         elif isinstance(other, Asset):
             scene.asset(f'map/{other.name}', other.path)
             about[other.name] = 'triangles as rerun reads them'
@@ -267,6 +273,13 @@ def place_of(contents: Sequence[Content]) -> Array:
         if points is not None and len(points):
             return np.asarray(np.median(points, axis=0), np.float64)
     return np.zeros(3)
+
+
+def vertices(contents: Sequence[Content], origin_m: Array) -> list[Array]:
+    """Return the vertices of meshes and the positions of trajectories, (N, 3) m each."""
+    meshes = [each.mesh.vertices for each in contents if isinstance(each, ShownMesh)]
+    ways = [each.trajectory.xyz for each in contents if isinstance(each, Way)]
+    return [found - origin_m for found in (*meshes, *ways)]
 
 
 def box_of(places: Sequence[Array]) -> tuple[Array, Array]:

@@ -73,7 +73,7 @@ def turning_view(
         kinds = ''.join(f'<option>{name}</option>' for name in ('surfels', *layers))
         choice = f'<label>show <select id="shown">{kinds}</select></label>'
     for name, mesh in layers.items():
-        if len(mesh) > MAX_TRIANGLES:
+        if len(mesh) > MAX_TRIANGLES // len(layers):
             note += f' {len(mesh):,} triangles of the {name} are merged into fewer.'
     origin_m = np.asarray(summary.get('origin_m', (0.0, 0.0, 0.0)), np.float64)
     data = json.dumps(view_data(shown, trajectory, layers, origin_m)).replace('<', '\\u003c')
@@ -155,7 +155,9 @@ def view_data(
         'ramp': encoded(ramp.astype(np.uint8)),
         'size': [float(side) for side in size],
         'largest': largest,
-        'layers': [mesh_data(mesh, low, size) for mesh in layers.values()],
+        'layers': [
+            mesh_data(mesh, low, size, MAX_TRIANGLES // len(layers)) for mesh in layers.values()
+        ],
         'middle': [float(place) for place in low + 0.5 * size + origin_m],
         'heights': [f'{origin_m[2] + end:.{decimals}f} m' for end in (low[2], high[2])],
     }

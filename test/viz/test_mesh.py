@@ -11,6 +11,7 @@ import pytest
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
 from surfel_mapper.viz.mesh import MAX_TRIANGLES, reduced, VERTEX, vertex_normals
 from surfel_mapper.viz.report import write_report
+from surfel_mapper.viz.turning_view import BESIDE_MESHES, SURFEL
 from test.viz.test_history import mapped
 from test.viz.test_report import Parsed, plane
 
@@ -64,11 +65,12 @@ def test_a_reduced_mesh_keeps_shape_and_colours(most):
     assert (small.colors[top] == [250, 0, 0]).all()
 
 
-def page(tmp_path, mesh):
+def page(tmp_path, *meshes, surfels=None):
     mapper, history = mapped(3)
     path = tmp_path / 'report.html'
-    layers = {} if mesh is None else {'mesh': mesh}
-    write_report(path, 'street', mapper.summary(), plane(20), history, layers=layers)
+    layers = {f'layer {n}': mesh for n, mesh in enumerate(meshes) if mesh is not None}
+    shown = plane(20) if surfels is None else surfels
+    write_report(path, 'street', mapper.summary(), shown, history, layers=layers)
     text = path.read_text(encoding='utf-8')
     parsed = Parsed(text)
     return len(text), parsed, json.loads(parsed.one('script', id='map'))
@@ -95,6 +97,17 @@ def test_a_large_mesh_makes_no_large_page(tmp_path):
     assert size < 2_000_000
     assert len(base64.b64decode(data['layers'][0]['triangles'])) <= 12 * MAX_TRIANGLES
     assert 'shown' in [attributes.get('id') for _, attributes in parsed.tags]
+
+
+def test_two_large_meshes_beside_many_surfels_make_no_large_page(tmp_path):
+    large = sphere(300, 20.0, (5.0, 5.0, 5.0))
+    size, _, data = page(tmp_path, large, large, surfels=plane(215))
+
+    assert len(base64.b64decode(data['surfels'])) == SURFEL.itemsize * BESIDE_MESHES
+    drawn = [len(base64.b64decode(layer['triangles'])) // 12 for layer in data['layers']]
+    assert min(drawn) > MAX_TRIANGLES // 6
+    assert sum(drawn) <= MAX_TRIANGLES
+    assert size < 1_600_000  # pictures of map and models take another 0.4 MB
 
 
 def test_without_a_mesh_there_is_nothing_to_choose(tmp_path):

@@ -182,6 +182,31 @@ def test_files_of_a_replay_share_the_frame_of_the_map_far_from_zero(tmp_path):
     np.testing.assert_allclose(np.ravel(sensor['Transform3D:translation']), [2.0, 1.0, 0.0])
 
 
+def hidden(tmp_path):
+    """Return the paths that the blueprint of the recording of a view hides, below its view."""
+    from rerun import chunk as reader
+
+    file = reader.RrdReader(str(tmp_path / 'shown.rrd'))
+    (store,) = file.blueprints()
+    return {
+        re.search(r'/overrides(/.*)/visualizers$', chunk.entity_path)[1]
+        for chunk in file.stream(store=store).to_chunks()
+        if 'EntityBehavior:visible' in chunk.to_record_batch().schema.names
+    }
+
+
+def test_a_mesh_is_hidden_only_beside_surfels(tmp_path, capsys):
+    ground_map().save(tmp_path / 'map.npz')
+    write_mesh(tmp_path / 'mesh.ply', sphere(8, 3.0, (5.0, 5.0, 5.0)))
+    shown(tmp_path, tmp_path / 'map.npz', tmp_path / 'mesh.ply')
+    assert hidden(tmp_path) == {'/map/mesh'}
+    assert 'triangles, hidden: its eye' in capsys.readouterr().out
+
+    shown(tmp_path, tmp_path / 'mesh.ply')
+    assert hidden(tmp_path) == set()
+    assert 'hidden' not in capsys.readouterr().out
+
+
 def test_surfels_of_ply_are_discs_with_their_values(tmp_path, capsys):
     surfel_map = ground_map(UTM)
     surfel_map.save(tmp_path / 'map.ply')
