@@ -18,6 +18,7 @@ then (``kept``), and that of patches reported as merged into another (``merged``
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
 from time import perf_counter, process_time
 from typing import Any
 
@@ -54,16 +55,16 @@ WINDOW, METRE, METRES = 10, 2, 14
 """Scans in the window for ids, number of scans a metre, and metres."""
 
 
-def run() -> list[Row]:
-    """Return a row for every voxel size of the street and for every whole scan."""
+def run() -> Iterator[Row]:
+    """Yield a row for every voxel size of the street and for every whole scan."""
     scans = street_scans()
     with one_core():
-        rows = [case('street', scans, size_m, radius_m) for size_m, radius_m in CASES]
+        for size_m, radius_m in CASES:
+            yield case('street', scans, size_m, radius_m)
         for name, points in real_scans():
             if name in STANDING:
-                rows.append(case(name, repeated(points), STANDING_SIZE_M, np.inf))
-        rows.append(ids_over_time())
-    return rows
+                yield case(name, repeated(points), STANDING_SIZE_M, np.inf)
+        yield ids_over_time()
 
 
 def ids_over_time() -> Row:

@@ -12,7 +12,7 @@ from the cloud thinned to 1 cm and from the whole cloud.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import json
 import os
 from pathlib import Path
@@ -45,20 +45,31 @@ KINECT = 1.425e-3
 
 SIZES_M = (0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.06)
 WARM = 2
+MOST_RUNS = 40
 PEER_RUNS = 3
 
+PEER_SIZES_M = (0.01, 0.0)
+"""Thinning of the cloud for Open3D; 0: none."""
 
-def run(options: Options) -> list[Row]:
-    """Return rows of rooms, labelled frames of a table, scans of lidars, and live models."""
-    rows: list[Row] = []
-    runs = max(min(options.scans, 40), 5)
+
+def run(options: Options) -> Iterator[Row]:
+    """Yield rows of labelled frames of a table, scans of lidars, live models, and rooms."""
+    yield from tabletop.run(options)
+    yield from scan_planes.run(options)
+    yield from live_models.run()
+    yield from rooms(options)
+
+
+def rooms(options: Options) -> Iterator[Row]:
+    """Yield rows of rooms, ours and those of Open3D."""
+    runs = max(min(options.scans, MOST_RUNS), 5)
     for name, noise in (('room', 0.0), ('room, Kinect noise', KINECT)):
         points, _ = room(noise_per_range_sq=noise)
         with one_core():
-            rows += [case(name, points, size_m, noise, runs) for size_m in SIZES_M]
-            if options.peers:
-                rows += [peer(name, points, size_m, options.cache) for size_m in (0.01, 0.0)]
-    return [*rows, *tabletop.run(options), *scan_planes.run(options), *live_models.run()]
+            for size_m in SIZES_M:
+                yield case(name, points, size_m, noise, runs)
+            for size_m in PEER_SIZES_M if options.peers else ():
+                yield peer(name, points, size_m, options.cache)
 
 
 def case(

@@ -36,17 +36,15 @@ SUFFIXES = ('.pcd', '.ply', '.bin')
 METHOD = 'planar patches'
 
 
-def run(options: Options) -> list[Row]:
-    """Return rows for every scan and voxel size, ours and those of Open3D."""
-    rows: list[Row] = []
+def run(options: Options) -> Iterator[Row]:
+    """Yield rows for every scan and voxel size, ours and those of Open3D."""
     for name, points in real_scans():
         for size_m in SIZES_M:
             row: Row = {'cloud': name, 'voxel_m': size_m, 'points': len(points)}
             with one_core():
-                rows.append({**row, 'who': 'surfel_mapper', **ours(points, size_m)})
+                yield {**row, 'who': 'surfel_mapper', **ours(points, size_m)}
             if options.peers:
-                rows.append({**row, **peer(points, size_m, options.cache)})
-    return rows
+                yield {**row, **peer(points, size_m, options.cache)}
 
 
 def real_scans() -> Iterator[tuple[str, npt.NDArray[np.float32]]]:

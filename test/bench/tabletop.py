@@ -20,7 +20,7 @@ the points within a voxel of their boxes, and within 1 cm of their planes.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 import contextlib
 import json
 import os
@@ -60,22 +60,20 @@ PICTURE_SIZE_M, PICTURE_FRAMES = 0.02, 4
 RUNS = 4
 
 
-def run(options: Options) -> list[Row]:
-    """Return a row for every voxel size, ours and those of Open3D."""
+def run(options: Options) -> Iterator[Row]:
+    """Yield a row for every voxel size, ours and those of Open3D."""
     data = os.environ.get('SURFEL_MAPPER_TEST_DATA')
     files = sorted((Path(data) / 'data' / 'osd').glob('*.pcd')) if data else []
     if not files:
-        return []
+        return
     frames = [frame(file) for file in files]
-    rows: list[Row] = []
     with one_core():
         for size_m in SIZES_M:
             found = [ours(points, labels, size_m) for points, labels in frames]
-            rows.append(mean_row('surfel_mapper', size_m, found))
+            yield mean_row('surfel_mapper', size_m, found)
         if options.peers:
-            rows += peer_rows(frames, options.cache)
+            yield from peer_rows(frames, options.cache)
         picture(frames[:PICTURE_FRAMES], options)
-    return rows
 
 
 def picture(
@@ -239,18 +237,17 @@ def mean_row(name: str, size_m: float, found: Sequence[dict[str, float]]) -> Row
 
 def peer_rows(
     frames: Sequence[tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]], cache: Path
-) -> list[Row]:
-    """Return rows of Open3D's planar patches at every voxel size, and of its RANSAC planes."""
-    rows: list[Row] = []
+) -> Iterator[Row]:
+    """Yield rows of Open3D's planar patches at every voxel size, and of its RANSAC planes."""
     for name, sizes in (('planar patches', SIZES_M), ('RANSAC', (0.01,))):
         for size_m in sizes:
             who = f'{OPEN3D_TABLETOP.name} {name}'
             try:
                 found = [peer(points, labels, name, size_m, cache) for points, labels in frames]
             except PeerError as error:
-                return [{'cloud': 'tabletop', 'who': f'{who}, not measured: {error}'}]
-            rows.append(mean_row(who, size_m, found))
-    return rows
+                yield {'cloud': 'tabletop', 'who': f'{who}, not measured: {error}'}
+                return
+            yield mean_row(who, size_m, found)
 
 
 def peer(
