@@ -34,7 +34,6 @@ def chart_components(
     graph: SurfelGraph,
     rows: Rows,
     starts: Indices,
-    bridges: Rows,
     fold_angle_deg: float,
     least: int,
 ) -> list[Rows]:
@@ -47,8 +46,6 @@ def chart_components(
         The voxels.
     rows, starts : (M,) int32, (K + 1,) int64
         Components: k has rows starts[k] to starts[k + 1] - 1.
-    bridges : (B, 2) int32
-        Pairs of connected rows without a link.
     fold_angle_deg : float
         Largest angle between a normal and the mean of its chart.
     least : int
@@ -65,15 +62,13 @@ def chart_components(
         members = rows[starts[k] : starts[k + 1]]
         if doubtful[k]:
             ordered = members[np.argsort(graph.key[members])]
-            found += bisected(graph, ordered, bridges, rules[0], least)
+            found += bisected(graph, ordered, rules[0], least)
         else:
             found.append(members)
     return found
 
 
-def bisected(
-    graph: SurfelGraph, members: Rows, bridges: Rows, limit: float, least: int
-) -> list[Rows]:
+def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> list[Rows]:
     """Return the charts of one component whose rows are sorted by key."""
     found, waiting, size_m = [], [members], graph.map.voxel_size_m
     while waiting:
@@ -84,16 +79,16 @@ def bisected(
         normals, points = graph.normal[part], graph.position[part]
         if bisect_chart(normals, points, limit, STACKED_VOXELS * size_m, size_m, side):
             for half in (part[side], part[~side]):
-                waiting += connected_parts(graph, half, bridges)
+                waiting += connected_parts(graph, half)
         else:
             found.append(part)
     return found
 
 
-def connected_parts(graph: SurfelGraph, rows: Rows, bridges: Rows) -> list[Rows]:
+def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:
     """Return the connected components of rows, each in the order of the rows."""
     parent = np.empty(len(rows), np.int64)
-    connected_components(rows, graph.links, graph.neighbours, graph.places, bridges, parent)
+    connected_components(rows, graph.links, graph.neighbours, graph.places, parent)
     if not parent.any():  # the usual case: one component
         return [rows]
     order = np.argsort(parent, kind='stable')

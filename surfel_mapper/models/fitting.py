@@ -16,7 +16,7 @@ Source: Gao and Dong 2025 (A Real-Time Multi-Model Parametric Representation of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from time import perf_counter
 from typing import Any
@@ -26,32 +26,17 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
-from surfel_mapper.filters.grids import ScanVoxels
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
+from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
 from surfel_mapper.models.growth import (
-    add_facets,
     estimate_noise,
-    extend_planes,
     grow,
     Grown,
     grown,
     owner_table,
-    pieces_of,
     VoxelPoints,
 )
-from surfel_mapper.models.joining import join_patches
-from surfel_mapper.models.kernels.voxel_means import (
-    average_runs,
-    CHUNK,
-    finite_ends,
-    label_points,
-    row_bits,
-    sorted_runs,
-    voxel_keys,
-    voxel_runs,
-)
-from surfel_mapper.models.kernels.voxel_points import gather_voxels
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.patches import fit_patches, PatchPoints
 from surfel_mapper.models.seams import with_smooth_seams
@@ -63,6 +48,7 @@ from surfel_mapper.models.segmentation import (
     segment_cloud,
     thickness,
 )
+from surfel_mapper.models.thinning import thin, Thinned
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
@@ -70,11 +56,8 @@ Indices = npt.NDArray[np.int64]
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
 
-COARSER, SPARSE_SHARE = (2.0, 4.0, 8.0, 16.0), 0.05
-"""Coarser voxels for sparse points, and the share of points on no patch from which they help."""
-
-COARSE_TOLERANCE_VOXELS = 0.04
-"""Tolerance of facets in coarser voxels, at least: at 50 m a road sags more than near patches."""
+COARSER = (2.0, 4.0, 8.0, 16.0)
+"""Coarser voxels for sparse points."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
@@ -190,31 +173,22 @@ def grow_sparse(
     thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
 ) -> Grown:
     """Find facets in coarser voxels if many points are on no patch, and join across gaps."""
-    finest, noise = config.voxel_size_m, (config.noise_m, config.noise_per_range_sq)
-    owner, normals, curved = found.owner, found.normals, found.curved
-    of_row = np.empty(thinned.num_points, np.int32)
+    noise = config.noise_m, config.noise_per_range_sq
+    rules = CoarseRules(config.voxel_size_m, found.tolerance_m, noise, view)
+    normals, curved = found.normals, found.curved
+    owner: npt.NDArray[np.int32] = np.full(thinned.num_points, -1, np.int32)
+    owner[voxels.rows] = found.owner
+    joined = False
     for factor in COARSER:
-        if not len(owner) or np.count_nonzero(owner < 0) < SPARSE_SHARE * len(owner):
+        if not (owner[voxels.rows] < 0).sum() >= max(SPARSE_SHARE * len(found.owner), 1.0):
             break
-        size_m = factor * finest
-        coarse = thin(thinned.points, size_m).by_voxel()
-        of_row[voxels.rows] = owner
-        before = of_row[coarse.rows]
-        after = np.maximum(before, -1)
-        extend_planes(coarse, after, curved, (size_m, found.tolerance_m))
-        facet_m = max(found.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
-        num = add_facets(coarse, after, len(normals), (size_m, facet_m), config)
-        table = owner_table(coarse, after)
-        index, normals, bent = join_patches(pieces_of(coarse, table, num), view, noise, finest)
-        # coarse voxels resolve less: what was curved stays so, unless a larger plane takes it
-        was = np.append(curved, np.zeros(num - len(curved), np.bool_))
-        points = np.bincount(after[after >= 0], minlength=num)
-        total = np.bincount(index, points, len(normals))
-        curved = bent | (2.0 * np.bincount(index, points * was, len(normals)) > total)
-        of_row[coarse.rows] = np.where(after < 0, before, np.append(index, 0)[after])
-        owner = of_row[voxels.rows]
-    if owner is found.owner:
+        size_m, joined = factor * config.voxel_size_m, True
+        normals, curved = grow_coarse(
+            thinned.points, owner, (normals, curved), size_m, rules, config
+        )
+    if not joined:
         return found
+    owner = owner[voxels.rows]
     return grown(owner, owner_table(voxels, owner), normals, curved, found.tolerance_m)
 
 
@@ -313,74 +287,6 @@ def group_moments(points: Array, group: Indices, counts: Indices) -> tuple[Array
     for i, j in np.ndindex(3, 3):
         covariance[:, i, j] = np.bincount(group, away[:, i] * away[:, j], number)
     return mean, covariance / np.maximum(counts - 1, 1)[:, None, None]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Thinned:
-    """
-    Mean point of every occupied voxel.
-
-    Attributes
-    ----------
-    means : (M, 3) float64, m
-        In the order of the voxels.
-    runs : (R,) int64
-        Rows of the cloud by voxel; see models/kernels/voxel_means.py.
-    num_points : int
-        Number of all points, finite or not.
-    points : (N, 3) float32 or float64, m
-        The cloud.
-    keys : (V,) int64, optional
-        Keys of the voxels, if runs have their ranks instead.
-    bits : (3,) int64
-        Bits of x, y and z in the keys.
-
-    """
-
-    means: Array
-    runs: Indices
-    num_points: int
-    points: npt.NDArray[Any]
-    keys: Indices | None
-    bits: Indices
-
-    def by_voxel(self) -> VoxelPoints:
-        """Return the finite points by voxel, with the neighbours of voxels."""
-        number = len(self.means)
-        held = int((self.runs & (CHUNK - 1)).sum()) + len(self.runs)
-        points = np.empty((held, 3), self.points.dtype)
-        rows, starts = np.empty(held, np.int32), np.empty(number + 1, np.int64)
-        keys, to_key = np.empty(number, np.int64), row_bits(self.num_points)
-        gather_voxels(self.points, self.runs, to_key, points, rows, starts, keys)
-        full = keys if self.keys is None else self.keys[keys]
-        return VoxelPoints.of(points, rows, starts, full, self.bits)
-
-    def point_labels(self, labels: npt.NDArray[np.int32]) -> npt.NDArray[np.int32]:
-        """Return labels of all points from those of the means; -1 if not finite."""
-        found = np.full(self.num_points, -1, np.int32)
-        label_points(self.runs, row_bits(self.num_points), labels, found)
-        return found
-
-
-def thin(points: npt.NDArray[Any], voxel_size_m: float) -> Thinned:
-    """Return the means of the points (N, 3) in each voxel."""
-    points, ends = np.ascontiguousarray(points), np.empty((2, 3))
-    if not finite_ends(points, ends):
-        none = np.empty(0, np.int64)
-        return Thinned(np.empty((0, 3)), none, len(points), points, None, np.zeros(3, np.int64))
-    grid = ScanVoxels.between(ends[0], ends[1], np.full(3, voxel_size_m), 'origin')
-    keys, to_key = np.empty(len(points), np.int64), row_bits(len(points))
-    voxel_keys(points, grid.size, grid.shift, grid.base, grid.bits, keys)
-    key_bits, unique = int(grid.bits.sum()), None
-    if key_bits + to_key > 63:  # keys too long: renumber the occupied voxels
-        held = keys >= 0
-        unique, keys[held] = np.unique(keys[held], return_inverse=True)
-        key_bits = len(points).bit_length()
-    num = voxel_runs(keys, to_key)
-    runs = sorted_runs(keys[:num], key_bits, to_key)
-    means = np.empty((num, 3))
-    means = means[: average_runs(points, runs, to_key, means)]
-    return Thinned(means, runs, len(points), points, unique, grid.bits)
 
 
 def fitted_patches(

@@ -9,9 +9,9 @@ of each primitive follow from the present map, to the bit; its history decides t
 frames within a tenth of the thickness of a plane.
 
 An update reads the changed voxels (surfel_graph.py), recomputes the connected components around
-them, cuts these into charts (charts.py), matches ids (id_matching.py), and refits patches with
-material changes (live_patches.py). Flat voxels without a patch and rough voxels are one Gaussian
-each.
+them, cuts these into charts (charts.py), grows and joins all charts as those of one cloud
+(surfel_joining.py), matches ids (id_matching.py), and refits patches with material changes
+(live_patches.py). Flat voxels without a patch and rough voxels are one Gaussian each.
 
 Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are our own.
 """
@@ -41,6 +41,7 @@ from surfel_mapper.models.live_patches import PatchFitter, symmetric, Tracked
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
+from surfel_mapper.models.surfel_joining import SurfelJoining
 
 __all__ = ['LiveModels', 'ModelUpdate']
 
@@ -72,6 +73,7 @@ class LiveModels:
         self.versions: dict[int, int] = {}
         self._graph = SurfelGraph(config, surfel_map)
         self._fitter = PatchFitter(self._graph)
+        self._joining = SurfelJoining(self._graph, config)
         self._next_id = 0
         self.clear()
 
@@ -80,7 +82,9 @@ class LiveModels:
         self._cleared = (*getattr(self, '_cleared', ()), *self.versions)
         self.versions.clear()
         self._graph.clear()
+        self._joining.clear()
         self._patches: dict[int, Tracked] = {}
+        self._charts: dict[int, list[Rows]] = {}
         self._surfels: Surfels | None = None
         self._model: MultiModel | None = None
 
@@ -89,13 +93,12 @@ class LiveModels:
         start = perf_counter()
         self._surfels = self._model = None
         change = self._graph.update()
-        touched, rows, starts, bridges = self._regrouped(change)
-        members, ends = self._charts(rows, starts, bridges)
-        old = self._old_patches(change, touched)
+        self._recut(change)
+        members, ends = self._sorted(self._joined(change.rows))
         labels = self._graph.label[members].astype(np.int64)
-        matched = match(old, labels, ends, self._next_id)
+        matched = match(np.array(sorted(self._patches), np.int64), labels, ends, self._next_id)
         self._next_id += len(matched.created)
-        born, changed, died = self._relabel(change, touched, rows, members, ends, matched.ids)
+        born, changed, died = self._relabel(members, ends, matched.ids)
         changed += self._refit(members, ends, matched)
         for gone in matched.removed:
             del self._patches[gone]
@@ -153,15 +156,16 @@ class LiveModels:
             x, y = np.mgrid[0:side, 0:side] * (0.2 * size_m)
             bend /= size_m
             points = np.stack([x, y, bend * x * x], -1).reshape(-1, 3)
-            moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m)]
+            far = 10.0 * points[::10] + 50.0 * size_m  # sparse: patches grow in coarse voxels
+            moments = [surfel_map.add(part) for part in (points, points[:20] + 0.1 * size_m, far)]
             models.update()
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
-            none = np.empty((0, 2), np.int32)
-            bisected(models._graph, np.arange(2, dtype=np.int32), none, 0.5, 1)
+            bisected(models._graph, np.arange(2, dtype=np.int32), 0.5, 1)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])
+            surfel_map.remove(moments[2])
         models.update()
 
     def summary(self) -> dict[str, Any]:
@@ -174,89 +178,55 @@ class LiveModels:
             'bytes': model.size_bytes,
         }
 
-    def _regrouped(self, change: GraphChange) -> tuple[npt.NDArray[np.bool_], Rows, Indices, Rows]:
-        """
-        Recompute connected components around changes.
-
-        Returns
-        -------
-        (R,) bool
-            Components with a change.
-        (M,) int32
-            Their rows, component by component.
-        (K + 1,) int64
-            First row of each, and M.
-        (B, 2) int32
-            Pairs of connected rows without a link.
-
-        """
-        graph = self._graph
+    def _recut(self, change: GraphChange) -> None:
+        """Recompute connected components around changes, and cut these into charts."""
+        graph, least = self._graph, self.config.min_voxels
         size = len(graph.key)
-        rows, flags = np.empty(size, np.int32), np.zeros(size, np.bool_)
+        rows: Rows = np.empty(size, np.int32)
+        flags = np.zeros(size, np.bool_)
         flags[change.relinked] = flags[change.touched] = True
+        self._charts = {name: kept for name, kept in self._charts.items() if not flags[name]}
         single = (graph.kind == FLAT) & (graph.component < 0)
         apart = rows[: rows_of_groups(graph.component, flags, single, rows)].copy()
         parent = np.empty(len(apart), np.int64)
-        places, none = graph.places, np.empty((0, 2), np.int32)
-        connected_components(apart, graph.links, graph.neighbours, places, none, parent)
-        group = np.full(size, -1, np.int32)
-        group[apart] = parent
-        bridges = graph.bridges(group)
-        connected_components(apart, graph.links, graph.neighbours, places, bridges, parent)
+        connected_components(apart, graph.links, graph.neighbours, graph.places, parent)
         name_components(apart, parent, graph.key, graph.component)
-        flags[:] = False
-        flags[graph.component[apart]] = True
-        flags[graph.component[change.hosts]] = True
-        single[:] = False
-        num = rows_of_groups(graph.component, flags, single, rows)
-        return flags, *self._sorted(rows[:num], graph.component), bridges
+        number = np.full(size, -1, np.int32)
+        number[apart] = graph.component[apart]
+        rows, starts = self._sorted(number)
+        large = np.diff(starts) >= least
+        ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
+        kept = rows[np.repeat(large, np.diff(starts))]
+        for chart in chart_components(graph, kept, ends, self.config.fold_angle_deg, least):
+            ordered = chart[np.argsort(graph.key[chart])]
+            self._charts.setdefault(int(graph.component[chart[0]]), []).append(ordered)
 
-    def _sorted(self, rows: Rows, group: Rows) -> tuple[Rows, Indices]:
-        """Return rows sorted by group, and the start of each group."""
+    def _joined(self, changed: Rows) -> Rows:
+        """Return the patch of each row, -1 for none: charts with what they grow over, joined."""
+        graph = self._graph
+        owner = np.full(len(graph.key), -1, np.int32)
+        charts = [chart for parts in self._charts.values() for chart in parts]
+        for number, chart in enumerate(charts):
+            owner[chart] = number
+        if not self.config.absorb:
+            return owner
+        hosted = np.flatnonzero(graph.host >= 0)
+        owner[hosted] = owner[graph.host[hosted]]
+        return self._joining.update(owner, changed)
+
+    def _sorted(self, group: Rows) -> tuple[Rows, Indices]:
+        """Return rows with a group sorted by it, and the start of each group."""
+        rows = np.flatnonzero(group >= 0).astype(np.int32)
         ordered, starts = np.empty_like(rows), np.empty(len(rows) + 1, np.int64)
         num = sort_by_group(rows, group, self._graph.places, ordered, starts)
         return ordered, starts[: num + 1]
 
-    def _charts(self, rows: Rows, starts: Indices, bridges: Rows) -> tuple[Rows, Indices]:
-        """Return the voxels of patches with those they host, and the start of each patch."""
-        graph, least = self._graph, self.config.min_voxels
-        large = np.flatnonzero(np.diff(starts) >= least)
-        kept = np.repeat(np.diff(starts) >= least, np.diff(starts))
-        ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
-        charts = chart_components(
-            graph, rows[kept], ends, bridges, self.config.fold_angle_deg, least
-        )
-        number = np.full(len(graph.key), -1, np.int32)
-        for k, chart in enumerate(charts):
-            number[chart] = k
-        hosted = np.flatnonzero(graph.host >= 0)
-        number[hosted] = number[graph.host[hosted]]
-        return self._sorted(np.flatnonzero(number >= 0).astype(np.int32), number)
-
-    def _old_patches(self, change: GraphChange, touched: npt.NDArray[np.bool_]) -> Indices:
-        """Return the ids of the patches that may have changed."""
-        flags = touched.copy()
-        flags[change.relinked] = flags[change.touched] = True
-        found = [number for number, known in self._patches.items() if flags[known.component]]
-        return np.array(sorted(found), np.int64)
-
     def _relabel(
-        self,
-        change: GraphChange,
-        touched: npt.NDArray[np.bool_],
-        rows: Rows,
-        members: Rows,
-        ends: Indices,
-        ids: list[int],
+        self, members: Rows, ends: Indices, ids: list[int]
     ) -> tuple[list[int], list[int], list[int]]:
-        """Label all affected voxels; return Gaussians created, changed and removed."""
+        """Label all voxels; return Gaussians created, changed and removed."""
         graph = self._graph
-        hosted = np.flatnonzero(graph.host >= 0)
-        hosted = hosted[touched[graph.component[graph.host[hosted]]]]
-        concerned = np.zeros(len(graph.key), np.bool_)
-        for part in (rows, change.rows, hosted):
-            concerned[part] = True
-        every = np.flatnonzero(concerned)
+        every = np.flatnonzero(graph.key >= 0)
         before, was_gaussian = graph.label[every].astype(np.int64), graph.is_gaussian[every]
         graph.label[every], graph.is_gaussian[every] = -1, False
         graph.label[members] = np.repeat(np.array(ids, np.int32), np.diff(ends))
@@ -273,23 +243,17 @@ class LiveModels:
 
     def _refit(self, members: Rows, ends: Indices, matched: IdMatches) -> list[int]:
         """Refit patches with material changes; return the ids of those that existed."""
-        graph, chosen, parts = self._graph, [], []
-        flat = np.flatnonzero(graph.component[members] >= 0)
-        first = members[flat[np.searchsorted(flat, ends[:-1])]]
-        is_material = np.logical_or.reduceat(graph.is_material[members], ends[:-1])
-        found = zip(matched.ids, graph.component[first].tolist(), is_material, strict=True)
-        for k, (number, component, matters) in enumerate(found):
+        chosen, parts = [], []
+        is_material = np.logical_or.reduceat(self._graph.is_material[members], ends[:-1])
+        for k, (number, matters) in enumerate(zip(matched.ids, is_material, strict=True)):
             rows, known = members[ends[k] : ends[k + 1]], self._patches.get(number)
-            if known is not None:
-                known.component = component
-                if not matters and np.array_equal(known.rows, rows):
-                    continue
-            chosen.append(number)
-            parts.append((rows, component))
+            if known is None or matters or not np.array_equal(known.rows, rows):
+                chosen.append(number)
+                parts.append(rows)
         before = [self._patches.get(number) for number in chosen]
-        fitted = self._fitter.fit(chosen, [rows for rows, _ in parts], before)
-        for (patch, origin, field), (rows, component) in zip(fitted, parts, strict=True):
-            self._patches[patch.id] = Tracked(patch, rows, component, origin, field)
+        fitted = self._fitter.fit(chosen, parts, before)
+        for (patch, origin, field), rows in zip(fitted, parts, strict=True):
+            self._patches[patch.id] = Tracked(patch, rows, origin, field)
         return [number for number, known in zip(chosen, before, strict=True) if known is not None]
 
     def _count(self, created: list[int], changed: list[int], removed: list[int]) -> None:

@@ -58,8 +58,6 @@ class Tracked:
         Plane or Surface, as published.
     rows : (n,) int32
         Rows of its voxels.
-    component : int
-        Connected component of its voxels.
     origin : (3,) float64, m
         Anchor of the lattice of its grid.
     fitted : FittedField, optional
@@ -69,7 +67,6 @@ class Tracked:
 
     patch: Plane
     rows: Rows
-    component: int
     origin: Array
     fitted: FittedField | None
 

@@ -36,9 +36,7 @@ from surfel_mapper.models.kernels.surfel_classes import (
     NONE,
 )
 from surfel_mapper.models.kernels.surfel_links import (
-    find_bridges,
     find_hosts,
-    flag_components,
     link_neighbours,
     ROUNDS,
     spread,
@@ -169,14 +167,12 @@ class SurfelGraph:
         touched = self.component[here]
         self.component[here[~is_flat]] = -1
         relinked.append(self._relinked(here, marked, num))
-        rehosted, old_hosts, new_hosts, around = self._rehosted(here, near)
-        relinked.append(around)
+        self._find_hosts(here, near)
         return GraphChange(
             num_voxels=len(changed) + len(gone.key),
-            rows=np.concatenate([here, rehosted]),
+            rows=here,
             relinked=unique_components(relinked),
-            touched=unique_components([touched, self.component[old_hosts[old_hosts >= 0]]]),
-            hosts=new_hosts[new_hosts >= 0],
+            touched=unique_components([touched]),
             gone=gone.remaining,
         )
 
@@ -312,48 +308,25 @@ class SurfelGraph:
             self.is_material,
         )
 
-    def _rehosted(self, here: Rows, emptied: Rows) -> tuple[Rows, Rows, Rows, Rows]:
-        """Recompute hosts: rows, hosts before and now, and components that may be connected."""
+    def is_thin(self, rows: npt.NDArray[Any], normals: Array) -> npt.NDArray[np.bool_]:
+        """Return which voxels (K,) are thin enough along directions (K, 3) to lie on a plane."""
+        xx, xy, xz, yy, yz, zz = self.covariance[rows].T
+        x, y, z = normals.T
+        along = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
+        thin: npt.NDArray[np.bool_] = along < self._host_rules[1]
+        return thin
+
+    def _find_hosts(self, here: Rows, emptied: Rows) -> None:
+        """Recompute the hosts of voxels around changes."""
         if not self._absorbs:
-            none = np.empty(0, np.int32)
-            return none, none, none, none
+            return
         around = self._around(here, emptied, ROUNDS)
         rows = around[(self.kind[around] != FLAT) & (self.kind[around] != NONE)]
         flat = here[self.kind[here] == FLAT]
-        before, was = self.host[rows], self.host[flat]
         self.host[flat], self.level[flat] = -1, 0
         state = (self.kind, self.position, self.normal)
         rules = self._host_rules
         find_hosts(rows, self.neighbours, state, self.covariance, rules, self.host, self.level)
-        changed = (before != self.host[rows]) | self.is_material[rows]
-        flags = np.zeros(len(self.key), np.bool_)
-        if len(around) == np.count_nonzero(self.key >= 0):
-            flags[self.component[around[self.component[around] >= 0]]] = True
-        else:
-            flag_components(around, self.neighbours, self.host, self.component, flags)
-        once = np.concatenate([was, before[changed]])
-        components = np.flatnonzero(flags).astype(np.int32)
-        return rows[changed], once, self.host[rows[changed]], components
-
-    def bridges(self, group: Rows) -> npt.NDArray[np.int32]:
-        """
-        Return pairs (B, 2) of flat voxels of one surface with sparse or rough ones between them.
-
-        Parameters
-        ----------
-        group : (R,) int32
-            Connected component by links of each row, -1 for rows that are left out.
-
-        """
-        hosted = np.flatnonzero(self.level > 0).astype(np.int32)
-        state = (self.kind, self.position, self.normal, self.own_kind)
-        used = hosted, self.host, self.neighbours, state, self._link_rules, group
-        pairs = np.empty((4096, 2), np.int32)
-        num = find_bridges(*used, pairs)
-        if num > len(pairs):
-            pairs = np.empty((num, 2), np.int32)
-            find_bridges(*used, pairs)
-        return pairs[:num]
 
 
 def half_neighbourhood(reach: int) -> npt.NDArray[np.int64]:
@@ -374,13 +347,11 @@ class GraphChange:
     num_voxels : int
         Voxels that appeared, changed or disappeared.
     rows : (N,) int32
-        Rows whose label may change, apart from those of relinked components.
+        Rows of changed voxels, and of those with sparse neighbours that changed.
     relinked : (C,) int32
         Components whose connectivity may have changed.
     touched : (C,) int32
-        Components with any change of their voxels or of voxels that they host.
-    hosts : (H,) int32
-        Rows that host other voxels now.
+        Components with any change of their voxels.
     gone : (G,) int32
         Labels of Gaussians whose voxels disappeared, without those that moved to another row.
 
@@ -390,7 +361,6 @@ class GraphChange:
     rows: Rows
     relinked: Rows
     touched: Rows
-    hosts: Rows
     gone: Rows
 
 

@@ -12,7 +12,8 @@ them: every voxel changes, few patches grow. Without SURFEL_MAPPER_TEST_DATA the
 
 The last row is that of ids in a window of ten scans, a metre apart: of the patches of which at
 least half of the voxels are on patches a metre on, the share whose voxels mostly have the same id
-then (``kept``), and that of patches reported as merged into another (``merged``).
+then (``kept``), that of patches reported as merged into another (``merged``), and the share that
+is kept of all others (``others``).
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ def ids_over_time() -> Row:
                 kept += max(set(ids), key=ids.count) == patch
                 merged += patch in gone
         before = now
-    share = {'kept': kept / known, 'merged': merged / known}
+    share = {'kept': kept / known, 'merged': merged / known, 'others': kept / (known - merged)}
     return {'cloud': 'street, live, ids', 'who': 'surfel_mapper', 'patches': known, **share}
 
 

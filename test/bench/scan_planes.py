@@ -78,14 +78,22 @@ def in_boxes(
     points: npt.NDArray[np.floating], model: MultiModel, size_m: float
 ) -> npt.NDArray[np.int64]:
     """Return the patch with the smallest box around each point (N,), -1 for none."""
-    wider, boxes = 0.5 * size_m * np.array([1.0, 1.0, 0.0]), []
+    wider = 0.5 * size_m * np.array([1.0, 1.0, 0.0])
+    cloud, found = points.astype(np.float64), np.full(len(points), -1)
+    by_label = np.argsort(model.labels, kind='stable')
+    along_x = np.argsort(cloud[:, 0], kind='stable')
+    x, boxes = cloud[along_x, 0], []
     for patch in model.patches:
-        own = patch.to_local(points[model.labels == patch.id].astype(np.float64))
+        ends = np.searchsorted(model.labels[by_label], [patch.id, patch.id + 1])
+        own = patch.to_local(cloud[by_label[slice(*ends)]])
         boxes.append((own.min(axis=0) - wider, own.max(axis=0) + wider))
-    found = np.full(len(points), -1)
     for k in np.argsort([-(high - low)[:2].prod() for low, high in boxes]):
-        local = model.patches[k].to_local(points.astype(np.float64))
-        found[((local >= boxes[k][0]) & (local <= boxes[k][1])).all(axis=1)] = k
+        (low, high), patch = boxes[k], model.patches[k]
+        middle = 0.5 * (low + high) @ patch.R_patch_map[:, 0] + patch.mean[0]
+        half = 0.5 * (high - low) @ np.abs(patch.R_patch_map[:, 0]) + 1e-6  # m, for rounding
+        near = along_x[slice(*np.searchsorted(x, [middle - half, middle + half]))]
+        local = patch.to_local(cloud[near])
+        found[near[((local >= low) & (local <= high)).all(axis=1)]] = k
     return found
 
 

@@ -13,9 +13,10 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ConfigError, ModelError
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.models import evaluate, fit
-from surfel_mapper.models.fitting import separated, thin
+from surfel_mapper.models.fitting import separated
 from surfel_mapper.models.growth import grown, owner_table
 from surfel_mapper.models.segmentation import folded, merge_clusters, segment_cloud
+from surfel_mapper.models.thinning import thin
 from test.bench import scan_planes, tabletop
 from test.models.scenes import (
     A,

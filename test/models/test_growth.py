@@ -6,8 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.growth import extend_planes
+from surfel_mapper.models.thinning import thin
 
 NOISE_M, COARSE_M, TOLERANCE_M = 0.01, 0.8, 0.02
 

@@ -16,6 +16,7 @@ import pytest
 from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.live import LiveModels
+from surfel_mapper.models.surfel_joining import BLOCK_BITS
 from test.models.live_scenes import (
     groups,
     id_at,
@@ -355,6 +356,48 @@ def test_sparse_voxels_join_the_plane_that_they_lie_on():
     above = few + rng.uniform(0.04, 0.05)
     _, models = of_points(np.concatenate([cells((0, 1.2), (0, 1.2)), above]))
     assert id_at(models, above[0]) == -1
+
+
+def test_planes_grow_over_gaps_to_the_sparse_voxels_on_them():
+    rng = np.random.default_rng(3)
+    near, beyond = cells((0, 2.4), (0, 2.4)), cells((6.0, 7.2), (0, 2.4))
+    far = rng.uniform([2.4, 0, 0], [6, 2.4, 0], (150, 3))
+    above = rng.uniform([2.4, 0, 0.15], [6, 2.4, 0.6], (60, 3))
+    points = np.concatenate([near, beyond, far, above]) + 1e-3
+    points[:, 2] += 2e-3 * rng.standard_normal(len(points))
+    _, models = of_points(points)
+    (plane,) = models.model.planes
+    far, above = points[-210:-60], points[-60:]
+    assert np.mean([id_at(models, place) == plane.id for place in far]) > 0.95
+    assert id_at(models, beyond[0]) == plane.id
+    assert plane.id not in {id_at(models, place) for place in above}
+
+
+def test_models_across_blocks_equal_a_batch():
+    rng = np.random.default_rng(4)
+    settings = ModelsLayerConfig(min_points=4, noise_m=0.005)
+    half_m = VOXEL_M * 2 ** (BLOCK_BITS - 1)
+    floor = cells((half_m - 3.0, half_m + 3.0), (half_m - 1.0, half_m + 1.0), spacing=0.03)
+    floor[:, 2] += 3e-3 * rng.standard_normal(len(floor))
+    wall = cells((half_m - 3.0, half_m - 1.0), (0.1, 1.5), spacing=0.03)[:, [0, 2, 1]]
+    wall[:, 1] += half_m
+    points, held = np.concatenate([floor, wall]), []
+    surfel_map = SurfelMap(VOXEL_M)
+    models = LiveModels(settings, surfel_map)
+    for _ in range(8):
+        near = np.abs(points - points[rng.integers(len(points))]).max(axis=1) < 1.0
+        held.append(surfel_map.add(points[near | (rng.random(len(points)) < 0.1)], origin=VIEW))
+        if len(held) > 4:
+            surfel_map.remove(held.pop(0))
+        models.update()
+        assert groups(models) == groups(live(surfel_map.copy(), settings))
+    surfel_map.add(points, origin=VIEW)
+    models.update()
+    assert len(models.model.planes) == 2
+    counts = np.unique(
+        models.model.labels[models.surfels.position[:, 2] < 0.05], return_counts=True
+    )
+    assert counts[1].max() > 0.95 * counts[1].sum()
 
 
 def test_planes_hold_the_exact_moments_of_their_points():

@@ -18,10 +18,10 @@ WINDOW, SCANS, STEP = 10, 15, 3
 NOISE_M, VOXEL_M, MIN_POINTS = 0.01, 0.5, 10
 
 
-@pytest.fixture(scope='module')
-def street():
+@pytest.fixture(scope='module', params=[1, 2])
+def street(request):
     """Return models after a drive, and the label of the surface of every voxel."""
-    world = World.street(seed=1, length_m=200.0)
+    world = World.street(seed=request.param, length_m=200.0)
     lidar = Lidar(beams=64, columns=1024, range_noise_m=NOISE_M)
     simulation = Simulation(world, lidar)
     surfel_map = SurfelMap(VOXEL_M)
@@ -64,7 +64,9 @@ def test_the_ground_is_in_few_pieces(street):
     assert len(found) <= 6
     assert found.sum() > 0.95 * used.sum()
     assert found[0] > 0.9 * used.sum()
-    assert pieces(models, ground).sum() > 0.8 * ground.sum()
+    everywhere = pieces(models, ground)
+    assert everywhere[:6].sum() > 0.93 * ground.sum()
+    assert everywhere[0] > 0.92 * ground.sum()
 
 
 def test_patches_are_of_one_surface(street):

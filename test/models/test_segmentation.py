@@ -14,10 +14,10 @@ from scipy.spatial.distance import cdist
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.kernels.symmetric3 import eigen_frame
 from surfel_mapper.models import fit
-from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.kernels.frames import orient, range_moments
 from surfel_mapper.models.kernels.region_merging import gap, same_surface
 from surfel_mapper.models.segmentation import merge_clusters, segment_cloud
+from surfel_mapper.models.thinning import thin
 from test.models.scenes import A, room, sheet, VIEW
 
 OFF_GRID = (0.011, 0.004, 0.007)

@@ -22,8 +22,11 @@ STEADY_SHARE = 0.5
 of a ball vary alike in two directions, and their principal axis turns with every scan.
 """
 
-FOLD_PERCENTILE = 98.0
-"""A surface is folded unless this percentage of normals is near the mean."""
+FOLD_PERCENTILE, MOST_FOLDED = 98.0, 20
+"""
+A surface is folded unless this percentage of normals is near the mean, and at most this number is
+not: a cup on a table has less than 2 % of the voxels of both.
+"""
 
 STACKED_SHARE = 0.05
 """A chart overlaps itself if more than this share of its columns is too high."""
@@ -100,7 +103,7 @@ def bisect_chart(normals, points, limit, height, size, side):
     if bisect_folded(normals, mean, limit, side):
         axis = dominant_axis(normals)
         cosines = dot_products(normals, axis)
-        if percentile(np.abs(cosines), 100.0 - FOLD_PERCENTILE) < limit:
+        if is_folded(np.abs(cosines), limit):
             return True
         mean = axis  # equal up to sign: the voxels have no common viewpoint
     return bisect_stacked(points, mean, height, size, side)
@@ -119,9 +122,15 @@ def bisect_folded(normals, mean, limit, side):
     cosines = dot_products(normals, mean)
     if len(normals) < 2 or cosines.min() >= limit:
         return False
-    if percentile(cosines, 100.0 - FOLD_PERCENTILE) >= limit:
-        return False
-    return bisect_normals(normals, side)
+    return is_folded(cosines, limit) and bisect_normals(normals, side)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def is_folded(cosines, limit):
+    """Return whether too many cosines (n,) to the mean normal are below the limit."""
+    if (cosines < limit).sum() > MOST_FOLDED:
+        return True
+    return percentile(cosines, 100.0 - FOLD_PERCENTILE) < limit
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -35,7 +35,7 @@ def rows_of_groups(group, flags, extra, rows):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def connected_components(rows, links, neighbours, places, bridges, parent):
+def connected_components(rows, links, neighbours, places, parent):
     """
     Find the connected components of linked voxels.
 
@@ -43,7 +43,6 @@ def connected_components(rows, links, neighbours, places, bridges, parent):
     links       (R,) uint64
     neighbours  (R, 2 H) int32
     places      (R,) int32, all -1; restored afterwards
-    bridges     (B, 2) int32, more pairs of connected rows, in the list or not
     parent      (M,) int64, out: index of the first voxel of the component
     """
     for i in range(len(rows)):
@@ -59,11 +58,6 @@ def connected_components(rows, links, neighbours, places, bridges, parent):
                     parent[max(one, other)] = min(one, other)
             bits >>= np.uint64(1)
             h += 1
-    for k in range(len(bridges)):
-        i, j = places[bridges[k, 0]], places[bridges[k, 1]]
-        if i >= 0 and j >= 0:
-            one, other = find_root(parent, np.int64(i)), find_root(parent, np.int64(j))
-            parent[max(one, other)] = min(one, other)
     for i in range(len(rows)):
         parent[i] = find_root(parent, i)
         places[rows[i]] = -1

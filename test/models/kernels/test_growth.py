@@ -9,7 +9,6 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.growth import estimate_noise, line_above_zero
 from surfel_mapper.models.kernels.growth import (
     assign_points,
@@ -25,6 +24,7 @@ from surfel_mapper.models.kernels.voxel_points import (
     merge_owners,
     owner_means,
 )
+from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both
 
 SIZE = 0.1

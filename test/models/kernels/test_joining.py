@@ -9,7 +9,6 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.growth import owner_table, sorted_table
 from surfel_mapper.models.kernels.joining import (
     height_errors,
@@ -18,6 +17,7 @@ from surfel_mapper.models.kernels.joining import (
     sort_owners,
     touching_patches,
 )
+from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both
 
 SIZE = 0.1

@@ -7,7 +7,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from surfel_mapper.models.fitting import thin
 from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.joining import join_patches, layers, single_regions, touching_regions
 from surfel_mapper.models.kernels import region_joining
@@ -17,6 +16,7 @@ from surfel_mapper.models.kernels.region_joining import (
     join_pair,
     join_smooth,
 )
+from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both, interpreted
 
 SIZE_M = 0.05

@@ -32,9 +32,7 @@ from surfel_mapper.models.kernels.surfel_groups import (
     sort_by_group,
 )
 from surfel_mapper.models.kernels.surfel_links import (
-    find_bridges,
     find_hosts,
-    flag_components,
     link_neighbours,
     ROUNDS,
     spread,
@@ -200,17 +198,8 @@ def test_components_equal_scipy_and_are_named_by_the_least_key(call):
     _, expected = scipy_components(coo_array((np.ones(len(i)), (i, table[i, h])), (num, num)))
     rows = np.flatnonzero(kind == FLAT).astype(np.int32)
     places, parent = np.full(num, -1, np.int32), np.empty(len(rows), np.int64)
-    none = np.empty((0, 2), np.int32)
-    call(connected_components, rows, links, table, places, none, parent)
+    call(connected_components, rows, links, table, places, parent)
     assert (places == -1).all()
-    same = parent[:, None] == parent[None]
-    np.testing.assert_array_equal(same, expected[rows][:, None] == expected[rows][None])
-
-    bridges = rows[[[0, -1], [3, -2]]]
-    call(connected_components, rows, links, table, places, bridges, parent)
-    both_ends = np.concatenate([np.stack([i, table[i, h]]), bridges.T], axis=1)
-    bridged = coo_array((np.ones(both_ends.shape[1]), tuple(both_ends)), (num, num))
-    _, expected = scipy_components(bridged)
     same = parent[:, None] == parent[None]
     np.testing.assert_array_equal(same, expected[rows][:, None] == expected[rows][None])
 
@@ -282,41 +271,6 @@ def test_spread_lists_all_within_some_steps(call):
         assert set(found[:num].tolist()) == expected
         assert not marks.any()
         expected |= {int(j) for i in expected for j in table[i] if j >= 0}
-
-
-@both
-def test_bridges_join_the_hosts_of_touching_voxels_of_one_surface(call):
-    table, kind, position, normal = grid_of_surfels(12)
-    rng = np.random.default_rng(13)
-    kind[rng.random(len(kind)) < 0.6] = ROUGH
-    flat = np.flatnonzero(kind == FLAT)
-    host = np.where(kind == FLAT, -1, rng.choice(flat, len(kind))).astype(np.int32)
-    hosted = np.flatnonzero(host >= 0).astype(np.int32)
-    group = np.where(kind == FLAT, rng.integers(-1, 6, len(kind)), -1).astype(np.int32)
-    expected = set()
-    for row in hosted:
-        one = host[row]
-        for near in table[row][table[row] >= 0]:
-            other = host[near] if host[near] >= 0 else near
-            if min(group[one], group[other]) < 0 or group[one] == group[other]:
-                continue
-            delta, cosine = position[one] - position[other], normal[one] @ normal[other]
-            first, second = normal[one] @ delta, normal[other] @ delta
-            on_plane = abs(cosine) > RULES[0] and 0.5 * (abs(first) + abs(second)) < RULES[1]
-            if on_plane or (cosine > RULES[2] and 0.5 * abs(first + second) < RULES[3]):
-                expected.add((int(one), int(other)))
-    pairs = np.empty((2000, 2), np.int32)
-    state = kind, position, normal, kind
-    num = call(find_bridges, hosted, host, table, state, RULES, group, pairs)
-    assert {tuple(pair) for pair in pairs[:num].tolist()} == expected
-    assert len(expected) > 5
-    assert call(find_bridges, hosted, host, table, state, RULES, group, pairs[:1]) == num
-
-    flags, rows = np.zeros(len(kind), bool), hosted[:2]
-    component = np.where(kind == FLAT, np.arange(len(kind)), -1).astype(np.int32)
-    call(flag_components, rows, table, host, component, flags)
-    near = {int(j) for row in rows for j in (row, *table[row]) if j >= 0}
-    assert set(np.flatnonzero(flags)) == {int(host[j]) if host[j] >= 0 else j for j in near}
 
 
 @both

@@ -1,0 +1,119 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+Patches in coarser voxels: growth over sparse points, and joins across gaps.
+
+Rings of a lidar and objects in its way leave gaps in the ground that are wider than a voxel.
+In voxels of two and more times the size both sides touch, so planes grow and patches are joined
+by the rules of fine voxels. Clouds and surfels of a map use it alike: a surfel is one point.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from surfel_mapper.config import ModelsConfig
+from surfel_mapper.models.growth import add_facets, extend_planes, owner_table, pieces_of
+from surfel_mapper.models.joining import join_patches, Pieces
+from surfel_mapper.models.thinning import thin
+
+Array = npt.NDArray[np.float64]
+Owners = npt.NDArray[np.int32]
+
+Shape = tuple[Array, npt.NDArray[np.bool_]]
+"""Normals (K, 3) of patches, and whether each is a curved surface (K,)."""
+
+COARSE_TOLERANCE_VOXELS = 0.04
+"""Tolerance of facets in coarser voxels, at least: at 50 m a road sags more than near patches."""
+
+
+SPARSE_SHARE = 0.05
+"""Share of points on no patch from which coarser voxels help."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CoarseRules:
+    """
+    Rules of growth that are the same in voxels of all sizes.
+
+    Attributes
+    ----------
+    finest_m : float
+        Edge of the finest voxels.
+    tolerance_m : float
+        Distance up to which a point lies on a facet.
+    noise : (float, float)
+        Sigma of the points is noise[0] + noise[1] range^2, m.
+    view : (3,) float64, m, optional
+        Position of the sensor, that normals face; if omitted, joined patches face the side of
+        their parts.
+
+    """
+
+    finest_m: float
+    tolerance_m: float
+    noise: tuple[float, float]
+    view: Array | None = None
+
+
+def grow_coarse(
+    points: npt.NDArray[Any],
+    owner: Owners,
+    shape: Shape,
+    size_m: float,
+    rules: CoarseRules,
+    facets: ModelsConfig | None = None,
+) -> Shape:
+    """
+    Grow planes over free points, join patches, and return the normals and curvature of these.
+
+    Parameters
+    ----------
+    points : (N, 3) float, m
+        Points that are not finite are left out.
+    owner : (N,) int32
+        Patch of every point, negative for none; changed in place.
+    shape : (K, 3) float64, (K,) bool
+        Normals of the patches, and which are curved.
+    size_m : float
+        Edge of the voxels.
+    rules : CoarseRules
+        The other rules.
+    facets : ModelsConfig, optional
+        Settings of facets, which are grown from free points if given.
+
+    """
+    normals, curved = shape
+    coarse = thin(points, size_m).by_voxel()
+    before = owner[coarse.rows]
+    after = np.maximum(before, -1)
+    if size_m > rules.finest_m:
+        extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
+    num = len(normals)
+    if facets is not None:
+        facet_m = max(rules.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
+        num = add_facets(coarse, after, num, (size_m, facet_m), facets)
+    pieces = pieces_of(coarse, owner_table(coarse, after), num)
+    view = beyond(pieces, normals) if rules.view is None else rules.view
+    index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
+    # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
+    was = np.append(curved, np.zeros(num - len(curved), np.bool_))
+    held = np.bincount(after[after >= 0], minlength=num)
+    total = np.bincount(index, held, len(normals))
+    curved = bent | (2.0 * np.bincount(index, held * was, len(normals)) > total)
+    owner[coarse.rows] = np.where(after < 0, before, np.append(index, 0)[after])
+    return normals, curved
+
+
+def beyond(pieces: Pieces, normals: Array) -> Array:
+    """Return a viewpoint (K, 3) for each patch, 1 m from its mean along its normal."""
+    number = len(normals)
+    patch = np.repeat(np.arange(number), np.diff(pieces.starts))
+    total = np.bincount(patch, pieces.weights, number)
+    sums = [np.bincount(patch, pieces.weights * x, number) for x in pieces.means.T]
+    view: Array = np.stack(sums, axis=1) / np.maximum(total, 1.0)[:, None] + normals
+    return view
