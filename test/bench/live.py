@@ -9,7 +9,9 @@ reliable, with the defaults of the middleware, or, in rows ``with profile``, wit
 shared memory. A rate is sustained if every cloud published comes back as a change; the latency of
 ``~/normals`` counts from the stamp of its latest scan, while clouds come. Idle is a node that has
 mapped, with nothing coming in. Rows ``transport`` are a subscriber of rclpy that only takes the
-clouds, in place of the node: no subscriber is faster.
+clouds, in place of the node, with ordinary priority. The rows of the node by defaults depend on
+whether Linux permits it real-time priority (docs/node.md); without: ``setpriv
+--bounding-set=-sys_nice -- python -m test.bench --only live`` as root.
 
 Only the rows of the node at 20 Hz grow with ``--scans``; live_long.py has the long ones alone.
 """
