@@ -11,6 +11,7 @@ same files.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager, ExitStack
 import logging
 import multiprocessing
@@ -270,6 +271,31 @@ def interrupt_held() -> Iterator[None]:
         raise KeyboardInterrupt
 
 
+def connected(scheduler: str) -> Any:
+    """
+    Return a client of a scheduler; raise ClusterError if it does not answer as one.
+
+    Dask waits for ever for a server that says nothing, and takes the answers of others for the
+    lengths of arrays (MemoryError).
+    """
+    from distributed import Client
+
+    answer: Future[Any] = Future()
+
+    def connect() -> None:
+        try:
+            answer.set_result(Client(scheduler, timeout=CONNECT_S))
+        except Exception as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=connect, daemon=True).start()
+    try:
+        return answer.result(2 * CONNECT_S)
+    except Exception as error:
+        reason = str(error) or type(error).__name__
+        raise ClusterError(f'{scheduler}: no Dask scheduler answers: {reason}') from error
+
+
 @contextmanager
 def open_executor(workers: int | None = None, scheduler: str | None = None) -> Iterator[Executor]:
     """
@@ -297,7 +323,7 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
     method = start_forkserver() if scheduler is None else 'spawn'
     try:
         import dask
-        from distributed import Client
+        import distributed  # noqa: F401 - may be missing alone
     except ImportError as error:
         raise DependencyError(
             f'dask cannot be loaded ({error}). It runs the workers; install it with '
@@ -317,11 +343,7 @@ def open_executor(workers: int | None = None, scheduler: str | None = None) -> I
                 client = start_local(workers, started)
                 yield DaskExecutor(client)
             return
-        try:
-            client = Client(scheduler, timeout=CONNECT_S)
-        except (OSError, ValueError, TypeError) as error:  # the last without keys for TLS
-            raise ClusterError(f'{scheduler}: no Dask scheduler answers: {error}') from error
-        with client:
+        with connected(scheduler) as client:
             if not client.scheduler_info(n_workers=-1)['workers']:
                 raise ClusterError(f'{scheduler}: no workers; start some with `dask worker`')
             yield DaskExecutor(client)

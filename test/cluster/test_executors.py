@@ -173,11 +173,14 @@ def test_strangers_get_no_page_and_end_nothing(two_workers):
 
 def is_refused(stranger, sent):
     """Send bytes; return whether the connection ends, with an error of HTTP or of TLS, or none."""
+    stranger.settimeout(60.0)
     try:
         stranger.sendall(sent)
         stranger.shutdown(socket.SHUT_WR)
         answer = b''.join(iter(lambda: stranger.recv(1 << 16), b''))
-    except ConnectionError:
+    except TimeoutError:
+        return False
+    except OSError:  # the other end was faster
         return True
     return not answer or answer[:12] in (b'HTTP/1.1 400', b'HTTP/1.1 404') or answer[0] == 0x15
 
@@ -316,3 +319,31 @@ def test_a_scheduler_that_does_not_answer_is_refused_by_name(monkeypatch, addres
     monkeypatch.setattr(executors, 'CONNECT_S', 1)
     with pytest.raises(ClusterError, match=address), open_executor(scheduler=address):
         pass
+
+
+@pytest.mark.parametrize(
+    'answer',
+    [None, b'', b'HTTP/1.0 400 Bad Request\r\n\r\n', random.Random(2).randbytes(4096)],
+    ids=['silence', 'closed', 'http', 'garbage'],
+)
+def test_a_server_that_is_no_scheduler_is_refused_by_name(monkeypatch, answer):
+    """Silence was waited for without end; answers of others became lengths of arrays."""
+    monkeypatch.setattr(executors, 'CONNECT_S', 2)
+    accepted = []
+
+    def serve():
+        while True:
+            connection, _ = server.accept()
+            accepted.append(connection)
+            if answer is not None:
+                connection.sendall(answer)
+            if answer == b'':
+                connection.close()
+
+    with socket.create_server(('127.0.0.1', 0)) as server:
+        address = f'tcp://127.0.0.1:{server.getsockname()[1]}'
+        threading.Thread(target=serve, daemon=True).start()
+        with pytest.raises(ClusterError, match=address), open_executor(scheduler=address):
+            pytest.fail('it has begun')
+        for connection in accepted:
+            connection.close()
