@@ -211,14 +211,14 @@ def show_live(args: argparse.Namespace) -> None:
     """Show a running node until Ctrl-C, or until the page ends."""
     from surfel_mapper.cli._ros import loading_ros
 
-    try:
-        with loading_ros(), opened(args) as scene:
-            from surfel_mapper.ros.node_view import show_node
+    with loading_ros(), opened(args) as scene:
+        from surfel_mapper.ros.node_view import show_node
 
-            announce(scene)
+        announce(scene)
+        try:
             show_node(scene, args.live, args.color, args.ros_args, scene.has_ended)
-    except KeyboardInterrupt:
-        print(file=sys.stderr)
+        except KeyboardInterrupt:  # the usual end, of a file too: it is whole
+            print(file=sys.stderr)
 
 
 def show_recording(path: Path, args: argparse.Namespace, scene: Scene) -> None:

@@ -110,10 +110,12 @@ def test_a_node_is_viewed_by_its_topics(start, peer, tmp_path):
     expected = surfels_after(NUM_SCANS)
     peer.spin_until(lambda: normals[-1].width == len(expected))
 
-    file = tmp_path / 'shown.rrd'
+    folder = tmp_path / 'view'  # the file has another name until it is whole
+    folder.mkdir()
+    file = folder / 'shown.rrd'
     view = start('view', '--live', '--rrd', str(file))
     deadline = time.monotonic() + TIMEOUT_S
-    while not (file.exists() and os.path.getsize(file) > 40 * len(expected)):
+    while not any(part.stat().st_size > 40 * len(expected) for part in folder.iterdir()):
         view.check()
         assert time.monotonic() < deadline
         time.sleep(0.1)
