@@ -143,7 +143,7 @@ $(OUSTER_ENV)/.ready: setup.py pyproject.toml
 $(DEMO_STAMP): setup.py pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	{ echo 'Python 3.10 or newer is needed: make PYTHON=python3.12 ...' >&2; exit 1; }
-	@echo 'Once: packages from PyPI into $(VENV)/, about 190 MB to download, 700 MB on the disk'
+	@echo 'Once: packages from PyPI into $(VENV)/, about 190 MB to download, 750 MB on the disk'
 	$(PYTHON) -m venv $(VENV_FLAGS) $(if $(wildcard $(VENV)/.ready-$(OTHER)),--clear) $(VENV)
 	$(BIN)/python -m pip install -q --disable-pip-version-check -e '.$(DEMO_EXTRAS)'
 	touch $@
