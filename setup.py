@@ -18,6 +18,10 @@ from setuptools import find_packages, setup
 
 NAME = 'surfel_mapper'
 
+# A reserved domain, which stands for the address that the project does not have yet: release.yml
+# publishes nothing while it is here, in package.xml or in CITATION.cff.
+SITE = 'https://surfel-mapper.example'
+
 REQUIRED = [
     # The lower bounds are what Ubuntu 24.04 has, the system of ROS 2 Jazzy, so that its apt
     # packages are kept; of numba and rosbags, which it lacks, the oldest that the tests pass with.
@@ -154,6 +158,13 @@ setup(
     long_description_content_type='text/markdown',
     maintainer='surfel_mapper contributors',
     maintainer_email='maintainers@surfel-mapper.example',
+    url=SITE,
+    project_urls={
+        'Documentation': f'{SITE}/docs/',
+        'Source': f'{SITE}/source/',
+        'Issues': f'{SITE}/issues/',
+        'Changelog': f'{SITE}/docs/changelog/',
+    },
     license='Apache-2.0',
     keywords=['ROS', 'lidar', 'point cloud', 'surfel', 'mapping'],
     classifiers=[

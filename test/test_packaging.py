@@ -36,6 +36,27 @@ def test_the_citation_states_the_version():
     assert citation['license'] == MANIFEST.findtext('license')
 
 
+def test_the_addresses_are_the_same_everywhere():
+    site = re.search(r"^SITE = '([^']+)'", SETUP, flags=re.MULTILINE).group(1)
+    in_setup = dict(re.findall(r"'(\w+)': f'{SITE}(/[^']*)'", SETUP))
+    expected = {
+        'website': site,
+        'repository': site + in_setup['Source'],
+        'bugtracker': site + in_setup['Issues'],
+    }
+    assert {url.get('type'): url.text for url in MANIFEST.iter('url')} == expected
+    citation = yaml.safe_load((ROOT / 'CITATION.cff').read_text(encoding='utf-8'))
+    assert citation['url'] == expected['website']
+    assert citation['repository-code'] == expected['repository']
+
+
+def test_no_release_has_the_reserved_domain():
+    release = yaml.safe_load((ROOT / '.github/workflows/release.yml').read_text(encoding='utf-8'))
+    (check,) = (s['run'] for s in release['jobs']['build']['steps'] if 'grep' in s.get('run', ''))
+    refused = subprocess.run(['bash', '-c', check], cwd=ROOT, capture_output=True, check=False)
+    assert (refused.returncode == 1) == ('surfel-mapper.example' in SETUP)
+
+
 def test_workflows_run_targets_of_the_makefile():
     makefile = (ROOT / 'Makefile').read_text(encoding='utf-8')
     targets = set(re.findall(r'^([a-z]+):', makefile, flags=re.MULTILINE))

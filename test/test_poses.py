@@ -309,11 +309,12 @@ def lines_of(function):
         lines += event == 'line'
         return trace
 
+    before = sys.gettrace()  # of a measurement of coverage
     sys.settrace(trace)
     try:
         function()
     finally:
-        sys.settrace(None)
+        sys.settrace(before)
     return lines
 
 
