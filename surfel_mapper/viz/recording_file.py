@@ -56,6 +56,7 @@ class RecordingFile:
                 try:
                     if self._error is None:
                         self._file.write(content)
+                        self._file.flush()
                 except OSError as error:
                     self._error = error
 

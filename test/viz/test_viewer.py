@@ -130,6 +130,7 @@ def addresses(port):
 
 FULL = """
 import resource, sys
+sys.dont_write_bytecode = True  # it would be cut
 from surfel_mapper.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
 sys.exit(main(sys.argv[1:]))
