@@ -14,6 +14,8 @@ import math
 import re
 from typing import NoReturn
 
+from surfel_mapper.errors import one_line
+
 CUT, APART, INTERRUPTED = 3, 4, 130
 """
 Exit codes: a recording ends too early and --strict was given; scans were mapped apart from the
@@ -43,7 +45,7 @@ class Parser(argparse.ArgumentParser):
         found = re.search(r": invalid choice: '([^']*)' \(choose from (.*)\)$", message)
         if found:
             message += nearest(found[1], re.findall(r"[^', ]+", found[2]))
-        super().error(message)
+        super().error(one_line(message))
 
     def refuse_unknown(self, words: list[str]) -> NoReturn:
         """Exit with 2 for words that are no arguments, naming the nearest option of each."""

@@ -20,6 +20,7 @@ from typing import Any, TYPE_CHECKING
 from surfel_mapper.cli._arguments import CUT
 from surfel_mapper.cli._output import printable, show_lines
 from surfel_mapper.cli._progress import progress
+from surfel_mapper.errors import escaped
 
 if TYPE_CHECKING:
     from surfel_mapper.bags.reader import BagReader
@@ -113,7 +114,8 @@ def report(content: dict[str, Any], made: list[Offer]) -> str:
     if content['undecodable']:
         lines.append(f'{content["undecodable"]} messages of clouds or poses are damaged')
     for clouds in dict.fromkeys(offer.clouds for offer in made):
-        lines += ['', f'clouds of {clouds} with a pose, and the settings for --config:']
+        with_a_pose = f'clouds of {clouds} with a pose, and the settings for --config:'
+        lines += ['', escaped(with_a_pose)]
         for offer in made:
             lines += offered(offer) if offer.clouds == clouds else []
     if not made:
@@ -213,4 +215,4 @@ def offered(offer: Offer) -> list[str]:
     lines = [f'  {offer.poses}: {offer.covered} of {offer.total}, in the frame {fixed}']
     if offer.missing:
         lines.append(f'    {offer.missing}')
-    return [*lines, *(f'      {line}' for line in text.splitlines())]
+    return [*map(escaped, lines), *(f'      {line}' for line in text.splitlines())]

@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except UsageError as error:
         args.parser.print_usage(sys.stderr)
-        return refused(args.verb, str(error), 2)
+        return refused(args.verb, one_line(error), 2)
     except SurfelMapperError as error:
         return refused(args.verb, str(error))
     except OSError as error:

@@ -10,7 +10,7 @@ disk, see the old file or the new one, never a part.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 import json
 import os
@@ -104,6 +104,13 @@ def sync_directory(directory: Path) -> None:
             os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def check_names(path: str | Path, names: Iterable[str]) -> None:
+    """Refuse names of columns that would change the meaning of a header of text."""
+    for name in names:
+        if not re.fullmatch('[!-~]+', name):
+            raise FileFormatError(f'{path}: column {name!r}, expected ASCII without spaces')
 
 
 def write_json(path: str | Path, content: Mapping[str, Any]) -> None:

@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import DependencyError, FileFormatError
-from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.text_table import read_table, whole
 from surfel_mapper.mapping.surfel_columns import surfel_columns
 
@@ -107,9 +107,10 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
     Raises
     ------
     FileFormatError
-        If the file cannot be written.
+        If the file cannot be written, or the name of a column is not ASCII or has spaces.
 
     """
+    check_names(path, columns)
     layout = np.dtype([(name, v.dtype.newbyteorder('<')) for name, v in columns.items()])
     table = np.empty(len(next(iter(columns.values()))), layout)
     for name, values in columns.items():

@@ -26,7 +26,7 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.atomic import replace_file
+from surfel_mapper.files.atomic import check_names, replace_file
 from surfel_mapper.files.text_table import read_table, whole
 
 if TYPE_CHECKING:
@@ -119,9 +119,10 @@ def write_points(path: str | Path, columns: Mapping[str, npt.NDArray[Any]]) -> N
     Raises
     ------
     FileFormatError
-        If the file cannot be written.
+        If the file cannot be written, or the name of a column is not ASCII or has spaces.
 
     """
+    check_names(path, columns)
     properties, table = as_table(columns)
     header = (
         'ply\nformat binary_little_endian 1.0\ncomment surfel_mapper, metres\n'

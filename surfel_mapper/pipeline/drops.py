@@ -15,6 +15,7 @@ import logging
 import time
 
 from surfel_mapper.counters import Counters
+from surfel_mapper.errors import one_line
 from surfel_mapper.scan import Scan
 
 _log = logging.getLogger(__name__)
@@ -55,7 +56,7 @@ REMEDIES = {
 
 def described(error: BaseException) -> str:
     """Return an error in a line: its type, and its text on one line if it has any."""
-    text = ' '.join(str(error).split())
+    text = one_line(' '.join(str(error).split()))
     return f'{type(error).__name__}: {text}' if text else type(error).__name__
 
 

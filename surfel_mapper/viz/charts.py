@@ -228,5 +228,10 @@ def _svg(figure: Figure, about: str) -> str:
         text = re.sub(pattern, '', text)
     for color, variable in VARIABLES.items():
         text = text.replace(color, variable)
-    label = escape(escaped(about), quote=True)
+    label = as_html(about)
     return text.replace('<svg', f'<svg role="img" aria-label="{label}"', 1)
+
+
+def as_html(text: object) -> str:
+    """Return text for a page: control characters, tags and quotes are escaped."""
+    return escape(escaped(str(text)))

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterable, Sequence
-from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +27,7 @@ from surfel_mapper.layers.drawings import (
 )
 from surfel_mapper.models.shapes import CORNERS, FACES
 from surfel_mapper.tsdf.mesh import EMPTY, Mesh
+from surfel_mapper.viz.charts import as_html
 from surfel_mapper.viz.mesh import MAX_TRIANGLES
 
 Array = npt.NDArray[np.float64]
@@ -167,19 +167,20 @@ def section_html(section: Section, picture: str | Path | None = None) -> str:
 
     """
     cells = ''.join(
-        f'<div><dt>{escape(k)}</dt><dd>{escape(v)}</dd></div>' for k, v in section.figures.items()
+        f'<div><dt>{as_html(k)}</dt><dd>{as_html(v)}</dd></div>'
+        for k, v in section.figures.items()
     )
-    parts = [f'<h2>{escape(section.title)}</h2>']
+    parts = [f'<h2>{as_html(section.title)}</h2>']
     if cells:
         parts.append(f'<dl class="figures">{cells}</dl>')
     if picture is not None:
         png = base64.b64encode(Path(picture).read_bytes()).decode()
-        alt = f'picture: {escape(section.title)}'
+        alt = f'picture: {as_html(section.title)}'
         parts.append(f'<img class="wide" alt="{alt}" src="data:image/png;base64,{png}">')
     if section.table is not None:
         parts.append(table_html(section.table))
     if section.note:
-        parts.append(f'<p class="none">{escape(section.note)}</p>')
+        parts.append(f'<p class="none">{as_html(section.note)}</p>')
     return ''.join(parts)
 
 
@@ -188,8 +189,8 @@ def table_html(table: Table) -> str:
     num_texts = table.num_texts
 
     def cells(tag: str, values: Sequence[str]) -> str:
-        texts = ''.join(f'<{tag}>{escape(value)}</{tag}>' for value in values[:num_texts])
-        numbers = (f'<{tag} class="number">{escape(v)}</{tag}>' for v in values[num_texts:])
+        texts = ''.join(f'<{tag}>{as_html(value)}</{tag}>' for value in values[:num_texts])
+        numbers = (f'<{tag} class="number">{as_html(v)}</{tag}>' for v in values[num_texts:])
         return texts + ''.join(numbers)
 
     rows = []

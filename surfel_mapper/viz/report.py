@@ -14,7 +14,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping, Sequence
 import hashlib
-from html import escape
 from importlib.resources import files
 import json
 from pathlib import Path
@@ -28,7 +27,7 @@ from surfel_mapper.counters import STAGES
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.tsdf.mesh import Mesh
-from surfel_mapper.viz.charts import histogram, lines, named_bars, short
+from surfel_mapper.viz.charts import as_html, histogram, lines, named_bars, short
 from surfel_mapper.viz.history import History
 from surfel_mapper.viz.turning_view import turning_view
 
@@ -88,7 +87,7 @@ def write_report(
     valid = surfels.select(np.isfinite(surfels.planarity))
     shown = valid if drawn is None else drawn.select(np.isfinite(drawn.planarity))
     parts = [
-        f'<h1>{escape(title)}</h1><p class="about">{escape(about(summary))}</p>',
+        f'<h1>{as_html(title)}</h1><p class="about">{as_html(about(summary))}</p>',
         figures(summary, history),
         turning_view(shown, history.trajectory, summary, picture, layers or {}),
         *sections,
@@ -114,7 +113,7 @@ def page(title: str, body: str) -> str:
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<link rel="icon" href="data:,"><title>{escape(title)}</title>'
+        f'<link rel="icon" href="data:,"><title>{as_html(title)}</title>'
         f'<style>{style}</style></head>\n<body>{body}'
         f'<footer>made by surfel_mapper</footer>\n<script>{script}</script></body></html>\n'
     )
@@ -169,7 +168,7 @@ def figures(summary: Mapping[str, Any], history: History) -> str:
     if summary.get('replay_s'):
         speed = summary.get('recorded_s', 0.0) / summary['replay_s']
         shown['speed'] = f'{speed:.3g} \u00d7 real time'
-    cells = ''.join(f'<div><dt>{k}</dt><dd>{escape(v)}</dd></div>' for k, v in shown.items())
+    cells = ''.join(f'<div><dt>{k}</dt><dd>{as_html(v)}</dd></div>' for k, v in shown.items())
     return f'<dl class="figures">{cells}</dl>'
 
 
@@ -178,12 +177,12 @@ def tracking_table(registration: Mapping[str, Any]) -> str:
     if 'tracking' not in registration:
         return ''
     states = ''.join(
-        f'<tr><td>{escape(state)}</td><td>{found["scans"]}</td><td>{found["seconds"]:.1f}</td></tr>'
+        f'<tr><td>{as_html(state)}</td><td>{found["scans"]}</td><td>{found["seconds"]:.1f}</td></tr>'
         for state, found in registration['tracking'].items()
     )
     parts = ''.join(
         f'<p>apart_{number}: {part["scans"]} scans from {part["first_s"]:.3f} to '
-        f'{part["last_s"]:.3f} s have no certain place on the map: {escape(part["reason"])}</p>'
+        f'{part["last_s"]:.3f} s have no certain place on the map: {as_html(part["reason"])}</p>'
         for number, part in enumerate(registration['apart'], start=1)
     )
     head = '<tr><th>state</th><th>scans</th><th>s</th></tr>'
@@ -256,14 +255,14 @@ def pose_errors_table(errors: Mapping[str, Any] | None) -> str:
     )
     return (
         f'<h2>Errors of the poses</h2><table><tr><th></th>{head}</tr>{rows}</table>'
-        f'<p>{escape(drift)}</p>'
+        f'<p>{as_html(drift)}</p>'
     )
 
 
 def times_table(summary: Mapping[str, Any]) -> str:
     """Return a table of the median and 99th percentile of every stage."""
     rows = ''.join(
-        f'<tr><td>{escape(str(stage))}</td><td class="number">{times["median"]:.2f}</td>'
+        f'<tr><td>{as_html(stage)}</td><td class="number">{times["median"]:.2f}</td>'
         f'<td class="number">{times["p99"]:.2f}</td></tr>'
         for stage, times in sorted(
             summary['milliseconds'].items(), key=lambda item: stage_order(item[0])
@@ -286,7 +285,7 @@ def settings_table(settings: Mapping[str, Any]) -> str:
 
     def table(values: Mapping[str, Any]) -> str:
         rows = ''.join(
-            f'<tr><td>{escape(name)}</td><td>{escape(json.dumps(value, default=str))}</td></tr>'
+            f'<tr><td>{as_html(name)}</td><td>{as_html(json.dumps(value, default=str))}</td></tr>'
             for name, value in values.items()
         )
         return f'<table>{rows}</table>'

@@ -114,6 +114,18 @@ def test_frames_are_shown_without_the_slash_of_ros1(tmp_path, capsys):
     assert f'  /tf: {NUM_SCANS} of {NUM_SCANS}, in the frame odom' in capsys.readouterr().out
 
 
+def test_names_of_frames_are_no_lines_of_the_report(tmp_path, capsys):
+    """The frame of a cloud began a line of its own, among the reasons for poses that lack."""
+    entries = drive()
+    for row in entries:
+        if row[1] == CLOUD:
+            row[3].header.frame_id = 'lidar\n[FATAL] forged\u202e'
+    assert main(['info', str(write_rosbag2(tmp_path / 'bag', entries))]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert not [line for line in lines if line.startswith('[FATAL]') or not line.isprintable()]
+    assert sum('lidar\\n[FATAL] forged\\u202e' in line for line in lines) > 1
+
+
 def test_names_of_columns_cannot_write_to_the_terminal(tmp_path, capsys):
     """A PLY has its columns' names, and a file its own, from outside."""
     folder = tmp_path / 'scans\x1b[2J'

@@ -51,6 +51,15 @@ def test_the_help_of_a_verb_shows_an_example(verb, capsys):
     assert example.startswith(f'surfel-mapper {verb} ')
 
 
+@pytest.mark.parametrize('arguments', [('fly\x1b[2J',), ('replay', 'a', '--a\nb\x1b[2J')])
+def test_wrong_usage_with_control_characters_is_one_line(arguments, capsys):
+    """A shell expands patterns to the names of files, which come from outside."""
+    assert usage_code(*arguments) == 2
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert '\\x1b[2J' in said
+    assert 'error: ' in said
+
+
 @pytest.mark.parametrize('arguments', [(), ('fly',), ('replay',), ('replay', 'a', '--fly')])
 def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
     assert usage_code(*arguments) == 2

@@ -161,3 +161,11 @@ def test_an_earlier_file_stays_if_the_new_one_cannot_be_written(tmp_path):
 
     with pytest.raises(FileFormatError, match='not a regular file'):
         write_points(tmp_path / 'a.pcd', {'x': np.zeros(3)})
+
+
+@pytest.mark.parametrize('name', ['a b', 'a\nend_header', '\x1b[31m', 'é', ''])
+def test_a_name_that_would_change_the_header_is_refused(tmp_path, name):
+    columns = {'x': np.zeros(1), name: np.zeros(1)}
+    with pytest.raises(FileFormatError, match='expected ASCII without spaces'):
+        write_points(tmp_path / 'a.pcd', columns)
+    assert not list(tmp_path.iterdir())

@@ -208,3 +208,11 @@ def test_an_empty_mesh_gives_an_empty_file(tmp_path):
     plyfile = pytest.importorskip('plyfile')
     found = plyfile.PlyData.read(tmp_path / 'mesh.ply')
     assert len(found['vertex'].data) == len(found['face'].data) == 0
+
+
+@pytest.mark.parametrize('name', ['a b', 'a\nend_header', '\x1b[31m', 'é', ''])
+def test_a_name_that_would_change_the_header_is_refused(tmp_path, name):
+    columns = {'x': np.zeros(1), name: np.zeros(1)}
+    with pytest.raises(FileFormatError, match='expected ASCII without spaces'):
+        write_points(tmp_path / 'a.ply', columns)
+    assert not list(tmp_path.iterdir())

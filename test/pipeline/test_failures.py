@@ -20,6 +20,7 @@ from surfel_mapper.layers import Layer
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import SlidingWindow
 from surfel_mapper.pipeline import inserter
+from surfel_mapper.pipeline.drops import described
 from surfel_mapper.pipeline.preparation import Preparation
 from surfel_mapper.pipeline.reduction import Reduction
 from surfel_mapper.pipeline.saved_state import save_mapper
@@ -230,3 +231,9 @@ def test_guarded_work_is_counted_and_goes_on(caplog):
     assert "a timer failed: KeyError: 'x'" in caplog.text
     with pytest.raises(KeyboardInterrupt), mapper.guarded('a timer'):
         raise KeyboardInterrupt
+
+
+def test_errors_are_described_in_a_line_without_control_characters():
+    """The answer of a service has the text of the error too, not only the log."""
+    assert described(ValueError('a\n b\x1b[2J\u202e')) == 'ValueError: a b\\x1b[2J\\u202e'
+    assert described(MemoryError()) == 'MemoryError'
