@@ -6,15 +6,19 @@ Tables of docs/faults.md and SECURITY.md from runs and tests, limits from the co
 ``python -m test.fuzz --seconds 600 > fuzz.log`` and then ``python -m test.fuzz.claims fuzz.log``
 write them: faults, findings and numbers of inputs from the tests, costs from the log of one or
 several runs, the last row of an input counts. Logs of ``test.soak``, ``test.soak.faults 10`` and
-``test.soak.node_faults 10`` give the rows of long runs. The limits that SECURITY.md states are
+``test.soak.node_faults 10`` give the rows of long runs, and logs of all shares of
+``test_failures.py``, from ``test.fuzz`` or pytest -rP, those of kills and failed allocations; the
+last log of a share counts. The limits that SECURITY.md states are
 compared with the constants of the code; the command lists those that differ, and a test fails.
 """
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 import re
 import sys
+from typing import NamedTuple
 
 from surfel_mapper import budget
 from surfel_mapper.bags import bag_file, chunked, compression, decoders, paths
@@ -26,6 +30,7 @@ from surfel_mapper.poses import buffer
 from test.fuzz import findings_table, oracle
 from test.fuzz.__main__ import HEAD
 from test.fuzz.harnesses import HARNESSES
+from test.fuzz.test_failures import FEWER, SHARES
 from test.ros import fault_table
 
 SECURITY = fault_table.PAGE.parents[1] / 'SECURITY.md'
@@ -37,6 +42,25 @@ TOTAL = '| inputs of `make fuzz`, by atheris and then measured |'
 RUN = re.compile(r'^\| `python -m test\.soak.*\|$', re.MULTILINE)
 
 ROW = re.compile(r'^\| (\w+) \| (\d+) \| (\d+) \|.*\|$', re.MULTILINE)
+
+
+SHARE = re.compile(r'^share (\d+)\b', re.MULTILINE)
+
+FAILED = re.compile(
+    r'^(\w+): (\d+) allocations failed(?:, (\d+) in a call of numba)?', re.MULTILINE
+)
+
+UNTIL_THE_MAP = re.compile(r'^replay up to its map: (\{.*?\})', re.MULTILINE)
+
+KILLED = re.compile(r'^killed at (\d+) steps of writing$', re.MULTILINE)
+
+KILLS = '| steps of writing where the process was killed, by `make fuzz` and in the rows below |'
+
+OF_THE_MAP = '| allocations of insert, remove, reduce, read and load that failed, each of them |'
+
+OF_A_REPLAY = '| allocations of a small replay up to its map that failed, each of them |'
+
+SAMPLED = '| allocations of a replay with its imports and threads that failed, sampled |'
 
 
 def limits() -> list[str]:
@@ -87,6 +111,72 @@ def page_with_runs(text: str, logs: str) -> str:
     return text
 
 
+class Failures(NamedTuple):
+    """Allocations that failed in logs of all shares, and those that ended or stalled a process."""
+
+    of_the_map: int
+    crashed: int
+    of_a_replay: int
+    ended: int
+    sampled: int
+
+    @classmethod
+    def of(cls, logs: str) -> Failures:
+        """Add up the shares; those of the map and of samples come again after FEWER shares."""
+        _, *parts = SHARE.split(logs)
+        found: dict[int, str] = {}
+        for share, text in zip(map(int, parts[::2]), parts[1::2], strict=True):
+            if UNTIL_THE_MAP.search(text):
+                found.pop(share, None)  # the order of the logs decides below too
+                found[share] = text
+        missing = set(range(SHARES)) - found.keys()
+        if missing:
+            raise SystemExit(f'no log of share {", ".join(map(str, sorted(missing)))}')
+        replays = [
+            json.loads(UNTIL_THE_MAP.search(text)[1].replace("'", '"'))
+            for _, text in sorted(found.items())
+        ]
+        distinct = {share % FEWER: text for share, text in found.items()}
+        rows = [row for text in distinct.values() for row in FAILED.findall(text)]
+        return cls(
+            of_the_map=sum(int(number) for name, number, _ in rows if name != 'replay'),
+            crashed=sum(
+                int(number or 0) for text in found.values() for *_, number in FAILED.findall(text)
+            ),
+            of_a_replay=sum(counts['failed'] for counts in replays),
+            ended=sum(len(counts['crashed']) + len(counts['hung']) for counts in replays),
+            sampled=sum(int(number) for name, number, _ in rows if name == 'replay'),
+        )
+
+
+def page_with_failures(text: str, logs: str) -> str:
+    """Return the page with the rows of failed allocations and of kills that logs have."""
+    rows = {}
+    if SHARE.search(logs):
+        found = Failures.of(logs)
+        ended = f'{found.crashed or "none"} ended the process'
+        rows[OF_THE_MAP] = f'{found.of_the_map:,} | the map is that before or after; {ended} |'
+        ended = f'{found.ended or "none"} ended or stalled the process'
+        rows[OF_A_REPLAY] = f'{found.of_a_replay:,} | the whole map or none; {ended} |'
+        rows[SAMPLED] = f'{found.sampled:,} | the same |'
+    if killed := KILLED.findall(logs):
+        rows[KILLS] = f'{int(killed[-1]):,} and {kills_of_tests()} | incomplete files: 0 |'
+    for row, cells in rows.items():
+        if row not in text:
+            raise SystemExit(f'{fault_table.PAGE.name} has no row of{row.strip("|")}')
+        text = re.sub(
+            rf'^{re.escape(row)}.*$', lambda _, r=f'{row} {cells}': r, text, flags=re.MULTILINE
+        )
+    return text
+
+
+def kills_of_tests() -> int:
+    """Return the steps at which tests of test/ros kill a process that saves, and a replay."""
+    from test.ros import test_faults_files as tests
+
+    return tests.STEPS_OF_SAVING * len(tests.SIGNALS) + tests.STEPS_OF_REPLAY
+
+
 def security_page() -> str:
     """Return SECURITY.md with the table of findings."""
     before, _, rest = SECURITY.read_text(encoding='utf-8').partition(findings_table.BEGIN)
@@ -123,7 +213,7 @@ def main(*logs: str) -> int:
     """Write the tables; print the limits that SECURITY.md lacks, and return their number."""
     text = fault_table.page_with(fault_table.table())
     output = '\n'.join(Path(log).read_text('utf-8') for log in logs)
-    text = page_with_runs(text, output)
+    text = page_with_failures(page_with_runs(text, output), output)
     if HEAD[0] in output:
         text = page_with_costs(text, output)
     fault_table.PAGE.write_text(text, encoding='utf-8')

@@ -11,6 +11,7 @@ import pytest
 
 from test.fuzz import claims
 from test.fuzz.harnesses import HARNESSES
+from test.fuzz.test_failures import FEWER, SHARES
 from test.soak.long_run import row_of
 
 FIGURE = re.compile(r'\d[\d,]*')
@@ -44,6 +45,63 @@ def test_a_harness_that_broke_leaves_the_page_as_it_is():
     rows = '\n'.join(f'| {name} | 1 | 2 | 0 | 0.0 | 1 |' for name in [*HARNESSES][1:])
     with pytest.raises(SystemExit, match=f'no row of {next(iter(HARNESSES))}: broken'):
         claims.page_with_costs('', rows)
+
+
+def log_of(share):
+    lost = "{'failed': %d, 'crashed': [%s], 'hung': [], 'last': 9} Exception ignored in: {}"
+    return '\n'.join(
+        [
+            f'share {share} of {SHARES} of the failures',
+            f'insert: {share} allocations failed, 0 in a call of numba',
+            f'load: 100 allocations failed, {int(share == 3)} in a call of numba',
+            'replay: 7 allocations failed',
+            f'replay up to its map: {lost % (10 + share, "5" if share == 9 else "")}',
+            'killed at 30 steps of writing\n',
+        ]
+    )
+
+
+def test_failures_are_added_up_over_the_shares_and_none_is_counted_twice():
+    """Shares of the map come again after FEWER, which made four of each of its failures."""
+    logs = 'share 2 of 32 of the failures\ninsert: 999 allocations failed, 0 in a call of numba\n'
+    logs += ''.join(map(log_of, range(SHARES)))
+    found = claims.Failures.of(logs)
+    assert found == claims.Failures(
+        of_the_map=FEWER * 100 + sum(range(SHARES - FEWER, SHARES)),
+        crashed=1,
+        of_a_replay=SHARES * 10 + sum(range(SHARES)),
+        ended=1,
+        sampled=FEWER * 7,
+    )
+    again = log_of(3).replace('1 in a call', '0 in a call').replace('insert: 3 ', 'insert: 30 ')
+    later = claims.Failures.of(logs + again)  # the last of a share counts
+    assert (later.crashed, later.of_the_map) == (0, found.of_the_map - 27 + 30)
+    with pytest.raises(SystemExit, match='no log of share 0, 31'):
+        claims.Failures.of(''.join(map(log_of, range(1, SHARES - 1))))
+
+
+def test_rows_of_failures_replace_those_of_the_page():
+    page = '\n'.join(
+        f'{row} 1 | old |'
+        for row in (claims.KILLS, claims.OF_THE_MAP, claims.OF_A_REPLAY, claims.SAMPLED)
+    )
+    logs = ''.join(map(log_of, range(SHARES)))
+    assert claims.page_with_failures(page, '') == page
+    assert claims.page_with_failures(page, logs).splitlines() == [
+        f'{claims.KILLS} 30 and 54 | incomplete files: 0 |',
+        f'{claims.OF_THE_MAP} 1,020 | the map is that before or after; 1 ended the process |',
+        f'{claims.OF_A_REPLAY} 816 | the whole map or none; 1 ended or stalled the process |',
+        f'{claims.SAMPLED} 56 | the same |',
+    ]
+    with pytest.raises(SystemExit, match='no row of'):
+        claims.page_with_failures('', logs)
+
+
+def test_the_page_has_the_rows_of_failures():
+    text = claims.fault_table.PAGE.read_text(encoding='utf-8')
+    for row in (claims.KILLS, claims.OF_THE_MAP, claims.OF_A_REPLAY, claims.SAMPLED):
+        assert f'\n{row} ' in text
+    assert f' and {claims.kills_of_tests()} | incomplete files: 0 |' in text
 
 
 def test_tests_that_the_pages_name_exist():

@@ -82,6 +82,7 @@ def test_a_save_that_is_killed_at_any_step_leaves_the_old_file_or_the_new(tmp_pa
     kills = dict(line.rsplit(maxsplit=1) for line in done.stdout.splitlines())
     assert kills.keys() == set(WRITERS) - ({'parquet'} if find_spec('pyarrow') is None else set())
     assert min(map(int, kills.values())) >= 5
+    print(f'killed at {sum(map(int, kills.values()))} steps of writing')
 
 
 KEPT = {}

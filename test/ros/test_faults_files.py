@@ -74,6 +74,15 @@ def ends_at(number, how, function):
         os._exit(0)
 
 
+STEPS_OF_SAVING = 12
+"""Two files: the flush of each, its rename and the flush of its directory, before and after."""
+
+STEPS_OF_REPLAY = 30
+"""Five files of three steps, before and after each."""
+
+SIGNALS = (signal.SIGKILL, signal.SIGTERM)
+
+
 def leftovers(folder):
     return [path for path in folder.iterdir() if path.suffix == '.part']
 
@@ -84,7 +93,7 @@ def leftovers(folder):
     counted='nothing',
     lost='at most the map being saved; a `.part` file may remain',
 )
-@pytest.mark.parametrize('how', [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize('how', SIGNALS)
 def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
     old, new = mapper_of(2, tmp_path), mapper_of(3, tmp_path)
     digests = {old.map.digest(), new.map.digest()}
@@ -98,8 +107,7 @@ def test_killing_the_process_while_saving_leaves_complete_maps(tmp_path, how):
         if not was_ended:
             break
         number += 1
-    # two files: the flush of each, its rename and the flush of its directory, before and after
-    assert number == 12
+    assert number == STEPS_OF_SAVING
     assert load_map(tmp_path / 'map.npz')[0].digest() == new.map.digest()
     assert len(leftovers(tmp_path)) <= 8
 
@@ -126,7 +134,7 @@ def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypa
         write_files(output, formats, mapper, trajectory, summary, History())
 
     number = 0
-    while ends_at(number, (signal.SIGKILL, signal.SIGTERM)[number % 2], write):
+    while ends_at(number, SIGNALS[number % 2], write):
         whole = {path.name for path in output.iterdir() if path.suffix != '.part'}
         assert 'summary.json' not in whole or {'map.npz', 'map.ply', 'map.pcd'} <= whole
         if 'map.npz' in whole:
@@ -135,7 +143,7 @@ def test_killing_a_replay_while_writing_leaves_complete_files(tmp_path, monkeypa
             read_points(output / 'map.ply')
         shutil.rmtree(output)
         number += 1
-    assert number == 30  # five files of three steps, before and after each
+    assert number == STEPS_OF_REPLAY
 
 
 class Disk:
