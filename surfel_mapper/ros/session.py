@@ -206,10 +206,12 @@ class Session:
                 f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)
-        if self._viewer is not None:
-            self._viewer.add(update)
-        if self.registration is not None:
-            self.registration.publish(update)
+        with self.mapper.guarded('showing a scan'):
+            if self._viewer is not None:
+                self._viewer.add(update)
+        with self.mapper.guarded('publishing of the pose'):
+            if self.registration is not None:
+                self.registration.publish(update)
         with self.mapper.guarded('a checkpoint'):
             self._checkpoints.save_if_due()
         now_ns = self._node.get_clock().now().nanoseconds

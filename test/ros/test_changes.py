@@ -136,6 +136,25 @@ def test_the_next_full_map_repairs_a_lost_change():
     assert_equal(mirror, node)
 
 
+@pytest.mark.parametrize('moments', [True, False])
+@pytest.mark.parametrize('is_first', [True, False])
+def test_a_change_that_cannot_be_published_comes_with_the_next(moments, is_first):
+    node = Node(**{'publish.moments': moments, 'window.max_scans': 2})
+    known, lost = set(), 0 if is_first else 5
+    for number in range(9):
+        try:
+            with node.changes.undone_on_error():
+                change, _ = node.map_scan(number * SECOND)
+                if number in (lost, lost + 1):
+                    raise MemoryError
+        except MemoryError:
+            continue
+        known |= set(pack_keys(change.surfels.voxel_index).tolist())
+        known -= set(pack_keys(change.removed).tolist())
+        now = node.mapper.map.keys(node.changes.min_points)
+        assert known == set(now.tolist())
+
+
 def test_a_mirror_follows_clearing_and_loading():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(3):
