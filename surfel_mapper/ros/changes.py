@@ -26,6 +26,10 @@ LIST_EVERY = 30
 """After this many scans the voxels of the map are listed again, which takes milliseconds."""
 
 
+BEHIND = -1
+"""Number of scans published, if a change could not be: all since it are collected then."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapChange:
     """
@@ -60,7 +64,7 @@ class ChangeTracker:
         self._published: PublishedKeys | None = None
         self._version = mapper.map.version
         self._num_resets = mapper.counters.resets
-        self._is_behind = False
+        self._num_mapped = mapper.counters.mapped
 
     @property
     def min_points(self) -> int:
@@ -73,7 +77,7 @@ class ChangeTracker:
         self._published = None
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
-        self._is_behind = False
+        self._num_mapped = self._mapper.counters.mapped
 
     @contextmanager
     def undone_on_error(self) -> Iterator[None]:
@@ -83,7 +87,7 @@ class ChangeTracker:
         try:
             yield
         except Exception:  # MemoryError too
-            self._is_behind = True
+            self._num_mapped = BEHIND
             self._version = version
             if published is not None:
                 self._published = published
@@ -95,7 +99,8 @@ class ChangeTracker:
         num_resets = self._mapper.counters.resets
         is_only_scan = update.alignment is None and num_resets == self._num_resets
         self._num_resets = num_resets
-        if not is_only_scan or self._is_behind:
+        num_mapped, self._num_mapped = self._num_mapped, self._mapper.counters.mapped
+        if not is_only_scan or self._num_mapped > num_mapped + 1:
             return self.collect()
         if self._published is None:
             self._published = PublishedKeys(self._keys())
@@ -118,7 +123,7 @@ class ChangeTracker:
         before = np.empty(0, np.int64) if self._published is None else self._published.keys()
         self._published = PublishedKeys(keys)
         self._version = surfel_map.version
-        self._is_behind = False
+        self._num_mapped = self._mapper.counters.mapped
         return MapChange(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
 
     def _keys(self) -> Keys:
