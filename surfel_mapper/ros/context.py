@@ -105,14 +105,16 @@ class NodeHandler(logging.Handler):
 def logging_to(logger: RcutilsLogger) -> Iterator[None]:
     """Send the log of this package to a node's logger, and nowhere else, in a with-block."""
     package = logging.getLogger('surfel_mapper')
-    handler, propagate = NodeHandler(logger), package.propagate
+    handler, propagate, level = NodeHandler(logger), package.propagate, package.level
     package.addHandler(handler)
     package.propagate = False
+    package.setLevel(logging.INFO)
     try:
         yield
     finally:
         package.removeHandler(handler)
         package.propagate = propagate
+        package.setLevel(level)
 
 
 def enlarge_shared_memory() -> None:

@@ -12,6 +12,8 @@ pytest.importorskip('rclpy', reason='rclpy is not installed: no ROS')
 
 from nav_msgs.srv import LoadMap
 from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -94,6 +96,18 @@ def test_a_service_that_fails_refuses_the_request(peer, failures):
         assert not answer.success
         assert answer.message == 'MemoryError: no room'
         assert failures.pop() == (f'a request to {name}', MemoryError)
+
+
+def test_a_parameter_whose_callback_fails_is_refused(peer, failures):
+    peer.node.declare_parameter('a', 1)
+    peer.node.add_on_set_parameters_callback(fail)
+    client = AsyncParameterClient(peer.node, '/peer')
+    peer.spin_until(client.services_are_ready)
+    (answer,) = peer.result(client.set_parameters([Parameter('a', value=2)])).results
+    assert not answer.successful
+    assert answer.reason == 'MemoryError: no room'
+    assert peer.node.get_parameter('a').value == 1
+    assert [kind for _, kind in failures] == [MemoryError]
 
 
 def test_an_error_outside_of_our_callbacks_does_not_end_the_executor(peer, monkeypatch):

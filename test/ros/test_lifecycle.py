@@ -269,6 +269,23 @@ def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     assert late[0] == early[-1]
 
 
+def test_a_node_that_is_killed_continues_from_its_checkpoint(start, peer, tmp_path):
+    places = {'output.directory': tmp_path / 'maps', 'output.checkpoint_s': 0.001}
+    first = start('node', *arguments(**places))
+    peer.advertise('/odom', '/points')
+    changed = peer.collect(PointCloud2, f'{NODE}/changed', ALL)
+    messages = drive(3)
+    send(peer, messages)
+    peer.spin_until(lambda: len(changed) == 3)
+    peer.diagnosis({'scans.mapped': 3})  # from the thread that writes them, so after the last
+    first.kill()
+
+    second = start('node', *arguments(**places, **{'map.load': 'latest'}))
+    peer.diagnosis({'state': 'active', 'scans.mapped': 0, 'window_scans': 3})
+    _, mapper = mapped(messages)
+    assert f'map.checkpoint.npz, digest {mapper.map.digest()}' in second.output
+
+
 def test_a_restarted_node_replaces_the_latched_map_of_a_killed_one(start, peer):
     first = start('node', *ARGUMENTS)
     peer.advertise('/odom', '/points')
