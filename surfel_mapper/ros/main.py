@@ -11,18 +11,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 import threading
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.task import Future
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.memory import keep_freed_memory, share_freed_memory
 from surfel_mapper.ros.context import context, explain, logging_to
 from surfel_mapper.ros.main_thread import Signals
 from surfel_mapper.ros.node import MapperNode
-from surfel_mapper.ros.turns import take_turns
 from surfel_mapper.threads import real_time_threads
 
 
@@ -83,19 +82,13 @@ def run_tasks(node: MapperNode, signals: Signals) -> None:
 @contextmanager
 def executing(node: MapperNode) -> Iterator[None]:
     """Run the callbacks of a node in a thread, in a with-block."""
-    executor = SingleThreadedExecutor(context=node.context)
+    executor = SingleThreadedExecutor()
     executor.add_node(node)
-    stopping = threading.Event()
-
-    def turn() -> bool:
-        if stopping.is_set():
-            return False
-        executor.spin_once()
-        return True
+    stopping: Future[None] = Future()
 
     def spin() -> None:
         try:
-            take_turns(turn, partial(node.report_failure, 'a turn of the executor'))
+            executor.spin_until_future_complete(stopping)
         except BaseException as error:
             node.tasks.fail(error)
 
@@ -104,7 +97,6 @@ def executing(node: MapperNode) -> Iterator[None]:
     try:
         yield
     finally:
-        stopping.set()
-        executor.create_task(stopping.is_set)  # a turn of its own, which ends the wait
+        stopping.set_result(None)
         thread.join()
         executor.shutdown()

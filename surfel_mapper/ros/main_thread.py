@@ -101,15 +101,7 @@ class Task(NamedTuple):
 
 
 class TaskQueue:
-    """
-    Functions for the main thread to call, and errors for it to raise.
-
-    Attributes
-    ----------
-    has_failed : bool
-        Whether the node ends because of an error, and not of a signal.
-
-    """
+    """Functions for the main thread to call, and errors for it to raise."""
 
     def __init__(self) -> None:
         self.has_failed = False
@@ -153,9 +145,6 @@ class TaskQueue:
             done = False
             try:
                 done = item.action()
-            except Exception:
-                self.has_failed = True
-                raise
             finally:
                 item.done.set_result(done)
 

@@ -138,10 +138,9 @@ class Session:
         if self._compiler.ident is not None:
             self._compiler.join()
         self.thread.stop()
-        with self.mapper.guarded('the end of the outputs'):
-            self.outputs.close()
-            if self._viewer is not None:
-                self._viewer.close()
+        self.outputs.close()
+        if self._viewer is not None:
+            self._viewer.close()
         log = self._node.get_logger()
         with self.mapper.guarded('the end of the input'):
             self.mapper.finish()
@@ -151,8 +150,8 @@ class Session:
         if save:
             try:
                 log.info(f'saved {save_map(self.mapper)}')
-            except Exception as error:  # MemoryError too
-                log.error(f'the map could not be saved: {error or repr(error)}')
+            except (SurfelMapperError, OSError) as error:
+                log.error(f'the map could not be saved: {error}')
         log.info(report(self.mapper))
 
     def _opened_viewer(self) -> LiveViewer | None:
@@ -206,12 +205,10 @@ class Session:
                 f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)
-        with self.mapper.guarded('showing a scan'):
-            if self._viewer is not None:
-                self._viewer.add(update)
-        with self.mapper.guarded('publishing of the pose'):
-            if self.registration is not None:
-                self.registration.publish(update)
+        if self._viewer is not None:
+            self._viewer.add(update)
+        if self.registration is not None:
+            self.registration.publish(update)
         with self.mapper.guarded('a checkpoint'):
             self._checkpoints.save_if_due()
         now_ns = self._node.get_clock().now().nanoseconds
