@@ -190,7 +190,7 @@ class Scene:
         """
         Look at a place from obliquely above, as far away as a box, (3,) m each, needs.
 
-        What is at the hidden paths is shown once its eye in the panel is clicked.
+        Hidden paths are shown once their eye in the panel is clicked.
         """
         import rerun.blueprint as blueprint
 

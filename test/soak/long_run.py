@@ -29,7 +29,7 @@ def row_of(command: str, rows: Sequence[Mapping[str, Any]], result: str) -> str:
     rows : sequence of mapping
         Of each block: scans, mapped, rss_MB, median_ms, p99_ms; sent and clouds_lost in the last.
     result : str
-        What was checked at the end.
+        Checks at the end.
 
     """
     blocks = [row for row in rows if 'rss_MB' in row]
