@@ -37,7 +37,8 @@ from surfel_mapper.models.kernels.surfel_groups import (
     rows_of_groups,
     sort_by_group,
 )
-from surfel_mapper.models.live_patches import PatchFitter, symmetric, Tracked
+from surfel_mapper.models.live_patches import Described, PatchFitter, symmetric, Tracked
+from surfel_mapper.models.live_seams import rows_beyond
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
@@ -243,18 +244,33 @@ class LiveModels:
 
     def _refit(self, members: Rows, ends: Indices, matched: IdMatches) -> list[int]:
         """Refit patches with material changes; return the ids of those that existed."""
-        chosen, parts = [], []
+        chosen: dict[int, Rows] = {}
         is_material = np.logical_or.reduceat(self._graph.is_material[members], ends[:-1])
         for k, (number, matters) in enumerate(zip(matched.ids, is_material, strict=True)):
             rows, known = members[ends[k] : ends[k + 1]], self._patches.get(number)
             if known is None or matters or not np.array_equal(known.rows, rows):
-                chosen.append(number)
-                parts.append(rows)
-        before = [self._patches.get(number) for number in chosen]
-        fitted = self._fitter.fit(chosen, parts, before)
-        for (patch, origin, field), rows in zip(fitted, parts, strict=True):
-            self._patches[patch.id] = Tracked(patch, rows, origin, field)
-        return [number for number, known in zip(chosen, before, strict=True) if known is not None]
+                chosen[number] = rows
+        existed = [number for number in chosen if number in self._patches]
+        groups = self._fitter.describe(list(chosen.values()))
+        gone = [*chosen, *matched.removed]
+        beyond = rows_beyond(self._graph, self._patches, gone, groups)
+        again = [n for n in beyond if n not in chosen and self._continues_otherwise(n, beyond[n])]
+        self._fit(list(chosen), groups, beyond)
+        self._fit(again, self._fitter.describe([self._patches[n].rows for n in again]), beyond)
+        return existed + again
+
+    def _continues_otherwise(self, number: int, beyond: Rows) -> bool:
+        """Return whether the voxels beyond the seams of a surface changed."""
+        same = np.array_equal(self._patches[number].beyond, beyond)
+        return not same or bool(self._graph.is_material[beyond].any())
+
+    def _fit(self, ids: list[int], groups: Described, beyond: dict[int, Rows]) -> None:
+        """Fit patches anew."""
+        none: Rows = np.empty(0, np.int32)
+        before = [self._patches.get(number) for number in ids]
+        parts = [beyond.get(number, none) for number in ids]
+        for tracked in self._fitter.fit(ids, groups, before, parts) if ids else ():
+            self._patches[tracked.patch.id] = tracked
 
     def _count(self, created: list[int], changed: list[int], removed: list[int]) -> None:
         """Update the versions."""

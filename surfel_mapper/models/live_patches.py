@@ -47,7 +47,7 @@ MOST_TURN_RAD = math.radians(45.0)
 """A frame that turns farther is rebuilt; below, its x is kept."""
 
 
-@dataclass(slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Tracked:
     """
     A patch and its input.
@@ -58,6 +58,10 @@ class Tracked:
         Plane or Surface, as published.
     rows : (n,) int32
         Rows of its voxels.
+    beyond : (m,) int32
+        Rows of voxels of other surfaces that continue it, to which it is fitted, too.
+    normal, box : (3,), (2, 3) float64
+        Mean normal; least and greatest coordinates of its surfels, m.
     origin : (3,) float64, m
         Anchor of the lattice of its grid.
     fitted : FittedField, optional
@@ -67,8 +71,46 @@ class Tracked:
 
     patch: Plane
     rows: Rows
+    beyond: Rows
+    normal: Array
+    box: Array
     origin: Array
     fitted: FittedField | None
+
+    @property
+    def is_surface(self) -> bool:
+        """Whether the patch is curved."""
+        return isinstance(self.patch, Surface)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Described:
+    """
+    Groups of voxels before their fit.
+
+    Attributes
+    ----------
+    rows : list of (n,) int32
+        Rows of the voxels of each.
+    total, means, covariances : (K,) int64, (K, 3), (K, 3, 3) float64
+        Moments of all points.
+    boxes : (K, 2, 3) float64, m
+        Least and greatest coordinates of the surfels.
+    samples : PatchPoints
+        Points across the surfels.
+    frames, curved : (K, 3, 3) float64, (K,) bool
+        Axes of the patch as rows, and whether it is a surface.
+
+    """
+
+    rows: list[Rows]
+    total: Indices
+    means: Array
+    covariances: Array
+    boxes: Array
+    samples: PatchPoints
+    frames: Array
+    curved: npt.NDArray[np.bool_]
 
 
 class PatchFitter:
@@ -87,64 +129,100 @@ class PatchFitter:
         self._size_m = graph.map.voxel_size_m
         self._surface_pitch_m = max(self._size_m, 3.0 * graph.thickness_m)
 
+    def describe(self, rows: list[Rows]) -> Described:
+        """Return moments, frames and kind of groups of voxels."""
+        graph, every = self._graph, np.concatenate([np.empty(0, np.int32), *rows])
+        starts = np.cumsum([0, *(len(part) for part in rows)])
+        total, means, covariances = self._merged(every, starts)
+        normals = np.empty_like(means)
+        mean_normals(every, starts, graph.kind == FLAT, graph.normal, normals)
+        thickness = np.full(len(rows), graph.limit_m)
+        samples = PatchPoints(self._points(every), POINTS * starts, normals, thickness)
+        frames, curved = self._frames(samples)
+        frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
+        positions = graph.position[every]
+        boxes = np.stack(
+            [end.reduceat(positions, starts[:-1]) for end in (np.minimum, np.maximum)], axis=1
+        )
+        return Described(rows, total, means, covariances, boxes, samples, frames, curved)
+
     def fit(
-        self, ids: list[int], rows: list[Rows], before: list[Tracked | None]
-    ) -> list[tuple[Plane, Array, FittedField | None]]:
+        self,
+        ids: list[int],
+        groups: Described,
+        before: list[Tracked | None],
+        beyond: list[Rows],
+    ) -> list[Tracked]:
         """
-        Return patches, the anchors of their grids, and fields relative to these.
+        Return patches.
 
         Parameters
         ----------
         ids : list of int
             Ids of the patches.
-        rows : list of (n,) int32
-            Rows of their voxels.
+        groups : Described
+            Their voxels; frames are changed in place.
         before : list of Tracked or None
             The previous patches.
+        beyond : list of (m,) int32
+            Rows of voxels that continue them.
 
         """
-        if not ids:
-            return []
-        graph, every = self._graph, np.concatenate(rows)
-        starts = np.concatenate([[0], np.cumsum([len(part) for part in rows])])
-        total, means, covariances = self._merged(every, starts)
-        normals = np.empty_like(means)
-        mean_normals(every, starts, graph.kind == FLAT, graph.normal, normals)
-        thickness = np.full(len(ids), graph.limit_m)
-        groups = PatchPoints(self._points(every), POINTS * starts, normals, thickness)
-        frames, curved = self._described(groups)
-        frames[~curved] = plane_frames(covariances[~curved], normals[~curved])
-        origins, stays = self._steadied(before, frames, means, covariances, curved)
+        samples, frames, curved, means = groups.samples, groups.frames, groups.curved, groups.means
+        origins, stays = self._steadied(before, groups)
         pitches = np.where(curved, self._surface_pitch_m, PLANE_PITCH_VOXELS * self._size_m)
-        local = np.empty_like(groups.points)
-        cells = cells_of(
-            groups, (origins, frames, pitches, local), 0.5 * self._size_m, snapped=True
-        )
-        fields = self._fields(cells, curved, before, stays)
+        placed = origins, frames, pitches, np.empty_like(samples.points)
+        cells = cells_of(samples, placed, 0.5 * self._size_m, snapped=True)
+        known = [t.fitted if t and stay else None for t, stay in zip(before, stays, strict=True)]
+        ends = np.array([len(part) for part in beyond])
+        fields = self._fields(cells, np.flatnonzero(curved & (ends == 0)), known)
+        seams = np.flatnonzero(curved & (ends > 0))
+        if len(seams):
+            wider = self._wider_cells(seams, samples, beyond, (origins, frames, pitches))
+            found = self._fields(wider, np.arange(len(seams)), [known[k] for k in seams])
+            fields.update((int(seams[k]), field) for k, field in found.items())
         shifts = np.einsum('kij,kj->ki', frames, means - origins)
         cells.origins[:] -= shifts[:, :2]  # published grids are relative to the mean
-        rms_m = rms_across(covariances, frames[:, 2], total)
-        found = []
+        rms_m = rms_across(groups.covariances, frames[:, 2], groups.total)
+        patches = []
         for k, grid in enumerate(cells.grids()):
-            field, common = fields.get(k), (ids[k], int(total[k]), means[k], covariances[k])
-            if field is None:
-                patch = Plane(*common, frames[k], float(rms_m[k]), grid)
-            else:
-                error_m = self._rms_m(field.field, frames[k], origins[k], rows[k])
-                spline = moved(field.field, shifts[k])
-                patch = Surface(*common, frames[k], error_m, grid, spline)
-            found.append((patch, origins[k], field))
-        return found
+            field, rows = fields.get(k), groups.rows[k]
+            common = ids[k], int(groups.total[k]), means[k], groups.covariances[k], frames[k]
+            patch = Plane(*common, float(rms_m[k]), grid)
+            if field is not None:
+                error_m = self._rms_m(field.field, frames[k], origins[k], rows)
+                patch = Surface(*common, error_m, grid, moved(field.field, shifts[k]))
+            place = samples.normals[k], groups.boxes[k], origins[k]
+            patches.append(Tracked(patch, rows, beyond[k], *place, field))
+        return patches
+
+    def _wider_cells(
+        self,
+        chosen: Indices,
+        samples: PatchPoints,
+        beyond: list[Rows],
+        frames: tuple[Array, Array, Array],
+    ) -> Cells:
+        """Return the cells of patches with the voxels beyond; frames: anchors, axes, pitches."""
+        parts = [
+            part
+            for k in chosen
+            for part in (
+                samples.points[samples.starts[k] : samples.starts[k + 1]],
+                self._points(beyond[k]),
+            )
+        ]
+        points, ends = np.concatenate(parts), np.cumsum([len(part) for part in parts])[1::2]
+        starts = np.concatenate([[0], ends])
+        groups = PatchPoints(points, starts, samples.normals[chosen], samples.thickness[chosen])
+        origins, axes, pitches = (part[chosen] for part in frames)
+        placed = origins, axes, pitches, np.empty_like(points)
+        return cells_of(groups, placed, 0.5 * self._size_m, snapped=True)
 
     def _fields(
-        self,
-        cells: Cells,
-        curved: npt.NDArray[np.bool_],
-        before: list[Tracked | None],
-        stays: npt.NDArray[np.bool_],
+        self, cells: Cells, chosen: Indices, before: list[FittedField | None]
     ) -> dict[int, FittedField]:
-        """Return the fields of curved patches: small ones anew, large ones near changes."""
-        chosen = np.flatnonzero(curved)
+        """Return the fields of chosen patches: small ones anew, large ones near changes."""
         small = is_small(cells.sizes[chosen], DEGREE)
         fitted, heights = fit_grids(cells, chosen[small], DEGREE, SMOOTHING)
         found = {
@@ -152,10 +230,9 @@ class PatchFitter:
             for k, field in zip(chosen[small].tolist(), fitted, strict=True)
         }
         for k in chosen[~small].tolist():
-            known = before[k]
             sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-            was = known.fitted if known is not None and stays[k] else None
-            found[k] = fit_field(float(cells.pitches[k]), cells.origins[k].copy(), sums, was)
+            origin = cells.origins[k].copy()
+            found[k] = fit_field(float(cells.pitches[k]), origin, sums, before[k])
         return found
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:
@@ -176,7 +253,7 @@ class PatchFitter:
         sample_voxels(rows, graph.position, graph.axes, low, self._size_m, points)
         return points
 
-    def _described(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
+    def _frames(self, groups: PatchPoints) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return the frames (K, 3, 3) of groups as surfaces, and whether they are curved."""
         number = len(groups.thickness)
         means, frames = np.empty((number, 3)), np.empty((number, 3, 3))
@@ -195,19 +272,15 @@ class PatchFitter:
         return frames, curved
 
     def _steadied(
-        self,
-        before: list[Tracked | None],
-        frames: Array,
-        means: Array,
-        covariances: Array,
-        curved: npt.NDArray[np.bool_],
+        self, before: list[Tracked | None], groups: Described
     ) -> tuple[Array, npt.NDArray[np.bool_]]:
         """Return anchors, and whether frames stay; frames are changed in place."""
+        frames, means, curved = groups.frames, groups.means, groups.curved
         origins, stays = means.copy(), np.zeros(len(means), np.bool_)
         known = {
             k: tracked
             for k, tracked in enumerate(before)
-            if tracked is not None and isinstance(tracked.patch, Surface) == curved[k]
+            if tracked is not None and tracked.is_surface == curved[k]
         }
         if not known:
             return origins, stays
@@ -216,7 +289,7 @@ class PatchFitter:
         anchors = np.array([tracked.origin for tracked in known.values()])
         normals = frames[rows, 2]
         turn = np.linalg.norm(was[:, 2] - normals, axis=1)
-        radius = 3.0 * np.sqrt(np.trace(covariances[rows], axis1=1, axis2=2))
+        radius = 3.0 * np.sqrt(np.trace(groups.covariances[rows], axis1=1, axis2=2))
         # a plane must fit at its boundary; a field adapts its heights
         near = curved[rows] | (turn * radius < STILL * self._graph.thickness_m)
         still = (turn < STILL_RAD) & near

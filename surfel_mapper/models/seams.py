@@ -7,6 +7,8 @@ A closed cylinder is cut into charts, as each must be a height field. Fitted to 
 alone, a chart bends freely at its boundary: on a cylinder of 0.3 m with 5 mm of noise the normals
 of two charts differ by 17 deg at the seam. With the points of its neighbours within three voxels
 of the seam, and cells of two voxels, by less than 2 deg. Coverage stays that of its own points.
+
+Clouds and maps use it alike: a surfel is one point.
 """
 
 from __future__ import annotations
@@ -18,10 +20,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
+from surfel_mapper.models.kernels.seams import find_continuations
 from surfel_mapper.models.multi_model import Surface
 from surfel_mapper.models.patches import cells_of, PatchPoints, splines_of
+from surfel_mapper.models.thinning import thin
 
 Array = npt.NDArray[np.float64]
+Indices = npt.NDArray[np.int64]
 
 REACH_VOXELS = 3.0
 """Distance from its own points up to which a surface is fitted to those of its neighbours."""
@@ -34,6 +39,9 @@ CREASE = math.cos(math.radians(35.0))
 
 STEEPEST = 0.5
 """Sine of the angle between a smooth continuation and the surface: 30 deg."""
+
+UPRIGHT = math.cos(math.radians(75.0))
+"""Least cosine between a continuation and the mean normal: a height field cannot be vertical."""
 
 
 def with_smooth_seams(
@@ -52,18 +60,20 @@ def with_smooth_seams(
         Settings of their fit.
 
     """
+    if len(surfaces) < 2:
+        return surfaces
+    every = np.concatenate(points)
     normals = [
         surface.normals(surface.to_local(own)[:, :2])
         for surface, own in zip(surfaces, points, strict=True)
     ]
-    beyond = [
-        continuation(number, points, normals, REACH_VOXELS * config.voxel_size_m)
-        for number in range(len(surfaces))
-    ]
+    axes = np.array([surface.normal for surface in surfaces])
+    owner = np.repeat(np.arange(len(surfaces)), [len(part) for part in points])
+    beyond = continuations(every, np.concatenate(normals), owner, axes, config.voxel_size_m)
     chosen = [number for number, found in enumerate(beyond) if len(found)]
     if not chosen:
         return surfaces
-    parts = [np.concatenate([points[number], beyond[number]]) for number in chosen]
+    parts = [np.concatenate([points[number], every[beyond[number]]]) for number in chosen]
     groups = PatchPoints(
         points=np.concatenate(parts),
         starts=np.concatenate([[0], np.cumsum([len(part) for part in parts])]),
@@ -85,25 +95,34 @@ def with_smooth_seams(
     return found
 
 
-def continuation(number: int, points: list[Array], normals: list[Array], reach_m: float) -> Array:
-    """Return the points (M, 3) of other surfaces that continue one within a distance."""
-    from scipy.spatial import cKDTree  # 0.2 s that clouds without seams save
+def continuations(
+    points: Array, normals: Array, owner: Indices, axes: Array, voxel_size_m: float
+) -> list[Indices]:
+    """
+    Return the rows of the points that continue each surface, ascending.
 
-    own, found = points[number], [np.empty((0, 3))]
-    low, high = own.min(axis=0) - reach_m, own.max(axis=0) + reach_m
-    tree = None
-    for other, every in enumerate(points):
-        inside = ((every >= low) & (every <= high)).all(axis=1)
-        if other == number or not inside.any():
-            continue
-        tree = tree or cKDTree(own)
-        near, across = every[inside], normals[other][inside]
-        away_m, nearest = tree.query(near, distance_upper_bound=reach_m)
-        kept = np.flatnonzero(np.isfinite(away_m))
-        near, across, nearest = near[kept], across[kept], nearest[kept]
-        here = normals[number][nearest]
-        height_m = np.abs(np.einsum('ij,ij->i', near - own[nearest], here))
-        continues = height_m < STEEPEST * np.maximum(away_m[kept], reach_m / REACH_VOXELS)
-        continues &= np.abs(np.einsum('ij,ij->i', across, here)) > CREASE
-        found.append(near[continues])
-    return np.concatenate(found)
+    Parameters
+    ----------
+    points : (N, 3) float64, m
+        Points of all surfaces.
+    normals : (N, 3) float64
+        Normals of these, of any sign.
+    owner : (N,) int64
+        Surface of each.
+    axes : (K, 3) float64
+        Mean normals of the surfaces.
+    voxel_size_m : float
+        Edge of the voxels; see REACH_VOXELS.
+
+    """
+    reach_m = REACH_VOXELS * voxel_size_m
+    voxels = thin(points, reach_m).by_voxel()
+    tables = voxels.starts, voxels.rows, *voxels.adjacent
+    rules = reach_m, CREASE, STEEPEST, voxel_size_m, UPRIGHT
+    pairs = np.empty((len(points), 2), np.int64)
+    num = find_continuations(tables, points, normals, owner, axes, rules, pairs)
+    if num > len(pairs):
+        pairs = np.empty((num, 2), np.int64)
+        find_continuations(tables, points, normals, owner, axes, rules, pairs)
+    surface, row = pairs[np.lexsort((pairs[:num, 1], pairs[:num, 0]))].T
+    return np.split(row, np.searchsorted(surface, np.arange(1, len(axes))))

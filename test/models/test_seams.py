@@ -1,6 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Surfaces that continue each other: position and normal at their seams, creases, thin walls."""
+"""
+Surfaces that continue each other: position and normal at their seams, creases, thin walls.
+
+Bounds of live models are those of fit: medians of half the noise, in position.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +12,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from surfel_mapper.config import ModelsConfig
+from surfel_mapper.config import ModelsConfig, ModelsLayerConfig
+from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models import fit
-from surfel_mapper.models.seams import continuation
+from surfel_mapper.models.live import LiveModels
+from surfel_mapper.models.seams import continuations
 
 NOISE_M = 0.005
 
@@ -29,12 +35,12 @@ def ball(radius_m, noise_m, num=60_000):
     return way * (radius_m + noise_m * rng.standard_normal((num, 1)))
 
 
-def seams(model, points, size_m):
+def seams(surfaces, labels, points, size_m):
     """Return distances, m, and angles, deg, of neighbours at the points beside their seams."""
     gaps, angles = [np.empty(0)], [np.empty(0)]
-    for one in model.surfaces:
-        for other in model.surfaces[: model.surfaces.index(one)]:
-            own, others = points[model.labels == one.id], points[model.labels == other.id]
+    for number, one in enumerate(surfaces):
+        for other in surfaces[:number]:
+            own, others = points[labels == one.id], points[labels == other.id]
             own = own[np.isfinite(cKDTree(others).query(own, distance_upper_bound=size_m)[0])]
             here, there = one.to_local(own), other.to_local(own)
             a, b = one.normals(here[:, :2]), other.normals(there[:, :2])
@@ -52,12 +58,71 @@ def seams(model, points, size_m):
 def test_surfaces_meet_within_the_noise(points, most_deg):
     model = fit(points, ModelsConfig(voxel_size_m=0.03), (0.0, 0.0, 5.0))
     assert len(model.surfaces) >= 4
-    gap_m, angle_deg = seams(model, points, 0.03)
+    gap_m, angle_deg = seams(model.surfaces, model.labels, points, 0.03)
     assert len(gap_m) > 2000
     assert np.median(gap_m) < 0.5 * NOISE_M
     assert np.quantile(gap_m, 0.9) < NOISE_M
     assert np.median(angle_deg) < most_deg
     assert np.mean([surface.rms_m for surface in model.surfaces]) < 1.5 * NOISE_M
+
+
+def live_labels(models, points):
+    """Return the label of the voxel of each point."""
+    voxels, size_m = models.surfels.voxel_index, models.map.voxel_size_m
+    label = dict(zip(map(tuple, voxels.tolist()), models.model.labels.tolist(), strict=True))
+    index = np.floor(points / size_m).astype(np.int64)
+    return np.array([label[tuple(voxel)] for voxel in index.tolist()])
+
+
+@pytest.mark.parametrize(
+    ('points', 'size_m', 'most_deg'),
+    [
+        (cylinder(0.3, NOISE_M), 0.03, 4.0),
+        (ball(0.3, NOISE_M), 0.03, 4.0),
+        (cylinder(0.3, NOISE_M), 0.06, 6.0),
+        (ball(0.3, NOISE_M), 0.06, 6.0),
+    ],
+)
+def test_live_surfaces_meet_within_the_noise(points, size_m, most_deg):
+    surfel_map = SurfelMap(size_m)
+    surfel_map.add(points, origin=(0.0, 0.0, 5.0))
+    models = LiveModels(ModelsLayerConfig(noise_m=NOISE_M), surfel_map)
+    models.update()
+    surfaces = models.model.surfaces
+    assert len(surfaces) >= 4
+    gap_m, angle_deg = seams(surfaces, live_labels(models, points), points, size_m)
+    assert len(gap_m) > 2000
+    assert np.median(gap_m) < 0.5 * NOISE_M
+    assert np.quantile(gap_m, 0.9) < max(NOISE_M, 0.1 * size_m)
+    assert np.median(angle_deg) < most_deg
+    assert np.mean([surface.rms_m for surface in surfaces]) < 1.5 * NOISE_M
+
+
+def test_seams_after_changes_beside_them_equal_a_batch():
+    points, settings = cylinder(0.3, NOISE_M), ModelsLayerConfig(noise_m=NOISE_M)
+    surfel_map = SurfelMap(0.06)
+    models = LiveModels(settings, surfel_map)
+    surfel_map.add(points, origin=(0.0, 0.0, 5.0))
+    models.update()
+    chart = live_labels(models, points)
+    for surface in models.model.surfaces[:2]:  # its neighbours change at their seams only
+        own = chart == surface.id
+        surfel_map.add(points[own] * [1.03, 1.03, 1.0], origin=(0.0, 0.0, 5.0))
+        update = models.update()
+        assert surface.id in update.updated
+        assert len(update.updated) >= 3
+    batch = LiveModels(settings, surfel_map.copy())
+    batch.update()
+    here, there = live_labels(models, points), live_labels(batch, points)
+    surfaces = {surface.id: surface for surface in batch.model.surfaces}
+    assert len(surfaces) >= 4
+    for surface in models.model.surfaces:
+        own = points[here == surface.id]
+        twin = surfaces[int(there[here == surface.id][0])]
+        assert set(there[here == surface.id]) == {twin.id}
+        local = twin.to_local(surface.lifted(surface.to_local(own)[:, :2]))
+        away_m = np.abs(local[:, 2] - twin.heights(local[:, :2]))
+        assert np.quantile(away_m, 0.9) < NOISE_M  # the history decides where cells begin
 
 
 def test_coverage_is_that_of_own_points():
@@ -90,9 +155,31 @@ def test_points_beyond_a_smooth_seam_continue_a_surface(tilt_deg, start, expecte
     tilt = np.radians(tilt_deg)
     own, normal = sheet(np.array([0.0, 0.0, 1.0]), np.zeros(3))
     other, others = sheet(np.array([np.sin(tilt), 0.0, np.cos(tilt)]), np.array(start))
-    found = continuation(0, [own, other], [normal, others], 0.09)
+    points, normals = np.concatenate([own, other]), np.concatenate([normal, others])
+    owner, axes = np.repeat([0, 1], len(own)), np.array([normal[0], others[0]])
+    found = points[continuations(points, normals, owner, axes, 0.03)[0]]
     assert bool(len(found)) == expected
     if expected:
-        reach = np.linalg.norm(found - own[:, None], axis=2).min(axis=0) if len(found) < 500 else 0
-        assert np.max(reach) <= 0.09
+        assert cKDTree(own).query(found)[0].max() < 0.09
         assert len(found) > 0.5 * (np.abs(other[:, 0]) < 0.08).sum()
+
+
+def test_continuations_equal_those_of_every_pair():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(0.0, 1.0, (400, 3)) * [1.0, 1.0, 0.1]
+    normals = rng.standard_normal((400, 3)) * 0.4 + [0.0, 0.0, 1.0]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    owner, axes = rng.integers(0, 4, 400), np.tile([0.0, 0.0, 1.0], (4, 1))
+    found = continuations(points, normals, owner, axes, 0.05)
+    for surface in range(4):
+        own, expected = np.flatnonzero(owner == surface), []
+        for row in np.flatnonzero(owner != surface):
+            away = np.linalg.norm(points[own] - points[row], axis=1)
+            near = own[away.argmin()]
+            height = abs((points[row] - points[near]) @ normals[near])
+            smooth = away.min() < 0.15 and height < 0.5 * max(away.min(), 0.05)
+            turned = abs(normals[row] @ normals[near]) < np.cos(np.radians(35.0))
+            if smooth and not turned and abs(normals[row, 2]) > np.cos(np.radians(75.0)):
+                expected.append(row)
+        assert found[surface].tolist() == expected
+        assert len(expected) > 20
