@@ -2,6 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parts of a map in files add up to the map, and its digest is computed tile by tile."""
 
+import shutil
+
 import numpy as np
 import pytest
 
@@ -45,34 +47,47 @@ def dataset(directory, surfel_map):
     return directory / 'map'
 
 
-@pytest.mark.parametrize(('columns', 'rows_read'), [((), 1), ((), 900), (('intensity',), 10**6)])
-def test_the_digest_of_a_dataset_is_that_of_the_map(tmp_path, monkeypatch, columns, rows_read):
-    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', rows_read)
-    surfel_map = scattered(columns=columns)
+@pytest.fixture(scope='module')
+def written(tmp_path_factory):
+    """Return a scattered map and its dataset, not to be changed."""
+    surfel_map = scattered()
+    return surfel_map, dataset(tmp_path_factory.mktemp('tiles'), surfel_map)
 
-    directory = dataset(tmp_path, surfel_map)
+
+@pytest.fixture(scope='module')
+def with_intensity(tmp_path_factory):
+    """Return the same with a column."""
+    surfel_map = scattered(columns=('intensity',))
+    return surfel_map, dataset(tmp_path_factory.mktemp('tiles'), surfel_map)
+
+
+@pytest.mark.parametrize(
+    ('which', 'rows_read'), [('written', 1), ('written', 900), ('with_intensity', 10**6)]
+)
+def test_the_digest_of_a_dataset_is_that_of_the_map(request, monkeypatch, which, rows_read):
+    monkeypatch.setattr(parquet_tiles, 'ROWS_READ', rows_read)
+    surfel_map, directory = request.getfixturevalue(which)
 
     assert len(tiles_in(directory)) > 8
     assert dataset_digest(directory) == surfel_map.digest()
 
 
-@pytest.mark.parametrize('columns', [(), ('intensity',)])
-def test_a_dataset_is_read_as_the_map_it_is(tmp_path, columns):
-    surfel_map = scattered(columns=columns)
-    assert dataset_in(tmp_path) is None
-    directory = dataset(tmp_path, surfel_map)
+@pytest.mark.parametrize('which', ['written', 'with_intensity'])
+def test_a_dataset_is_read_as_the_map_it_is(request, tmp_path, which):
+    surfel_map, directory = request.getfixturevalue(which)
 
-    assert dataset_in(tmp_path) == dataset_in(directory) == directory
+    assert dataset_in(tmp_path) is None
+    assert dataset_in(directory.parent) == dataset_in(directory) == directory
     assert read_tiles(directory).digest() == surfel_map.digest()
     with pytest.raises(FileFormatError, match='voxel'):
         read_tiles(directory, voxel_size_m=0.2)
 
 
-def test_the_tiles_of_a_map_are_squares_and_together_the_map(tmp_path):
-    surfel_map = scattered()
+def test_the_tiles_of_a_map_are_squares_and_together_the_map(written):
+    surfel_map, directory = written
     again, most = SurfelMap(0.5), 0
 
-    for tile, path in tiles_in(dataset(tmp_path, surfel_map)).items():
+    for tile, path in tiles_in(directory).items():
         part = read_map(path)  # which checks the digest of the tile
         index = part.moments().voxel_index
         assert (index[:, :2] >> TILE_BITS == tile).all()
@@ -83,11 +98,10 @@ def test_the_tiles_of_a_map_are_squares_and_together_the_map(tmp_path):
     assert most < len(surfel_map) / 2
 
 
-def test_other_tools_read_a_dataset_by_tile(tmp_path):
+def test_other_tools_read_a_dataset_by_tile(written):
     from pyarrow import dataset as arrow_dataset
 
-    surfel_map = scattered()
-    directory = dataset(tmp_path, surfel_map)
+    surfel_map, directory = written
 
     table = arrow_dataset.dataset(directory, partitioning='hive').to_table()
     index = np.stack([table.column(name).to_numpy() for name in 'ijk'], axis=1)
@@ -98,10 +112,10 @@ def test_other_tools_read_a_dataset_by_tile(tmp_path):
     np.testing.assert_array_equal(table.column('tile_i').to_numpy(), index[:, 0] >> TILE_BITS)
 
 
-def test_a_row_group_of_a_tile_holds_a_few_voxels_in_i(tmp_path):
+def test_a_row_group_of_a_tile_holds_a_few_voxels_in_i(written):
     from pyarrow import parquet
 
-    for path in tiles_in(dataset(tmp_path, scattered())).values():
+    for path in tiles_in(written[1]).values():
         blocks = []
         with parquet.ParquetFile(path) as file:
             for group in range(file.metadata.num_row_groups):
@@ -126,12 +140,12 @@ def test_a_map_in_one_file_is_split_without_loading_it(tmp_path, monkeypatch):
     assert again == surfel_map
 
 
-def test_a_tile_as_a_part_is_complete(tmp_path):
-    (tile, path), *_ = tiles_in(dataset(tmp_path, scattered())).items()
+def test_a_tile_as_a_part_is_complete(written):
+    (tile, path), *_ = tiles_in(written[1]).items()
     part = tile_part(path)
     assert read_part(part) == read_map(path)
     assert part.num_voxels == len(read_map(path))
-    assert Tile(tile.i, tile.j).path == path.relative_to(tmp_path / 'map')
+    assert Tile(tile.i, tile.j).path == path.relative_to(written[1])
 
 
 def test_voxels_at_the_corners_of_space_have_tiles_too(tmp_path):
@@ -158,12 +172,12 @@ def test_an_empty_map_makes_a_shard_without_tiles(tmp_path):
     assert write_shard(tmp_path / 'shard.parquet', SurfelMap(0.5)) == {}
 
 
-def test_a_directory_without_tiles_and_tiles_of_two_maps_are_refused(tmp_path):
+def test_a_directory_without_tiles_and_tiles_of_two_maps_are_refused(written, tmp_path):
     with pytest.raises(FileFormatError, match='no tiles of a map'):
         dataset_digest(tmp_path)
     with pytest.raises(FileFormatError, match='no tiles of a map'):
         read_tiles(tmp_path)
-    first = dataset(tmp_path, scattered())
+    first = shutil.copytree(written[1], tmp_path / 'map')
     other = SurfelMap(0.2)
     other.add(np.full((3, 3), 900.0))
     write_tile(first / Tile(99, 99).path, other)

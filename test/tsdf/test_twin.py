@@ -74,7 +74,7 @@ def test_the_kernel_equals_its_numpy_twin(sensor, settings, monkeypatch):
         T = POSE.copy()
         T[0, 3] += 0.3 * number
         index = BlockSelection(config).blocks(image, T).index
-        twin.integrate(config, expected, image, T, index[index @ [1, 2, 4] % 7 == 0])
+        twin.integrate(config, expected, image, T, index[index @ [1, 2, 4] % 11 == 0])  # slow
         one.integrate(image, T, number)
     checked = 0
     for block, (D, W, C, W_color) in expected.items():
