@@ -10,6 +10,7 @@ MAX_FAILURES times in a row is switched off until it is cleared, because it may 
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 import logging
 from typing import Any
@@ -52,7 +53,7 @@ class LayerStack:
         layers = [layer(config, around) for layer in enabled(config)]
         self.by_name: Mapping[str, Layer] = {layer.name: layer for layer in layers}
         self._drops = drops
-        self._failures: dict[str, int] = {}
+        self._failures: Counter[tuple[str, str]] = Counter()  # in a row, by name and task
 
     def __iter__(self) -> Iterator[Layer]:
         """Iterate over the layers that are not switched off, in their order."""
@@ -89,13 +90,13 @@ class LayerStack:
             try:
                 voxels = layer.voxels_to_clear(inserted)
             except Exception as error:  # MemoryError too
-                self._count_failure(layer, inserted, error)
+                self._count_failure(layer, 'clear', inserted, error)
                 continue
             if len(voxels):
                 found.append(voxels)
                 self._drops.counters.voxels_cleared[layer.name] += len(voxels)
             laps.end(layer.name)
-            self._failures.pop(layer.name, None)
+            self._failures.pop((layer.name, 'clear'), None)
         if len(found) < 2:
             return found[0] if found else np.empty((0, 3), np.int32)
         return np.unique(np.concatenate(found), axis=0)
@@ -109,12 +110,12 @@ class LayerStack:
             try:
                 result = layer.follow(inserted)
             except Exception as error:  # MemoryError too
-                self._count_failure(layer, inserted, error)
+                self._count_failure(layer, 'follow', inserted, error)
                 continue
+            self._failures.pop((layer.name, 'follow'), None)
             if result is not None:
                 results[layer.name] = result
                 laps.end(layer.name)
-                self._failures.pop(layer.name, None)
         return results
 
     def clear(self) -> None:
@@ -156,19 +157,21 @@ class LayerStack:
                 found[layer.name] = layer.summary()
         return {name: figures for name, figures in found.items() if figures}
 
-    def _count_failure(self, layer: Layer, inserted: InsertedScan, error: Exception) -> None:
+    def _count_failure(
+        self, layer: Layer, task: str, inserted: InsertedScan, error: Exception
+    ) -> None:
         """Count a failure; switch the layer off if it was the last of several in a row."""
         name, stamp_s = layer.name, inserted.scan.stamp_ns / 1e9
         is_known = isinstance(error, SurfelMapperError)
         text = str(error) if is_known else described(error)
         self._drops.message(name, f'layer {name}: scan at {stamp_s:.6f} s: {text}')
-        self._failures[name] = self._failures.get(name, 0) + 1
-        if self._failures[name] >= MAX_FAILURES and not isinstance(error, CloudFormatError):
+        self._failures[name, task] += 1
+        if self._failures[name, task] >= MAX_FAILURES and not isinstance(error, CloudFormatError):
             self._drops.counters.layers_off[name] = text
             _log.error(
                 'layer %s is switched off until the map is cleared: it failed %d times in a row, '
                 'last with: %s',
                 name,
-                self._failures[name],
+                self._failures[name, task],
                 text,
             )

@@ -385,7 +385,7 @@ class Mapper:
 
         """
         alignment = self._inserter.align(self.config)
-        _log.info('aligned: %s', alignment)
+        _log.debug('aligned: %s', alignment)
         return alignment
 
     def close_loops(self, progress: Callable[[str], object] = lambda text: None) -> LoopMove:
@@ -411,7 +411,7 @@ class Mapper:
 
         """
         move = self._inserter.close_loops(self.config, progress)
-        _log.info('loops: %s', move)
+        _log.debug('loops: %s', move)
         return move
 
     @property

@@ -9,6 +9,8 @@ aligned, its present voxels are compared with the published ones, which covers a
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +24,10 @@ Keys = npt.NDArray[np.int64]
 
 LIST_EVERY = 30
 """After this many scans the voxels of the map are listed again, which takes milliseconds."""
+
+
+BEHIND = -1
+"""Number of scans published, if a change could not be: all since it are collected then."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,6 +64,7 @@ class ChangeTracker:
         self._published: PublishedKeys | None = None
         self._version = mapper.map.version
         self._num_resets = mapper.counters.resets
+        self._num_mapped = mapper.counters.mapped
 
     @property
     def min_points(self) -> int:
@@ -70,13 +77,30 @@ class ChangeTracker:
         self._published = None
         self._version = self._mapper.map.version
         self._num_resets = self._mapper.counters.resets
+        self._num_mapped = self._mapper.counters.mapped
+
+    @contextmanager
+    def undone_on_error(self) -> Iterator[None]:
+        """In a with-block, take a change back that cannot be published; it comes with the next."""
+        version, published = self._version, self._published
+        num_changes = 0 if published is None else len(published)
+        try:
+            yield
+        except Exception:  # MemoryError too
+            self._num_mapped = BEHIND
+            self._version = version
+            if published is not None:
+                self._published = published
+                published.cut(num_changes)
+            raise
 
     def after_scan(self, update: Update) -> MapChange:
         """Return the changes of a scan, and all others since the last call."""
         num_resets = self._mapper.counters.resets
         is_only_scan = update.alignment is None and num_resets == self._num_resets
         self._num_resets = num_resets
-        if not is_only_scan:
+        num_mapped, self._num_mapped = self._num_mapped, self._mapper.counters.mapped
+        if not is_only_scan or self._num_mapped > num_mapped + 1:
             return self.collect()
         if self._published is None:
             self._published = PublishedKeys(self._keys())
@@ -99,6 +123,7 @@ class ChangeTracker:
         before = np.empty(0, np.int64) if self._published is None else self._published.keys()
         self._published = PublishedKeys(keys)
         self._version = surfel_map.version
+        self._num_mapped = self._mapper.counters.mapped
         return MapChange(surfels, unpack_keys(np.setdiff1d(before, keys, assume_unique=True)))
 
     def _keys(self) -> Keys:
@@ -139,6 +164,10 @@ class PublishedKeys:
     def append(self, change: MapChange) -> None:
         """Add a change."""
         self._changes.append(change)
+
+    def cut(self, number: int) -> None:
+        """Keep the first changes."""
+        del self._changes[number:]
 
     def keys(self) -> Keys:
         """Return all keys, ascending."""

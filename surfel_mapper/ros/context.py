@@ -58,7 +58,7 @@ def context(ros_args: Sequence[str]) -> Iterator[None]:
     """
     try:
         rclpy.init(args=list(ros_args), signal_handler_options=SignalHandlerOptions.NO)
-    except RuntimeError as error:
+    except (RuntimeError, UnicodeError) as error:  # the latter: a file's name is no text
         raise ConfigError(f'arguments after --ros-args: {explain(error)}') from error
     try:
         yield
@@ -66,7 +66,7 @@ def context(ros_args: Sequence[str]) -> Iterator[None]:
         rclpy.try_shutdown()
 
 
-def explain(error: RuntimeError) -> str:
+def explain(error: RuntimeError | UnicodeError) -> str:
     """Return why ROS refuses to start; adds a remedy to the two messages that lack one."""
     reason = str(error).partition(', at /')[0]
     if 'before ros__parameters' in reason:  # such a file is one for --config of replay
@@ -105,14 +105,16 @@ class NodeHandler(logging.Handler):
 def logging_to(logger: RcutilsLogger) -> Iterator[None]:
     """Send the log of this package to a node's logger, and nowhere else, in a with-block."""
     package = logging.getLogger('surfel_mapper')
-    handler, propagate = NodeHandler(logger), package.propagate
+    handler, propagate, level = NodeHandler(logger), package.propagate, package.level
     package.addHandler(handler)
     package.propagate = False
+    package.setLevel(logging.INFO)
     try:
         yield
     finally:
         package.removeHandler(handler)
         package.propagate = propagate
+        package.setLevel(level)
 
 
 def enlarge_shared_memory() -> None:

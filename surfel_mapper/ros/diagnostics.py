@@ -138,6 +138,7 @@ class Totals:
             dropped=self.dropped - last.dropped,
             latency_s=latency(session, 99) if self.received > last.received else None,
             paused=session.thread.paused,
+            layers_off=session.mapper.counters.layers_off,
             loss=session.inputs.loss() if self.lost > last.lost or not self.received else '',
         )
 

@@ -9,7 +9,7 @@ Imports no ROS: counts in, sentences out.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 
 from surfel_mapper.config import DiagnosticsConfig
@@ -45,6 +45,8 @@ class Interval:
         99th percentile from stamp to publication; None if no scan was mapped.
     paused : bool
         Whether clouds are dropped on request.
+    layers_off : mapping of str to str
+        Last error of each layer that is switched off, by its name.
     loss : str
         Messages lost by the middleware, and the remedy; empty if none.
 
@@ -58,6 +60,7 @@ class Interval:
     dropped: Counter[str] = field(default_factory=Counter)
     latency_s: float | None = None
     paused: bool = False
+    layers_off: Mapping[str, str] = field(default_factory=dict)
     loss: str = ''
 
 
@@ -68,6 +71,8 @@ def findings(interval: Interval, limits: DiagnosticsConfig) -> Iterator[tuple[in
         yield WARN, interval.loss
     if interval.paused:
         yield WARN, 'paused: clouds are dropped until ~/pause is called with false'
+    for name, error in interval.layers_off.items():
+        yield WARN, f'layer {name} is off until ~/clear, it failed repeatedly: {error}'
     yield from _drops(interval, limits)
     yield from _latency(interval, limits)
 

@@ -76,14 +76,16 @@ class LayerOutputs:
         )
         for topic in self._topics:
             if topic.layer.name in update.layers and not topic.has_rate:
-                topic.publish_if_read()
+                with self._mapper.guarded(f'publishing of layer {topic.layer.name}'):
+                    topic.publish_if_read()
 
     def expire(self) -> None:
         """Publish all topics again, now or at their next time; called in the mapping thread."""
         for topic in self._topics:
             topic.expire()
             if not topic.has_rate:
-                topic.publish_if_read()
+                with self._mapper.guarded(f'publishing of layer {topic.layer.name}'):
+                    topic.publish_if_read()
 
     def start_timers(self, config: Config) -> None:
         """Publish at the rates of these settings; called in the executor's thread."""

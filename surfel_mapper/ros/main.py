@@ -11,17 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 import threading
 
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.task import Future
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.memory import keep_freed_memory, share_freed_memory
 from surfel_mapper.ros.context import context, explain, logging_to
 from surfel_mapper.ros.main_thread import Signals
 from surfel_mapper.ros.node import MapperNode
+from surfel_mapper.ros.turns import take_turns
 from surfel_mapper.threads import real_time_threads
 
 
@@ -82,13 +83,19 @@ def run_tasks(node: MapperNode, signals: Signals) -> None:
 @contextmanager
 def executing(node: MapperNode) -> Iterator[None]:
     """Run the callbacks of a node in a thread, in a with-block."""
-    executor = SingleThreadedExecutor()
+    executor = SingleThreadedExecutor(context=node.context)
     executor.add_node(node)
-    stopping: Future[None] = Future()
+    stopping = threading.Event()
+
+    def turn() -> bool:
+        if stopping.is_set():
+            return False
+        executor.spin_once()
+        return True
 
     def spin() -> None:
         try:
-            executor.spin_until_future_complete(stopping)
+            take_turns(turn, partial(node.report_failure, 'a turn of the executor'))
         except BaseException as error:
             node.tasks.fail(error)
 
@@ -97,6 +104,7 @@ def executing(node: MapperNode) -> Iterator[None]:
     try:
         yield
     finally:
-        stopping.set_result(None)
+        stopping.set()
+        executor.create_task(stopping.is_set)  # a turn of its own, which ends the wait
         thread.join()
         executor.shutdown()

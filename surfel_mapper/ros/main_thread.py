@@ -101,7 +101,15 @@ class Task(NamedTuple):
 
 
 class TaskQueue:
-    """Functions for the main thread to call, and errors for it to raise."""
+    """
+    Functions for the main thread to call, and errors for it to raise.
+
+    Attributes
+    ----------
+    has_failed : bool
+        Whether the node ends because of an error, and not of a signal.
+
+    """
 
     def __init__(self) -> None:
         self.has_failed = False
@@ -145,6 +153,9 @@ class TaskQueue:
             done = False
             try:
                 done = item.action()
+            except Exception:
+                self.has_failed = True
+                raise
             finally:
                 item.done.set_result(done)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
+from functools import partial
 import threading
 from typing import Any, NamedTuple, TypeVar
 
@@ -23,6 +24,7 @@ from surfel_mapper.messages.poses import StampedPose
 from surfel_mapper.pipeline import Mapper, Update
 from surfel_mapper.pipeline.drops import described, INTERNAL, REMEDIES
 from surfel_mapper.pipeline.scan_images import MAX_IMAGES
+from surfel_mapper.ros.turns import take_turns
 from surfel_mapper.scan import Scan
 from surfel_mapper.sensors.depth import SceneImage
 
@@ -77,7 +79,7 @@ class MappingThread:
     mapper : Mapper
         Accessed by this thread only, from ``start`` to ``stop``.
     on_failure : callable
-        Called in this thread with an unexpected error, after which the thread ends.
+        Called in this thread with the error that ends it; see take_turns.
 
     Attributes
     ----------
@@ -195,10 +197,9 @@ class MappingThread:
                 self._changed.notify()
 
     def _run(self, on_update: Callable[[Update], None]) -> None:
-        """Work until stopped or until an unexpected error."""
+        """Work until stopped, or until an error ends the thread."""
         try:
-            while self._step(on_update):
-                pass
+            take_turns(partial(self._step, on_update), partial(self.report_failure, 'mapping'))
         except BaseException as error:
             self._on_failure(error)
         with self._changed:
@@ -219,7 +220,8 @@ class MappingThread:
             item = self._work.popleft() if self._work else None
             self._num_clouds -= isinstance(item, QueuedCloud)
             lost, self._lost = self._lost, Counter()
-        self._count(lost)
+        with self._mapper.guarded('counting of drops'):
+            self._count(lost)
         for pose, static in poses:
             with self._mapper.guarded('a pose'):
                 self._mapper.add_pose(*pose, static=static)
@@ -227,7 +229,8 @@ class MappingThread:
             with self._mapper.guarded('an image'):
                 self._mapper.add_image(image)
         if isinstance(item, QueuedCloud):
-            self._add(item)
+            with self._mapper.guarded('a cloud'):
+                self._add(item)
         elif item is not None:
             with self._mapper.guarded('a task between two scans'):
                 run_call(item)

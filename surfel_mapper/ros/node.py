@@ -187,8 +187,10 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
         session, self._session = self._session, None
         self._diagnostics.watch(None)
         if session is not None:
-            session.deactivate()
-            session.close(save=save)
+            try:
+                session.deactivate()
+            finally:
+                session.close(save=save)
             self._withdraw()
 
     def _withdraw(self) -> None:

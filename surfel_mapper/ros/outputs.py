@@ -100,13 +100,18 @@ class Outputs:
     def publish_update(self, update: Update) -> None:
         """Publish the changes of a scan; called in the mapping thread."""
         self._stamp_ns = update.stamp_ns
-        self._origin.publish(update.stamp_ns)
-        self._alignment.publish(update)
+        guarded = self._mapper.guarded  # a topic that fails keeps none of the others back
+        with guarded('publishing of the origin'):
+            self._origin.publish(update.stamp_ns)
+        with guarded('publishing of the alignment'):
+            self._alignment.publish(update)
         self._layers.publish_update(update)
         if self._mapper.derives:
-            self._publish_surfels(update)
+            with guarded('publishing of surfels'):
+                self._publish_surfels(update)
         if self._filtered.get_subscription_count():
-            self._publish_filtered(update.filtered)
+            with guarded('publishing of the filtered scan'):
+                self._publish_filtered(update.filtered)
 
     def publish_aligned(self) -> None:
         """Publish the result of ~/align; called in the mapping thread."""
@@ -120,10 +125,12 @@ class Outputs:
         Needed whenever the map or its settings have changed otherwise than by a scan.
         """
         self._published.clear()
-        self._origin.publish(self._stamp_ns)
+        with self._mapper.guarded('publishing of the origin'):
+            self._origin.publish(self._stamp_ns)
         self._layers.expire()
         if self._mapper.derives and self._has_clients():
-            self._publish_change(self._changes.collect())
+            with self._changes.undone_on_error():
+                self._publish_change(self._changes.collect())
 
     def start_timers(self, config: Config) -> None:
         """Publish at the rates of these settings; called in the executor's thread."""
@@ -179,7 +186,8 @@ class Outputs:
 
     def _publish_surfels(self, update: Update) -> None:
         if self._has_clients():
-            self._publish_change(self._changes.after_scan(update))
+            with self._changes.undone_on_error():
+                self._publish_change(self._changes.after_scan(update))
         else:
             self._changes.reset()
         if self._scan_normals.get_subscription_count():

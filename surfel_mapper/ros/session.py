@@ -138,9 +138,10 @@ class Session:
         if self._compiler.ident is not None:
             self._compiler.join()
         self.thread.stop()
-        self.outputs.close()
-        if self._viewer is not None:
-            self._viewer.close()
+        with self.mapper.guarded('the end of the outputs'):
+            self.outputs.close()
+            if self._viewer is not None:
+                self._viewer.close()
         log = self._node.get_logger()
         with self.mapper.guarded('the end of the input'):
             self.mapper.finish()
@@ -150,8 +151,8 @@ class Session:
         if save:
             try:
                 log.info(f'saved {save_map(self.mapper)}')
-            except (SurfelMapperError, OSError) as error:
-                log.error(f'the map could not be saved: {error}')
+            except Exception as error:  # MemoryError too
+                log.error(f'the map could not be saved: {error or repr(error)}')
         log.info(report(self.mapper))
 
     def _opened_viewer(self) -> LiveViewer | None:
@@ -205,10 +206,12 @@ class Session:
                 f'{self.mapper.map.num_voxels} voxels'
             )
         self.outputs.publish_update(update)
-        if self._viewer is not None:
-            self._viewer.add(update)
-        if self.registration is not None:
-            self.registration.publish(update)
+        with self.mapper.guarded('showing a scan'):
+            if self._viewer is not None:
+                self._viewer.add(update)
+        with self.mapper.guarded('publishing of the pose'):
+            if self.registration is not None:
+                self.registration.publish(update)
         with self.mapper.guarded('a checkpoint'):
             self._checkpoints.save_if_due()
         now_ns = self._node.get_clock().now().nanoseconds

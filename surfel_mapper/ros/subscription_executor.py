@@ -24,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable
 import copy
 from dataclasses import dataclass, field
+from functools import partial
 import math
 import threading
 import time
@@ -41,6 +42,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.ros.base_node import BaseNode
+from surfel_mapper.ros.turns import take_turns
 
 OVERRIDABLE = (QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH, QoSPolicyKind.DURABILITY)
 """Policies that a user can set for a subscription in ``qos_overrides``, beside reliability."""
@@ -139,7 +141,7 @@ class SubscriptionExecutor:
     node : BaseNode
         The node that subscribes.
     on_failure : callable
-        Called in the thread with an unexpected error, after which the thread ends.
+        Called in the thread with the error that ends it; see take_turns.
 
     """
 
@@ -312,13 +314,19 @@ class SubscriptionExecutor:
 
     def _run(self) -> None:
         try:
-            while self._end_s == math.inf:
-                self._wait()
-                self._follow_publishers()
-                while self._take_turn():
-                    pass
+            take_turns(self._turn, partial(self._node.report_failure, 'a turn of subscriptions'))
         except BaseException as error:
             self._on_failure(error)
+
+    def _turn(self) -> bool:
+        """Wait for messages and call their callbacks; return False at the end."""
+        if self._end_s != math.inf:
+            return False
+        self._wait()
+        self._follow_publishers()
+        while self._take_turn():
+            pass
+        return True
 
     def _wait(self) -> None:
         """Return when a message has arrived, or the thread has to end; call event callbacks."""

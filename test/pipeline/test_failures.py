@@ -147,6 +147,39 @@ def test_a_layer_that_fails_three_times_in_a_row_is_switched_off(fragile, caplog
     assert 'layers_off' not in mapper.summary()
 
 
+def test_a_layer_that_follows_but_cannot_clear_is_switched_off_too(fragile, monkeypatch):
+    """Each success of the one forgave a failure of the other."""
+
+    def broken(self, inserted):
+        raise MemoryError
+
+    monkeypatch.setattr(fragile, 'voxels_to_clear', broken)
+    mapper = mapper_with()
+    drive(mapper, 1.0, 2.0)
+    assert not mapper.counters.layers_off
+    drive(mapper, 3.0, 4.0)
+    assert mapper.fragile.stamps == [1, 2]
+    assert mapper.counters.messages_ignored == {'fragile': 3}
+    assert mapper.counters.layers_off == {'fragile': 'MemoryError'}
+
+
+def test_failures_of_a_layer_without_results_are_not_in_a_row_if_some_succeed(
+    fragile, monkeypatch
+):
+    """Only a result ended a row of failures, and not every layer has one."""
+    fails = iter([True, True, False, True, True, False])
+
+    def follow(self, inserted):
+        if next(fails):
+            raise MemoryError
+
+    monkeypatch.setattr(fragile, 'follow', follow)
+    mapper = mapper_with()
+    drive(mapper, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert mapper.counters.messages_ignored == {'fragile': 4}
+    assert not mapper.counters.layers_off
+
+
 def switched_off(fragile, mapper):
     fragile.error = RuntimeError('broken')
     drive(mapper, 1.0, 2.0, 3.0)

@@ -136,6 +136,48 @@ def test_the_next_full_map_repairs_a_lost_change():
     assert_equal(mirror, node)
 
 
+@pytest.mark.parametrize('moments', [True, False])
+@pytest.mark.parametrize('is_first', [True, False])
+def test_a_change_that_cannot_be_published_comes_with_the_next(moments, is_first):
+    node = Node(**{'publish.moments': moments, 'window.max_scans': 2})
+    known, lost = set(), 0 if is_first else 5
+    for number in range(9):
+        try:
+            with node.changes.undone_on_error():
+                change, _ = node.map_scan(number * SECOND)
+                if number in (lost, lost + 1):
+                    raise MemoryError
+        except MemoryError:
+            continue
+        known |= set(pack_keys(change.surfels.voxel_index).tolist())
+        known -= set(pack_keys(change.removed).tolist())
+        now = node.mapper.map.keys(node.changes.min_points)
+        assert known == set(now.tolist())
+
+
+@pytest.mark.parametrize('moments', [True, False])
+def test_a_scan_whose_changes_cannot_be_derived_comes_with_the_next(moments, monkeypatch):
+    """With ``publish.moments`` the voxels that it had emptied stayed in copies of the map."""
+    node = Node(**{'publish.moments': moments, 'window.max_scans': 2})
+    derive, known = SurfelMap.surfels_changed, set()
+
+    def derive_later(*args):
+        if number in (5, 6):
+            raise MemoryError
+        return derive(*args)
+
+    monkeypatch.setattr(SurfelMap, 'surfels_changed', derive_later)
+    for number in range(9):
+        if number in (5, 6):
+            with pytest.raises(ValueError, match='not enough values'):  # there is no update
+                node.map_scan(number * SECOND)
+            continue
+        change, _ = node.map_scan(number * SECOND)
+        known |= set(pack_keys(change.surfels.voxel_index).tolist())
+        known -= set(pack_keys(change.removed).tolist())
+        assert known == set(node.mapper.map.keys(node.changes.min_points).tolist())
+
+
 def test_a_mirror_follows_clearing_and_loading():
     node, mirror = Node(), MapMirror(0.5)
     for number in range(3):

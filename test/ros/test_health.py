@@ -76,6 +76,12 @@ def test_latency_is_a_warning_or_an_error_beyond_its_limits(latency_s, level):
     assert [severity for severity, _ in said] == ([] if level is None else [level])
 
 
+def test_a_layer_that_is_switched_off_is_a_warning_with_its_error():
+    ((level, text),) = found(received=20, layers_off={'tsdf': 'MemoryError'})
+    assert level == WARN
+    assert text == 'layer tsdf is off until ~/clear, it failed repeatedly: MemoryError'
+
+
 def test_latency_is_ignored_with_other_clocks_and_zero_limits():
     assert found(latency_s=3e8) == []
     assert found(latency_s=-3e8) == []

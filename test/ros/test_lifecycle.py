@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from importlib.util import find_spec
 import signal
+import sys
 
 import pytest
 
@@ -18,12 +19,16 @@ from sensor_msgs.msg import PointCloud2
 
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.pipeline import Mapper
+from surfel_mapper.pipeline.checkpoints import checkpoint_paths
 from surfel_mapper.pipeline.reduction import WarmUpSteps
 from surfel_mapper.ros.context import context
-from surfel_mapper.ros.main import executing
+from surfel_mapper.ros.inputs import Inputs
+from surfel_mapper.ros.main import create_node, executing
 from surfel_mapper.ros.node import MapperNode
-from test.ros.driving import ARGUMENTS, drive, mapped, send
-from test.ros.live import LATCHED, NODE, RVIZ
+from surfel_mapper.ros.pose_outputs import OriginOutput
+from surfel_mapper.ros.session import Session
+from test.ros.driving import ARGUMENTS, arguments, drive, mapped, send
+from test.ros.live import ALL, LATCHED, NODE, RVIZ
 
 STATES = ('unconfigured', 'inactive', 'active', 'finalized')
 WAITING = [*ARGUMENTS, '-p', 'autostart:=false']
@@ -160,6 +165,54 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
     assert values['window_scans'] == '2'
 
 
+def failing_after(method):
+    """Return a method that does its work, and then fails."""
+
+    def failing(self):
+        method(self)
+        raise MemoryError
+
+    return failing
+
+
+@pytest.mark.parametrize('ending', ['a thread', 'a transition', 'unsubscribing'])
+def test_a_node_that_cannot_go_on_saves_its_map(prefork, peer, monkeypatch, tmp_path, ending):
+    """Topics that fail all the time keep neither ~/changed nor checkpoints back before that."""
+
+    def fail(*_):
+        raise MemoryError
+
+    monkeypatch.setattr(OriginOutput, 'publish', fail)
+    settings = {'output.directory': tmp_path, 'output.checkpoint_s': 0.001}
+    messages = drive(3)
+    with context(arguments(**settings)):
+        node = create_node()
+        with executing(node):
+            node.start()
+            peer.advertise('/odom', '/points')
+            changed = peer.collect(PointCloud2, f'{NODE}/changed', ALL)
+            send(peer, messages)
+            _, values = peer.diagnosis({'scans.mapped': 3})
+            peer.spin_until(lambda: len(changed) == 3)
+            checkpoint, _ = checkpoint_paths(node._config.output)
+            assert checkpoint.is_file()
+            checkpoint.unlink()
+            if ending == 'unsubscribing':
+                monkeypatch.setattr(Inputs, 'unsubscribe', failing_after(Inputs.unsubscribe))
+            if ending == 'a transition':
+                monkeypatch.setattr(Session, 'deactivate', failing_after(Session.deactivate))
+                node.tasks.submit(node.trigger_deactivate)
+            else:
+                node._session.thread.post(lambda: sys.exit('the end'))
+            with pytest.raises((MemoryError, SystemExit)):
+                node.tasks.run(lambda: None)
+            node.end()
+        node.destroy_node()
+    _, mapper = mapped(messages)
+    assert load_map(checkpoint)[0].digest() == mapper.map.digest()
+    assert int(values['messages_ignored.internal_error']) >= 3
+
+
 def test_a_setting_that_changes_while_a_parameter_of_rclpy_is_declared_stays(peer):
     class Slow(Parameter):
         """Its name is known after another thread has changed a setting."""
@@ -214,6 +267,23 @@ def test_a_late_subscriber_gets_the_map_of_an_inactive_node(start, peer):
     late = peer.collect(PointCloud2, f'{NODE}/normals', LATCHED)
     peer.spin_until(lambda: late)
     assert late[0] == early[-1]
+
+
+def test_a_node_that_is_killed_continues_from_its_checkpoint(start, peer, tmp_path):
+    places = {'output.directory': tmp_path / 'maps', 'output.checkpoint_s': 0.001}
+    first = start('node', *arguments(**places))
+    peer.advertise('/odom', '/points')
+    changed = peer.collect(PointCloud2, f'{NODE}/changed', ALL)
+    messages = drive(3)
+    send(peer, messages)
+    peer.spin_until(lambda: len(changed) == 3)
+    peer.diagnosis({'scans.mapped': 3})  # from the thread that writes them, so after the last
+    first.kill()
+
+    second = start('node', *arguments(**places, **{'map.load': 'latest'}))
+    peer.diagnosis({'state': 'active', 'scans.mapped': 0, 'window_scans': 3})
+    _, mapper = mapped(messages)
+    assert f'map.checkpoint.npz, digest {mapper.map.digest()}' in second.output
 
 
 def test_a_restarted_node_replaces_the_latched_map_of_a_killed_one(start, peer):

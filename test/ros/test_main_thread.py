@@ -116,6 +116,20 @@ def test_an_error_in_a_task_is_raised_in_the_main_thread():
     assert answer.result(TIMEOUT_S) is False
 
 
+@pytest.mark.parametrize('error', [MemoryError, KeyboardInterrupt])
+def test_a_task_that_fails_is_a_failure_of_the_node_and_a_signal_is_none(error):
+    """The map was saved only if another thread had failed."""
+
+    def act():
+        raise error
+
+    tasks = TaskQueue()
+    tasks.submit(act)
+    with pytest.raises(error):
+        tasks.run(nothing)
+    assert tasks.has_failed == (error is MemoryError)
+
+
 def test_tasks_after_closing_return_false():
     tasks = TaskQueue()
     before = tasks.submit(lambda: True)

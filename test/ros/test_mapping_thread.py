@@ -174,6 +174,24 @@ def test_an_unexpected_error_is_counted_and_the_thread_goes_on():
     assert bench.mapper.counters.messages_ignored == {'internal_error': 4}
 
 
+def test_an_error_between_two_inputs_is_counted_and_the_next_is_mapped(bench, monkeypatch):
+    """Without memory for the list of drops the thread ended, and with it the node."""
+    has_input, failures = bench.thread._has_input, [MemoryError()]
+
+    def fail_once():
+        if failures:
+            raise failures.pop()
+        return has_input()
+
+    monkeypatch.setattr(bench.thread, '_has_input', fail_once)
+    bench.put_pose(START_NS)
+    bench.put_cloud(START_NS)
+    bench.thread.stop()
+
+    assert bench.stamps == [START_NS]
+    assert bench.mapper.counters.messages_ignored == {'internal_error': 1}
+
+
 def test_a_fatal_error_ends_the_thread_and_cancels_calls():
     def fail(update):
         raise SystemExit('broken')
