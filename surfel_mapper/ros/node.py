@@ -113,6 +113,16 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
             self.trigger_shutdown()
         self._release(save=self._config.output.save_on_shutdown)
 
+    def destroy_node(self) -> None:
+        """
+        Destroy the node with the services of its life cycle.
+
+        rclpy leaves those to the garbage collector. Until then the middleware's participant and
+        its threads live on, and a node of the same name finds a service that does not answer.
+        """
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
         """Set parameters from a service request; a refusal names the parameter and the reason."""
         if reason := refusal(self, parameter_list):

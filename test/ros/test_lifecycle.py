@@ -165,6 +165,15 @@ def test_settings_changed_while_kernels_compile_are_used(prefork, peer, monkeypa
     assert values['window_scans'] == '2'
 
 
+def test_a_destroyed_node_leaves_the_graph(peer):
+    """Its services, else found by the clients of the next node, answer no more."""
+    with context(WAITING):
+        node = create_node()
+        peer.spin_until(lambda: peer.node.count_services(f'{NODE}/get_state'))
+        node.destroy_node()
+        peer.spin_until(lambda: not peer.node.count_services(f'{NODE}/get_state'))
+
+
 def failing_after(method):
     """Return a method that does its work, and then fails."""
 
