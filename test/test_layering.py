@@ -15,6 +15,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 import re
 import sys
+from typing import NamedTuple
 
 import pytest
 
@@ -104,17 +105,47 @@ MODULES = {
 }
 
 
+class Source(NamedTuple):
+    """The parts of a file that the tests look at."""
+
+    imports: list[str]
+    """The full name of every module imported."""
+
+    classes: list[str]
+    docstring: str
+    num_lines: int
+    layer_settings: list[str]
+    """Line and name of every setting of a layer that is read from a configuration."""
+
+
 @cache
-def imports(path: Path) -> list[str]:
-    """Return the full name of every module that a file imports."""
-    names = []
-    for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
+def parsed(path: Path) -> Source:
+    """Parse a file, once for all tests."""
+    text = path.read_text(encoding='utf-8')
+    tree = ast.parse(text)
+    names, settings = [], []
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             names += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f'{path}:{node.lineno}: relative import'
             names += [f'{node.module}.{alias.name}' for alias in node.names]
-    return names
+        elif isinstance(node, ast.Attribute) and is_layer_setting(node):
+            settings.append(f'{node.lineno}: .{node.attr}')
+    classes = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    docstring = ast.get_docstring(tree) or ''
+    return Source(names, classes, docstring, text.count('\n'), settings)
+
+
+def is_layer_setting(node: ast.Attribute) -> bool:
+    """Return whether an attribute is the settings of a layer in a configuration."""
+    owner = getattr(node.value, 'attr', getattr(node.value, 'id', ''))
+    return node.attr in LAYER_SETTINGS and owner.strip('_') in CONFIGS
+
+
+def imports(path: Path) -> list[str]:
+    """Return the full name of every module that a file imports."""
+    return parsed(path).imports
 
 
 def is_at_home(module: str, homes: tuple[str, ...]) -> bool:
@@ -158,12 +189,10 @@ def test_modules_import_their_own_folder_and_lower_levels():
 
 def test_only_layers_and_their_parts_read_the_settings_of_layers():
     found = [
-        f'{name}:{node.lineno}: .{node.attr}'
+        f'{name}:{setting}'
         for name, path in MODULES.items()
         if not name.startswith(('config/', 'layers/', *LAYER_SETTINGS))
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-        if isinstance(node, ast.Attribute) and node.attr in LAYER_SETTINGS
-        if getattr(node.value, 'attr', getattr(node.value, 'id', '')).strip('_') in CONFIGS
+        for setting in parsed(path).layer_settings
     ]
     assert found == []
 
@@ -237,9 +266,9 @@ def test_the_package_itself_imports_nothing_foreign():
 def test_no_two_classes_share_a_name():
     homes: dict[str, list[str]] = {}
     for module, path in MODULES.items():
-        for node in ast.parse(path.read_text(encoding='utf-8')).body:
-            if isinstance(node, ast.ClassDef) and not node.name.startswith('_'):
-                homes.setdefault(node.name, []).append(module)
+        for name in parsed(path).classes:
+            if not name.startswith('_'):
+                homes.setdefault(name, []).append(module)
     assert {name: where for name, where in homes.items() if len(where) > 1} == {}
 
 
@@ -254,8 +283,7 @@ WHY_LONG = re.compile(r'\bone module\b|module is long|longer than other', re.IGN
 def test_short_and_long_modules_say_why():
     found = []
     for module, path in MODULES.items():
-        text = path.read_text(encoding='utf-8')
-        lines, docstring = text.count('\n'), ast.get_docstring(ast.parse(text)) or ''
+        lines, docstring = parsed(path).num_lines, parsed(path).docstring
         if module.endswith('__init__.py'):
             continue
         if lines < SHORT and not WHY_SHORT.search(docstring):
@@ -270,8 +298,7 @@ def test_every_folder_has_a_docstring():
     silent = [
         folder.relative_to(ROOT).as_posix()
         for folder in folders
-        if not (folder / '__init__.py').exists()
-        or ast.get_docstring(ast.parse((folder / '__init__.py').read_text())) is None
+        if not (folder / '__init__.py').exists() or not parsed(folder / '__init__.py').docstring
     ]
     assert silent == []
 

@@ -9,6 +9,7 @@ Readers of damaged and hostile input are tested in test/fuzz, the node in test/r
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 import re
 
@@ -38,10 +39,18 @@ def name_of(node):
     return node.id if isinstance(node, ast.Name) else ''
 
 
-def dangers(source):
-    """Return the calls in a source that run external code or programs."""
+@cache
+def searched(path):
+    """Return the dangers in a file, and whether it imports by a text; parsed once."""
+    nodes = list(ast.walk(ast.parse(path.read_text(encoding='utf-8'))))
+    calls = (name_of(node.func) for node in nodes if isinstance(node, ast.Call))
+    return dangers(nodes), any(name.endswith('import_module') for name in calls)
+
+
+def dangers(nodes):
+    """Return the calls among the nodes of a source that run external code or programs."""
     found = []
-    for node in ast.walk(ast.parse(source)):
+    for node in nodes:
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names if alias.name.split('.')[0] in MODULES]
         elif isinstance(node, ast.ImportFrom) and (node.module or '').split('.')[0] in MODULES:
@@ -70,7 +79,7 @@ def dangers_of_call(call):
 
 
 def test_no_source_unpickles_evaluates_or_starts_programs():
-    found = {path: dangers(path.read_text(encoding='utf-8')) for path in SOURCES}
+    found = {path: searched(path)[0] for path in SOURCES}
     assert {path.name: faults for path, faults in found.items() if faults} == STARTS_RERUN
     assert len(found) > 100
 
@@ -90,7 +99,7 @@ def test_no_source_unpickles_evaluates_or_starts_programs():
     ],
 )
 def test_dangerous_calls_are_found(source):
-    assert dangers(source)
+    assert dangers(ast.walk(ast.parse(source)))
 
 
 IMPORTERS = {
@@ -108,12 +117,7 @@ IMPORTERS = {
 
 
 def test_only_known_modules_import_by_a_text():
-    found = {
-        path.relative_to(PACKAGE).as_posix()
-        for path in SOURCES
-        for node in ast.walk(ast.parse(path.read_text(encoding='utf-8')))
-        if isinstance(node, ast.Call) and name_of(node.func).endswith('import_module')
-    }
+    found = {path.relative_to(PACKAGE).as_posix() for path in SOURCES if searched(path)[1]}
     assert found == {*IMPORTERS}
 
 

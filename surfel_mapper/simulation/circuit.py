@@ -11,6 +11,7 @@ corners on arcs; legs may be driven several times and in both directions.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from itertools import combinations, pairwise
 import math
@@ -122,21 +123,22 @@ def circuit_primitives(seed: int, corners: Corners) -> list[Primitive]:
     check_overlap(legs)
     pose = street_pose()
     T_world_street = pose_matrix(pose[:3], pose[3:])
+    T_street_world = inverse(T_world_street)
     kept = [_ground(T_world_street, np.array(corners, np.float64))]
     for number, (first, last) in enumerate(legs):
-        others = [leg for leg in legs if leg != (first, last)]
+        others = np.array([leg for leg in legs if leg != (first, last)]).reshape(-1, 2, 2)
         T_street_leg = _leg_pose(first, last)
         length_m = math.dist(first, last)
-        move = compose(T_world_street, compose(T_street_leg, inverse(T_world_street)))
+        move = compose(T_world_street, compose(T_street_leg, T_street_world))
         for primitive in street_primitives(1000 * seed + number, length_m):
             if primitive.label == 'ground':
                 continue
-            at = compose(inverse(T_world_street), primitive.T_world_primitive)[:2, 3]
+            at = compose(T_street_world, primitive.T_world_primitive)[:2, 3]
             if not -END_M <= at[0] <= length_m + END_M:
                 continue
-            x, y = T_street_leg[:2, :2] @ at + T_street_leg[:2, 3]
+            place = T_street_leg[:2, :2] @ at + T_street_leg[:2, 3]
             reach_m = math.hypot(*primitive.half_m[:2]) + PAVEMENT_Y_M[1]
-            if any(_distance((x, y), leg) < reach_m for leg in others):
+            if (_distances(place, others) < reach_m).any():
                 continue
             kept.append(_moved(primitive, move))
     return kept
@@ -186,13 +188,16 @@ def _ground(T_world_street: Transform, corners: npt.NDArray[np.float64]) -> Prim
 def _moved(primitive: Primitive, motion: Transform) -> Primitive:
     """Return a primitive moved by a motion of the world."""
     T = compose(motion, primitive.T_world_primitive)
-    values = primitive.to_mapping()
-    return Primitive(**{**values, 'xyz': tuple(T[:3, 3]), 'q_xyzw': tuple(q_xyzw(T))})
+    return replace(primitive, xyz=tuple(T[:3, 3]), q_xyzw=tuple(q_xyzw(T)))
 
 
-def _distance(place: tuple[float, float], leg: Sequence[tuple[float, float]]) -> float:
-    """Return the distance of a place from a leg, m."""
-    first, last = np.array(leg)
-    way = last - first
-    along = np.clip(np.dot(np.array(place) - first, way) / np.dot(way, way), 0.0, 1.0)
-    return math.dist(place, first + along * way)
+def _distances(
+    place: npt.NDArray[np.float64], legs: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """Return the distances of a place (2,) from (L, 2, 2) legs, (L,) m."""
+    first, way = legs[:, 0], legs[:, 1] - legs[:, 0]
+    off = place - first
+    along = (off * way).sum(axis=1) / (way * way).sum(axis=1)
+    off = off - np.clip(along, 0.0, 1.0)[:, None] * way
+    distances_m: npt.NDArray[np.float64] = np.hypot(off[:, 0], off[:, 1])
+    return distances_m

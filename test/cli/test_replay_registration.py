@@ -105,7 +105,7 @@ FULL, LONG = ('hall_os0_full', 22), ('hall_os0_long', 118)
 
 @pytest.mark.parametrize(
     ('recorded', 'every'),
-    [(FULL, 1), (FULL, 2), (FULL, 3), (LONG, 2), (LONG, 3)],
+    [(FULL, 1), (FULL, 3), (LONG, 3)],
     indirect=['recorded'],
     ids=str,
 )

@@ -3,7 +3,7 @@
 """
 The corpus of every harness and seeded mutations of it: our errors only, and bounded memory.
 
-The same inputs in every run, about 20,000; ``make fuzz`` searches on.
+The same inputs in every run, about 10,000; ``make fuzz`` searches on.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ def colliding_keys(num, rng):
 def test_rows_are_inserted_and_removed_as_in_a_dict(call):
     rng = np.random.default_rng(1)
     many = call is compiled
-    owner = Owner(call, 30_000 if many else 900, 256 if many else 8)
+    owner = Owner(call, 9_000 if many else 900, 64 if many else 8)
     keys = colliding_keys(len(owner.rows), rng).tolist()
     free = list(range(len(owner.rows)))
     for step in range(3):

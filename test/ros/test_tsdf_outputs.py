@@ -215,7 +215,8 @@ def test_rates_changed_while_running_hold_at_once(start, peer):
 
 
 def test_a_late_reader_gets_the_whole_mesh_and_then_changes_only(start, peer):
-    start_node(start, peer, **SETTINGS, **{'layers.tsdf.max_range_m': 100.0})
+    coarse = {'layers.tsdf.voxel_size_m': 0.4, 'layers.tsdf.truncation_m': 1.2}
+    start_node(start, peer, **{**SETTINGS, **coarse, 'layers.tsdf.max_range_m': 100.0})
     meshes = peer.collect(MarkerArray, f'{BASE}/mesh_tiles', MESHES)
     peer.spin_until(lambda: num_complete(meshes) == 1)  # before the first scan, without triangles
     directions = LidarModel(rows=32, columns=360, vertical_fov_deg=60.0).directions.reshape(-1, 3)

@@ -32,9 +32,10 @@ pytestmark = [
 __all__ = ['browser']  # a fixture
 
 
-@pytest.fixture
-def served(tmp_path):
-    """Serve a map until the end of the test; yield the address of the page."""
+@pytest.fixture(scope='module')
+def served(tmp_path_factory):
+    """Serve a map until the end of the tests; yield the address of the page."""
+    tmp_path = tmp_path_factory.mktemp('served')
     ground_map().save(tmp_path / 'map.npz')
     command = [sys.executable, '-m', 'surfel_mapper.cli.main', 'view', str(tmp_path / 'map.npz')]
     environment = {**os.environ, 'BROWSER': 'true'}
