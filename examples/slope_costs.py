@@ -57,7 +57,7 @@ def main() -> None:
 
 def write(grid: CostGrid, output: Path) -> None:
     """Write an image, its first row the greatest y, and its position."""
-    image = np.where(grid.cost < 0, UNKNOWN, grid.cost).astype(np.uint8)[::-1]
+    image = np.where(grid.cost < 0, UNKNOWN, grid.cost.astype(np.int16)).astype(np.uint8)[::-1]
     header = f'P5 {image.shape[1]} {image.shape[0]} 255\n'
     output.with_suffix('.pgm').write_bytes(header.encode() + image.tobytes())
     output.with_suffix('.yaml').write_text(

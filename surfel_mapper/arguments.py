@@ -16,16 +16,45 @@ import numpy as np
 import numpy.typing as npt
 
 
+def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
+    """
+    Return values as an array; raise ValueError, with their name, if none can be made.
+
+    Lists of unequal rows and tensors on a graphics card are refused. Masked values become nan:
+    NumPy would return the values under the mask.
+    """
+    if isinstance(values, np.ma.MaskedArray):
+        kept: Any = values if values.dtype.kind == 'f' else values.astype(np.float64)
+        return np.asarray(kept.filled(np.nan))
+    try:
+        return np.asarray(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        is_list = isinstance(values, (list, tuple))
+        cause = ' of unequal rows' if is_list else f' that is no array ({error})'
+        raise ValueError(f'{name}: a {type(values).__name__}{cause}, expected numbers') from None
+
+
 def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return values as float64; raise ValueError, with their name, if they are not numbers."""
+    found = as_array(name, values)
     try:
-        if np.iscomplexobj(values):
+        if found.dtype.kind in 'cmMSUV':  # dates would become their number of ticks
             raise TypeError
         with np.errstate(over='ignore'):  # wider floats become infinite
-            return np.asarray(values, np.float64)
+            return np.asarray(found, np.float64)
     except (TypeError, ValueError, OverflowError):
         shown = repr(values) if isinstance(values, str) else f'a {type(values).__name__}'
+        if isinstance(values, np.ndarray):
+            shown = f'{found.dtype} {found.shape}'
         raise ValueError(f'{name}: {shown}, expected numbers') from None
+
+
+def as_real(name: str, value: object) -> float:
+    """Return a number, of any type of numbers but bool; raise TypeError for others."""
+    if isinstance(value, (bool, np.bool_)) or not isinstance(value, (int, float, np.number)):
+        shown = f'a {type(value).__name__}' if isinstance(value, np.ndarray) else f'{value!r:.60}'
+        raise TypeError(f'{name}: {shown}, expected a number')
+    return float(as_numbers(name, value))
 
 
 def as_whole(name: str, value: object) -> int:
@@ -37,6 +66,17 @@ def as_whole(name: str, value: object) -> int:
         bits = int(value).bit_length()
         raise ValueError(f'{name}: a number of {bits} bits, expected at most 63 and a sign')
     return int(value)
+
+
+def check_rows(name: str, rows: object) -> None:
+    """Raise IndexError if rows are neither a slice nor a mask or indices in one dimension."""
+    if isinstance(rows, slice):
+        return
+    found = as_array(name, rows)  # type: ignore[arg-type]
+    if found.ndim != 1 or (found.size and found.dtype.kind not in 'iub'):
+        raise IndexError(
+            f'{name}: {found.dtype} {found.shape}, expected a slice, a mask or row indices'
+        )
 
 
 def made_array(array: npt.NDArray[Any], dtype: Any, copy: bool | None) -> npt.NDArray[Any]:

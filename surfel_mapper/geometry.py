@@ -22,6 +22,8 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_array
+
 Transform = npt.NDArray[np.float64]
 """A (4, 4) float64 matrix; takes points in frame b to frame a if called T_a_b."""
 
@@ -60,7 +62,13 @@ def pose_matrix(xyz: Iterable[float], q_xyzw: Iterable[float]) -> Transform:
         If a number is missing or not finite, or the norm of the quaternion is not 1 +- 1e-3.
 
     """
-    t, q = [float(v) for v in xyz], [float(v) for v in q_xyzw]
+    try:
+        t, q = [float(v) for v in xyz], [float(v) for v in q_xyzw]
+    except TypeError:
+        raise ValueError(
+            f'pose of a {type(xyz).__name__} and a {type(q_xyzw).__name__}, expected 3 numbers '
+            '(x y z) and 4 (qx qy qz qw)'
+        ) from None
     if len(t) != 3 or len(q) != 4:
         raise ValueError(
             f'pose of {len(t)} and {len(q)} numbers, expected 3 (x y z) and 4 (qx qy qz qw)'
@@ -127,7 +135,7 @@ def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
         0 0 0 1. So a transposed transform is refused.
 
     """
-    matrix = np.asarray(T_a_b)
+    matrix = as_array(name, T_a_b)
     if matrix.shape != (4, 4) or matrix.dtype.kind not in 'fiu':
         raise ValueError(f'{name}: {matrix.dtype} {matrix.shape}, expected float (4, 4)')
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()

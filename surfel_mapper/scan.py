@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_array, as_numbers, check_kind, check_rows
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PointTimes:
@@ -94,8 +96,10 @@ class Scan:
     Raises
     ------
     ValueError
-        If the points are not a floating point array (N, 3), the stamp is no whole number, or a
-        column is not of length N.
+        If the points are not a floating point array (N, 3), the stamp is no whole number, a
+        column is not of length N, or a pose or the free directions have another shape.
+    TypeError
+        If the frame is no name, or the columns are no mapping.
 
     """
 
@@ -114,6 +118,8 @@ class Scan:
     def __post_init__(self) -> None:
         """Check the shapes."""
         points = self.points
+        if isinstance(points, np.ma.MaskedArray):
+            raise ValueError('points: a MaskedArray, expected an array: points.filled(np.nan)')
         if not isinstance(points, np.ndarray):
             raise ValueError(f'points: {type(points).__name__}, expected an array (N, 3)')
         if points.ndim != 2 or points.shape[1] != 3:
@@ -131,11 +137,21 @@ class Scan:
             value = getattr(self, name)
             if not isinstance(value, (kind, type(None))):
                 raise TypeError(f'{name}: a {type(value).__name__}, expected a {kind.__name__}')
+        for name in ('T_base_sensor', 'T_map_sensor'):
+            if (T := getattr(self, name)) is not None:
+                object.__setattr__(self, name, as_numbers(name, T))
+                if np.shape(T) != (4, 4):
+                    raise ValueError(f'{name}: shape {np.shape(T)}, expected (4, 4)')
+        if self.free is not None and as_array('free', self.free).shape[1:] != (3,):
+            raise ValueError(f'free: shape {np.shape(self.free)}, expected directions (K, 3)')
         if self.depth is not None and self.depth.points is not points:
             object.__setattr__(self, 'depth', None)
         if getattr(self.columns, 'num_rows', None) == len(points):
             return  # columns of filters are lazy: measuring would compute each
+        check_kind('columns', self.columns, Mapping)
         for name, column in self.columns.items():
+            if not hasattr(column, '__len__'):
+                raise ValueError(f'column {name}: {column!r:.60}, expected an array (N,)')
             if len(column) != len(points):
                 raise ValueError(
                     f'column {name}: {len(column)} rows, expected one for each of '
@@ -161,6 +177,7 @@ class Scan:
             A mask over the points, or indices in the order of the result.
 
         """
+        check_rows('rows', rows)
         columns = {name: column[rows] for name, column in self.columns.items()}
         times = self.times and replace(self.times, offsets=self.times.offsets[rows])
         return replace(self, points=self.points[rows], columns=columns, times=times, msg=None)

@@ -24,7 +24,8 @@ PACKAGE = ROOT / 'surfel_mapper'
 
 LEVELS = (
     {'budget', 'errors'},
-    {'arguments', 'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
+    {'arguments'},
+    {'config', 'counters', 'geometry', 'kernels', 'memory', 'scan', 'threads'},
     {'filters', 'mapping'},
     {'alignment', 'models', 'poses', 'sensors', 'tsdf'},
     {'files', 'messages'},

@@ -163,7 +163,21 @@ class Config:
         }
 
     def stage(self, name: str) -> Any:
-        """Return the stage of a layer of another package, by its name: ``layers.heights``."""
+        """
+        Return the stage of a layer of another package, by its name: ``layers.heights``.
+
+        Raises
+        ------
+        ConfigError
+            If no package has registered it.
+
+        """
+        if not isinstance(name, str) or name not in {**self.more, **layer_stages()}:
+            known = ', '.join(sorted(layer_stages())) or 'none is registered'
+            raise ConfigError(
+                f'{name!r:.60}: no stage of a layer of another package ({known}); the others are '
+                'attributes, as config.map'
+            )
         return self.more[name] if name in self.more else layer_stages()[name]()
 
     def replace(self, mapping: Mapping[str, Any]) -> Config:

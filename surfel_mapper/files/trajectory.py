@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers, as_path, as_whole, made_array
+from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, made_array
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
@@ -101,6 +101,25 @@ class Trajectory:
     xyz: npt.NDArray[np.float64]
     q_xyzw: npt.NDArray[np.float64]
 
+    def __post_init__(self) -> None:
+        """Turn lists into arrays; raise ValueError if shapes or types are not as above."""
+        for name, width in (('xyz', 3), ('q_xyzw', 4)):
+            found = as_numbers(name, getattr(self, name))
+            if found.ndim != 2 or found.shape[1] != width:
+                raise ValueError(f'{name}: shape {found.shape}, expected (S, {width})')
+            object.__setattr__(self, name, found)
+        lengths = [len(self.xyz), len(self.q_xyzw)]
+        if self.stamp_ns is not None:
+            stamps = as_array('stamp_ns', self.stamp_ns)
+            if stamps.ndim != 1 or (stamps.size and stamps.dtype.kind not in 'iu'):
+                raise ValueError(
+                    f'stamp_ns: {stamps.dtype} {stamps.shape}, expected whole nanoseconds (S,)'
+                )
+            object.__setattr__(self, 'stamp_ns', stamps.astype(np.int64, copy=False))
+            lengths.append(len(stamps))
+        if len(set(lengths)) > 1:
+            raise ValueError(f'positions, rotations, stamps: {lengths}, expected as many of each')
+
     def __len__(self) -> int:
         """Return the number of poses."""
         return len(self.xyz)
@@ -169,7 +188,7 @@ class Trajectory:
             raise ValueError(f'T_fixed_sensor: shape {poses.shape}, expected (S, 4, 4)')
         for row, pose in enumerate(poses):
             check_rigid(f'T_fixed_sensor[{row}]', pose)
-        stamps = None if stamp_ns is None else np.asarray(stamp_ns)
+        stamps = None if stamp_ns is None else as_array('stamp_ns', stamp_ns)
         if stamps is not None:
             if stamps.dtype.kind not in 'iu':
                 raise ValueError(f'stamp_ns: {stamps.dtype}, expected whole nanoseconds (int64)')

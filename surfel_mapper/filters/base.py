@@ -24,7 +24,7 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers
+from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import setting, Settings
 from surfel_mapper.errors import FilterError
 from surfel_mapper.filters.columns import LazyColumns
@@ -67,7 +67,7 @@ def as_scan(points: Scan | npt.ArrayLike) -> Scan:
     """
     if isinstance(points, Scan):
         return points
-    array = np.asarray(points)
+    array = as_array('points', points)
     if array.dtype not in (np.float32, np.float64):
         array = as_numbers('points', array)
     return Scan(points=array.reshape(-1, 3) if array.size == 0 else array, stamp_ns=0, frame_id='')

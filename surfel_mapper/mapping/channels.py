@@ -36,9 +36,9 @@ def channel_names(columns: tuple[str, ...]) -> tuple[str, ...]:
 
     """
     is_several = isinstance(columns, (tuple, list))
-    unknown = [name for name in columns if name not in CHANNELS] if is_several else columns
-    if unknown or not is_several:
-        raise ValueError(f'columns: {unknown}, expected some of {list(CHANNELS)}')
+    unknown = [name for name in columns if name not in [*CHANNELS]] if is_several else [columns]
+    if unknown:
+        raise ValueError(f'columns: {unknown[0]!r:.60}, expected some of {list(CHANNELS)}')
     return tuple(channel for name in columns for channel in CHANNELS[name])
 
 

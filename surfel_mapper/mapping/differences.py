@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from surfel_mapper.arguments import as_real
 from surfel_mapper.errors import MapError
 from surfel_mapper.mapping.moments import pack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -80,6 +81,8 @@ def diff(
     for each in (before, after):
         if not isinstance(each, SurfelMap):
             raise TypeError(f'diff: a {type(each).__name__}, expected two SurfelMaps')
+    if not 0.0 <= as_real('angle_deg', angle_deg) <= 90.0:  # false for nan
+        raise ValueError(f'angle_deg: {angle_deg}, expected 0 to 90 degrees')
     lattices = [(each.voxel_size_m, each.level) for each in (before, after)]
     if lattices[0] != lattices[1]:
         raise MapError(

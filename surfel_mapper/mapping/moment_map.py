@@ -19,13 +19,12 @@ Points are reduced to moments and surfels derived from them in ``SurfelMap`` (su
 
 from __future__ import annotations
 
-import operator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers, as_whole
+from surfel_mapper.arguments import as_array, as_numbers, as_whole
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
@@ -70,10 +69,10 @@ class MomentMap:
     def __init__(
         self, voxel_size_m: float, columns: tuple[str, ...], level: int, origin_m: npt.ArrayLike
     ) -> None:
-        if level not in range(MAX_LEVEL + 1):
+        if as_whole('level', level) not in range(MAX_LEVEL + 1):
             raise ValueError(f'level: {level}, expected 0 to {MAX_LEVEL}')
         self.voxel_size_m = voxel_size_m
-        self.level = operator.index(level)
+        self.level = int(level)
         self.origin_m = origin_m
         self.version = 0
         self.columns = columns
@@ -249,7 +248,7 @@ class MomentMap:
         if voxel_index is None:
             chosen = self._table.changed_after(-1, 1)
         else:
-            index = np.asarray(voxel_index)
+            index = as_array('voxel_index', voxel_index)
             if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
                 kind = f'{index.dtype} {index.shape}'
                 raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')

@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_array, check_rows
 from surfel_mapper.errors import MapError, MapLimitError
 from surfel_mapper.kernels.layout import (
     BITS,
@@ -93,7 +94,9 @@ class ScanMoments:
     is_reduced: bool = field(default=False, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Default to zero channels for every voxel."""
+        """Default to zero channels for every voxel; a map tests the arrays when it takes them."""
+        if not isinstance(self.key, np.ndarray):
+            raise ValueError(f'key: a {type(self.key).__name__}, expected an array (K,)')
         if self.channels is None:
             object.__setattr__(self, 'channels', np.empty((len(self.key), 0), np.int64))
 
@@ -133,6 +136,7 @@ class ScanMoments:
 
     def select(self, voxels: slice | npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of selected voxels: a slice, a mask (K,) bool or row indices."""
+        check_rows('voxels', voxels)
         names = ('key', 'count', 'total', 'product', 'view', 'channels')
         return replace(self, **{name: getattr(self, name)[voxels] for name in names})
 
@@ -156,7 +160,7 @@ def point_keys(
 
 def whole_keys(key: npt.ArrayLike) -> npt.NDArray[np.int64]:
     """Return voxel keys (K,) as the kernels take them; TypeError for other arrays."""
-    found = np.asarray(key)
+    found = as_array('keys', key)
     if found.ndim != 1 or (found.size and found.dtype.kind not in 'iu'):
         raise TypeError(f'keys: {found.dtype} {found.shape}, expected int64 (K,)')
     return np.ascontiguousarray(found, np.int64)

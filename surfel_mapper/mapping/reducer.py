@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers
+from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.grouping import build_table, CHUNK
@@ -125,6 +125,8 @@ class Reducer:
 
         """
         points = as_points(points)
+        if columns is not None and not isinstance(columns, Mapping):
+            raise TypeError(f'columns: a {type(columns).__name__}, expected arrays by name')
         if T_map_sensor is not None:
             check_rigid('T_map_sensor', T_map_sensor)
         pose = np.eye(4) if T_map_sensor is None else np.asarray(T_map_sensor, np.float64)
@@ -202,11 +204,7 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
 
     Arrays that fulfil this and are writeable are not copied.
     """
-    try:
-        array = np.asarray(points)
-    except ValueError:  # lists of unequal length, or a sequence of other things
-        kind = type(points).__name__
-        raise ValueError(f'points: a {kind} of unequal rows, expected (N, 3) numbers') from None
+    array = as_array('points', points)
     if array.dtype.names:  # Surfels, or a structured array
         columns = ', '.join(array.dtype.names[:4])
         raise ValueError(

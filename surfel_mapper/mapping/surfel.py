@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_whole
+from surfel_mapper.arguments import as_array, as_whole
 from surfel_mapper.mapping.point_sums import COLUMNS, NO_POINTS, PointSums, ROUNDING, ROWS
 
 Array = npt.NDArray[np.float64]
@@ -273,7 +273,7 @@ def _checked(
     limit: float = MAX_COORDINATE_M,
 ) -> Array:
     """Return numbers as a new float64 array of a shape, by default (3,) or (N, 3)."""
-    found = np.asarray(numbers)
+    found = as_array(name, numbers)
     if found.dtype.kind not in 'fiu':
         raise ValueError(f'{name}: dtype {found.dtype}, expected real numbers')
     fits = found.shape == shape if shape else found.ndim in (1, 2) and found.shape[-1] == 3

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers, as_path, as_whole
+from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import means
@@ -234,10 +234,19 @@ class SurfelMap(MomentMap):
             Maximum number of surfels; a larger map is subsampled evenly in space, by a hash of
             the voxel, so that the selection changes little while the map grows.
 
+        Raises
+        ------
+        TypeError
+            If a number is not whole.
+        ValueError
+            If at_most is negative.
+
         """
         min_points = as_whole('min_points', min_points)
         if at_most is None:
             return self._derive(self._table.changed_after(-1, min_points))
+        if as_whole('at_most', at_most) < 0:
+            raise ValueError(f'at_most: {at_most}, expected 0 or more')
         return self._derive(self._table.thinned(min_points, at_most))
 
     def num_surfels(self, min_points: int = 1) -> int:
@@ -319,8 +328,9 @@ class SurfelMap(MomentMap):
             origin_m=self.origin_m,
         )
         if within is not None:
-            if np.shape(within) != (2, 3) or np.asarray(within).dtype.kind != 'i':
-                raise ValueError(f'within: {within!r}, expected two voxel indices, i j k')
+            box = as_array('within', within)
+            if box.shape != (2, 3) or box.dtype.kind != 'i':
+                raise ValueError(f'within: {within!r:.60}, expected two voxel indices, i j k')
             fine = self._moments_of(self._table.find(self._table.keys_in_box(*within)))
         else:
             fine = self._moments_of(self._table.changed_after(-1, 1))

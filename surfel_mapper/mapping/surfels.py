@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import made_array
+from surfel_mapper.arguments import as_array, made_array
 from surfel_mapper.errors import DependencyError
 from surfel_mapper.mapping.kernels.surfels import derive_surfels
 from surfel_mapper.threads import share
@@ -191,7 +191,7 @@ class Surfels:
 
         """
         if not isinstance(rows, slice):
-            rows = np.asarray(rows)
+            rows = as_array('rows', rows)
             if rows.size == 0 and rows.dtype != np.bool_:
                 rows = rows.astype(np.int64)
             if rows.ndim != 1 or rows.dtype.kind not in 'iub':

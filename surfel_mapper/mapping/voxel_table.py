@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_array
 from surfel_mapper.kernels import hashing, layout
 from surfel_mapper.mapping.kernels.queries import (
     keys_in_box,
@@ -171,7 +172,7 @@ class VoxelTable:
 
     def checked(self, rows: npt.ArrayLike) -> npt.NDArray[np.int32]:
         """Return rows (K,) as the kernels take them; IndexError if the table does not have one."""
-        found = np.asarray(rows)
+        found = as_array('rows', rows)
         if found.ndim != 1 or found.dtype.kind != 'i':
             raise IndexError(f'rows: {found.dtype} {found.shape}, expected those of find')
         last = len(self.rows.array) - 1

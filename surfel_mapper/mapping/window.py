@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import check_kind
+from surfel_mapper.arguments import as_whole, check_kind
 from surfel_mapper.config import WindowConfig
 from surfel_mapper.mapping.moments import point_keys, ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
@@ -117,7 +117,7 @@ class SlidingWindow:
         if config is not None:
             check_kind('config', config, WindowConfig, hint='WindowConfig(max_scans=100)')
         self.config = config or WindowConfig()
-        self.max_voxels = max_voxels
+        self.max_voxels = as_whole('max_voxels', max_voxels)
         self.max_total_bytes = 0
         self.keeps_scans = False
         self._map = surfel_map
@@ -170,6 +170,7 @@ class SlidingWindow:
 
         """
         check_kind('scan', scan, WindowedScan)
+        min_points = as_whole('min_points', min_points)
         self._map.insert(scan.moments)
         self._append(scan)
         evicted = []
@@ -216,6 +217,7 @@ class SlidingWindow:
             Indices of the voxels that held at least ``min_points`` and are empty now.
 
         """
+        min_points = as_whole('min_points', min_points)
         held = self._map.moments(voxel_index)
         if not len(held):
             return np.empty((0, 3), np.int32)
@@ -250,6 +252,7 @@ class SlidingWindow:
 
         """
         check_kind('scans', scans, Mapping)
+        min_points = as_whole('min_points', min_points)
         checked_scans(scans.values())
         old = list(self)
         left = np.concatenate([np.empty(0, np.int64), *(old[p].moments.key for p in scans)])

@@ -173,9 +173,9 @@ def replay(
     from surfel_mapper.offline.request import Request
     from surfel_mapper.viz.history import History
 
-    check_kind('options', options or ReplayOptions(), ReplayOptions)
+    options = ReplayOptions() if options is None else options
+    check_kind('options', options, ReplayOptions)
     check_kind('progress', progress, Callable)  # type: ignore[arg-type]
-    options = options or ReplayOptions()
     request = path if isinstance(path, Request) else Request(path=as_path(path))
     settings = configured(config, options)
     directory = output_directory(

@@ -25,7 +25,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import check_kind
+from surfel_mapper.arguments import as_whole, check_kind
 from surfel_mapper.config import Config, declarations
 from surfel_mapper.counters import Counters
 from surfel_mapper.errors import CloudFormatError, ConfigError, MapError
@@ -172,6 +172,9 @@ class Mapper:
                 f'stamp_ns: {stamp_ns!r}, expected whole nanoseconds as an int, such as '
                 'round(seconds * 1e9)'
             )
+        check_kind('static', static, bool)
+        for name, numbers in (('xyz', xyz), ('q_xyzw', q_xyzw)):
+            check_kind(name, numbers, Iterable)
         add = partial(self._poses.add, parent, child, stamp_ns, xyz, q_xyzw, static=static)
         if static:
             add()
@@ -193,6 +196,7 @@ class Mapper:
         dropped. The topic is for the log. Raises TypeError for anything but a Scan.
         """
         check_kind('scan', scan, Scan, hint='Scan(points=..., stamp_ns=..., frame_id=...)')
+        check_kind('topic', topic, str)
         self.counters.received += 1
         if topic:
             self._drops.name_topic(scan.frame_id, topic)
@@ -453,6 +457,8 @@ class Mapper:
             If there is no transform.
 
         """
+        check_kind('frame_id', frame_id, str)
+        stamp_ns = as_whole('stamp_ns', stamp_ns)
         if frame_id == self.map_frame:
             return np.eye(4)
         fixed, at_ns = self.config.frames.fixed, stamp_ns or self.transforms.newest_ns or 0
@@ -479,7 +485,7 @@ class Mapper:
             Voxels are 2^level times larger than those of the map.
 
         """
-        surfel_map = self.map.coarsen(level) if level else self.map
+        surfel_map = self.map.coarsen(level) if as_whole('level', level) else self.map
         return surfel_map.surfels(self.config.map.min_points)
 
     def clear_region(self, region: Region) -> npt.NDArray[np.int32]:

@@ -26,6 +26,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_real
 from surfel_mapper.errors import ConfigError
 from surfel_mapper.kernels.layout import KEY
 from surfel_mapper.mapping.storage import Slab
@@ -88,7 +89,7 @@ class EuclideanField:
 
     def __init__(self, blocks: BlockMap, *, max_m: float = 2.0, radius_m: float = 0.0) -> None:
         size_m, voxels = blocks.config.voxel_size_m, blocks.voxels_per_block
-        if not size_m <= max_m <= kernels.MAX_REACH * size_m:
+        if not size_m <= as_real('esdf.max_m', max_m) <= kernels.MAX_REACH * size_m:
             raise ConfigError(
                 f'esdf.max_m: {max_m}, expected {size_m} to {kernels.MAX_REACH * size_m:g}, that '
                 f'is 1 to {kernels.MAX_REACH} voxels'

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.arguments import as_numbers
+from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.config import TsdfConfig
-from surfel_mapper.errors import PoseError
+from surfel_mapper.errors import CloudFormatError, PoseError
 from surfel_mapper.tsdf.kernels import lookup as kernels
 
 logger = logging.getLogger(__name__)
@@ -79,6 +79,35 @@ def settings(config: TsdfConfig) -> Float32:
     found[kernels.MAX_WEIGHT] = config.max_weight
     found[kernels.CONTRADICTS] = 0.5 * config.voxel_size_m
     found[kernels.LEAST] = max(config.mesh_min_weight, 1e-30)
+    return found
+
+
+def checked_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
+    """Return points (N, 3) as float32 or float64; raise CloudFormatError for other shapes."""
+    try:
+        found = as_array('points', points)
+    except ValueError as error:
+        raise CloudFormatError(str(error)) from None
+    if found.ndim != 2 or found.shape[1] != 3 or found.dtype.kind not in 'fiu':
+        raise CloudFormatError(f'points: {found.dtype} {found.shape}, expected (N, 3) float')
+    if found.dtype == np.float16:
+        return found.astype(np.float32)
+    return found if found.dtype in (np.float32, np.float64) else found.astype(np.float64)
+
+
+def checked_column(
+    name: str, values: Any, kind: Any, shapes: tuple[tuple[int, ...], ...]
+) -> npt.NDArray[Any] | None:
+    """Return a column of points as an array; raise CloudFormatError for other types and shapes."""
+    if values is None:
+        return None
+    try:
+        found = as_array(name, values)
+    except ValueError as error:
+        raise CloudFormatError(str(error)) from None
+    if found.shape not in shapes or not np.issubdtype(found.dtype, kind):
+        expected = f'{kind.__name__} {" or ".join(map(str, shapes))}, one for each point'
+        raise CloudFormatError(f'{name}: {found.dtype} {found.shape}, expected {expected}')
     return found
 
 

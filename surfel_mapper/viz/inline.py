@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from surfel_mapper.arguments import as_numbers
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.viz.detail import drawn_surfels
@@ -82,7 +83,9 @@ def show(
         surfels = shown.surfels(min_points)
         if place is None and len(surfels):
             place = np.median(surfels.position, axis=0)
-        near = np.zeros(3) if place is None else place
+        near = np.zeros(3) if place is None else as_numbers('place', place)
+        if near.shape != (3,) or not np.isfinite(near).all():
+            raise ValueError(f'place: {place!r}, expected x y z, m, finite')
         drawn = drawn_surfels(shown, min_points, near, most_shown({}))
     else:
         surfels = drawn = shown

@@ -22,7 +22,7 @@ from surfel_mapper.layers.distance_field.obstacles import obstacle_distances, Ob
 from surfel_mapper.tsdf.blocks import BlockMap
 from surfel_mapper.tsdf.euclidean import EuclideanField
 from surfel_mapper.tsdf.integrator import Integrator
-from surfel_mapper.tsdf.measurements import Integrated
+from surfel_mapper.tsdf.measurements import checked_column, checked_points, Integrated
 from surfel_mapper.tsdf.mesh import Mesh, Mesher
 from surfel_mapper.tsdf.point_integrator import PointIntegrator
 from surfel_mapper.tsdf.queries import labels_at, sample, states
@@ -101,6 +101,10 @@ class DistanceField:
             field is unchanged.
 
         """
+        points = checked_points(points)
+        num = len(points)
+        colors = checked_column('colors', colors, np.uint8, ((num, 3), (num, 4)))
+        labels = checked_column('labels', labels, np.signedinteger, ((num,),))
         if sensor is None:
             by_points = PointIntegrator(self.blocks)
             return by_points.integrate(
@@ -233,6 +237,7 @@ class DistanceField:
             If the file cannot be written.
 
         """
+        check_kind('compress', compress, int, hint='True or False')
         save_tsdf(as_path(path), self.blocks, compress=compress)
 
     @classmethod
