@@ -3,10 +3,10 @@
 """
 Large height fields of a map that changes are refitted only near changes.
 
-A cell whose mean height changed by less than ``STILL_M`` keeps the height that it was fitted
-with. Control points farther than ``MARGIN`` cells from a change stay as they are: its influence
-decays within that distance. The knots depend on the number of cells, so large grids
-grow by blocks.
+A cell whose mean height changed by less than ``still_m`` keeps the height that it was fitted
+with, and conjugate gradients stop when no control point moves farther. Control points farther
+than ``MARGIN`` cells from a change stay as they are: its influence decays within that distance.
+The knots depend on the number of cells, so large grids grow by blocks.
 """
 
 from __future__ import annotations
@@ -32,10 +32,6 @@ Mask = npt.NDArray[np.bool_]
 SMOOTHING = 1e-2
 """Weight of the second differences."""
 
-STILL_M = 2e-4
-"""Smallest change of the mean height of a cell that is refitted, m."""
-TOLERANCE_M = 2e-4
-"""Conjugate gradients stop when no control point moves farther, m."""
 MARGIN = 5
 """Cells around a change whose control points are refitted."""
 DEGREE = 3
@@ -63,7 +59,7 @@ class FittedField:
 
 
 def fit_field(
-    pitch_m: float, origin: Array, sums: Array, before: FittedField | None
+    pitch_m: float, origin: Array, sums: Array, before: FittedField | None, still_m: float
 ) -> FittedField:
     """
     Return the field that fits the mean heights of many cells; others see fit_grids.
@@ -78,6 +74,8 @@ def fit_field(
         Sums of x, y, z and number of the points in every cell.
     before : FittedField, optional
         The previous field, over cells of the same lattice.
+    still_m : float
+        Change of a height that does not matter, m.
 
     """
     origin, sums = in_blocks(pitch_m, origin, sums)
@@ -88,9 +86,10 @@ def fit_field(
     known = np.zeros(start.control.shape, np.bool_)
     known[1:-1, 1:-1] = touched = filled
     if before is not None:
-        touched = taken_over(before, start, heights, known)
+        touched = taken_over(before, start, heights, known, still_m)
         means[..., 2] = np.where(filled, heights, 0.0)
-    return FittedField(relaxed(start, means, filled, touched, known), heights)
+    field = relaxed(start, means, (filled, touched, known), still_m)
+    return FittedField(field, heights)
 
 
 def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]:
@@ -103,7 +102,9 @@ def in_blocks(pitch_m: float, origin: Array, sums: Array) -> tuple[Array, Array]
     return lowest, np.pad(sums, padding)
 
 
-def taken_over(before: FittedField, start: HeightField, heights: Array, known: Mask) -> Mask:
+def taken_over(
+    before: FittedField, start: HeightField, heights: Array, known: Mask, still_m: float
+) -> Mask:
     """
     Copy the previous field into the initial one, and restore heights that hardly changed.
 
@@ -125,7 +126,7 @@ def taken_over(before: FittedField, start: HeightField, heights: Array, known: M
     earlier = np.full(heights.shape, np.nan)
     new, was = overlap(heights.shape, before.heights.shape, step)
     earlier[new] = before.heights[was]
-    still = np.abs(heights - earlier) < STILL_M
+    still = np.abs(heights - earlier) < still_m
     heights[still] = earlier[still]
     touched: Mask = ~(still | (np.isnan(heights) & np.isnan(earlier)))
     if heights.shape != before.heights.shape or step.any():  # the knots have moved
@@ -145,10 +146,10 @@ def overlap(
 
 
 def relaxed(
-    start: HeightField, means: Array, filled: Mask, touched: Mask, known: Mask
+    start: HeightField, means: Array, masks: tuple[Mask, Mask, Mask], tolerance_m: float
 ) -> HeightField:
-    """Return a large field, refitted near touched cells."""
-    control = start.control
+    """Return a large field, refitted near touched cells; masks: filled, touched, known points."""
+    (filled, touched, known), control = masks, start.control
     active, free = np.zeros(control.shape, np.bool_), np.zeros(control.shape, np.bool_)
     mark_active(filled, start.parts(), active)
     extrapolate(control, known, active)
@@ -170,7 +171,7 @@ def relaxed(
         control.shape[1],
         np.concatenate(ats),
         np.concatenate(seconds),
-        (SMOOTHING, RIDGE, TOLERANCE_M),
+        (SMOOTHING, RIDGE, tolerance_m),
         np.flatnonzero(free),
         flat,
     )

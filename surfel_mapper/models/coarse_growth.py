@@ -109,6 +109,34 @@ def grow_coarse(
     return normals, curved
 
 
+def extend_coarse(
+    points: npt.NDArray[Any],
+    owner: Owners,
+    curved: npt.NDArray[np.bool_],
+    size_m: float,
+    rules: CoarseRules,
+) -> None:
+    """
+    Grow planes over free points, and join none.
+
+    Single points far from a sensor are tens of metres apart. In voxels as large patches of all
+    kinds touch, so joins there are wrong as often as not.
+
+    Parameters
+    ----------
+    points, owner, size_m, rules
+        See grow_coarse.
+    curved : (K,) bool
+        Patches that do not grow.
+
+    """
+    coarse = thin(points, size_m).by_voxel()
+    before = owner[coarse.rows]
+    after = np.maximum(before, -1)
+    extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
+    owner[coarse.rows] = np.where(after < 0, before, after)
+
+
 def beyond(pieces: Pieces, normals: Array) -> Array:
     """Return a viewpoint (K, 3) for each patch, 1 m from its mean along its normal."""
     number = len(normals)

@@ -32,6 +32,7 @@ from surfel_mapper.models.charts import bisected, chart_components
 from surfel_mapper.models.id_matching import IdMatches, match
 from surfel_mapper.models.kernels.surfel_classes import FLAT, NONE, YOUNG
 from surfel_mapper.models.kernels.surfel_groups import (
+    common_labels,
     connected_components,
     name_components,
     rows_of_groups,
@@ -96,11 +97,10 @@ class LiveModels:
         change = self._graph.update()
         self._recut(change)
         members, ends = self._sorted(self._joined(change.rows))
-        labels = self._graph.label[members].astype(np.int64)
-        matched = match(np.array(sorted(self._patches), np.int64), labels, ends, self._next_id)
+        ids, matched = self._matched(members, ends)
         self._next_id += len(matched.created)
-        born, changed, died = self._relabel(members, ends, matched.ids)
-        changed += self._refit(members, ends, matched)
+        born, changed, died = self._relabel(members, ends, ids)
+        changed += self._refit(members, ends, ids, matched)
         for gone in matched.removed:
             del self._patches[gone]
         created = sorted([*matched.created, *born])
@@ -207,8 +207,8 @@ class LiveModels:
         graph = self._graph
         owner = np.full(len(graph.key), -1, np.int32)
         charts = [chart for parts in self._charts.values() for chart in parts]
-        for number, chart in enumerate(charts):
-            owner[chart] = number
+        if charts:
+            owner[np.concatenate(charts)] = np.repeat(np.arange(len(charts)), [*map(len, charts)])
         if not self.config.absorb:
             return owner
         hosted = np.flatnonzero(graph.host >= 0)
@@ -222,38 +222,54 @@ class LiveModels:
         num = sort_by_group(rows, group, self._graph.places, ordered, starts)
         return ordered, starts[: num + 1]
 
+    def _matched(self, members: Rows, ends: Indices) -> tuple[Indices, IdMatches]:
+        """Return the ids of patches (K,), and those of patches with other voxels than before."""
+        labels, ids = self._graph.label[members], np.empty(len(ends) - 1, np.int64)
+        common_labels(labels, ends, ids)
+        sizes = np.diff(ends)
+        for k, number in enumerate(ids.tolist()):
+            known = self._patches.get(number)
+            if known is None or len(known.rows) != sizes[k]:
+                ids[k] = -1
+        other = ids < 0
+        old = np.array(sorted(self._patches.keys() - set(ids.tolist())), np.int64)
+        starts = np.concatenate([[0], np.cumsum(sizes[other])])
+        others = labels[np.repeat(other, sizes)].astype(np.int64)
+        matched = match(old, others, starts, self._next_id)
+        ids[other] = matched.ids
+        return ids, matched
+
     def _relabel(
-        self, members: Rows, ends: Indices, ids: list[int]
+        self, members: Rows, ends: Indices, ids: Indices
     ) -> tuple[list[int], list[int], list[int]]:
         """Label all voxels; return Gaussians created, changed and removed."""
         graph = self._graph
-        every = np.flatnonzero(graph.key >= 0)
-        before, was_gaussian = graph.label[every].astype(np.int64), graph.is_gaussian[every]
-        graph.label[every], graph.is_gaussian[every] = -1, False
-        graph.label[members] = np.repeat(np.array(ids, np.int32), np.diff(ends))
-        kind = graph.own_kind[every]
-        now_gaussian = (graph.label[every] < 0) & (kind != YOUNG) & (kind != NONE)
-        new = now_gaussian & ~was_gaussian
-        before[new] = self._next_id + np.arange(new.sum())
-        self._next_id += int(new.sum())
-        graph.label[every[now_gaussian]] = before[now_gaussian]
-        graph.is_gaussian[every[now_gaussian]] = True
-        changed = now_gaussian & was_gaussian & graph.is_material[every]
+        before, was_gaussian, kind = graph.label.copy(), graph.is_gaussian, graph.own_kind
+        graph.label[:] = -1
+        graph.label[members] = np.repeat(ids, np.diff(ends))
+        now_gaussian = (graph.label < 0) & (kind != YOUNG) & (kind != NONE)
+        new = np.flatnonzero(now_gaussian & ~was_gaussian)
+        before[new] = self._next_id + np.arange(len(new))
+        self._next_id += len(new)
+        rows = np.flatnonzero(now_gaussian)
+        graph.label[rows] = before[rows]
+        changed = before[now_gaussian & was_gaussian & graph.is_material]
         died = before[was_gaussian & ~now_gaussian]
-        return before[new].tolist(), before[changed].tolist(), died.tolist()
+        graph.is_gaussian = now_gaussian
+        return before[new].tolist(), changed.tolist(), died.tolist()
 
-    def _refit(self, members: Rows, ends: Indices, matched: IdMatches) -> list[int]:
+    def _refit(self, members: Rows, ends: Indices, ids: Indices, matched: IdMatches) -> list[int]:
         """Refit patches with material changes; return the ids of those that existed."""
-        chosen: dict[int, Rows] = {}
+        others = set(matched.ids)
         is_material = np.logical_or.reduceat(self._graph.is_material[members], ends[:-1])
-        for k, (number, matters) in enumerate(zip(matched.ids, is_material, strict=True)):
-            rows, known = members[ends[k] : ends[k + 1]], self._patches.get(number)
-            if known is None or matters or not np.array_equal(known.rows, rows):
-                chosen[number] = rows
+        chosen = {
+            number: members[ends[k] : ends[k + 1]]
+            for k, (number, matters) in enumerate(zip(ids.tolist(), is_material, strict=True))
+            if matters or number in others
+        }
         existed = [number for number in chosen if number in self._patches]
         groups = self._fitter.describe(list(chosen.values()))
-        gone = [*chosen, *matched.removed]
-        beyond = rows_beyond(self._graph, self._patches, gone, groups)
+        beyond = rows_beyond(self._graph, self._patches, [*chosen, *matched.removed], groups)
         again = [n for n in beyond if n not in chosen and self._continues_otherwise(n, beyond[n])]
         self._fit(list(chosen), groups, beyond)
         self._fit(again, self._fitter.describe([self._patches[n].rows for n in again]), beyond)

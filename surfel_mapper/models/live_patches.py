@@ -43,6 +43,10 @@ STILL = 0.1
 
 STILL_RAD = math.radians(1.0)
 """A frame stays while its normal turns by less."""
+
+STILL_HEIGHT = 0.01
+"""Heights of a field are resolved to this share of the thickness of a flat voxel."""
+
 MOST_TURN_RAD = math.radians(45.0)
 """A frame that turns farther is rebuilt; below, its x is kept."""
 
@@ -128,6 +132,7 @@ class PatchFitter:
         self._graph = graph
         self._size_m = graph.map.voxel_size_m
         self._surface_pitch_m = max(self._size_m, 3.0 * graph.thickness_m)
+        self._still_m = STILL_HEIGHT * graph.thickness_m
 
     def describe(self, rows: list[Rows]) -> Described:
         """Return moments, frames and kind of groups of voxels."""
@@ -231,8 +236,8 @@ class PatchFitter:
         }
         for k in chosen[~small].tolist():
             sums = cells.sums[cells.of(k)].reshape(*cells.sizes[k], 4)
-            origin = cells.origins[k].copy()
-            found[k] = fit_field(float(cells.pitches[k]), origin, sums, before[k])
+            pitch_m, origin = float(cells.pitches[k]), cells.origins[k].copy()
+            found[k] = fit_field(pitch_m, origin, sums, before[k], self._still_m)
         return found
 
     def _merged(self, rows: Rows, starts: Indices) -> tuple[Indices, Array, Array]:

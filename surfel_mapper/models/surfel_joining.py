@@ -21,10 +21,15 @@ import numpy.typing as npt
 from surfel_mapper.config import ModelsLayerConfig
 from surfel_mapper.kernels.layout import INDEX_BITS
 from surfel_mapper.models.charts import STACKED_VOXELS
-from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
+from surfel_mapper.models.coarse_growth import (
+    CoarseRules,
+    extend_coarse,
+    grow_coarse,
+    SPARSE_SHARE,
+)
 from surfel_mapper.models.kernels.charts import bisect_chart
 from surfel_mapper.models.kernels.surfel_classes import FLAT
-from surfel_mapper.models.kernels.surfel_groups import mean_normals
+from surfel_mapper.models.kernels.surfel_groups import find_pieces, mean_normals
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -33,6 +38,9 @@ Indices = npt.NDArray[np.int64]
 
 FACTORS = (1.0, 2.0, 4.0)
 """Edges of the voxels in which charts are joined, in those of the map."""
+
+FARTHEST = 16.0
+"""Edge of the voxels in which planes grow at last, over single voxels tens of metres apart."""
 
 BLOCK_BITS = 9
 """Blocks have two to this power of voxels a side."""
@@ -63,10 +71,11 @@ class SurfelJoining:
 
     def clear(self) -> None:
         """Forget all joins."""
-        none: Indices = np.empty(0, np.int64)
-        self._block: Indices = none
-        self._piece: Indices = none
-        self._region: Indices = none
+        none: Rows = np.empty(0, np.int32)
+        self._blocks: dict[int, int] = {}
+        self._key: Indices = np.empty(0, np.int64)
+        self._block = self._piece = self._region = none
+        self._overlaps: dict[bytes, bool] = {}
 
     def update(self, owner: Rows, changed: Rows) -> Rows:
         """
@@ -81,85 +90,108 @@ class SurfelJoining:
 
         """
         key = self._graph.key
-        block = np.where(key >= 0, (key + HALF) & ~INSIDE, -1)
-        blocks = np.unique(block[block >= 0])
-        number = np.searchsorted(blocks, block)
-        piece = pieces_in_blocks(owner, number, len(blocks), key)
-        more = len(key) - len(self._block)
-        before = np.append(self._block, np.full(more, -1))
-        is_other = piece != np.append(self._piece, np.full(more, -1))
-        is_other[changed] = True
-        is_other |= block != before
-        touched = np.union1d(block[is_other], before[is_other])
-        region = np.append(self._region, np.full(more, -1))
+        was = self._moved(key)
+        piece, before = np.empty_like(owner), self._piece
+        find_pieces(owner, self._block, key, piece)
+        is_touched = np.zeros(len(self._blocks) + 1, np.bool_)  # the last: rows without a voxel
+        for rows in (changed, piece != before):
+            is_touched[self._block[rows]] = True
+        is_touched[was] = True
+        is_touched[-1] = False
+        region, block = self._region, self._block
         region[block < 0] = -1
-        again = np.flatnonzero((block >= 0) & np.isin(block, touched))
-        again = again[np.lexsort((key[again], number[again]))]
-        ends = np.flatnonzero(np.diff(number[again])) + 1
+        again = np.flatnonzero(is_touched[block])
+        again = again[np.lexsort((key[again], block[again]))]
+        ends = np.flatnonzero(np.diff(block[again])) + 1
         for rows in np.split(again, ends) if len(again) else ():
-            region[rows] = self._joined(rows, piece[rows])
-        self._block, self._piece, self._region = block, piece, region
-        found = patches(owner, np.flatnonzero((piece >= 0) & (piece == key)), region)
-        return self._separated(found, owner, block)
+            region[rows] = self._joined(rows.astype(np.int64), piece[rows])
+        self._piece = piece
+        first = np.flatnonzero(piece == np.arange(len(piece)))
+        found = patches(owner, first, region)
+        return self._separated(found, owner, first, is_touched)
 
-    def _separated(self, patch: Rows, owner: Rows, block: Indices) -> Rows:
+    def _moved(self, key: Indices) -> Rows:
+        """Find the blocks of new voxels; return the previous ones of rows with other voxels."""
+        more = len(key) - len(self._key)
+        if more:
+            self._key = np.append(self._key, np.full(more, -1))
+            none = np.full(more, -1, np.int32)
+            self._block, self._piece, self._region = (
+                np.append(rows, none) for rows in (self._block, self._piece, self._region)
+            )
+        moved = np.flatnonzero(key != self._key)
+        was: Rows = np.unique(self._block[moved])
+        self._key[moved] = key[moved]
+        block = np.where(key[moved] >= 0, (key[moved] + HALF) & ~INSIDE, -1)
+        names, which = np.unique(block, return_inverse=True)
+        numbers = [-1 if n < 0 else self._blocks.setdefault(n, len(self._blocks)) for n in names]
+        self._block[moved] = np.array(numbers, np.int32)[which]
+        return was
+
+    def _separated(
+        self, patch: Rows, owner: Rows, first: Indices, is_touched: npt.NDArray[np.bool_]
+    ) -> Rows:
         """Return patches (R,), those across blocks that are no height fields as charts again."""
-        graph, size_m = self._graph, self._graph.map.voxel_size_m
-        rows = np.flatnonzero(patch >= 0)
-        low = np.full(int(patch.max(initial=-1)) + 1, np.iinfo(np.int64).max)
-        high = np.full_like(low, -1)
-        np.minimum.at(low, patch[rows], block[rows])
-        np.maximum.at(high, patch[rows], block[rows])
+        number, block = int(patch.max(initial=-1)) + 1, self._block[first]
+        low, high = np.full(number, len(self._blocks)), np.full(number, -1)
+        np.minimum.at(low, patch[first], block)
+        np.maximum.at(high, patch[first], block)
+        known, self._overlaps = self._overlaps, {}
         found = patch.copy()
         for name in np.flatnonzero(low < high):
-            mine = rows[patch[rows] == name]
-            mine = mine[np.argsort(graph.key[mine])]
-            side = np.empty(len(mine), np.bool_)
-            rules = self._limit, STACKED_VOXELS * size_m, size_m
-            if bisect_chart(graph.normal[mine], graph.position[mine], *rules, side):
-                found[mine] = np.where(owner[mine] < 0, -1, len(low) + owner[mine])
+            pieces = first[patch[first] == name]
+            code = pieces.tobytes()
+            if is_touched[self._block[pieces]].any() or code not in known:
+                known[code] = self._overlaps_itself(np.flatnonzero(patch == name))
+            self._overlaps[code] = known[code]
+            if known[code]:
+                mine = np.flatnonzero(patch == name)
+                found[mine] = np.where(owner[mine] < 0, -1, number + owner[mine])
         return found
 
-    def _joined(self, rows: Indices, piece: Indices) -> Indices:
-        """Return the region of each row of a block, in the order of their keys, -1 for none."""
-        graph, names = self._graph, np.unique(piece[piece >= 0])
-        patch = np.where(piece >= 0, np.searchsorted(names, piece), -1).astype(np.int32)
-        was_free = patch < 0
+    def _overlaps_itself(self, rows: Indices) -> bool:
+        """Return whether voxels are no height field."""
+        graph, size_m = self._graph, self._graph.map.voxel_size_m
+        rows = rows[np.argsort(graph.key[rows])]
+        rules = self._limit, STACKED_VOXELS * size_m, size_m
+        side = np.empty(len(rows), np.bool_)
+        return bool(bisect_chart(graph.normal[rows], graph.position[rows], *rules, side))
+
+    def _joined(self, rows: Indices, piece: Rows) -> Rows:
+        """Return the region (n,) of each row of a block, in the order of their keys, or -1."""
+        graph, size_m = self._graph, self._graph.map.voxel_size_m
+        graph.places[rows] = np.arange(len(rows))
+        place = np.where(piece >= 0, graph.places[piece], -1)
+        graph.places[rows] = -1
+        names = np.flatnonzero(place == np.arange(len(rows)))
         if not len(names):
-            return np.full(len(rows), -1)
+            return np.full(len(rows), -1, np.int32)
+        patch = np.where(place >= 0, np.searchsorted(names, place), -1).astype(np.int32)
+        was_free = patch < 0
         order = np.argsort(patch, kind='stable')[was_free.sum() :]
         starts = np.searchsorted(patch[order], np.arange(len(names) + 1))
         normals: Array = np.empty((len(names), 3))
         curved: npt.NDArray[np.bool_] = np.zeros(len(names), np.bool_)
         is_flat = graph.kind == FLAT
         mean_normals(rows[order].astype(np.int32), starts, is_flat, graph.normal, normals)
-        points, size_m = graph.position[rows], graph.map.voxel_size_m
+        points = graph.position[rows]
         rules = CoarseRules(size_m, graph.thickness_m, (self._noise_m, 0.0))
         for factor in FACTORS:
             if factor > 1.0 and np.count_nonzero(patch < 0) < SPARSE_SHARE * len(patch):
                 break
             normals, curved = grow_coarse(points, patch, (normals, curved), factor * size_m, rules)
+        else:
+            extend_coarse(points, patch, curved, FARTHEST * size_m, rules)
         came = np.flatnonzero(was_free & (patch >= 0))
         patch[came[~graph.is_thin(rows[came], normals[patch[came]])]] = -1
-        least = np.full(len(normals), np.iinfo(np.int64).max)
-        np.minimum.at(least, patch[~was_free], piece[~was_free])
-        found: Indices = np.where(patch >= 0, least[patch], -1)
+        least = np.full(len(normals), len(rows))
+        np.minimum.at(least, patch[names], names)
+        found: Rows = np.full(len(rows), -1, np.int32)
+        found[patch >= 0] = rows[least[patch[patch >= 0]]]
         return found
 
 
-def pieces_in_blocks(owner: Rows, block: Indices, num_blocks: int, key: Indices) -> Indices:
-    """Return the least key (R,) of the voxels of the same chart in the same block, -1 for none."""
-    held = np.flatnonzero(owner >= 0)
-    number = int(owner.max(initial=-1)) + 1
-    code = block[held] * number + owner[held]
-    least = np.full(num_blocks * number, np.iinfo(np.int64).max)
-    np.minimum.at(least, code, key[held])
-    found = np.full(len(owner), -1)
-    found[held] = least[code]
-    return found
-
-
-def patches(owner: Rows, first: Indices, region: Indices) -> Rows:
+def patches(owner: Rows, first: Indices, region: Rows) -> Rows:
     """
     Return the patch of each row (R,), -1 for none: regions of blocks that share a chart.
 
@@ -169,19 +201,20 @@ def patches(owner: Rows, first: Indices, region: Indices) -> Rows:
         Charts.
     first : (P,) int64
         The row of least key of every chart in every block.
-    region : (R,) int64
-        Regions by name, -1 for none.
+    region : (R,) int32
+        Regions, by the row of least key of their charts, -1 for none.
 
     """
     from scipy.sparse import coo_array  # 0.2 s that maps without models save
     from scipy.sparse.csgraph import connected_components
 
-    names, number = np.unique(region[first]), int(owner.max(initial=-1)) + 1
-    ends = owner[first], number + np.searchsorted(names, region[first])
+    names, place = np.unique(region[first], return_inverse=True)
+    number = int(owner.max(initial=-1)) + 1
     size = number + len(names)
+    ends = owner[first], number + place
     links = coo_array((np.ones(len(first), np.bool_), ends), (size, size))
     _, part = connected_components(links, directed=False)
-    found = np.full(len(owner), -1, np.int32)
-    held = np.flatnonzero(region >= 0)
-    found[held] = part[number + np.searchsorted(names, region[held])]
+    table = np.full(len(owner) + 1, -1, np.int32)  # the last: no region
+    table[names] = part[number:]
+    found: Rows = table[region]
     return found

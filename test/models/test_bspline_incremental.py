@@ -10,7 +10,7 @@ import pytest
 from surfel_mapper.models.bspline import fit_pspline, initial_field
 from surfel_mapper.models.bspline_incremental import DEGREE, fit_field, SMOOTHING
 
-PITCH_M = 0.25
+PITCH_M, STILL_M = 0.25, 2e-4
 HOLE = (slice(30, 34), slice(20, 25))
 
 
@@ -38,7 +38,7 @@ def places(number=2000):
 
 def test_large_field_equals_the_direct_solution():
     data = sums()
-    large = fit_field(PITCH_M, np.zeros(2), data, None)
+    large = fit_field(PITCH_M, np.zeros(2), data, None, STILL_M)
     filled = data[..., 3] > 0.0
     means = data[filled][:, :3] / 4.0
     start = initial_field(PITCH_M, np.zeros(2), data[..., 2] / 4.0, filled, DEGREE)
@@ -51,29 +51,29 @@ def test_large_field_equals_the_direct_solution():
 
 
 def test_field_far_from_a_change_is_bitwise_constant():
-    before = fit_field(PITCH_M, np.zeros(2), sums(), None)
-    after = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), before)
+    before = fit_field(PITCH_M, np.zeros(2), sums(), None, STILL_M)
+    after = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), before, STILL_M)
     xy = places()
     far = np.hypot(*(xy - 3.0).T) > 1.0 + 14 * PITCH_M
     assert far.sum() > 500
     np.testing.assert_array_equal(after.field.heights(xy[far]), before.field.heights(xy[far]))
-    fresh = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), None)
+    fresh = fit_field(PITCH_M, np.zeros(2), sums(bump=0.1), None, STILL_M)
     np.testing.assert_allclose(after.field.heights(xy), fresh.field.heights(xy), atol=2e-3)
 
 
 def test_unchanged_input_keeps_the_field():
-    before = fit_field(PITCH_M, np.zeros(2), sums(), None)
-    after = fit_field(PITCH_M, np.zeros(2), sums(), before)
+    before = fit_field(PITCH_M, np.zeros(2), sums(), None, STILL_M)
+    after = fit_field(PITCH_M, np.zeros(2), sums(), before, STILL_M)
     np.testing.assert_array_equal(after.field.control, before.field.control)
 
 
 @pytest.mark.parametrize('first', [(-3, 0), (-20, -20), (0, 0)])
 def test_growing_grid_continues_the_previous_field(first):
-    before = fit_field(PITCH_M, np.zeros(2), sums(), None)
+    before = fit_field(PITCH_M, np.zeros(2), sums(), None, STILL_M)
     origin = PITCH_M * np.array(first, float)
     data = sums(60 - first[0] + 5, 44 - first[1], first=first)
-    after = fit_field(PITCH_M, origin, data, before)
-    fresh = fit_field(PITCH_M, origin, data, None)
+    after = fit_field(PITCH_M, origin, data, before, STILL_M)
+    fresh = fit_field(PITCH_M, origin, data, None, STILL_M)
     xy = np.random.default_rng(1).uniform(origin + 0.3, (14.7, 10.7), (2000, 2))
     cell = ((xy - origin) / PITCH_M).astype(int)
     xy = xy[data[cell[:, 0], cell[:, 1], 3] > 0.0]

@@ -234,3 +234,61 @@ def merge_voxels(rows, starts, count, position, covariance, total, mean, merged)
         merged[k, 0], merged[k, 1] = scale * (xx - sx * mx), scale * (xy - sx * my)
         merged[k, 2], merged[k, 3] = scale * (xz - sx * mz), scale * (yy - sy * my)
         merged[k, 4], merged[k, 5] = scale * (yz - sy * mz), scale * (zz - sz * mz)
+
+
+@njit(cache=True, nogil=True)
+def find_pieces(owner, block, key, piece):
+    """
+    Find the voxel of least key of each group in each block.
+
+    owner  (R,) int32, group of each row, -1 for none
+    block  (R,) int32, block of each row with an owner
+    key    (R,) int64
+    piece  (R,) int32, out: row of that voxel, -1 for none
+
+    The pieces of a group are a chain; neighbouring rows mostly are of the same one.
+    """
+    number = 0
+    for group in owner:
+        number = max(number, group + 1)
+    head, recent = np.full(number, -1, np.int32), np.full(number, -1, np.int32)
+    after, least = np.empty(len(owner), np.int32), np.empty(len(owner), np.int32)
+    num = 0
+    for row in range(len(owner)):
+        piece[row] = -1
+        group = owner[row]
+        if group < 0:
+            continue
+        at = recent[group]
+        if at < 0 or block[least[at]] != block[row]:
+            at = head[group]
+            while at >= 0 and block[least[at]] != block[row]:
+                at = after[at]
+            if at < 0:
+                at = num
+                after[at], least[at], head[group] = head[group], row, at
+                num += 1
+            recent[group] = at
+        if key[row] < key[least[at]]:
+            least[at] = row
+        piece[row] = at
+    for row in range(len(owner)):
+        if piece[row] >= 0:
+            piece[row] = least[piece[row]]
+
+
+@njit(cache=True, nogil=True)
+def common_labels(labels, starts, found):
+    """
+    Find the groups whose members all have the same label.
+
+    labels  (M,) int32
+    starts  (K + 1,) int64, first member of each group, and M
+    found   (K,) int64, out: that label, -1 for several
+    """
+    for k in range(len(found)):
+        found[k] = labels[starts[k]]
+        for i in range(starts[k] + 1, starts[k + 1]):
+            if labels[i] != found[k]:
+                found[k] = -1
+                break

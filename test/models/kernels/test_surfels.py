@@ -22,8 +22,10 @@ from surfel_mapper.models.kernels.surfel_classes import (
     YOUNG,
 )
 from surfel_mapper.models.kernels.surfel_groups import (
+    common_labels,
     connected_components,
     find_doubtful,
+    find_pieces,
     mean_normals,
     merge_voxels,
     name_components,
@@ -361,3 +363,24 @@ def test_samples_of_surfels_are_three_by_three_and_stay_in_their_voxel(call):
     x, y = np.meshgrid([0.15, 0.25, 0.35], [0.0, 0.25, 0.5], indexing='ij')
     np.testing.assert_allclose(points[:, :2], np.stack([x, y], -1).reshape(-1, 2), atol=1e-15)
     assert (points[:, 2] == 0.25).all()
+
+
+@both
+def test_pieces_are_named_by_the_least_key_of_each_group_in_each_block(call):
+    rng = np.random.default_rng(11)
+    owner = rng.integers(-1, 6, 500).astype(np.int32)
+    block, key = rng.integers(0, 4, 500).astype(np.int32), rng.permutation(500)
+    piece = np.empty(500, np.int32)
+    call(find_pieces, owner, block, key, piece)
+    assert (piece[owner < 0] == -1).all()
+    for row in np.flatnonzero(owner >= 0):
+        mine = np.flatnonzero((owner == owner[row]) & (block == block[row]))
+        assert piece[row] == mine[key[mine].argmin()]
+
+
+@both
+def test_common_labels_are_of_groups_of_one_label(call):
+    labels = np.array([3, 3, 3, -1, -1, 5, 3, 7], np.int32)
+    found = np.empty(4, np.int64)
+    call(common_labels, labels, np.array([0, 3, 5, 7, 8]), found)
+    assert found.tolist() == [3, -1, -1, 7]
