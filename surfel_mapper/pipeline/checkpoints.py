@@ -13,6 +13,7 @@ import logging
 import os
 from pathlib import Path
 import time
+from zipfile import is_zipfile
 
 from surfel_mapper.config import OutputConfig
 from surfel_mapper.errors import FileFormatError, MapError
@@ -64,15 +65,18 @@ class Checkpoints:
         self._saved_s, version = time.monotonic(), mapper.map.version
         newest, before = checkpoint_paths(mapper.config.output)
         make_directory(newest.parent)
-        files = [(newest, before)]
-        for (new, _), (old, _) in zip(*(layer_files(p, mapper) for p in files[0]), strict=True):
-            files.append((new, old))
-        for path in (path for pair in files for path in pair):
+        both = (layer_files(path, mapper) for path in (newest, before))
+        layers = [(new, old) for (new, _), (old, _) in zip(*both, strict=True)]
+        for path in (newest, before, *(path for pair in layers for path in pair)):
             if path.is_symlink():
                 raise FileFormatError(f'{path}: a link, expected a file or none')
-        for new, old in files:
-            if new.exists():
-                os.replace(new, old)
+        if is_zipfile(newest):  # else it is cut, or layers are those of a checkpoint that failed
+            before.unlink(missing_ok=True)  # first, and last comes back: a map has its own layers
+            for new, old in layers:
+                old.unlink(missing_ok=True)
+                if new.exists():
+                    os.replace(new, old)
+            os.replace(newest, before)
         save_mapper(newest, mapper)
         self._version = version
         return newest

@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.map_state import load_map
 from surfel_mapper.files.parquet_tiles import read_part, write_shard, write_tile
-from surfel_mapper.pipeline import checkpoints
+from surfel_mapper.pipeline import checkpoints, saved_state
 from surfel_mapper.pipeline.checkpoints import checkpoint_paths, Checkpoints, load_start
 from test.pipeline.made_scans import add_pose, insert, mapper_with, scan_at
 
@@ -209,6 +209,44 @@ def test_a_checkpoint_that_cannot_be_written_leaves_the_one_before(tmp_path, clo
         with pytest.raises(FileFormatError):
             saving.save_if_due()
     assert not newest.exists()
+    assert load_map(before)[0].digest() == digest
+
+
+def test_a_checkpoint_that_fails_after_its_layers_leaves_those_of_the_one_before(
+    tmp_path, clock, monkeypatch
+):
+    mapper = mapper_in(tmp_path, **{'layers.tsdf.enabled': True})
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    drive(mapper, 1.0)
+    saving.save()
+    digest = mapper.map.digest()
+    field = newest.with_suffix('.tsdf.npz').read_bytes()
+
+    def full(*_):
+        raise FileFormatError('no space')
+
+    monkeypatch.setattr(saved_state, 'save_map', full)
+    for stamp_s in (2.0, 3.0):
+        drive(mapper, stamp_s)
+        with pytest.raises(FileFormatError, match='no space'):
+            saving.save()
+        assert newest.with_suffix('.tsdf.npz').read_bytes() != field
+        assert before.with_suffix('.tsdf.npz').read_bytes() == field
+        assert load_map(before)[0].digest() == digest
+
+
+def test_a_cut_checkpoint_takes_the_place_of_no_whole_one(tmp_path, clock, monkeypatch):
+    mapper = mapper_in(tmp_path)
+    saving, (newest, before) = Checkpoints(mapper), checkpoint_paths(mapper.config.output)
+    drive(mapper, 1.0)
+    saving.save()
+    digest = mapper.map.digest()
+    drive(mapper, 2.0)
+    saving.save()
+    newest.write_bytes(newest.read_bytes()[:-100])
+    drive(mapper, 3.0)
+    saving.save()
+    assert load_map(newest)[0].digest() == mapper.map.digest()
     assert load_map(before)[0].digest() == digest
 
 
