@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MESSAGE_BYTES = 100
 """Memory charged for a message in an index: 48 bytes, and as much to sort it."""
 
-MAX_CONNECTIONS, CONNECTION_BYTES = 8192, 2000
+MAX_CONNECTIONS, CONNECTION_BYTES = 4096, 2000
 """Limit of the topics of a file (in ROS 1 a topic has one for each publisher), and memory of one.
 Recordings have some hundreds; each takes 20 us."""
 

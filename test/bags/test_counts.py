@@ -123,7 +123,7 @@ def test_many_topics_are_refused(tmp_path):
     for name, content in made.items():
         path = tmp_path / name
         path.write_bytes(content)
-        with pytest.raises(BagError, match='over 8192 topics'):
+        with pytest.raises(BagError, match='over 4096 topics'):
             BagReader(path)
 
 
