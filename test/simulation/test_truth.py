@@ -15,7 +15,7 @@ from surfel_mapper import SurfelMap
 from surfel_mapper.simulation import Simulation, World
 
 VOXEL_M = 0.5
-NUM_SCANS = 30
+NUM_SCANS = 12
 
 
 @pytest.fixture(scope='module')
