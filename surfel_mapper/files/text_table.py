@@ -28,6 +28,12 @@ PIECE_BYTES = 1 << 18
 MAX_WORD_BYTES = 1 << 16
 """Limit of a number, which may have that many digits."""
 
+NO_END = (
+    'no end of line after the last number, which may be cut off; truncated? If it is complete, '
+    'append an end of line'
+)
+"""Why a text is refused whose last number may lack digits."""
+
 
 def read_table(
     path: str | Path,
@@ -126,10 +132,7 @@ def pieces_of(path: str | Path, file: BinaryIO, budget: Budget) -> Iterator[byte
             raise FileFormatError(f'{path}: a number of over {MAX_WORD_BYTES} digits')
         yield piece
     if rest:
-        raise FileFormatError(
-            f'{path}: no end of line after the last number, which may be cut off; truncated? If '
-            'it is complete, append an end of line'
-        )
+        raise FileFormatError(f'{path}: {NO_END}')
 
 
 def fill(table: npt.NDArray[Any], words: list[bytes]) -> None:

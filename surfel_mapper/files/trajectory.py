@@ -32,7 +32,7 @@ from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, mad
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.text_table import plain, real
+from surfel_mapper.files.text_table import NO_END, plain, real
 from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
 
 logger = logging.getLogger(__name__)
@@ -274,15 +274,17 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
         first = next(lines, None)
         if first is None:
             raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-        warn_of_cut(path)
         format_ = format_ or guessed(path, first[1])
         lines = chain([first], lines)
-        if format_ == 'kitti':
-            return kitti_poses(path, lines)
         if format_ not in FORMATS:
             expected = ', '.join(FORMATS)
             raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
-        return stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
+        if format_ == 'kitti':
+            found = kitti_poses(path, lines)
+        else:
+            found = stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
+        check_end(path)
+        return found
 
 
 def stamped_poses(path: str | Path, rows: Iterable[tuple[str, int, list[float]]]) -> Trajectory:
@@ -329,12 +331,12 @@ def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]
         raise FileFormatError(f'{path}: no text, expected a file of poses') from error
 
 
-def warn_of_cut(path: str | Path) -> None:
-    """Log a warning if the last line of a text has no end: its last number may lack digits."""
+def check_end(path: str | Path) -> None:
+    """Raise FileFormatError if the last line has no end: its last number may lack digits."""
     with open_regular(path) as file:
         file.seek(-1, os.SEEK_END)
         if file.read(1) not in b'\r\n':
-            logger.warning('%s: its last line has no end; is the file cut off there?', path)
+            raise FileFormatError(f'{path}: {NO_END}')
 
 
 def is_comment(line: str) -> bool:
@@ -457,6 +459,7 @@ def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
         raise FileFormatError(
             f'{path}: {len(stamps)} stamps for {number} poses, expected one for each, ascending'
         )
+    check_end(path)
     return stamps
 
 

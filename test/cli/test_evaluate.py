@@ -123,7 +123,7 @@ def test_a_trajectory_that_is_moved_as_a_whole_has_no_error(street, capsys, tmp_
     for line in lines[1:]:
         stamp, x, *rest = line.split()
         moved.append(' '.join([stamp, repr(float(x) + 100.0), *rest]))
-    (tmp_path / 'moved.tum').write_text('\n'.join(moved))
+    (tmp_path / 'moved.tum').write_text('\n'.join([*moved, '']))
 
     result = evaluated(capsys, tmp_path / 'moved.tum', '--truth', output.parent / 'poses.tum')
 

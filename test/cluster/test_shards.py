@@ -123,7 +123,7 @@ def test_poses_of_a_file_are_known_in_the_middle_too(tmp_path, has_stamps):
     if not has_stamps:
         lines = [f'1 0 0 {row[1]} 0 1 0 {row[2]} 0 0 1 {row[3]}' for row in rows]
     poses = tmp_path / 'poses.txt'
-    poses.write_text('\n'.join(lines))
+    poses.write_text('\n'.join([*lines, '']))
     config = config.replace({'pose.source': 'odometry'})
     part = {'poses': poses, 'poses_format': 'tum' if has_stamps else 'kitti'}
     expected = in_one_go(bag, config, **part)

@@ -204,11 +204,12 @@ def test_evo_reads_the_trajectory_as_written(tmp_path):
     assert found.check()[0]
 
 
-def test_a_last_number_that_may_lack_digits_is_told(tmp_path, caplog):
-    path = tmp_path / 'a.txt'
-    write_tum(path, [0, 1], [np.eye(4), np.eye(4)])
+@pytest.mark.parametrize('cut', ['poses.txt', 'times.txt'])
+def test_a_last_number_that_may_lack_digits_is_refused(tmp_path, cut):
+    path = tmp_path / 'poses.txt'
+    path.write_text('1 0 0 0.25 0 1 0 0.5 0 0 1 0.125\n' * 2)
+    (tmp_path / 'times.txt').write_text('0.0\n0.1\n')
     assert len(read_trajectory(path)) == 2
-    assert not caplog.text
-    path.write_bytes(path.read_bytes()[:-2])  # 1.0 becomes 1.
-    assert len(read_trajectory(path)) == 2
-    assert f'{path}: its last line has no end' in caplog.text
+    (tmp_path / cut).write_bytes((tmp_path / cut).read_bytes()[:-1])
+    with pytest.raises(FileFormatError, match=f'{cut}: no end of line after the last number'):
+        read_trajectory(path)

@@ -199,10 +199,10 @@ def pose_file(tmp_path, format_, numbers=range(NUM_SCANS)):
     if format_ == 'tum':
         write_tum(path, STAMPS[list(numbers)], poses(numbers))
     elif format_ == 'csv':
-        rows = [f'{STAMPS[i]},{0.5 * i},0,{HEIGHT_M},0,0,0,1' for i in numbers]
-        path.write_text('\n'.join(['stamp_ns,x,y,z,qx,qy,qz,qw', *rows]))
+        rows = [f'{STAMPS[i]},{0.5 * i},0,{HEIGHT_M},0,0,0,1\n' for i in numbers]
+        path.write_text(''.join(['stamp_ns,x,y,z,qx,qy,qz,qw\n', *rows]))
     else:
-        path.write_text('\n'.join(f'1 0 0 {0.5 * i} 0 1 0 0 0 0 1 {HEIGHT_M}' for i in numbers))
+        path.write_text(''.join(f'1 0 0 {0.5 * i} 0 1 0 0 0 0 1 {HEIGHT_M}\n' for i in numbers))
     return path
 
 
