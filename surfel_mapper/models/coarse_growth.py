@@ -17,7 +17,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
-from surfel_mapper.models.growth import add_facets, extend_planes, owner_table, pieces_of
+from surfel_mapper.models.growth import (
+    add_facets,
+    extend_planes,
+    owner_table,
+    pieces_of,
+    VoxelPoints,
+)
 from surfel_mapper.models.joining import join_patches, Pieces
 from surfel_mapper.models.thinning import thin
 
@@ -87,24 +93,16 @@ def grow_coarse(
         Settings of facets, which are grown from free points if given.
 
     """
-    normals, curved = shape
     coarse = thin(points, size_m).by_voxel()
     before = owner[coarse.rows]
-    after = np.maximum(before, -1)
-    if size_m > rules.finest_m:
-        extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
-    num = len(normals)
-    if facets is not None:
-        facet_m = max(rules.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
-        num = add_facets(coarse, after, num, (size_m, facet_m), facets)
-    pieces = pieces_of(coarse, owner_table(coarse, after), num)
+    after, (normals, curved) = extended(coarse, before, shape, size_m, rules, facets)
+    pieces = pieces_of(coarse, owner_table(coarse, after), len(normals))
     view = beyond(pieces, normals) if rules.view is None else rules.view
     index, normals, bent = join_patches(pieces, view, rules.noise, rules.finest_m)
     # coarse voxels resolve less: a curved patch stays so, unless a larger plane takes it
-    was = np.append(curved, np.zeros(num - len(curved), np.bool_))
-    held = np.bincount(after[after >= 0], minlength=num)
+    held = np.bincount(after[after >= 0], minlength=len(curved))
     total = np.bincount(index, held, len(normals))
-    curved = bent | (2.0 * np.bincount(index, held * was, len(normals)) > total)
+    curved = bent | (2.0 * np.bincount(index, held * curved, len(normals)) > total)
     owner[coarse.rows] = np.where(after < 0, before, np.append(index, 0)[after])
     return normals, curved
 
@@ -112,29 +110,42 @@ def grow_coarse(
 def extend_coarse(
     points: npt.NDArray[Any],
     owner: Owners,
-    curved: npt.NDArray[np.bool_],
+    shape: Shape,
     size_m: float,
     rules: CoarseRules,
-) -> None:
+    facets: ModelsConfig | None = None,
+) -> Shape:
     """
-    Grow planes over free points, and join none.
+    Do the same, but join no patches.
 
     Single points far from a sensor are tens of metres apart. In voxels as large patches of all
-    kinds touch, so joins there are wrong as often as not.
-
-    Parameters
-    ----------
-    points, owner, size_m, rules
-        See grow_coarse.
-    curved : (K,) bool
-        Patches that do not grow.
-
+    kinds touch, and joins are wrong as often as not.
     """
     coarse = thin(points, size_m).by_voxel()
     before = owner[coarse.rows]
-    after = np.maximum(before, -1)
-    extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
+    after, shape = extended(coarse, before, shape, size_m, rules, facets)
     owner[coarse.rows] = np.where(after < 0, before, after)
+    return shape
+
+
+def extended(
+    coarse: VoxelPoints,
+    owner: Owners,
+    shape: Shape,
+    size_m: float,
+    rules: CoarseRules,
+    facets: ModelsConfig | None,
+) -> tuple[Owners, Shape]:
+    """Return the patches of points by voxel, -1 for none, after growth; see grow_coarse."""
+    (normals, curved), after = shape, np.maximum(owner, -1)
+    if size_m > rules.finest_m:
+        extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
+    if facets is not None:
+        facet_m = max(rules.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
+        found = add_facets(coarse, after, len(normals), (size_m, facet_m), facets)
+        normals = np.concatenate([normals, found])
+        curved = np.append(curved, np.zeros(len(found), np.bool_))
+    return after, (normals, curved)
 
 
 def beyond(pieces: Pieces, normals: Array) -> Array:

@@ -28,7 +28,12 @@ from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
-from surfel_mapper.models.coarse_growth import CoarseRules, grow_coarse, SPARSE_SHARE
+from surfel_mapper.models.coarse_growth import (
+    CoarseRules,
+    extend_coarse,
+    grow_coarse,
+    SPARSE_SHARE,
+)
 from surfel_mapper.models.growth import (
     estimate_noise,
     grow,
@@ -56,8 +61,8 @@ Indices = npt.NDArray[np.int64]
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
 
-COARSER = (2.0, 4.0, 8.0, 16.0)
-"""Coarser voxels for sparse points."""
+COARSER, FARTHEST = (2.0, 4.0, 8.0, 16.0), 64.0
+"""Coarser voxels for sparse points, and those in which nothing is joined any more."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
@@ -175,7 +180,7 @@ def grow_sparse(
     """Find facets in coarser voxels if many points are on no patch, and join across gaps."""
     noise = config.noise_m, config.noise_per_range_sq
     rules = CoarseRules(config.voxel_size_m, found.tolerance_m, noise, view)
-    normals, curved = found.normals, found.curved
+    shape = found.normals, found.curved
     owner: npt.NDArray[np.int32] = np.full(thinned.num_points, -1, np.int32)
     owner[voxels.rows] = found.owner
     joined = False
@@ -183,13 +188,14 @@ def grow_sparse(
         if not (owner[voxels.rows] < 0).sum() >= max(SPARSE_SHARE * len(found.owner), 1.0):
             break
         size_m, joined = factor * config.voxel_size_m, True
-        normals, curved = grow_coarse(
-            thinned.points, owner, (normals, curved), size_m, rules, config
-        )
+        shape = grow_coarse(thinned.points, owner, shape, size_m, rules, config)
+    else:
+        size_m = FARTHEST * config.voxel_size_m
+        shape = extend_coarse(thinned.points, owner, shape, size_m, rules, config)
     if not joined:
         return found
     owner = owner[voxels.rows]
-    return grown(owner, owner_table(voxels, owner), normals, curved, found.tolerance_m)
+    return grown(owner, owner_table(voxels, owner), *shape, found.tolerance_m)
 
 
 def blocks_of(means: Array, size_m: float) -> npt.NDArray[np.int32]:

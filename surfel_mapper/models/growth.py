@@ -262,7 +262,7 @@ def grow(
     owner = np.repeat(label, np.diff(voxels.starts))
     free = free_surfels(voxels, owner, size_m, median_m)
     extend_patches(voxels, label, (tangent, tolerance), free, owner)
-    num = add_facets(voxels, owner, len(patches), (size_m, median_m), config)
+    num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, median_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
     rename_owners(voxels.starts, group, index, owner)
@@ -382,9 +382,9 @@ def add_facets(
     number: int,
     sizes: tuple[float, float],
     config: ModelsConfig,
-) -> int:
+) -> Array:
     """
-    Grow facets from free points and write the owners; return the number of all patches.
+    Grow facets from free points, write their owners, from number on, and return their normals.
 
     sizes: edge of the voxels and tolerance, m
     """
@@ -399,7 +399,8 @@ def add_facets(
     )
     planes = np.empty((number + MOST_FACETS, 4))
     state = voxels.points, voxels.starts, voxels.adjacent
-    return int(find_facets(*state, free, rules, owner, planes, number))
+    num = find_facets(*state, free, rules, owner, planes, number)
+    return planes[number:num, :3]
 
 
 def tangents(means: Array, label: Owners, patches: list[Plane]) -> Array:

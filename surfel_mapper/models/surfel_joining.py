@@ -181,7 +181,8 @@ class SurfelJoining:
                 break
             normals, curved = grow_coarse(points, patch, (normals, curved), factor * size_m, rules)
         else:
-            extend_coarse(points, patch, curved, FARTHEST * size_m, rules)
+            shape = normals, curved
+            extend_coarse(points, patch, shape, FARTHEST * size_m, rules)
         came = np.flatnonzero(was_free & (patch >= 0))
         patch[came[~graph.is_thin(rows[came], normals[patch[came]])]] = -1
         least = np.full(len(normals), len(rows))

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from surfel_mapper.models.coarse_growth import CoarseRules, extend_coarse
 from surfel_mapper.models.growth import extend_planes
 from surfel_mapper.models.thinning import thin
 
@@ -34,3 +35,22 @@ def test_planes_take_the_sparse_points_on_them_and_no_others():
     owner = np.where(kind == 0, 0, -1).astype(np.int32)
     extend_planes(coarse, owner, np.array([True]), (COARSE_M, TOLERANCE_M))
     assert (owner[kind > 0] == -1).all()
+
+
+def test_planes_grow_over_single_points_far_apart_and_are_not_joined():
+    rng = np.random.default_rng(3)
+    near = rng.uniform([0.0, 0.0, 0.0], [32.0, 12.0, 0.0], (20_000, 3))
+    x, y = np.meshgrid(np.arange(33.0, 60.0, 3.0), [1.0, 5.0, 9.0])
+    far = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    above = far + np.array([0.0, 0.0, 1.0])
+    points = np.concatenate([near, far, above])
+    points[:, 2] += NOISE_M * rng.standard_normal(len(points))
+    owner = np.full(len(points), -1, np.int32)
+    owner[: len(near)] = near[:, 0] > 16.0  # two pieces of one plane
+    shape = np.tile([0.0, 0.0, 1.0], (2, 1)), np.zeros(2, np.bool_)
+    rules = CoarseRules(COARSE_M, TOLERANCE_M, (NOISE_M, 0.0))
+    normals, curved = extend_coarse(points, owner, shape, 4.0 * COARSE_M, rules)
+    assert len(normals) == len(curved) == 2
+    np.testing.assert_array_equal(owner[: len(near)], near[:, 0] > 16.0)
+    assert (owner[len(near) : -len(above)] >= 0).mean() > 0.9
+    assert (owner[-len(above) :] == -1).all()
