@@ -23,7 +23,6 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.exceptions import ParameterException
-from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import (
     LifecycleNodeMixin,
     LifecycleState,
@@ -244,15 +243,15 @@ class MapperNode(LifecycleNodeMixin, BaseNode):
 
     def _transit(self, request: ChangeState.Request, response: ChangeState.Response) -> bool:
         """Make a requested transition, in the main thread; return whether it succeeded."""
-        name = request.transition.label or str(request.transition.id)
+        number, label = request.transition.id, request.transition.label
         before, self.refusal = self.state, None
-        try:
+        possible = self._state_machine.available_transitions
+        done = (label or number) in [found[bool(label)] for found in possible]
+        if done:  # rcl would write the names of others to the log as they are
             done = bool(self._change_state(request, response).success)
-        except rclpy_implementation.RCLError:  # unknown transition, which rclpy does not catch
-            done = False
         if not done:
             reason = self.refusal or f'not possible while {before}'
-            self.get_logger().error(f'transition {name} refused: {reason}')
+            self.get_logger().error(f'transition {label or number} refused: {reason}')
         return done
 
     def _check_parameters(self, parameters: list[Parameter]) -> SetParametersResult:
