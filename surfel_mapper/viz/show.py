@@ -27,7 +27,11 @@ from surfel_mapper.viz.scene import ORANGE, RED, Scene
 Array = npt.NDArray[np.float64]
 
 MOST_DISCS = 250_000
-"""Limit of the discs of all maps together: 70 MB in the viewer, fluid without a graphics card."""
+"""
+Limit of the discs of all maps together: 70 MB in the viewer, a million triangles.
+
+Two cores without a graphics card draw a picture of 213,688 discs in 2.6 s, of 20,000 in 1.5.
+"""
 
 FAR_M = 10_000.0
 """Coordinates beyond this are shown about an origin; float32 resolves 1 mm there."""

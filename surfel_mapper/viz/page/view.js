@@ -181,7 +181,8 @@
 
   // All places are about the middle of the map, so that float32 is precise enough anywhere.
   const half = data.size.map((side) => side / 2);
-  const radius = Math.max(Math.hypot(...half), 1);
+  const reach = half.map((side) => side + data.largest); // with the discs on the edge
+  const radius = Math.max(Math.hypot(...reach), 1);
   const across = data.size[0] >= data.size[1];
   const start = { yaw: across ? -Math.PI / 2 : 0, pitch: 0.75, target: [0, 0, -0.15 * half[2]] };
   const MARGIN = 0.94;
@@ -205,7 +206,7 @@
     const [right, up, back] = axes();
     const wide = MARGIN * Math.tan(0.35) * (canvas.clientWidth || 1) / (canvas.clientHeight || 1);
     for (let corner = 0; corner < 8; corner++) {
-      const from = [0, 1, 2].map((axis) => (corner >> axis & 1 ? 1 : -1) * half[axis] - eye[axis]);
+      const from = [0, 1, 2].map((axis) => (corner >> axis & 1 ? 1 : -1) * reach[axis] - eye[axis]);
       const ahead = -dot(back, from);
       if (ahead <= 0 || Math.abs(dot(right, from)) > wide * ahead) return false;
       if (Math.abs(dot(up, from)) > MARGIN * Math.tan(0.35) * ahead) return false;
