@@ -10,6 +10,7 @@ them; both are read from the imports.
 from __future__ import annotations
 
 import ast
+from functools import cache
 from pathlib import Path
 
 from test.kernels.references import REFERENCES
@@ -18,7 +19,8 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / 'surfel_mapper'
 
 
-def imported(path: Path) -> set[Path]:
+@cache
+def imported(path: Path) -> frozenset[Path]:
     """Return the modules of package and tests that a module imports."""
     names = set()
     for node in ast.walk(ast.parse(path.read_text(encoding='utf-8'))):
@@ -27,7 +29,7 @@ def imported(path: Path) -> set[Path]:
         elif isinstance(node, ast.Import):
             names |= {alias.name for alias in node.names}
     paths = {ROOT / f'{name.replace(".", "/")}.py' for name in names}
-    return {found for found in paths if found.is_file()}
+    return frozenset(found for found in paths if found.is_file())
 
 
 def reaches(test: Path, kernels: Path) -> bool:

@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 import math
 
 import numpy as np
@@ -116,13 +117,20 @@ def test_the_models_are_twice_as_precise_as_gaussians_alone(seen):
     assert ours.compression > 100.0
 
 
+@cache
+def fitted_frame(file, size_m):
+    """Return points, labels and models of a real frame, for two tests."""
+    points, labels = tabletop.frame(file)
+    return points, labels, fit(points, ModelsConfig(voxel_size_m=size_m))
+
+
 @pytest.mark.parametrize('voxel_size_m', [0.01, 0.02])
 def test_real_frames_are_twice_as_precise_as_gaussians(data_folder, voxel_size_m):
     found = []
     for file in sorted((data_folder / 'data' / 'osd').glob('*.pcd')):
-        points, _ = read_scan(file)
-        for kinds in ('all', 'gaussians'):
-            model = fit(points, ModelsConfig(voxel_size_m=voxel_size_m, kinds=kinds))
+        points, _, all_kinds = fitted_frame(file, voxel_size_m)
+        gaussians = fit(points, ModelsConfig(voxel_size_m=voxel_size_m, kinds='gaussians'))
+        for model in (all_kinds, gaussians):
             row = evaluate(model, points)
             found.append((row.precision_rms_m, row.completeness_rms_m))
     ours, theirs = np.mean(found[::2], axis=0), np.mean(found[1::2], axis=0)
@@ -135,8 +143,7 @@ def test_real_frames_are_twice_as_precise_as_gaussians(data_folder, voxel_size_m
 def test_table_is_one_plane_and_objects_are_patches(data_folder, size_m, table, free):
     found = []
     for file in sorted((data_folder / 'data' / 'osd').glob('*.pcd')):
-        points, labels = tabletop.frame(file)
-        model = fit(points, ModelsConfig(voxel_size_m=size_m))
+        points, labels, model = fitted_frame(file, size_m)
         number = len(model.patches)
         patch = np.where(model.labels < number, model.labels, -1)
         planes = np.arange(number) < len(model.planes)
