@@ -110,6 +110,26 @@ def test_a_parameter_whose_callback_fails_is_refused(peer, failures):
     assert [kind for _, kind in failures] == [MemoryError]
 
 
+def test_a_request_of_more_than_500_parameters_is_refused(peer, failures):
+    """20,000 unknown names took 14 s, in which no other request was answered."""
+    client = AsyncParameterClient(peer.node, 'peer')
+    peer.spin_until(client.services_are_ready)
+    many = [Parameter(f'p{n}', value=n) for n in range(501)]
+    results = peer.result(client.set_parameters(many)).results
+    assert {(result.successful, result.reason) for result in results} == {
+        (False, 'ConfigError: 501 parameters, expected at most 500')
+    }
+    whole = peer.result(client.set_parameters_atomically(many)).result
+    assert whole.reason == 'ConfigError: 501 parameters, expected at most 500'
+    assert not peer.result(client.list_parameters(['use_sim_time'] * 501, 1)).result.names
+    assert failures == [
+        ('a request to peer/set_parameters', ConfigError),
+        ('a request to peer/set_parameters_atomically', ConfigError),
+        ('a request to peer/list_parameters', ConfigError),
+    ]
+    assert peer.result(client.list_parameters(['use_sim_time'], 1)).result.names
+
+
 def test_an_error_outside_of_our_callbacks_does_not_end_the_executor(peer, monkeypatch):
     """A request to a service of rclpy's own, as ~/get_state, that failed ended the node."""
     node = BaseNode('node', context=peer.node.context)
