@@ -84,6 +84,17 @@ def positive_int(text: str) -> int:
     return int(text)
 
 
+def finite(text: str) -> float:
+    """Return a finite number."""
+    try:
+        value = real(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f'{text!r}, expected a finite number')
+    return value
+
+
 def positive_float(text: str) -> float:
     """Return a finite positive number."""
     try:

@@ -18,7 +18,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
-from surfel_mapper.cli._arguments import positive_int, real, UsageError
+from surfel_mapper.cli._arguments import finite, positive_int, UsageError
 from surfel_mapper.cli._output import show_lines
 from surfel_mapper.cli._progress import progress
 from surfel_mapper.errors import escaped
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add('--color', choices=COLOURS, default='normal', help='of the surfels (normal)')
     add(
         '--at',
-        type=real,
+        type=finite,
         nargs=3,
         metavar=('X', 'Y', 'Z'),
         help='place to look at, m in the fixed frame; maps are finest there (end of the '

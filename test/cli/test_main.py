@@ -77,6 +77,7 @@ def test_wrong_usage_exits_with_2_and_a_hint(arguments, capsys):
         (('info', 'a', '--jsn'), 'no option --jsn, did you mean --json?'),
         (('info', 'a', 'b'), 'too many arguments: b'),
         (('merge', 'a', '--output', 'b', '--workers', '0'), 'a whole number of 1 or more'),
+        (('view', 'a', '--at', '1', '2', 'nan'), "--at: 'nan', expected a finite number"),
     ],
 )
 def test_a_mistyped_word_is_answered_with_the_nearest(arguments, says, capsys):
