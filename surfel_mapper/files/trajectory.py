@@ -14,6 +14,7 @@ The formats are in one module because they share the class, the check of poses a
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
@@ -21,7 +22,6 @@ from io import TextIOWrapper
 from itertools import chain
 import logging
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +71,9 @@ Largest entries of R R^T - I: of rotations taken as they are, and of those taken
 
 Files of six digits are within the first; the second is that of determinants of 0.999.
 """
+
+SAME = 3
+"""Numbers that have as many decimals by design, and not by chance."""
 
 MAX_LINE_BYTES = 1 << 16
 """Limit of the length of a line; poses have some hundred characters."""
@@ -280,11 +283,8 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
             expected = ', '.join(FORMATS)
             raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
         if format_ == 'kitti':
-            found = kitti_poses(path, lines)
-        else:
-            found = stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
-        check_end(path)
-        return found
+            return kitti_poses(path, lines)
+        return stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
 
 
 def stamped_poses(path: str | Path, rows: Iterable[tuple[str, int, list[float]]]) -> Trajectory:
@@ -312,7 +312,7 @@ def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]
     """Yield file:line and text of all lines but comments; a commented CSV header is kept."""
     try:
         with TextIOWrapper(open_regular(path), encoding='utf-8-sig') as file:
-            number = 0
+            number, decimals = 0, Counter[int]()
             while line := file.readline(MAX_LINE_BYTES):
                 number += 1
                 if len(line) == MAX_LINE_BYTES:
@@ -321,9 +321,13 @@ def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]
                     )
                 if number % CHECK_EVERY == 0:
                     budget.check_time()
+                has_end = line.endswith('\n')
                 line = line.strip()
                 if line and not is_comment(line):
                     budget.take(POSE_BYTES, f'line {number}')
+                    if not has_end:
+                        check_last(f'{path}:{number}', line, decimals)
+                    decimals[num_decimals(line)] += 1
                     yield f'{path}:{number}', line
     except OSError as error:
         raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
@@ -331,12 +335,22 @@ def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]
         raise FileFormatError(f'{path}: no text, expected a file of poses') from error
 
 
-def check_end(path: str | Path) -> None:
-    """Raise FileFormatError if the last line has no end: its last number may lack digits."""
-    with open_regular(path) as file:
-        file.seek(-1, os.SEEK_END)
-        if file.read(1) not in b'\r\n':
-            raise FileFormatError(f'{path}: {NO_END}')
+def check_last(where: str, line: str, decimals: Counter[int]) -> None:
+    """
+    Raise FileFormatError if a last line without an end lacks decimals of all others, else warn.
+
+    Editors and scripts leave the end of the last line out, so most such files are whole.
+    """
+    decimals = Counter({number: times for number, times in decimals.items() if number})
+    if len(decimals) == 1 and decimals.total() >= SAME and num_decimals(line) < min(decimals):
+        raise FileFormatError(f'{where}: {NO_END}')
+    logger.warning('%s: the last line has no end; is the file cut off there?', where)
+
+
+def num_decimals(line: str) -> int:
+    """Return how many characters follow the point of the last number of a line."""
+    words = line.replace(',', ' ').split() or ['']
+    return len(words[-1].partition('.')[2])
 
 
 def is_comment(line: str) -> bool:
@@ -459,7 +473,6 @@ def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
         raise FileFormatError(
             f'{path}: {len(stamps)} stamps for {number} poses, expected one for each, ascending'
         )
-    check_end(path)
     return stamps
 
 
