@@ -348,7 +348,7 @@ def check_last(where: str, line: str, decimals: Counter[int]) -> None:
 
 
 def num_decimals(line: str) -> int:
-    """Return how many characters follow the point of the last number of a line."""
+    """Return the number of characters after the point of the last number of a line."""
     words = line.replace(',', ' ').split() or ['']
     return len(words[-1].partition('.')[2])
 
