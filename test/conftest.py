@@ -87,9 +87,9 @@ LONGEST = (
     'test/docs/test_tutorials.py',
     'test/cli/test_replay_registration.py',
     'test/examples/test_examples.py',
-    'test/test_determinism.py',
+    'test/bench/test_drives.py',
 )
-"""Files of few tests that take 20 to 50 s each; the first forks, best while memory is small."""
+"""Files of few tests with 7 to 15 s of processor time each; the first forks, best while small."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
