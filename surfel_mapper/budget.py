@@ -194,6 +194,8 @@ def read_small_file(path: str | Path, max_bytes: int = MAX_TEXT_BYTES) -> bytes:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise ValueError(NOT_REGULAR)
         content = file.read(max_bytes + 1)
+    if content is None:  # a log of the kernel, such as /proc/kmsg, at its end
+        raise ValueError(NOT_REGULAR)
     if len(content) > max_bytes:
         raise ValueError(f'larger than {max_bytes} bytes')
     return content

@@ -4,6 +4,7 @@
 
 import logging
 import os
+import stat
 
 import pytest
 
@@ -64,6 +65,16 @@ def test_only_regular_files_of_limited_size_are_read(tmp_path):
             read_small_file(other)
     with pytest.raises(IsADirectoryError):
         read_small_file(tmp_path)
+
+
+def test_a_log_of_the_kernel_which_waits_like_a_pipe_is_not_read(tmp_path, monkeypatch):
+    """The file /proc/kmsg is regular, and at its end a read returns None."""
+    os.mkfifo(tmp_path / 'log')
+    writer = os.open(tmp_path / 'log', os.O_RDWR | os.O_NONBLOCK)
+    monkeypatch.setattr(stat, 'S_ISREG', lambda mode: True)
+    with pytest.raises(ValueError, match='not a regular file'):
+        read_small_file(tmp_path / 'log')
+    os.close(writer)
 
 
 def test_messages_are_one_line_without_control_characters():
