@@ -35,6 +35,10 @@ MAX_DEFINITION = 1 << 15
 """Limit of a definition in a ROS 1 bag, characters; rosbags takes 6 us for each."""
 
 
+MAX_VALUES = 1000
+"""Limit of the values that each message of a ROS 1 type has; rosbags unrolls them."""
+
+
 def import_rosbags() -> Any:
     """Return rosbags."""
     try:
@@ -183,7 +187,38 @@ def ros1_types(connection: Connection) -> Typestore:
         raise ValueError(f'a definition of {size} characters, expected at most {MAX_DEFINITION}')
     store = get_typestore(Stores.EMPTY)
     store.register(get_types_from_msg(connection.msgdef.data, connection.msgtype))
+    _num_values(store, connection.msgtype, {})
     return store
+
+
+def _num_values(store: Typestore, name: str, known: dict[str, int]) -> int:
+    """
+    Return the least number of values in a message of a type; an array of numbers counts as one.
+
+    Raises ValueError if there are over MAX_VALUES, or if a type contains itself or one without
+    values: then the bytes of a message do not bound the steps of reading it.
+    """
+    from rosbags.interfaces import Nodetype
+
+    known[name] = number = 0  # while it is open, so that it is refused inside of itself
+    fields: Any = store.fielddefs[name][1]
+    for field, (kind, content) in fields:
+        length = int(field != 'structure_needs_at_least_one_member')  # rosbags', in no message
+        if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+            is_fixed = kind == Nodetype.ARRAY
+            (kind, content), length = content[0], content[1] if is_fixed else 1
+        each = 1
+        if kind == Nodetype.NAME:
+            each = known[content] if content in known else _num_values(store, content, known)
+            if not each:
+                raise ValueError(f'{name}: {field} is of a type without values, or of itself')
+        else:
+            length = min(length, 1)
+        number += length * each
+    if number > MAX_VALUES:
+        raise ValueError(f'{name}: {number} values, expected at most {MAX_VALUES}')
+    known[name] = number
+    return number
 
 
 def new_writer(directory: Path, storage: str) -> Writer:

@@ -619,6 +619,21 @@ def test_a_state_is_read_without_threads(saved, monkeypatch):
     load_map(saved)
 
 
+@pytest.mark.parametrize(
+    'nested',
+    ['nav_msgs/Odometry a', 'B[] a', 'B[60000] a', 'C[60000] a', 'C[200] a\nC[801] b'],
+)
+def test_definitions_of_ros1_without_bounds_are_refused(nested):
+    """Nested arrays of nothing, 60,000 by 60,000, were read for hours; 2^31 filled the memory."""
+    rule = '\n' + '=' * 80 + '\nMSG: nav_msgs/'
+    text = f'{nested}{rule}B\nuint8[0] x{rule}C\nuint8 x'
+    definition = SimpleNamespace(data=text)
+    with pytest.raises(ValueError, match='values'):
+        decoders.ros1_types(SimpleNamespace(msgdef=definition, msgtype='nav_msgs/msg/Odometry'))
+    definition.data = f'C[200] a\nC[800] b{rule}C\nuint8 x'
+    decoders.ros1_types(SimpleNamespace(msgdef=definition, msgtype='nav_msgs/msg/Odometry'))
+
+
 @pytest.mark.parametrize('definition', [b'string x\n' * 100_000, b'string x\n' * 2])
 def test_definitions_of_ros1_are_parsed_once_and_up_to_a_size(tmp_path, monkeypatch, definition):
     """Each message parsed one that is wrong again, 5 s for 900 kB; so did 5 kB of bz2."""
