@@ -15,6 +15,7 @@ import os
 from pathlib import Path
 import tempfile
 from typing import Any
+import weakref
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +51,7 @@ class ScanSpool:
                 f'{self._directory}: no file for the points of scans: {error.strerror} '
                 '(loops.directory)'
             ) from error
+        weakref.finalize(self, self._file.close)
         self._size = 0
         self._layouts: list[dict[str, Layout]] = []
 
