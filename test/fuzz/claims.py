@@ -21,7 +21,7 @@ import sys
 from typing import NamedTuple
 
 from surfel_mapper import budget
-from surfel_mapper.bags import bag_file, chunked, compression, decoders, paths
+from surfel_mapper.bags import _rosbags, bag_file, chunked, compression, decoders, paths
 from surfel_mapper.config import yaml_files
 from surfel_mapper.geometry import MAX_TRANSLATION_M
 from surfel_mapper.messages.pointcloud2 import MAX_FIELDS
@@ -85,6 +85,7 @@ def limits() -> list[str]:
         f'{bag_file.MAX_CONNECTIONS:,} topics',
         f'{decoders.MAX_DEFINED:,} characters and one per {decoders.BYTES_EACH} bytes',
         f'and of {decoders.LEAST_DEFINITION:,} each at least',
+        f'{_rosbags.MAX_VALUES:,} values in a message of a type',
         f'{budget.FLOOR_S:.0f} s or {1e6 * budget.SECONDS_PER_BYTE:.0f} us per byte of processor'
         ' time',
         f'nesting of {yaml_files.MAX_DEPTH}; {yaml_files.MAX_NODES:,} nodes '
