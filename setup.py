@@ -144,7 +144,7 @@ DOCS = [
     'mkdocs>=1.6,<2',  # builds the site; its configuration is mkdocs.yml
     'mkdocs-material>=9.5',  # its theme
     'mkdocstrings[python]>=0.26',  # the reference, from docstrings
-    "pymdown-extensions>=10.2,<12; python_version < '3.11'",  # the last mkdocstrings for 3.10 needs it
+    "pymdown-extensions>=10.2,<12; python_version < '3.11'",  # mkdocstrings needs it
     'build>=1.2',  # wheel and sdist, for `make dist`
 ]
 
