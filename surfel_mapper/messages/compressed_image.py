@@ -35,11 +35,14 @@ DEPTH_HEADER = np.dtype([('format', '<i4'), ('quantum', '<f4', 2)])
 MAX_PIXELS = 1 << 26
 """Larger images are refused: 8192 x 8192 pixels."""
 
-PIXEL_BYTES = 6
-"""Memory per pixel: three channels, decoded and as an array."""
+GREY_BYTES, COLOR_BYTES, CONVERTED_BYTES = 6, 10, 14
+"""
+Memory per pixel of grey images, of colours, and of those converted to colours (1 bit, palette,
+alpha): as decoded, converted, as bytes and as an array. Measured: 3 to 6, 9.4, 11 to 13.5.
+"""
 
-SCANS_PIXEL_BYTES = 12
-"""The same of a JPEG of several scans, of which the decoder keeps all coefficients."""
+SCANS_BYTES = 6
+"""More of a JPEG of several scans, of which the decoder keeps all coefficients."""
 
 JPEG_MAGIC, START_OF_SCAN = b'\xff\xd8', b'\xff\xda'
 """First bytes of a JPEG; mark before each of its scans, which no compressed data contains."""
@@ -151,8 +154,8 @@ def pixels_of(
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
             width, height = image.size
-            num_scans = checked_scans(data, topic)
-            check_size(width, height, len(data), topic, size, num_scans)
+            pixel_bytes = bytes_of(image.mode, checked_scans(data, topic))
+            check_size(width, height, len(data), topic, size, pixel_bytes)
             shown = image if image.mode in ENCODINGS else image.convert('RGB')
             pixels = np.asarray(shown)
     except CloudFormatError:
@@ -176,13 +179,19 @@ def checked_scans(data: bytes, topic: str) -> int:
     return number
 
 
+def bytes_of(mode: str, num_scans: int) -> int:
+    """Return the memory that decoding takes per pixel, of an image in a mode of Pillow."""
+    grey = GREY_BYTES if mode in ENCODINGS else CONVERTED_BYTES
+    return (COLOR_BYTES if mode == 'RGB' else grey) + SCANS_BYTES * (num_scans > 1)
+
+
 def check_size(
     width: int,
     height: int,
     num_bytes: int,
     topic: str,
     size: tuple[int, int] | None,
-    num_scans: int = 0,
+    pixel_bytes: int,
 ) -> None:
     """Raise CloudFormatError if an image has another size than its camera, or too many pixels."""
     if size is not None and (width, height) != size:
@@ -192,7 +201,7 @@ def check_size(
         )
     if width * height > MAX_PIXELS:
         raise CloudFormatError(f'{topic}: {width} x {height} pixels, more than {MAX_PIXELS}')
-    needed = width * height * (SCANS_PIXEL_BYTES if num_scans > 1 else PIXEL_BYTES)
+    needed = width * height * pixel_bytes
     floor = FLOOR_BYTES if size is None else max(FLOOR_BYTES, needed)
     budget = Budget(topic, num_bytes, CloudFormatError, floor=floor)
     budget.take(needed, f'image of {width} x {height} pixels')

@@ -831,10 +831,10 @@ def test_a_file_of_sums_that_no_points_have_is_refused(tmp_path, name, value):
         load_map(path)
 
 
-def png(width, height):
+def png(width, height, mode='L'):
     """Return a black PNG."""
     file = io.BytesIO()
-    Image.new('L', (width, height)).save(file, 'PNG')
+    Image.new(mode, (width, height)).save(file, 'PNG')
     return SimpleNamespace(header=None, format='mono8; png compressed', data=file.getvalue())
 
 
@@ -852,6 +852,20 @@ def test_images_are_refused_by_the_size_in_their_header():
     error, peak = peak_of(lambda: unpacked_image(large, '/image', exact=True, size=(640, 480)))
     assert 'image of 6000 x 6000 pixels, the calibration is for 640 x 480' in str(error)
     assert peak < 10_000_000
+
+
+@finding(
+    'PNG of 1 bit a pixel, of a palette or with alpha, 3000 x 3000 pixels, 44 kB',
+    before='99 to 126 MB',
+    now='refused: below 10 MB',
+)
+@pytest.mark.parametrize('mode', ['1', 'P', 'LA', 'RGBA', 'RGB'])
+def test_images_that_are_converted_are_charged_for_it(mode):
+    large, small = png(3000, 3000, mode), png(1500, 1500, mode)
+    error, peak = peak_of(lambda: unpacked_image(large, '/image', exact=True))
+    assert f'needs {9_000_000 * (10 if mode == "RGB" else 14)} bytes' in str(error)
+    assert peak < 10_000_000
+    assert unpacked_image(small, '/image', exact=True).encoding == 'rgb8'
 
 
 def test_an_image_of_the_size_of_its_camera_is_decoded_however_well_it_is_packed():
