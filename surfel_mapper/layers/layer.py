@@ -310,7 +310,8 @@ class Layer:
             If the file cannot be written.
 
         """
-        raise NotImplementedError
+        # not abstract, because a layer without state has none
+        raise NotImplementedError(f'{type(self).__name__}: implement save')
 
     def load(self, path: Path) -> Callable[[], None]:
         """
@@ -325,7 +326,8 @@ class Layer:
             is as before then.
 
         """
-        raise NotImplementedError
+        # not abstract, because a layer without state has none
+        raise NotImplementedError(f'{type(self).__name__}: implement load, as it has save')
 
     def drawings(self) -> Sequence[Drawing]:
         """Return the layer as shapes in the map, for the viewer and the report."""

@@ -116,10 +116,10 @@ def extend_coarse(
     facets: ModelsConfig | None = None,
 ) -> Shape:
     """
-    Do the same, but join no patches.
+    Grow planes over free points; parameters and result are those of grow_coarse.
 
-    Single points far from a sensor are tens of metres apart. In voxels as large patches of all
-    kinds touch, and joins are wrong as often as not.
+    Joins no patches: single points far from a sensor are tens of metres apart, and in voxels as
+    large patches of all kinds touch, so that joins are wrong as often as not.
     """
     coarse = thin(points, size_m).by_voxel()
     before = owner[coarse.rows]

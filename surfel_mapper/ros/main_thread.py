@@ -153,7 +153,7 @@ class TaskQueue:
             done = False
             try:
                 done = item.action()
-            except Exception:
+            except Exception:  # ends the node, whose map is saved then
                 self.has_failed = True
                 raise
             finally:
