@@ -172,11 +172,14 @@ def show_all(
 def opened(args: argparse.Namespace) -> Scene:
     """Open the scene that the arguments ask for."""
     from surfel_mapper.viz.scene import Scene
+    from surfel_mapper.viz.server import LIVE, WHOLE
 
     if args.rrd is not None:
         return Scene.to_file(args.rrd)
     has_display = sys.platform != 'linux' or any(map(os.environ.get, DISPLAYS))
-    return Scene.to_window() if has_display and not args.browser else Scene.to_browser(args.port)
+    if has_display and not args.browser:
+        return Scene.to_window()
+    return Scene.to_browser(args.port, WHOLE if args.live is None else LIVE)
 
 
 def announce(scene: Scene) -> None:

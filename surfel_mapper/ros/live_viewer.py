@@ -17,7 +17,8 @@ import time
 from typing import TYPE_CHECKING
 
 from surfel_mapper.viz.scene import Scene
-from surfel_mapper.viz.viewer import Snapshot, Viewer
+from surfel_mapper.viz.server import LIVE
+from surfel_mapper.viz.viewer import Snapshot, Viewer, WHOLE_S
 
 if TYPE_CHECKING:
     from surfel_mapper.pipeline import Mapper, Update
@@ -45,10 +46,10 @@ class LiveViewer:
 
     def __init__(self, mapper: Mapper) -> None:
         settings = mapper.config.viewer
-        self._scene = Scene.to_browser(settings.port)
+        self._scene = Scene.to_browser(settings.port, LIVE)
         self._viewer = Viewer(mapper, self._scene, settings.color)
         self._period_s = 1.0 / settings.rate_hz
-        self._due_s = 0.0
+        self._due_s = self._whole_due_s = 0.0
         self._shots: queue.Queue[Snapshot | None] = queue.Queue(1)
         self._thread = threading.Thread(target=self._run, name='viewer', daemon=True)
         self._thread.start()
@@ -65,7 +66,10 @@ class LiveViewer:
         if now_s < self._due_s or self._shots.full() or not self._thread.is_alive():
             return
         self._due_s = now_s + self._period_s
-        self._shots.put(self._viewer.snapshot(update))
+        shot = self._viewer.snapshot(update, whole=now_s > self._whole_due_s)
+        if shot.surfels is not None:
+            self._whole_due_s = now_s + WHOLE_S
+        self._shots.put(shot)
 
     def close(self) -> None:
         """End the page; called when the mapping thread has ended."""

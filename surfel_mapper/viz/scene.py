@@ -33,6 +33,7 @@ from surfel_mapper.viz.server import (
     LOOPBACK,
     Server,
     started_server,
+    WHOLE,
 )
 
 Array = npt.NDArray[np.float64]
@@ -112,7 +113,7 @@ class Scene:
         return cls(stream, window=window)
 
     @classmethod
-    def to_browser(cls, port: int = 0) -> Scene:
+    def to_browser(cls, port: int = 0, memory: str = WHOLE) -> Scene:
         """
         Serve a page for a browser, on loopback only, until the scene is closed.
 
@@ -120,6 +121,8 @@ class Scene:
         ----------
         port : int
             Port of the page, and one less than that of its data; 0: free ones.
+        memory : str
+            Of its server: WHOLE, or LIVE for a running node.
 
         Raises
         ------
@@ -132,7 +135,7 @@ class Scene:
         rerun = import_rerun()
         data_port = port + 1 if port else free_port()
         port = port or free_port()
-        server = started_server(port, data_port)
+        server = started_server(port, data_port, memory)
         stream = rerun.RecordingStream('surfel_mapper')
         stream.connect_grpc(f'rerun+http://{LOOPBACK}:{data_port}/proxy')
         source = f'rerun%2Bhttp%3A%2F%2F{LOOPBACK}%3A{data_port}%2Fproxy'

@@ -23,16 +23,26 @@ LOOPBACK = '127.0.0.1'
 Server = subprocess.Popen[bytes]
 """A server of rerun, with a process group of its own."""
 
+WHOLE, LIVE = '75%', '512MiB'
+"""
+Memory of a server: of files and replays, which are kept whole, and of a running node, which has no
+end; there it holds the last minutes, for a page that is opened later.
+"""
+
 START_S = 20.0
 """Longest wait for a server to listen, s."""
 
 
-def started_server(port: int, data_port: int) -> Server:
-    """Return a server of a page and of its data, as soon as both ports are open."""
+def started_server(port: int, data_port: int, memory: str) -> Server:
+    """
+    Return a server of a page and of its data, as soon as both ports are open.
+
+    Beyond the memory, WHOLE or LIVE, it drops the oldest data that are not static.
+    """
     command = [
         *(rerun_program(), '--serve-web', '--bind', LOOPBACK, '--hide-welcome-screen'),
         *('--port', str(data_port), '--web-viewer-port', str(port)),
-        *('--server-memory-limit', '75%'),
+        *('--server-memory-limit', memory),
     ]
     server = subprocess.Popen(
         command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True

@@ -4,7 +4,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib.util import find_spec
 import os
 from pathlib import Path
@@ -22,8 +22,10 @@ from sensor_msgs.msg import PointCloud2, PointField
 from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
+from surfel_mapper.ros import node_view
 from surfel_mapper.viz.discs import DrawnDiscs
-from surfel_mapper.viz.server import free_port
+from surfel_mapper.viz.scene import Scene
+from surfel_mapper.viz.server import free_port, LIVE
 from test.ros.driving import arguments, drive, mapped, send
 from test.ros.live import cloud, LATCHED, NODE, room, START_NS, TIMEOUT_S
 
@@ -72,6 +74,15 @@ def shown(file, path):
     return rows
 
 
+def command_lines():
+    """Return the words of the command lines of all processes."""
+    found = []
+    for path in Path('/proc').glob('[0-9]*/cmdline'):
+        with suppress(OSError):  # it has ended
+            found.append(path.read_text().split('\0'))
+    return found
+
+
 def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
     port = free_port()
     settings = {'viewer.enabled': True, 'viewer.port': port, 'viewer.rate_hz': 100.0}
@@ -91,6 +102,9 @@ def test_a_node_serves_a_page_of_its_map(start, peer, tmp_path):
             assert time.monotonic() < deadline
             node.check()
             peer.spin_for(0.1)
+    commands = [words for words in command_lines() if str(port) in words]
+    assert commands
+    assert all(words[words.index('--server-memory-limit') + 1] == LIVE for words in commands)
     node.stop()
 
     maps = shown(file, '/map/surfels')
@@ -153,18 +167,47 @@ def test_messages_that_cannot_be_shown_are_left_out(start, peer, tmp_path):
     plain = cloud(START_NS, room(seed=1, num=100))
     publishers['/other/normals'].publish(plain)
     view.wait_for_output('no normal_x, normal_y, normal_z')
-    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z')
-    fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate(names)]
-    table = np.tile(np.float32([1.0, 2.0, 3.0, 0.0, 0.0, 1.0]), (50, 1))
-    whole = PointCloud2(
-        header=plain.header, height=1, width=50, fields=fields, point_step=24, row_step=1200
-    )
-    whole.data = table.tobytes()
-    publishers['/other/normals'].publish(whole)
+    publishers['/other/normals'].publish(plane_cloud(50, 3.0))
     peer.spin_for(3.0)
     assert view.stop() == 0, view.output
     assert '\x1b' not in view.output
     assert len(shown(file, '/map/surfels')) >= 1
+
+
+def test_a_view_shows_the_whole_map_again_when_a_quarter_has_changed(peer, tmp_path, monkeypatch):
+    monkeypatch.setattr(node_view, 'WHOLE_S', np.inf)
+    file = tmp_path / 'shown.rrd'
+    with Scene.to_file(file) as scene:
+        view = node_view.NodeView(peer.node, '/other', scene, 'normal')
+        view.show_normals(plane_cloud(40, 1.0))
+        view.show_normals(plane_cloud(40, 2.0))  # nothing tells what has changed
+        view.show_changed(plane_cloud(10, 2.5))
+        view.show_normals(plane_cloud(40, 3.0))
+        view.show_changed(plane_cloud(1, 3.5))
+        view.show_normals(plane_cloud(40, 4.0))
+        view.show_normals(plane_cloud(39, 5.0))
+        view.finish()
+        view.finish()
+    heights = [float(found[0, 2]) for found in shown(file, '/map/surfels')]
+    assert heights == [1.0, 2.0, 4.0, 5.0]
+
+
+def plane_cloud(num, height):
+    """Return a cloud of a level plane with normals."""
+    names = ('x', 'y', 'z', 'normal_x', 'normal_y', 'normal_z')
+    fields = [PointField(name=n, offset=4 * i, datatype=7, count=1) for i, n in enumerate(names)]
+    table = np.tile(np.float32([0.0, 0.0, height, 0.0, 0.0, 1.0]), (num, 1))
+    table[:, 0] = np.arange(num)
+    header = cloud(START_NS, room(seed=1, num=1)).header
+    return PointCloud2(
+        header=header,
+        height=1,
+        width=num,
+        fields=fields,
+        point_step=24,
+        row_step=24 * num,
+        data=table.tobytes(),
+    )
 
 
 FOREIGN = {'normals': PointCloud2, 'changed': PointCloud2, 'mesh': Marker, 'planes': MarkerArray}
