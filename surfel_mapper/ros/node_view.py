@@ -7,8 +7,8 @@ Shows ``~/normals`` (latched, so at once), ``~/changed``, ``~/mesh`` and ``~/pla
 machine that receives them. The topics lack the moments, so there is one level of detail; the size
 of discs is found from the gaps between them.
 
-The whole map is shown again when a quarter of it has changed, or after WHOLE_S, and changes at
-most every EVERY_S: all that the topics have would be 8 MB a second.
+Maps and changes are shown at most every MAP_S and CHANGE_S: all that the topics have of a lidar
+of 128 beams would be 25 MB a second.
 """
 
 from __future__ import annotations
@@ -36,13 +36,12 @@ from surfel_mapper.tsdf.mesh import Mesh
 from surfel_mapper.viz.contents import discs_of
 from surfel_mapper.viz.discs import Colouring, DrawnDiscs
 from surfel_mapper.viz.scene import Scene
-from surfel_mapper.viz.viewer import NEW, WHOLE_S
 
 SILENT_S = 5.0
 """Time without surfels after which a warning names the topics that were found, s."""
 
-EVERY_S = 0.5
-"""Shortest time between two changes that are shown, s."""
+MAP_S, CHANGE_S = 5.0, 1.0
+"""Shortest time between two maps, and between two changes, that are shown, s."""
 
 NORMALS = {'normal_x', 'normal_y', 'normal_z'}
 
@@ -68,18 +67,14 @@ class NodeView:
     ----------
     num_shown : int
         Number of maps that were shown.
-    num_changed : int or None
-        Number of surfels that have changed since; None before there was a change on its topic.
 
     """
 
     def __init__(self, node: Any, name: str, scene: Scene, colouring: str) -> None:
         self._node, self._name, self._scene, self._colouring = node, name, scene, colouring
         self.num_shown = 0
-        self.num_changed: int | None = None
         self._waiting: PointCloud2 | None = None
-        self._num_surfels = 0
-        self._whole_due_s = self._change_due_s = 0.0
+        self._map_due_s = self._change_due_s = 0.0
         changes = QoSProfile(depth=10)
         for topic, kind, show, qos in (
             ('normals', PointCloud2, self.show_normals, LATCHED),
@@ -99,35 +94,30 @@ class NodeView:
             self._node.get_logger().warning(text, throttle_duration_sec=1.0)
 
     def show_normals(self, msg: PointCloud2) -> None:
-        """Show all surfels, if enough of them have changed."""
+        """Show all surfels, if it is time."""
         self._waiting = msg
-        changed = abs(msg.width * msg.height - self._num_surfels) + (self.num_changed or 0)
-        is_due = time.monotonic() > self._whole_due_s
-        if is_due or self.num_changed is None or changed > NEW * self._num_surfels:
-            self._show_whole(msg)
+        if time.monotonic() >= self._map_due_s:
+            self._show_map(msg)
 
     def finish(self) -> None:
         """Show the newest map, if it is not shown."""
         if self._waiting is not None:
-            self._show(f'{self._name}/normals', self._show_whole, self._waiting)
+            self._show(f'{self._name}/normals', self._show_map, self._waiting)
 
-    def _show_whole(self, msg: PointCloud2) -> None:
+    def _show_map(self, msg: PointCloud2) -> None:
         """Show all surfels."""
         self._waiting = None
         discs = self._discs(msg)
         self._scene.colouring = Colouring.over(self._colouring, [discs])
         self._scene.discs('map/surfels', discs)
         self.num_shown += 1
-        self.num_changed = None if self.num_changed is None else 0
-        self._num_surfels = msg.width * msg.height
-        self._whole_due_s = time.monotonic() + WHOLE_S
+        self._map_due_s = time.monotonic() + MAP_S
 
     def show_changed(self, msg: PointCloud2) -> None:
         """Show the surfels that the last scan changed, if it is time."""
-        self.num_changed = (self.num_changed or 0) + msg.width * msg.height
-        if time.monotonic() > self._change_due_s:
-            self._change_due_s = time.monotonic() + EVERY_S
+        if time.monotonic() >= self._change_due_s:
             self._scene.discs('map/changed', self._discs(msg))
+            self._change_due_s = time.monotonic() + CHANGE_S
 
     def _discs(self, msg: PointCloud2) -> DrawnDiscs:
         """Return the surfels of a cloud, and go to its stamp."""

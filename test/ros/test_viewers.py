@@ -174,22 +174,20 @@ def test_messages_that_cannot_be_shown_are_left_out(start, peer, tmp_path):
     assert len(shown(file, '/map/surfels')) >= 1
 
 
-def test_a_view_shows_the_whole_map_again_when_a_quarter_has_changed(peer, tmp_path, monkeypatch):
-    monkeypatch.setattr(node_view, 'WHOLE_S', np.inf)
+@pytest.mark.parametrize(('least_s', 'expected'), [(0.0, [1.0, 2.0, 3.0]), (np.inf, [1.0, 3.0])])
+def test_a_view_shows_maps_at_most_so_often_and_the_newest_at_its_end(
+    peer, tmp_path, monkeypatch, least_s, expected
+):
+    monkeypatch.setattr(node_view, 'MAP_S', least_s)
     file = tmp_path / 'shown.rrd'
     with Scene.to_file(file) as scene:
         view = node_view.NodeView(peer.node, '/other', scene, 'normal')
-        view.show_normals(plane_cloud(40, 1.0))
-        view.show_normals(plane_cloud(40, 2.0))  # nothing tells what has changed
-        view.show_changed(plane_cloud(10, 2.5))
-        view.show_normals(plane_cloud(40, 3.0))
-        view.show_changed(plane_cloud(1, 3.5))
-        view.show_normals(plane_cloud(40, 4.0))
-        view.show_normals(plane_cloud(39, 5.0))
+        for height in (1.0, 2.0, 3.0):
+            view.show_normals(plane_cloud(40, height))
         view.finish()
         view.finish()
     heights = [float(found[0, 2]) for found in shown(file, '/map/surfels')]
-    assert heights == [1.0, 2.0, 4.0, 5.0]
+    assert heights == expected
 
 
 def plane_cloud(num, height):
