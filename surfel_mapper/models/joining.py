@@ -119,11 +119,10 @@ def join_patches(
     held = regions.rows > 0  # patches without points are in no region
     names = np.flatnonzero(held & (regions.root == np.arange(len(held))))
     normals, found = np.empty((2, len(names), 3))
-    describe_regions(names, *state, floor, regions, normals, found)
-    gain, turn, bend_m = found.T
-    bends = (bend_m > LEAST_BEND_VOXELS * size_m) & (turn > math.radians(LEAST_TURN_DEG))
+    limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
+    describe_regions(names, *state, floor, regions, limits, normals, found)
     index = np.searchsorted(names, regions.root).astype(np.int32)
-    return index, normals, (gain > CURVED_GAIN) & bends
+    return index, normals, (found > limits).all(axis=1)
 
 
 def single_regions(

@@ -90,28 +90,30 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def height_errors(points, weights, rows, normal, errors):
+def height_errors(points, normal, errors):
     """
     Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.
 
-    points   (N, 3), weights (N,) float64
-    rows     (n,) int64, of the points that are used
+    Two errors leave out the quartic, which takes most of the time.
+
+    points   (4, n) float64: x, y, z, weight
     normal   (3,) float64, of the plane
-    errors   (3,) float64, out: weighted mean squares of the residuals, m^2
+    errors   (2,) or (3,) float64, out: weighted mean squares of the residuals, m^2
 
     The Cholesky factor of the largest system contains those of the others, so one pass is enough.
     The turn is that of the normals of the quadric, for a strip of constant curvature the angle
     between its ends.
     """
-    number = len(rows)
-    local, share = np.empty((number, 3)), np.empty(number)
-    scale = local_points(points, weights, rows, normal, local, share)
-    quadric, terms = np.empty(TERMS[1]), np.empty(TERMS[2])
-    solve_heights(local, share, quadric)
-    turn = turn_of(local, quadric, share)
-    left = solve_heights(local, share, terms)
+    local = np.empty_like(points)
+    scale = local_points(points, normal, local)
+    quadric, terms = np.empty(TERMS[1]), np.empty(TERMS[len(errors) - 1])
+    matrix = np.empty((len(terms), len(terms)))
+    solve_heights(local, quadric, matrix)
+    solve_transposed(matrix, quadric)
+    turn = turn_of(local, quadric)
+    left = solve_heights(local, terms, matrix)
     done = 0
-    for d in range(3):
+    for d in range(len(errors)):
         for p in range(done, TERMS[d]):
             left -= terms[p] * terms[p]
         done = TERMS[d]
@@ -119,49 +121,52 @@ def height_errors(points, weights, rows, normal, errors):
     return turn
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def local_points(points, weights, rows, normal, local, share):
+@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc', 'nnan', 'nsz'})
+def local_points(points, normal, local):
     """
     Compute points over a plane, in [-1, 1]; return the factor to m.
 
-    local  (n, 3) float64, out
-    share  (n,) float64, out: weights, sum 1
+    points  of height_errors
+    local   (4, n) float64, out: x, y, height, share of the weight
     """
-    mean, x_axis, y_axis = np.zeros(3), np.empty(3), np.empty(3)
+    x_axis, y_axis = np.empty(3), np.empty(3)
     tangential_axes(normal, x_axis, y_axis)
-    total, scale = 0.0, 1e-12
-    for i in rows:
-        total += weights[i]
-        for j in range(3):
-            mean[j] += weights[i] * points[i, j]
-    for n in range(len(rows)):
-        i = rows[n]
-        share[n] = weights[i] / total
-        u = points[i, 0] - mean[0] / total
-        v = points[i, 1] - mean[1] / total
-        w = points[i, 2] - mean[2] / total
-        local[n, 0] = u * x_axis[0] + v * x_axis[1] + w * x_axis[2]
-        local[n, 1] = u * y_axis[0] + v * y_axis[1] + w * y_axis[2]
-        local[n, 2] = u * normal[0] + v * normal[1] + w * normal[2]
-        scale = max(scale, abs(local[n, 0]), abs(local[n, 1]))
-    local /= scale
+    (xa, xb, xc), (ya, yb, yc), (za, zb, zc) = x_axis, y_axis, normal
+    x, y, z, weight = points[0], points[1], points[2], points[3]
+    u, v, height, share = local[0], local[1], local[2], local[3]
+    total = a = b = c = 0.0
+    for n in range(len(x)):
+        total += weight[n]
+        a, b, c = a + weight[n] * x[n], b + weight[n] * y[n], c + weight[n] * z[n]
+    a, b, c, scale = a / total, b / total, c / total, 1e-12
+    for n in range(len(x)):
+        dx, dy, dz = x[n] - a, y[n] - b, z[n] - c
+        u[n] = dx * xa + dy * xb + dz * xc
+        v[n] = dx * ya + dy * yb + dz * yc
+        height[n] = dx * za + dy * zb + dz * zc
+        scale = max(scale, abs(u[n]), abs(v[n]))
+    for n in range(len(x)):
+        share[n] = weight[n] / total
+        u[n] /= scale
+        v[n] /= scale
+        height[n] /= scale
     return scale
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def solve_heights(local, share, reduced):
+def solve_heights(local, reduced, matrix):
     """
     Fit a height field by least squares; return the weighted mean square of the heights.
 
+    local    of local_points
     reduced  (T,) float64, out: right side of the triangular system; its squares are the parts of
-             the mean square that the terms explain, one after the other. With six terms, the
-             coefficients instead.
+             the mean square that the terms explain, one after the other
+    matrix   (T, T) float64 or larger, out: its Cholesky factor
     """
     size = len(reduced)
     degree = 2 if size == TERMS[1] else 4
     sums, right = np.empty((2, 2 * degree + 1, 2 * degree + 1))
-    squares = height_sums(local, share, degree, sums, right)
-    matrix = np.empty((size, size))
+    squares = height_sums(local, degree, sums, right)
     for p in range(size):
         x, y = POWERS[p]
         reduced[p] = right[y, x]
@@ -177,32 +182,36 @@ def solve_heights(local, share, reduced):
         for m in range(p):
             reduced[p] -= matrix[p, m] * reduced[m]
         reduced[p] /= matrix[p, p]
-    if size == TERMS[1]:
-        for p in range(size - 1, -1, -1):
-            for m in range(p + 1, size):
-                reduced[p] -= matrix[m, p] * reduced[m]
-            reduced[p] /= matrix[p, p]
     return squares
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def height_sums(local, share, degree, sums, right):
+def solve_transposed(matrix, reduced):
+    """Solve for the coefficients, in place; matrix and reduced of solve_heights."""
+    for p in range(len(reduced) - 1, -1, -1):
+        for m in range(p + 1, len(reduced)):
+            reduced[p] -= matrix[m, p] * reduced[m]
+        reduced[p] /= matrix[p, p]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def height_sums(local, degree, sums, right):
     """
     Sum monomials of x and y, and these times the height; return the weighted mean square height.
 
     The normal equations of degree d have (2 d + 1) (d + 1) different entries of their
     ((d + 1) (d + 2) / 2)^2, and a sum over all points at a time is four times as fast.
 
+    local  of local_points
     sums   (2 d + 1, 2 d + 1) float64, out: of share x^a y^b at [b, a], for a + b <= 2 d
     right  (2 d + 1, 2 d + 1) float64, out: of share z x^a y^b, for a + b <= d
     """
-    number = len(local)
-    powers, y, z = np.empty((2 * degree + 1, number)), np.empty(number), np.empty(number)
-    for n in range(number):
-        powers[0, n], y[n], z[n] = share[n], local[n, 1], local[n, 2]
+    number = local.shape[1]
+    powers, z = np.empty((2 * degree + 1, number)), local[2].copy()
+    x, y, powers[0] = local[0], local[1], local[3]
     for a in range(1, len(powers)):
         for n in range(number):
-            powers[a, n] = powers[a - 1, n] * local[n, 0]
+            powers[a, n] = powers[a - 1, n] * x[n]
     factor = np.ones(number)
     for b in range(2 * degree + 1):
         for a in range(2 * degree + 1 - b):
@@ -211,8 +220,7 @@ def height_sums(local, share, degree, sums, right):
             z *= factor
             for a in range(degree + 1 - b):
                 right[b, a] = product_sum(z, powers[a])
-            for n in range(number):
-                z[n] = local[n, 2]
+            z[:] = local[2]
         factor *= y
     z *= z
     return product_sum(z, powers[0])
@@ -227,33 +235,27 @@ def product_sum(a, b):
     return total
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
-def turn_of(local, terms, share):
+@njit(cache=True, nogil=True, error_model='numpy', fastmath={'reassoc'})
+def turn_of(local, terms):
     """
     Return sqrt(12) times the root mean square angle of a quadric's normals to their mean.
 
-    local  (n, 3) float64; terms (6,) float64, of the quadric
-    share  (n,) float64, in place: multiplied by the squared cosine of the slope, so that heights
-           weigh as much as distances from the surface
+    local  of local_points; shares are multiplied by the squared cosine of the slope, so that
+           heights weigh as much as distances from the surface
+    terms  (6,) float64, of the quadric
     """
-    number = len(local)
-    normals, mean = np.empty((number, 3)), np.zeros(3)
-    for n in range(number):
-        x, y = local[n, 0], local[n, 1]
-        normals[n, 0] = -(terms[1] + 2.0 * terms[3] * x + terms[4] * y)
-        normals[n, 1] = -(terms[2] + terms[4] * x + 2.0 * terms[5] * y)
-        length = math.sqrt(1.0 + normals[n, 0] ** 2 + normals[n, 1] ** 2)
-        normals[n, 0] /= length
-        normals[n, 1] /= length
-        normals[n, 2] = 1.0 / length
-        share[n] /= length * length
-        for j in range(3):
-            mean[j] += normals[n, j] / number
-    squares = 0.0
-    for n in range(number):
-        for j in range(3):
-            squares += (normals[n, j] - mean[j]) ** 2 / number
-    return math.sqrt(12.0 * squares)
+    x, y, share = local[0], local[1], local[3]
+    _, a, b, c, d, e = terms
+    sum_x = sum_y = sum_z = 0.0
+    for n in range(len(x)):
+        slope_x, slope_y = a + 2.0 * c * x[n] + d * y[n], b + d * x[n] + 2.0 * e * y[n]
+        length_sq = 1.0 + slope_x * slope_x + slope_y * slope_y
+        length = math.sqrt(length_sq)
+        sum_x, sum_y, sum_z = sum_x + slope_x / length, sum_y + slope_y / length, sum_z + 1 / length
+        share[n] /= length_sq
+    mean_sq = (sum_x * sum_x + sum_y * sum_y + sum_z * sum_z) / float(len(x)) ** 2
+    # unit normals: their mean square distance from the mean is 1 less its square
+    return math.sqrt(12.0 * max(1.0 - mean_sq, 0.0))
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -183,11 +183,12 @@ def gain_of(a, b, state, regions):
 
     state  points, weights and starts, see above, and the floor of join_smooth
     """
-    normal_a, normal_b = unit(regions.normal[a]), unit(regions.normal[b])
-    cosine = dot(normal_a, normal_b)
+    total_a, total_b = regions.normal[a], regions.normal[b]
+    lengths = max(length_of(total_a), 1e-12) * max(length_of(total_b), 1e-12)
+    cosine = dot(total_a, total_b) / lengths  # before any copy: most pairs end here
     if cosine < JOIN_COSINE:
         return 0.0
-    mean = unit(regions.normal[a] + regions.normal[b])
+    normal_a, normal_b, mean = unit(total_a), unit(total_b), unit(total_a + total_b)
     for region in (a, b):
         part = region
         while part >= 0:
@@ -197,15 +198,23 @@ def gain_of(a, b, state, regions):
     small = a if regions.extent[a] < regions.extent[b] else b
     rows_a, rows_b = rows_near(a, small, state, regions), rows_near(b, small, state, regions)
     stride = 1 + (len(rows_a) + len(rows_b)) // MOST_ROWS
-    # copies without gaps: fits are compiled for these only, which saves 4 s of 12
-    rows_a, rows_b = rows_a[::stride].copy(), rows_b[::stride].copy()
+    rows_a, rows_b = rows_a[::stride], rows_b[::stride]
     least = min(len(rows_a), len(rows_b))
     if least < 3:
         return 0.0
-    heights_a = heights(rows_a, normal_a, state)
-    heights_b = heights(rows_b, normal_b, state)
-    both = heights(np.concatenate((rows_a, rows_b)), mean, state)
+    points = np.empty((4, len(rows_a) + len(rows_b)))
+    gather(rows_a, state, points[:, : len(rows_a)])
+    gather(rows_b, state, points[:, len(rows_a) :])
+    points_a, points_b = points[:, : len(rows_a)].copy(), points[:, len(rows_a) :].copy()
+    floor = state[3]
+    both = heights(points, mean, True, floor)
+    heights_a = heights(points_a, normal_a, False, floor)
+    heights_b = heights(points_b, normal_b, False, floor)
     gain = heights_a[0] + heights_b[0] - both[0]
+    if gain > 0.0:  # quartics only lower it
+        heights_a = heights(points_a, normal_a, True, floor)
+        heights_b = heights(points_b, normal_b, True, floor)
+        gain = heights_a[0] + heights_b[0] - both[0]
     if cosine > COPLANAR_COSINE:
         sigma = max(regions.patch_sigma[a], regions.patch_sigma[b])
         if both[2] < COPLANAR_GROWTH * max(heights_a[2], heights_b[2], sigma):
@@ -233,17 +242,29 @@ def rows_near(region, small, state, regions):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def heights(rows, normal, state):
+def gather(rows, state, found):
+    """Copy points and weights of rows (n,) to found (4, n); state as of gain_of."""
+    points, weights, _, _ = state
+    for n in range(len(rows)):
+        i = rows[n]
+        for j in range(3):
+            found[j, n] = points[i, j]
+        found[3, n] = weights[i]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def heights(points, normal, quartic, floor):
     """
-    Fit height fields to points over a plane.
+    Fit height fields to points (4, n) over a plane; quartic: whether degree 4 is tried.
 
     Returns cost, cost of a plane, rms from a plane m, turn rad, and bend m of the quadric.
     """
-    points, weights, _, floor = state
-    errors, number = np.empty(3), len(rows)
-    turn = height_errors(points, weights, rows, normal, errors)
+    number = points.shape[1]
+    tries = 3 if quartic and number > POINTS_PER_TERM * TERMS[2] else 2
+    errors = np.empty(tries)
+    turn = height_errors(points, normal, errors)
     best = plane = number * math.log(errors[0] + floor) + TERMS[0] * math.log(number)
-    for d in range(1, 3):
+    for d in range(1, tries):
         if number > POINTS_PER_TERM * TERMS[d]:
             cost = number * math.log(errors[d] + floor) + TERMS[d] * math.log(number)
             best = min(best, cost)
@@ -252,12 +273,14 @@ def heights(rows, normal, state):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def describe_regions(names, points, weights, starts, floor, regions, normals, found):
+def describe_regions(names, points, weights, starts, floor, regions, limits, normals, found):
     """
     Compute normals of regions, and how curved they are.
 
     names    (J,) int64, regions
     points, weights, starts, floor  see join_smooth
+    limits   gain, turn and bend from which a region is curved; quartics are fitted only if the
+             gain of a quadric alone is less, but its turn and bend are not
     normals  (J, 3) float64, out
     found    (J, 3) float64, out: gain of the best height field over a plane; turn, rad, and bend,
              m, of the quadric
@@ -266,8 +289,12 @@ def describe_regions(names, points, weights, starts, floor, regions, normals, fo
     for k in range(len(names)):
         normals[k] = unit(regions.normal[names[k]])
         rows = rows_near(names[k], names[k], state, regions)
-        rows = rows[:: 1 + len(rows) // MOST_ROWS].copy()
-        best, plane, _, turn, bend = heights(rows, normals[k], state)
+        rows = rows[:: 1 + len(rows) // MOST_ROWS]
+        own = np.empty((4, len(rows)))
+        gather(rows, state, own)
+        best, plane, _, turn, bend = heights(own, normals[k], False, floor)
+        if turn > limits[1] and bend > limits[2] and plane - best <= limits[0]:
+            best, plane, _, turn, bend = heights(own, normals[k], True, floor)
         found[k, 0], found[k, 1], found[k, 2] = plane - best, turn, bend
 
 

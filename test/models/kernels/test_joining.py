@@ -107,7 +107,8 @@ def test_height_fields_equal_least_squares(call):
     z = 0.02 * x - 0.01 * y + 1e-3 * (x**2 - x * y) + 1e-3 * rng.standard_normal(200)
     points, weights = np.column_stack([x, y, z]), rng.uniform(0.5, 2.0, 200)
     errors, rows = np.empty(3), np.arange(0, 200, 2)
-    call(height_errors, points, weights, rows, np.array([0.0, 0.0, 1.0]), errors)
+    given = np.column_stack([points, weights])[rows].T.copy()
+    call(height_errors, given, np.array([0.0, 0.0, 1.0]), errors)
     x, y, z, weight = x[rows], y[rows], z[rows], weights[rows] / weights[rows].sum()
     for error, degree in zip(errors, (1, 2, 4), strict=True):
         exponents = [(i - j, j) for i in range(degree + 1) for j in range(i + 1)]
@@ -125,9 +126,7 @@ def test_turn_of_a_cylinder_is_the_angle_between_its_ends(call, turn_deg):
     )
     points = np.stack([np.sin(angle), along, np.cos(angle)], axis=-1).reshape(-1, 3)
     errors, normal = np.empty(3), np.array([0.0, 0.0, 1.0])
-    turn = call(
-        height_errors, points, np.ones(len(points)), np.arange(len(points)), normal, errors
-    )
+    turn = call(height_errors, np.vstack([points.T, np.ones(len(points))]), normal, errors)
     assert math.degrees(turn) == pytest.approx(turn_deg, rel=0.05)
     assert errors[1] < 0.01 * errors[0]
     assert errors[2] < 0.02 * errors[1]

@@ -115,7 +115,7 @@ def test_a_cylinder_turns_and_bends_by_its_arc(call):
     call(join_smooth, edges, adjacent, *state, floor, regions)
     names = np.unique(regions.root)
     normals, found = np.empty((2, len(names), 3))
-    call(describe_regions, names, *state, floor, regions, normals, found)
+    call(describe_regions, names, *state, floor, regions, (0.0, 0.0, 0.0), normals, found)
     assert len(names) == 3
     round_one = np.searchsorted(names, regions.root[0])
     # 72 deg of radius 1 m; the turn of a parabola of equal arc is a little larger
