@@ -41,7 +41,6 @@ from surfel_mapper.models.kernels.voxel_points import (
     find_core,
     LEAST_COSINE,
     merge_owners,
-    neighbour_rows,
     neighbour_table,
     owner_means,
 )
@@ -131,10 +130,9 @@ class VoxelPoints:
         bits: Indices,
     ) -> VoxelPoints:
         """Find the neighbours; bits (3,) of x, y and z in the keys."""
-        first, to_y, to_z = np.empty((len(keys), 9), np.int64), int(bits[0]), int(bits[:2].sum())
-        neighbour_rows(keys, to_y, to_z, first)
+        to_y, to_z = int(bits[0]), int(bits[:2].sum())
         ends, near = np.empty(len(keys) + 1, np.int64), np.empty(26 * len(keys), np.int32)
-        neighbour_table(keys, to_y, to_z, first, ends, near)
+        neighbour_table(keys, to_y, to_z, ends, near)
         return cls(points, rows, starts, (ends, near))
 
     def core(self) -> npt.NDArray[np.bool_]:

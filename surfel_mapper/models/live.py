@@ -199,8 +199,7 @@ class LiveModels:
         ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
         kept = rows[np.repeat(large, np.diff(starts))]
         for chart in chart_components(graph, kept, ends, self.config.fold_angle_deg, least):
-            ordered = chart[np.argsort(graph.key[chart])]
-            self._charts.setdefault(int(graph.component[chart[0]]), []).append(ordered)
+            self._charts.setdefault(int(graph.component[chart[0]]), []).append(chart)
 
     def _joined(self, changed: Rows) -> Rows:
         """Return the patch of each row, -1 for none: charts with what they grow over, joined."""

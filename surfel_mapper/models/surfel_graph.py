@@ -160,10 +160,9 @@ class SurfelGraph:
             self.neighbours,
         )
         changed, here = here, self._around(here, near, 1) if self._absorbs else here
-        was_flat = self.kind[here] == FLAT
-        self._measure(changed, here)
+        here, was = self._measure(changed, here)
         is_flat = self.kind[here] == FLAT
-        relinked.append(self.component[here[was_flat != is_flat]])
+        relinked.append(self.component[here[(was == FLAT) != is_flat]])
         touched = self.component[here]
         self.component[here[~is_flat]] = -1
         relinked.append(self._relinked(here, marked, num))
@@ -251,7 +250,7 @@ class SurfelGraph:
 
     def _around(self, rows: Rows, emptied: Rows, steps: int) -> Rows:
         """Return rows, those of neighbours of emptied voxels, and all within some steps."""
-        if 2 * len(rows) > np.count_nonzero(self.key >= 0):
+        if 4 * len(rows) > np.count_nonzero(self.key >= 0):  # cheaper than to walk
             return np.flatnonzero(self.key >= 0).astype(np.int32)
         found = np.empty(len(self.key), np.int32)
         start = np.concatenate([rows, emptied.ravel()])
@@ -259,9 +258,14 @@ class SurfelGraph:
         around = found[:num]
         return around[self.key[around] >= 0]
 
-    def _measure(self, rows: Rows, around: Rows) -> None:
-        """Copy surfels from the map, classify them and those around, mark material changes."""
-        before = self.kind[around]
+    def _measure(self, rows: Rows, around: Rows) -> tuple[Rows, npt.NDArray[np.uint8]]:
+        """
+        Copy surfels from the map, classify them and those around, mark material changes.
+
+        Returns the given rows and those around whose class or normal changed, with the previous
+        classes of both.
+        """
+        before, normals = self.kind[around], self.normal[around]
         surfels = self.map.surfels_of(rows)
         self.count[rows], self.position[rows] = surfels.num_points, surfels.position
         self.own_normal[rows], self.eigenvalues[rows] = surfels.normal, surfels.eigenvalues
@@ -307,6 +311,11 @@ class SurfelGraph:
             self._report_rules,
             self.is_material,
         )
+        self._is_here[rows] = True
+        moved = self._is_here[around] | (before != self.kind[around])
+        moved |= (normals != self.normal[around]).any(axis=1)
+        self._is_here[rows] = False
+        return around[moved], before[moved]
 
     def is_thin(self, rows: npt.NDArray[Any], normals: Array) -> npt.NDArray[np.bool_]:
         """Return which voxels (K,) are thin enough along directions (K, 3) to lie on a plane."""
@@ -347,7 +356,7 @@ class GraphChange:
     num_voxels : int
         Voxels that appeared, changed or disappeared.
     rows : (N,) int32
-        Rows of changed voxels, and of those with sparse neighbours that changed.
+        Rows of changed voxels, and of those whose class or normal changed with them.
     relinked : (C,) int32
         Components whose connectivity may have changed.
     touched : (C,) int32
