@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Patches in coarser voxels: growth over sparse points, and joins across gaps.
+Patches in voxels of other sizes: growth over points that are left, and joins across gaps.
 
-Rings of a lidar and objects in its way leave gaps in the ground that are wider than a voxel.
-In voxels of two and more times the size both sides touch, so planes grow and patches are joined
-by the rules of fine voxels. Clouds and surfels of a map use it alike: a surfel is one point.
+In finer voxels faces are flat that share a voxel with others. Rings of a lidar and objects in its
+way leave gaps in the ground that are wider than a voxel; in voxels of two and more times the size
+both sides touch, so planes grow and patches are joined by the rules of fine voxels. Clouds and
+surfels of a map use it alike: a surfel is one point.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ COARSE_TOLERANCE_VOXELS = 0.04
 
 
 SPARSE_SHARE = 0.05
-"""Share of points on no patch from which coarser voxels help."""
+"""Share of points on no patch from which voxels of other sizes help."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

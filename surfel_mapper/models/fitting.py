@@ -26,6 +26,7 @@ import numpy.typing as npt
 
 from surfel_mapper.config import ModelsConfig
 from surfel_mapper.errors import ModelError
+from surfel_mapper.filters.grids import AXIS_BITS, KEY_BITS
 from surfel_mapper.kernels.selection import copy_ranges, number_ranges
 from surfel_mapper.mapping.surfels import Surfels
 from surfel_mapper.models.coarse_growth import (
@@ -61,8 +62,12 @@ Indices = npt.NDArray[np.int64]
 BLOCK_VOXELS = 4.0
 """Edge of the blocks whose outliers are one Gaussian."""
 
-COARSER, FARTHEST = (2.0, 4.0, 8.0, 16.0), 64.0
-"""Coarser voxels for sparse points, and those in which nothing is joined any more."""
+SIZES = (0.5, 2.0, 4.0, 8.0, 16.0, 64.0, 128.0)
+"""Edges of the voxels in which points that are left are grown, in those of the cloud; the finer
+ones only if these can be numbered."""
+
+MOST_JOINED = 16.0
+"""Largest of these in which patches are joined, too."""
 
 STAGES = ('thin', 'neighbours', 'cluster', 'merge', 'fit', 'grow', 'refit')
 """Names of the stages of a fit with growth."""
@@ -177,21 +182,20 @@ def fit_points(
 def grow_sparse(
     thinned: Thinned, voxels: VoxelPoints, found: Grown, config: ModelsConfig, view: Array
 ) -> Grown:
-    """Find facets in coarser voxels if many points are on no patch, and join across gaps."""
+    """Find facets in finer, then in coarser voxels while many points are on no patch, and join."""
     noise = config.noise_m, config.noise_per_range_sq
     rules = CoarseRules(config.voxel_size_m, found.tolerance_m, noise, view)
     shape = found.normals, found.curved
     owner: npt.NDArray[np.int32] = np.full(thinned.num_points, -1, np.int32)
     owner[voxels.rows] = found.owner
     joined = False
-    for factor in COARSER:
-        if not (owner[voxels.rows] < 0).sum() >= max(SPARSE_SHARE * len(found.owner), 1.0):
+    halves = thinned.bits.max() < AXIS_BITS and thinned.bits.sum() + 3 <= KEY_BITS
+    for factor in SIZES if halves else SIZES[1:]:
+        if (owner[voxels.rows] < 0).sum() < max(SPARSE_SHARE * len(found.owner), 1.0):
             break
+        grown_over = grow_coarse if factor <= MOST_JOINED else extend_coarse
         size_m, joined = factor * config.voxel_size_m, True
-        shape = grow_coarse(thinned.points, owner, shape, size_m, rules, config)
-    else:
-        size_m = FARTHEST * config.voxel_size_m
-        shape = extend_coarse(thinned.points, owner, shape, size_m, rules, config)
+        shape = grown_over(thinned.points, owner, shape, size_m, rules, config)
     if not joined:
         return found
     owner = owner[voxels.rows]

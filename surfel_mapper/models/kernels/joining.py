@@ -250,8 +250,8 @@ def turn_of(local, terms):
     for n in range(len(x)):
         slope_x, slope_y = a + 2.0 * c * x[n] + d * y[n], b + d * x[n] + 2.0 * e * y[n]
         length_sq = 1.0 + slope_x * slope_x + slope_y * slope_y
-        length = math.sqrt(length_sq)
-        sum_x, sum_y, sum_z = sum_x + slope_x / length, sum_y + slope_y / length, sum_z + 1 / length
+        up = 1.0 / math.sqrt(length_sq)
+        sum_x, sum_y, sum_z = sum_x + slope_x * up, sum_y + slope_y * up, sum_z + up
         share[n] /= length_sq
     mean_sq = (sum_x * sum_x + sum_y * sum_y + sum_z * sum_z) / float(len(x)) ** 2
     # unit normals: their mean square distance from the mean is 1 less its square

@@ -4,8 +4,8 @@
 The points of a cloud by voxel: neighbours, sensor noise, and means by voxel and owner.
 
 Voxels are sorted by key: x in the lowest bits, y from bit ``to_y``, z from bit ``to_z``. The
-neighbours of a voxel are in nine rows along x. All are found in one pass with a place in the sorted
-keys for each row, which needs no hash table: 4 ns a voxel and row.
+neighbours of a voxel are in nine rows along x. One pass with a place in the sorted keys for each
+row finds all without a hash table, in 8 ns a voxel and row.
 """
 
 import math
