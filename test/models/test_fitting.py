@@ -241,9 +241,40 @@ def test_rings_of_a_lidar_on_a_floor_are_one_plane():
     assert abs(model.patches[int(counts.argmax())].normal[2]) == pytest.approx(1.0, abs=1e-4)
 
 
+def crates():
+    """Return points of 36 cubes of 0.7 m, and the face of each point."""
+    rng, parts = np.random.default_rng(3), []
+    for i, j in np.ndindex(6, 6):
+        middle = np.array([10.0 + 1.7 * i, 1.7 * j - 4.0, 0.3]) + rng.uniform(-0.2, 0.2, 3)
+        for axis, side in np.ndindex(3, 2):
+            face = rng.uniform(-0.35, 0.35, (120, 3))
+            face[:, axis] = 0.7 * side - 0.35
+            parts.append(face + middle)
+    points = np.concatenate(parts)
+    return points + 0.003 * rng.standard_normal(points.shape), np.arange(len(points)) // 120
+
+
+def test_faces_narrower_than_two_voxels_are_patches():
+    points, face = crates()
+    model = fit(points, ModelsConfig(voxel_size_m=0.5))
+    counts = [np.bincount(face[model.labels == patch.id]) for patch in model.patches]
+    assert sum(count.sum() for count in counts) > 0.9 * len(points)
+    assert sum(count.max() for count in counts) > 0.7 * len(points)
+
+
+def test_a_point_as_far_as_voxels_can_be_numbered_leaves_the_patches():
+    points = np.vstack([crates()[0], [0.9 * 2.0**30, 0.0, 0.0]])  # half voxels have 32 bits
+    model = fit(points, ModelsConfig(voxel_size_m=0.5))
+    assert np.isin(model.labels, [patch.id for patch in model.patches]).mean() > 0.9
+
+
 @pytest.mark.parametrize(
     ('name', 'share', 'residual_mm'),
-    [('velodyne_vls128_street', 0.9, 500.0), ('ouster_os0_128', 0.87, 250.0)],
+    [
+        ('velodyne_vls128_street', 0.9, 500.0),
+        ('ouster_os0_128', 0.87, 250.0),
+        ('pcl_room_scan2', 0.94, 30.0),
+    ],
 )
 def test_most_points_of_real_scans_are_on_patches(data_folder, name, share, residual_mm):
     (file,) = (data_folder / 'data' / 'scans').glob(f'{name}.*')
