@@ -122,8 +122,8 @@ def join_patches(
     limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
     describe_regions(names, *state, floor, regions, limits, normals, found)
     index = np.searchsorted(names, regions.root).astype(np.int32)
-    curved: npt.NDArray[np.bool_] = (found > limits).all(axis=1)
-    return index, normals, curved
+    gains, turns, bends = (found > limits).T
+    return index, normals, gains & turns & bends
 
 
 def single_regions(
