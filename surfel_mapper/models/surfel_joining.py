@@ -29,7 +29,7 @@ from surfel_mapper.models.coarse_growth import (
 )
 from surfel_mapper.models.kernels.charts import bisect_chart
 from surfel_mapper.models.kernels.surfel_classes import FLAT
-from surfel_mapper.models.kernels.surfel_groups import find_pieces, mean_normals
+from surfel_mapper.models.kernels.surfel_groups import find_doubtful, find_pieces, mean_normals
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -152,10 +152,16 @@ class SurfelJoining:
     def _overlaps_itself(self, rows: Indices) -> bool:
         """Return whether voxels are no height field."""
         graph, size_m = self._graph, self._graph.map.voxel_size_m
+        rules, starts = (self._limit, STACKED_VOXELS * size_m), np.array([0, len(rows)])
+        mean, doubtful = np.empty((1, 3)), np.empty(1, np.bool_)
+        every = np.ones(len(graph.key), np.bool_)
+        mean_normals(rows, starts, every, graph.normal, mean)
+        find_doubtful(rows, starts, mean, graph.normal, graph.position, rules, doubtful)
+        if not doubtful[0]:
+            return False
         rows = rows[np.argsort(graph.key[rows])]
-        rules = self._limit, STACKED_VOXELS * size_m, size_m
         side = np.empty(len(rows), np.bool_)
-        return bool(bisect_chart(graph.normal[rows], graph.position[rows], *rules, side))
+        return bool(bisect_chart(graph.normal[rows], graph.position[rows], *rules, size_m, side))
 
     def _joined(self, rows: Indices, piece: Rows) -> Rows:
         """Return the region (n,) of each row of a block, in the order of their keys, or -1."""

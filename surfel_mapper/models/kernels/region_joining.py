@@ -36,6 +36,9 @@ MOST_ROWS = 600
 POINTS_PER_TERM = 3.0
 """A height field needs more points."""
 
+CHUNK = 64
+"""Points with a common box: those of a chunk too far away are skipped together."""
+
 LAYER_SIGMAS = 3.0
 """Distance, in deviations of the noise, of a layer of a patch."""
 
@@ -144,7 +147,7 @@ def join_smooth(edges, adjacent, points, weights, starts, floor, regions):
     regions   Regions, in place
     """
     first, others = adjacent
-    state = points, weights, starts, floor
+    state = points, weights, starts, chunk_boxes(points), floor
     root, patches = regions.root, regions.patches
     heap = [(math.inf, np.int64(-1), np.int64(-1), np.int64(0), np.int64(0))]  # the last
     marked = np.full(len(root), -1, np.int64)
@@ -181,7 +184,7 @@ def gain_of(a, b, state, regions):
     """
     Return by how much a common height field of two regions is better than two; 0 for none.
 
-    state  points, weights and starts, see above, and the floor of join_smooth
+    state  points, weights and starts, see above, boxes of chunk_boxes, floor of join_smooth
     """
     total_a, total_b = regions.normal[a], regions.normal[b]
     lengths = max(length_of(total_a), 1e-12) * max(length_of(total_b), 1e-12)
@@ -203,10 +206,10 @@ def gain_of(a, b, state, regions):
     if least < 3:
         return 0.0
     points = np.empty((4, len(rows_a) + len(rows_b)))
-    gather(rows_a, state, points[:, : len(rows_a)])
-    gather(rows_b, state, points[:, len(rows_a) :])
+    gather(rows_a, state[0], state[1], points[:, : len(rows_a)])
+    gather(rows_b, state[0], state[1], points[:, len(rows_a) :])
     points_a, points_b = points[:, : len(rows_a)].copy(), points[:, len(rows_a) :].copy()
-    floor = state[3]
+    floor = state[4]
     both = heights(points, mean, True, floor)
     heights_a = heights(points_a, normal_a, False, floor)
     heights_b = heights(points_b, normal_b, False, floor)
@@ -223,28 +226,62 @@ def gain_of(a, b, state, regions):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def chunk_boxes(points):
+    """Return least and greatest coordinates of CHUNK points each, (C, 2, 3) float64."""
+    boxes = np.empty(((len(points) + CHUNK - 1) // CHUNK, 2, 3))
+    boxes[:, 0], boxes[:, 1] = np.inf, -np.inf
+    for i in range(len(points)):
+        box = boxes[i // CHUNK]
+        for j in range(3):
+            box[0, j] = min(box[0, j], points[i, j])
+            box[1, j] = max(box[1, j], points[i, j])
+    return boxes
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def rows_near(region, small, state, regions):
-    """Return the rows of a region near a small one, (n,) int64."""
-    points, _, starts, _ = state
-    rows = np.empty(regions.rows[region], np.int64)
+    """Return the rows of a region near a small one, (n,) int64; state as of gain_of."""
+    points, _, starts, boxes, _ = state
     limit = REACH * regions.extent[small]
-    every = region == small or regions.extent[region] < limit
+    if region == small or regions.extent[region] < limit:
+        return rows_of(region, starts, regions)
+    rows = np.empty(regions.rows[region], np.int64)
     x, y, z = regions.mean[small]
     part, num = region, 0
     while part >= 0:
-        for i in range(starts[part], starts[part + 1]):
-            dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
-            if every or dx * dx + dy * dy + dz * dz < limit * limit:
-                rows[num] = i
-                num += 1
+        i, end = starts[part], starts[part + 1]
+        while i < end:
+            box, stop = boxes[i // CHUNK], min(i // CHUNK * CHUNK + CHUNK, end)
+            dx = max(box[0, 0] - x, x - box[1, 0], 0.0)
+            dy = max(box[0, 1] - y, y - box[1, 1], 0.0)
+            dz = max(box[0, 2] - z, z - box[1, 2], 0.0)
+            if dx * dx + dy * dy + dz * dz >= limit * limit:
+                i = stop
+            while i < stop:
+                dx, dy, dz = points[i, 0] - x, points[i, 1] - y, points[i, 2] - z
+                if dx * dx + dy * dy + dz * dz < limit * limit:
+                    rows[num] = i
+                    num += 1
+                i += 1
         part = regions.after[part]
     return rows[:num]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def gather(rows, state, found):
-    """Copy points and weights of rows (n,) to found (4, n); state as of gain_of."""
-    points, weights, _, _ = state
+def rows_of(region, starts, regions):
+    """Return all rows of a region, (n,) int64."""
+    rows, part, num = np.empty(regions.rows[region], np.int64), region, 0
+    while part >= 0:
+        for i in range(starts[part], starts[part + 1]):
+            rows[num] = i
+            num += 1
+        part = regions.after[part]
+    return rows
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def gather(rows, points, weights, found):
+    """Copy points and weights of rows (n,) to found (4, n)."""
     for n in range(len(rows)):
         i = rows[n]
         for j in range(3):
@@ -285,13 +322,12 @@ def describe_regions(names, points, weights, starts, floor, regions, limits, nor
     found    (J, 3) float64, out: gain of the best height field over a plane; turn, rad, and bend,
              m, of the quadric
     """
-    state = points, weights, starts, floor
     for k in range(len(names)):
         normals[k] = unit(regions.normal[names[k]])
-        rows = rows_near(names[k], names[k], state, regions)
+        rows = rows_of(names[k], starts, regions)
         rows = rows[:: 1 + len(rows) // MOST_ROWS]
         own = np.empty((4, len(rows)))
-        gather(rows, state, own)
+        gather(rows, points, weights, own)
         best, plane, _, turn, bend = heights(own, normals[k], False, floor)
         if turn > limits[1] and bend > limits[2] and plane - best <= limits[0]:
             best, plane, _, turn, bend = heights(own, normals[k], True, floor)
