@@ -10,10 +10,10 @@ scan. Times are processor time (cpu_ms), as the machine may be shared, and clock
 Then whole real scans, not cut, again and again with 1 cm of noise, as a lidar that stands sees
 them: every voxel changes, few patches grow. Without SURFEL_MAPPER_TEST_DATA there are none.
 
-The last row is that of ids in a window of ten scans, a metre apart: of the patches of which at
+The last rows are those of ids in a window of ten scans, a metre apart: of the patches of which at
 least half of the voxels are on patches a metre on, the share whose voxels mostly have the same id
 then (``kept``), that of patches reported as merged into another (``merged``), and the share that
-is kept of all others (``others``).
+is kept of all others (``others``); of all patches, and without those of few voxels.
 """
 
 from __future__ import annotations
@@ -55,6 +55,9 @@ STANDING_SIZE_M, STANDING_NOISE_M = 0.5, 0.01
 WINDOW, METRE, METRES = 10, 2, 14
 """Scans in the window for ids, number of scans a metre, and metres."""
 
+MIN_VOXELS = ModelsLayerConfig().min_voxels, 12
+"""Voxels of a patch, at least."""
+
 
 def run() -> Iterator[Row]:
     """Yield a row for every voxel size of the street and for every whole scan."""
@@ -65,13 +68,14 @@ def run() -> Iterator[Row]:
         for name, points in real_scans():
             if name in STANDING:
                 yield case(name, repeated(points), STANDING_SIZE_M, np.inf)
-        yield ids_over_time()
+        for least in MIN_VOXELS:
+            yield ids_over_time(least)
 
 
-def ids_over_time() -> Row:
-    """Return the row of ids."""
+def ids_over_time(min_voxels: int) -> Row:
+    """Return the row of ids of patches of at least this number of voxels."""
     surfel_map, held = SurfelMap(STANDING_SIZE_M), deque()
-    models = LiveModels(ModelsLayerConfig(noise_m=0.01), surfel_map)
+    models = LiveModels(ModelsLayerConfig(noise_m=0.01, min_voxels=min_voxels), surfel_map)
     before: dict[tuple[int, ...], int] = {}
     known = kept = merged = 0
     for number, (points, origin) in enumerate(street_scans(METRE, WINDOW + METRES)):
@@ -90,7 +94,8 @@ def ids_over_time() -> Row:
                 merged += patch in gone
         before = now
     share = {'kept': kept / known, 'merged': merged / known, 'others': kept / (known - merged)}
-    return {'cloud': 'street, live, ids', 'who': 'surfel_mapper', 'patches': known, **share}
+    row: Row = {'cloud': 'street, live, ids', 'who': 'surfel_mapper', 'min_voxels': min_voxels}
+    return {**row, 'patches': known, **share}
 
 
 def patches_of_voxels(models: LiveModels) -> dict[tuple[int, ...], int]:

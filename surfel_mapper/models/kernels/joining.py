@@ -90,6 +90,16 @@ def touching_patches(starts, voxel, adjacent, first, owners, pairs):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
+def gather(rows, points, weights, found):
+    """Copy points and weights of rows (n,) to found (4, n), as height_errors takes them."""
+    for n in range(len(rows)):
+        i = rows[n]
+        for j in range(3):
+            found[j, n] = points[i, j]
+        found[3, n] = weights[i]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
 def height_errors(points, normal, errors):
     """
     Fit height fields of degree 1, 2 and 4 over a plane; return by how much the quadric turns, rad.

@@ -16,7 +16,7 @@ from numba import njit
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.joining import height_errors, TERMS
+from surfel_mapper.models.kernels.joining import gather, height_errors, TERMS
 
 JOIN_COSINE = math.cos(math.radians(50.0))
 """Least cosine of the angle between the normals of joined regions at their means."""
@@ -277,16 +277,6 @@ def rows_of(region, starts, regions):
             num += 1
         part = regions.after[part]
     return rows
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def gather(rows, points, weights, found):
-    """Copy points and weights of rows (n,) to found (4, n)."""
-    for n in range(len(rows)):
-        i = rows[n]
-        for j in range(3):
-            found[j, n] = points[i, j]
-        found[3, n] = weights[i]
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
