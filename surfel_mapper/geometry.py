@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -96,6 +97,19 @@ def q_xyzw(T_a_b: Transform) -> npt.NDArray[np.float64]:
     digits at any angle. At half a turn (w = 0) the sign is that of this division.
     """
     return np.array(_quaternion(T_a_b))
+
+
+def quaternions(T_a_b: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Return the rotations of transforms (S, 4, 4) as q_xyzw returns each, (S, 4), bit for bit."""
+    rows = np.ascontiguousarray(T_a_b.transpose(1, 2, 0))
+    (r00, r01, r02, _), (r10, r11, r12, _), (r20, r21, r22, _), _ = rows
+    found = np.array(_candidates(r00, r01, r02, r10, r11, r12, r20, r21, r22))
+    is_taken = (r00 + r11 + r22 > 0.0, (r00 >= r11) & (r00 >= r22), r11 >= r22)
+    first = np.argmax([*is_taken, np.ones(len(r00), bool)], axis=0)
+    q = found[first, :, np.arange(len(r00))]
+    x, y, z, w = q.T
+    norm = np.sqrt(((x * x + y * y) + z * z) + w * w)
+    return np.asarray(q / np.where(w < 0.0, -norm, norm)[:, None])
 
 
 def compose(T_a_b: Transform, T_b_c: Transform) -> Transform:
@@ -278,19 +292,33 @@ def face_normals(corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
 def _quaternion(T_a_b: Transform) -> tuple[float, ...]:
     """Return the unit quaternion x y z w of a transform, w >= 0."""
     (r00, r01, r02, _), (r10, r11, r12, _), (r20, r21, r22, _), _ = T_a_b.tolist()
-    # each candidate is 4 times one component times the quaternion
+    of_w, of_x, of_y, of_z = _candidates(r00, r01, r02, r10, r11, r12, r20, r21, r22)
     if r00 + r11 + r22 > 0.0:
-        q = (r21 - r12, r02 - r20, r10 - r01, 1.0 + ((r00 + r11) + r22))
+        q = of_w
     elif r00 >= r11 and r00 >= r22:
-        q = (1.0 + ((r00 - r11) - r22), r01 + r10, r02 + r20, r21 - r12)
+        q = of_x
     elif r11 >= r22:
-        q = (r01 + r10, 1.0 + ((r11 - r00) - r22), r12 + r21, r02 - r20)
+        q = of_y
     else:
-        q = (r02 + r20, r12 + r21, 1.0 + ((r22 - r00) - r11), r10 - r01)
+        q = of_z
     norm = math.sqrt(((q[0] * q[0] + q[1] * q[1]) + q[2] * q[2]) + q[3] * q[3])
     if q[3] < 0.0:
         norm = -norm
     return tuple(v / norm for v in q)
+
+
+def _candidates(
+    r00: Any, r01: Any, r02: Any, r10: Any, r11: Any, r12: Any, r20: Any, r21: Any, r22: Any
+) -> tuple[tuple[Any, ...], ...]:
+    """Return 4 w q, 4 x q, 4 y q, 4 z q of the quaternion q of a rotation: numbers or arrays."""
+    xy, yz, zx = r01 + r10, r12 + r21, r02 + r20
+    xw, yw, zw = r21 - r12, r02 - r20, r10 - r01
+    return (
+        (xw, yw, zw, 1.0 + ((r00 + r11) + r22)),
+        (1.0 + ((r00 - r11) - r22), xy, zx, xw),
+        (xy, 1.0 + ((r11 - r00) - r22), yz, yw),
+        (zx, yz, 1.0 + ((r22 - r00) - r11), zw),
+    )
 
 
 def _slerp_weight(alpha: float, drop: float) -> float:

@@ -23,6 +23,7 @@ from surfel_mapper.geometry import (
     inverse,
     pose_matrix,
     q_xyzw,
+    quaternions,
     rotation_angle,
     se3_exp,
     se3_log,
@@ -278,3 +279,12 @@ def test_normals_of_triangles_are_cross_products_of_their_sides(number):
     corners = np.random.default_rng(number).normal(size=(number, 3, 3))
     sides = corners[:, 1:] - corners[:, :1]
     assert np.array_equal(face_normals(corners), np.cross(sides[:, 0], sides[:, 1]))
+
+
+def test_quaternions_of_many_rotations_are_those_of_each():
+    rng = np.random.default_rng(9)
+    turns = [*rng.normal(size=(2000, 3)), *(np.pi * np.eye(3)), *(-np.pi * np.eye(3)), np.zeros(3)]
+    turns += [np.pi * axis / np.linalg.norm(axis) for axis in rng.normal(size=(200, 3))]
+    poses = np.array([twin_matrix(turn, [1, 2, 3]) for turn in turns])
+    np.testing.assert_array_equal(quaternions(poses), [q_xyzw(pose) for pose in poses])
+    assert quaternions(np.empty((0, 4, 4))).shape == (0, 4)

@@ -11,9 +11,7 @@ that are easily wrong when written by hand.
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Mapping, Sequence
-from functools import partial
 import io
 import itertools
 import json
@@ -23,26 +21,18 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.budget import Budget, open_regular
-from surfel_mapper.errors import DependencyError, FileFormatError
+from surfel_mapper.errors import DependencyError
 from surfel_mapper.files.atomic import replace_file
 from surfel_mapper.files.model_step import write_step
 from surfel_mapper.files.parquet import import_pyarrow
-from surfel_mapper.files.text_table import real, whole
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.outlines import outline
 from surfel_mapper.models.shapes import shape_of
 
 if TYPE_CHECKING:
-    from surfel_mapper.tsdf.mesh import Mesh
+    pass
 
 FORMAT, VERSION = 'surfel_mapper models', 1
-
-MAX_LINE_BYTES = 1 << 20
-"""Length of a line of OBJ: a polygon of 100,000 corners."""
-
-CHECK_EVERY = 1024
-"""Number of lines of an OBJ file after which the time is checked."""
 
 
 def write_models(
@@ -240,51 +230,6 @@ def write_obj(path: str | Path, model: MultiModel) -> None:
             np.savetxt(file, shape.vertices, 'v %.6f %.6f %.6f')
             np.savetxt(file, shape.faces + begin, 'f %d %d %d')
             begin += len(shape.vertices)
-
-
-def read_obj(path: str | Path) -> Mesh:
-    """
-    Return the polygons of an OBJ file as triangles, without colours.
-
-    Raises
-    ------
-    FileFormatError
-        If the file cannot be read, or has no faces of known vertices.
-
-    """
-    from surfel_mapper.tsdf.mesh import Mesh
-
-    vertices, triangles, number = array('d'), array('i'), 0
-    try:
-        budget = Budget.of_file(path, FileFormatError)
-        with open_regular(path) as file, budget.clock():
-            lines = iter(partial(file.readline, MAX_LINE_BYTES), b'')
-            for number, line in enumerate(lines, start=1):
-                if len(line) == MAX_LINE_BYTES:
-                    raise ValueError(f'over {MAX_LINE_BYTES} characters')
-                if not number % CHECK_EVERY:
-                    budget.check_time()
-                kind, *words = line.split() or [b'']
-                if kind == b'v':
-                    vertices.extend(map(real, words[:3]))
-                elif kind == b'f':  # a/b/c: vertex, texture, normal; below zero: from the end
-                    corners = [whole(word.partition(b'/')[0]) for word in words]
-                    corners = [c - 1 if c > 0 else len(vertices) // 3 + c for c in corners]
-                    for second, third in itertools.pairwise(corners[1:]):
-                        triangles.extend((corners[0], second, third))
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except (ValueError, OverflowError) as error:
-        raise FileFormatError(f'{path}: line {number} is damaged: {error}') from error
-    found = np.frombuffer(triangles, np.int32).reshape(-1, 3)
-    places = len(vertices) // 3
-    if not len(found) or found.min() < 0 or found.max() >= places or len(vertices) % 3:
-        raise FileFormatError(f'{path}: no faces of its {places} vertices')
-    return Mesh(
-        vertices=np.frombuffer(vertices, np.float64).reshape(-1, 3),
-        triangles=found,
-        colors=np.empty((0, 3), np.uint8),
-    )
 
 
 LAYERS = {

@@ -3,25 +3,18 @@
 """
 Trajectories as text: reading TUM, KITTI and CSV, writing TUM.
 
-Stamps are converted between decimal text and nanoseconds without a float, because the resolution
-of a float64 is only 240 ns for seconds since 1970; coordinates are written with the digits that
-restore the same float64. Poses are neither sorted nor interpolated here: a pose of the wrong time
-maps a scan to the wrong place.
+Coordinates are written with the digits that restore the same float64, stamps with all nanoseconds
+(stamps.py). Poses are neither sorted nor interpolated here: a pose of the wrong time maps a scan
+to the wrong place.
 
-The formats are in one module because they share the class, the check of poses and the stamps.
+The formats are in one module because they share the class and the check of stamps.
 """
 
 from __future__ import annotations
 
-from array import array
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
-from io import TextIOWrapper
 from itertools import chain
-import logging
-import math
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.arguments import as_array, as_numbers, as_path, as_whole, made_array
-from surfel_mapper.budget import Budget, open_regular
+from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import replace_file
-from surfel_mapper.files.text_table import NO_END, plain, real
-from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw
-
-logger = logging.getLogger(__name__)
+from surfel_mapper.files.pose_rows import matrix_rows, quaternion_rows, warn_of_skew
+from surfel_mapper.files.stamps import column_ns, read_times, seconds, UNITS_NS
+from surfel_mapper.files.text_lines import read_lines, table_rows, TextLines
+from surfel_mapper.geometry import check_rigid, pose_matrix, q_xyzw, quaternions
 
 FORMATS = ('tum', 'kitti', 'csv')
 
@@ -60,29 +53,11 @@ POSE_COLUMNS = (
 
 STAMP_COLUMNS = ('stamp', 'timestamp', 'time', 't')
 
-UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
-
-MOST_SECONDS = 10**11
-"""Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
-
-EXACT_SKEW, MAX_SKEW = 1e-5, 2e-3
-"""
-Largest entries of R R^T - I: of rotations taken as they are, and of those taken at all.
-
-Files of six digits are within the first; the second is that of determinants of 0.999.
-"""
-
-SAME = 3
-"""Numbers that have as many decimals by design, and not by chance."""
-
-MAX_LINE_BYTES = 1 << 16
-"""Limit of the length of a line; poses have some hundred characters."""
-
-POSE_BYTES = 300
-"""Memory of a pose while its file is read: twelve numbers, a stamp, and a copy of each."""
-
-CHECK_EVERY = 1024
-"""Number of poses after which the time is checked."""
+COLUMNS = {
+    'tum': (8, ': stamp x y z q'),
+    'kitti': (12, ': 3 rows of 4'),
+}
+"""Number of columns of the formats without a header, and their meaning."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -273,89 +248,26 @@ def read_trajectory(path: str | Path, format_: str | None = None) -> Trajectory:
     """
     budget = Budget.of_file(path, FileFormatError)
     with budget.clock():
-        lines = numbered_lines(path, budget)
+        lines = read_lines(path, budget)
         first = next(lines, None)
         if first is None:
             raise FileFormatError(f'{path}: no poses in it, expected a line for each')
-        format_ = format_ or guessed(path, first[1])
-        lines = chain([first], lines)
+        format_ = format_ or guessed(path, first.first())
         if format_ not in FORMATS:
             expected = ', '.join(FORMATS)
             raise FileFormatError(f'{path}: format {format_!r}, expected one of {expected}')
+        if format_ == 'csv':
+            return csv_poses(path, first, lines, budget)
+        lines = chain([first], lines)
         if format_ == 'kitti':
-            return kitti_poses(path, lines)
-        return stamped_poses(path, csv_rows(lines) if format_ == 'csv' else tum_rows(lines))
-
-
-def stamped_poses(path: str | Path, rows: Iterable[tuple[str, int, list[float]]]) -> Trajectory:
-    """Return the poses in rows of file:line, stamp and seven numbers."""
-    stamps, numbers = array('q'), array('d')
-    for where, stamp_ns, values in rows:
-        if stamps and stamp_ns <= stamps[-1]:
-            raise FileFormatError(f'{where}: stamp is not after that of the pose before')
-        check_pose(where, values)
-        stamps.append(stamp_ns)
-        numbers.extend(values)
-    if not stamps:
-        raise FileFormatError(f'{path}: no poses in it, only a header')
-    table = np.array(numbers).reshape(-1, 7)
-    return Trajectory(np.array(stamps), table[:, :3], table[:, 3:])
+            return kitti_poses(path, lines, budget)
+        return tum_poses(path, lines, budget)
 
 
 def trajectory_beside(path: Path) -> Path | None:
     """Return the trajectory in the directory of a map, or beside its file; None without one."""
     found = (path if path.is_dir() else path.parent) / TRAJECTORY
     return found if found.is_file() else None
-
-
-def numbered_lines(path: str | Path, budget: Budget) -> Iterator[tuple[str, str]]:
-    """Yield file:line and text of all lines but comments; a commented CSV header is kept."""
-    try:
-        with TextIOWrapper(open_regular(path), encoding='utf-8-sig') as file:
-            number, decimals = 0, Counter[int]()
-            while line := file.readline(MAX_LINE_BYTES):
-                number += 1
-                if len(line) == MAX_LINE_BYTES:
-                    raise FileFormatError(
-                        f'{path}:{number}: a line of over {MAX_LINE_BYTES} characters'
-                    )
-                if number % CHECK_EVERY == 0:
-                    budget.check_time()
-                has_end = line.endswith('\n')
-                line = line.strip()
-                if line and not is_comment(line):
-                    budget.take(POSE_BYTES, f'line {number}')
-                    if not has_end:
-                        check_last(f'{path}:{number}', line, decimals)
-                    decimals[num_decimals(line)] += 1
-                    yield f'{path}:{number}', line
-    except OSError as error:
-        raise FileFormatError(f'{path}: cannot be read: {error.strerror or error}') from error
-    except UnicodeDecodeError as error:
-        raise FileFormatError(f'{path}: no text, expected a file of poses') from error
-
-
-def check_last(where: str, line: str, decimals: Counter[int]) -> None:
-    """
-    Raise FileFormatError if a last line without an end lacks decimals of all others, else warn.
-
-    Editors and scripts leave the end of the last line out, so most such files are whole.
-    """
-    decimals = Counter({number: times for number, times in decimals.items() if number})
-    if len(decimals) == 1 and decimals.total() >= SAME and num_decimals(line) < min(decimals):
-        raise FileFormatError(f'{where}: {NO_END}')
-    logger.warning('%s: the last line has no end; is the file cut off there?', where)
-
-
-def num_decimals(line: str) -> int:
-    """Return the number of characters after the point of the last number of a line."""
-    words = line.replace(',', ' ').split() or ['']
-    return len(words[-1].partition('.')[2])
-
-
-def is_comment(line: str) -> bool:
-    """Return whether a line is a comment, and not a commented CSV header."""
-    return line.startswith(('#', '%')) and ',' not in line
 
 
 def guessed(path: str | Path, line: str) -> str:
@@ -372,35 +284,73 @@ def guessed(path: str | Path, line: str) -> str:
     return formats[count]
 
 
-def tum_rows(lines: Iterable[tuple[str, str]]) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield file:line, stamp and numbers of every pose of a TUM file."""
-    for where, line in lines:
-        columns = line.split()
-        if len(columns) != 8:
-            raise FileFormatError(f'{where}: {len(columns)} columns, expected 8: stamp x y z q')
-        yield where, nanoseconds(columns[0], where), floats(columns[1:], where)
+def tum_poses(path: str | Path, lines: Iterable[TextLines], budget: Budget) -> Trajectory:
+    """Return the poses of a TUM file."""
+    found = StampedPoses(path)
+    columns, meaning = COLUMNS['tum']
+    for rows in table_rows(lines, columns, budget, meaning=meaning):
+        found.add(rows.lines, column_ns(rows, 0), quaternion_rows(rows, slice(1, None)))
+    return found.trajectory()
 
 
-def csv_rows(lines: Iterable[tuple[str, str]]) -> Iterator[tuple[str, int, list[float]]]:
-    """Yield file:line, stamp and numbers of every pose of a CSV file with a header."""
-    lines = iter(lines)
-    first, text = next(lines)
-    header = [column_name(column) for column in text.lstrip('# ').split(',')]
+def csv_poses(
+    path: str | Path, first: TextLines, lines: Iterable[TextLines], budget: Budget
+) -> Trajectory:
+    """Return the poses of a CSV file with a header, its first line."""
+    header = [column_name(column) for column in first.first().lstrip('# ').split(',')]
     names = [name for name, _ in header]
     stamps = [place for place, name in enumerate(names) if name in STAMP_COLUMNS]
     places = [[names.index(alias) for alias in known if alias in names] for known in POSE_COLUMNS]
     if not stamps or not all(places):
         raise FileFormatError(
-            f'{first}: columns {", ".join(names)}; expected a header with stamp_s or '
+            f'{first.where(0)}: columns {", ".join(names)}; expected a header with stamp_s or '
             'stamp_ns, x, y, z, qx, qy, qz, qw'
         )
     wanted = [found[0] for found in places]
-    for where, line in lines:
-        row = line.split(',')
-        if len(row) != len(names):
-            raise FileFormatError(f'{where}: {len(row)} columns, expected {len(names)}')
-        stamp_ns = nanoseconds(row[stamps[0]], where, header[stamps[0]][1])
-        yield where, stamp_ns, floats([row[place] for place in wanted], where)
+    unit = header[stamps[0]][1]
+    found = StampedPoses(path)
+    lines = chain([first.without_first()], lines)
+    for rows in table_rows(lines, len(names), budget, separator=b','):
+        found.add(rows.lines, column_ns(rows, stamps[0], unit), quaternion_rows(rows, wanted))
+    return found.trajectory()
+
+
+class StampedPoses:
+    """
+    Poses with their stamps, while they are read.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, named in errors.
+
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = path
+        self._stamps: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)]
+        self._poses: list[npt.NDArray[np.float64]] = [np.empty((0, 7))]
+
+    def add(
+        self, lines: TextLines, stamp_ns: npt.NDArray[np.int64], poses: npt.NDArray[np.float64]
+    ) -> None:
+        """Append (R,) stamps and (R, 7) poses; raise FileFormatError if a stamp is not later."""
+        known = np.concatenate([self._stamps[-1][-1:], stamp_ns])
+        back = np.flatnonzero(np.diff(known) <= 0)
+        if len(back):
+            row = back[0] + 1 - (len(known) - len(stamp_ns))
+            raise FileFormatError(
+                f'{lines.where(row)}: stamp is not after that of the pose before'
+            )
+        self._stamps.append(stamp_ns)
+        self._poses.append(poses)
+
+    def trajectory(self) -> Trajectory:
+        """Return the poses; raise FileFormatError if there are none."""
+        stamps, poses = np.concatenate(self._stamps), np.concatenate(self._poses)
+        if not len(stamps):
+            raise FileFormatError(f'{self.path}: no poses in it, only a header or comments')
+        return Trajectory(stamps, poses[:, :3], poses[:, 3:])
 
 
 def column_name(text: str) -> tuple[str, str]:
@@ -413,108 +363,28 @@ def column_name(text: str) -> tuple[str, str]:
     return name, unit
 
 
-def kitti_poses(path: str | Path, lines: Iterable[tuple[str, str]]) -> Trajectory:
+def kitti_poses(path: str | Path, lines: Iterable[TextLines], budget: Budget) -> Trajectory:
     """Return the poses of a KITTI file, each the upper three rows of a matrix."""
-    numbers, most_skew = array('d'), 0.0
-    for where, line in lines:
-        columns = line.split()
-        if len(columns) != 12:
-            raise FileFormatError(f'{where}: {len(columns)} columns, expected 12: 3 rows of 4')
-        values = np.array(floats(columns, where)).reshape(3, 4)
-        skew = skew_of(values[:, :3])
-        if not skew <= MAX_SKEW:
-            raise FileFormatError(f'{where}: its first three columns are no rotation')
-        values[:, :3] = nearest_rotation(values[:, :3])
+    columns, meaning = COLUMNS['kitti']
+    xyz, turns, most_skew = [], [], 0.0
+    for rows in table_rows(lines, columns, budget, meaning=meaning):
+        poses, skew = matrix_rows(rows, slice(None))
+        xyz.append(poses[:, :3, 3].copy())
+        turns.append(quaternions(poses))
         most_skew = max(most_skew, skew)
-        numbers.extend(values.ravel())
     warn_of_skew(path, most_skew)
-    rows = np.array(numbers).reshape(-1, 3, 4)
-    turns = np.empty((len(rows), 4))
-    pose = np.eye(4)
-    for number, pose[:3] in enumerate(rows):
-        turns[number] = q_xyzw(pose)
-    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(rows))
-    return Trajectory(stamps, rows[:, :, 3].copy(), turns)
-
-
-def skew_of(matrix: npt.NDArray[np.float64]) -> float:
-    """Return the largest entry of R R^T - I of a (3, 3) matrix; inf if it is no rotation."""
-    if not np.isfinite(matrix).all() or np.abs(matrix).max() > 2.0:
-        return math.inf
-    skew = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    return skew if np.linalg.det(matrix) > 0.0 else math.inf
-
-
-def nearest_rotation(matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Return the rotation nearest to a (3, 3) matrix; itself if it is within EXACT_SKEW."""
-    if skew_of(matrix) <= EXACT_SKEW:
-        return matrix
-    left, _, right = np.linalg.svd(matrix)
-    return np.asarray(left @ right, np.float64)
-
-
-def warn_of_skew(path: str | Path, skew: float) -> None:
-    """Warn that rotations in a file are not orthonormal, if they are not."""
-    if skew > EXACT_SKEW:
-        logger.warning(
-            '%s: rotations are not orthonormal, R R^T - I has up to %.2g (at most %g is taken); '
-            'the nearest orthonormal ones are used',
-            *(path, skew, MAX_SKEW),
-        )
+    places = np.concatenate(xyz)
+    stamps = kitti_stamps(Path(path).with_name(KITTI_TIMES), len(places))
+    return Trajectory(stamps, places, np.concatenate(turns))
 
 
 def kitti_stamps(path: Path, number: int) -> npt.NDArray[np.int64] | None:
     """Return the stamps in a times.txt, which must have one line per pose."""
     if not path.is_file():
         return None
-    lines = numbered_lines(path, Budget.of_file(path, FileFormatError))
-    stamps = np.array(array('q', (nanoseconds(line, where) for where, line in lines)))
+    stamps = read_times(path)
     if len(stamps) != number or (np.diff(stamps) <= 0).any():
         raise FileFormatError(
             f'{path}: {len(stamps)} stamps for {number} poses, expected one for each, ascending'
         )
     return stamps
-
-
-def check_pose(where: str, values: list[float]) -> None:
-    """Raise FileFormatError if seven numbers are not a pose."""
-    try:
-        pose_matrix(values[:3], values[3:])
-    except ValueError as error:
-        raise FileFormatError(f'{where}: {error}') from error
-
-
-def floats(texts: Sequence[str], where: str) -> list[float]:
-    """Return finite numbers from text."""
-    try:
-        values = [real(text) for text in texts]
-    except ValueError as error:
-        raise FileFormatError(f'{where}: {error}, expected a number') from error
-    if not np.isfinite(values).all():
-        raise FileFormatError(f'{where}: {", ".join(texts)}: not all are finite')
-    return values
-
-
-def nanoseconds(text: str, where: str, unit: str = '') -> int:
-    """Return a time rounded to nanoseconds."""
-    try:
-        number = Decimal(plain(text.strip()))
-    except (InvalidOperation, ValueError) as error:
-        raise FileFormatError(f'{where}: {text!r} is no time') from error
-    if unit and unit not in UNITS_NS:
-        raise FileFormatError(f'{where}: unit {unit!r}, expected one of {", ".join(UNITS_NS)}')
-    most = 2**63 if unit else MOST_SECONDS
-    if not number.is_finite() or not -most <= number <= most:
-        raise FileFormatError(
-            f'{where}: time {text!r}, expected seconds (or a CSV column stamp_ns, stamp_us)'
-        )
-    stamp_ns = int((number * UNITS_NS[unit or 's']).to_integral_value())
-    if not 0 <= stamp_ns < 2**63:
-        raise FileFormatError(f'{where}: time {text!r}, expected 0 to 292 years')
-    return stamp_ns
-
-
-def seconds(stamp_ns: int) -> str:
-    """Return a time in seconds with all nine digits."""
-    whole, rest = divmod(stamp_ns, 10**9)
-    return f'{whole}.{rest:09d}'

@@ -15,10 +15,8 @@ not read, because the folders do not contain the calibration of the lidar.
 
 from __future__ import annotations
 
-from array import array
 from collections.abc import Callable, Iterator, Sequence, Sized
 from dataclasses import dataclass
-from datetime import datetime, timezone
 import json
 import math
 import os
@@ -31,20 +29,18 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.atomic import by_number
-from surfel_mapper.files.scan_files import read_scan
-from surfel_mapper.files.trajectory import (
-    check_pose,
-    floats,
+from surfel_mapper.files.pose_rows import (
+    matrix_rows,
     MAX_SKEW,
-    nanoseconds,
-    nearest_rotation,
-    numbered_lines,
-    read_trajectory,
-    skew_of,
-    Trajectory,
+    quaternion_rows,
+    rigid_poses,
     warn_of_skew,
 )
-from surfel_mapper.geometry import pose_matrix, q_xyzw
+from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.stamps import column_ns, read_dates, read_times
+from surfel_mapper.files.text_lines import finite, read_lines, Rows, table_rows
+from surfel_mapper.files.trajectory import read_trajectory, StampedPoses, Trajectory
+from surfel_mapper.geometry import pose_matrix, quaternions
 
 Floats = npt.NDArray[np.float64]
 
@@ -70,6 +66,9 @@ MULRAN_MOUNT = (1.7042, -0.021, 1.8047, 0.0001, 0.0003, 179.6654)
 """Pose of MulRan's Ouster in its base: x y z in m, roll pitch yaw in deg; of its calibration."""
 
 EARTH_M = 6378137.0
+
+MAX_CALIBRATION_BYTES = 1 << 16
+"""Size limit of a calibration; those of KITTI have 2 kB."""
 
 OBJECT_BYTES, LIST_BYTES, VALUE_BYTES = 240, 90, 70
 """Upper bounds of the memory of an object, a list and a value of JSON once it is read."""
@@ -138,7 +137,7 @@ def kitti_odometry(path: Path) -> Dataset | None:
     files, times = scans_in(path / 'velodyne', '.bin'), path / 'times.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = [nanoseconds(line, where) for where, line in lines_of(times)]
+    stamps_ns = read_times(times).tolist()
     check_number(times, stamps_ns, files)
     candidates = (path / 'poses.txt', path.parent.parent / 'poses' / f'{path.name}.txt')
     poses_path = next((each for each in candidates if each.is_file()), None)
@@ -148,7 +147,7 @@ def kitti_odometry(path: Path) -> Dataset | None:
     cameras = read_trajectory(poses_path, 'kitti')
     check_number(poses_path, cameras, files)
     T_cam_velo = rigid(path / 'calib.txt', mount)
-    poses = [np.linalg.inv(T_cam_velo) @ pose @ T_cam_velo for pose in cameras.matrices]
+    poses = np.linalg.inv(T_cam_velo) @ cameras.matrices @ T_cam_velo
     found = trajectory(times, stamps_ns, poses)
     return Dataset('KITTI odometry', files, stamps_ns, found, poses_path)
 
@@ -159,7 +158,7 @@ def kitti_raw(path: Path) -> Dataset | None:
     files, times = scans_in(folder / 'data', '.bin'), folder / 'timestamps.txt'
     if not files or not times.is_file():
         return None
-    stamps_ns = [date_ns(line, where) for where, line in lines_of(times)]
+    stamps_ns = read_dates(times).tolist()
     check_number(times, stamps_ns, files)
     drive = folder.parent
     oxts = scans_in(drive / 'oxts' / 'data', '.txt')
@@ -173,7 +172,7 @@ def kitti_raw(path: Path) -> Dataset | None:
             f'{calibrated}: {len(R)} numbers of R and {len(t)} of T, expected 9, 3'
         )
     T_velo_imu = rigid(calibrated, np.column_stack([R.reshape(3, 3), t]).ravel())
-    lidar = [T_map_imu @ np.linalg.inv(T_velo_imu) for T_map_imu in oxts_poses(oxts)]
+    lidar = np.array(oxts_poses(oxts)) @ np.linalg.inv(T_velo_imu)
     found = trajectory(times, stamps_ns, lidar)
     return Dataset('KITTI raw', files, stamps_ns, found, drive / 'oxts' / 'data')
 
@@ -192,7 +191,7 @@ def nuscenes(path: Path) -> Dataset | None:
     tables = next(iter(sorted(path.glob('v1.0-*/sample_data.json'))), None)
     if tables is None:
         return Dataset('nuScenes', files, stamps_ns)
-    poses = nuscenes_poses(tables, files)
+    poses = np.array(nuscenes_poses(tables, files))
     return Dataset('nuScenes', files, stamps_ns, trajectory(tables, stamps_ns, poses), tables)
 
 
@@ -231,12 +230,16 @@ def mulran(path: Path) -> Dataset | None:
     poses_path = path / 'global_pose.csv'
     if not poses_path.is_file():
         return Dataset('MulRan', files, stamps_ns)
-    times_ns, rows = stamped_rows(poses_path, 12, ',')
     T_base_lidar = euler_pose(MULRAN_MOUNT[:3], np.radians(MULRAN_MOUNT[3:]))
-    found = [nearest_pose(poses_path, row) for row in rows]
-    warn_of_skew(poses_path, max((skew for _, skew in found), default=0.0))
-    poses = [pose @ T_base_lidar for pose, _ in found]
-    return Dataset('MulRan', files, stamps_ns, trajectory(poses_path, times_ns, poses), poses_path)
+    poses, most_skew = StampedPoses(poses_path), 0.0
+    for rows in stamped_rows(poses_path, 12, b','):
+        T_map_base, skew = matrix_rows(rows, slice(1, None))
+        T_map_lidar = T_map_base @ T_base_lidar
+        numbers = np.hstack([T_map_lidar[:, :3, 3], quaternions(T_map_lidar)])
+        poses.add(rows.lines, column_ns(rows, 0, 'ns'), numbers)
+        most_skew = max(most_skew, skew)
+    warn_of_skew(poses_path, most_skew)
+    return Dataset('MulRan', files, stamps_ns, poses.trajectory(), poses_path)
 
 
 def helipr(path: Path) -> Dataset | None:
@@ -248,12 +251,10 @@ def helipr(path: Path) -> Dataset | None:
     poses_path = path / 'LiDAR_GT' / 'Ouster_gt.txt'
     if not poses_path.is_file():
         return Dataset('HeLiPR', files, stamps_ns, read=read)
-    times_ns, rows = stamped_rows(poses_path, 7)
-    for row in rows:
-        check_pose(str(poses_path), row.tolist())
-    poses = [pose_matrix(row[:3], row[3:]) for row in rows]
-    found = trajectory(poses_path, times_ns, poses)
-    return Dataset('HeLiPR', files, stamps_ns, found, poses_path, read)
+    poses = StampedPoses(poses_path)
+    for rows in stamped_rows(poses_path, 7):
+        poses.add(rows.lines, column_ns(rows, 0, 'ns'), quaternion_rows(rows, slice(1, None)))
+    return Dataset('HeLiPR', files, stamps_ns, poses.trajectory(), poses_path, read)
 
 
 def newer_college(path: Path) -> Dataset | None:
@@ -361,66 +362,40 @@ def json_of(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def lines_of(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield file:line and text of all lines but comments."""
+def stamped_rows(path: Path, columns: int, separator: bytes | None = None) -> Iterator[Rows]:
+    """Yield the rows of a table of a time, ns, and a number of columns."""
     budget = Budget.of_file(path, FileFormatError)
     with budget.clock():
-        yield from numbered_lines(path, budget)
-
-
-def stamped_rows(
-    path: Path, columns: int, separator: str | None = None
-) -> tuple[list[int], Floats]:
-    """Return the times, ns, and the numbers (R, columns) of lines that begin with a time in ns."""
-    stamps_ns, numbers = [], array('d')
-    for where, line in lines_of(path):
-        texts = line.split(separator)
-        if len(texts) != columns + 1:
-            raise FileFormatError(f'{where}: {len(texts)} columns, expected {columns + 1}')
-        stamps_ns.append(nanoseconds(texts[0], where, 'ns'))
-        numbers.extend(floats(texts[1:], where))
-    return stamps_ns, np.array(numbers, np.float64).reshape(-1, columns)
+        yield from table_rows(read_lines(path, budget), 1 + columns, budget, separator=separator)
 
 
 def calibration(path: Path) -> dict[str, Floats]:
     """Return the numbers of a file of lines NAME: NUMBERS; empty without the file."""
     found: dict[str, Floats] = {}
-    for _, line in lines_of(path) if path.is_file() else ():
-        name, _, rest = line.partition(':')
-        try:
-            found[name.strip()] = np.array(rest.split(), np.float64)
-        except ValueError:  # the date of the calibration
-            continue
+    if not path.is_file():
+        return found
+    if path.stat().st_size > MAX_CALIBRATION_BYTES:
+        raise FileFormatError(f'{path}: larger than {MAX_CALIBRATION_BYTES} bytes')
+    for lines in read_lines(path, Budget.of_file(path, FileFormatError)):
+        for line in lines.text.decode().splitlines():
+            name, _, rest = line.partition(':')
+            try:
+                found[name.strip()] = np.array(rest.split(), np.float64)
+            except ValueError:  # the date of the calibration
+                continue
     return found
 
 
 def rigid(path: Path, numbers: npt.ArrayLike) -> Floats:
-    """Return the pose of 12 numbers, as nearest_pose; warn if they are no exact rotation."""
-    pose, skew = nearest_pose(path, numbers)
-    warn_of_skew(path, skew)
-    return pose
-
-
-def nearest_pose(path: Path, numbers: npt.ArrayLike) -> tuple[Floats, float]:
-    """
-    Return the (4, 4) pose nearest to 12 numbers, row by row, and how far they are off (skew_of).
-
-    Raises
-    ------
-    FileFormatError
-        If they are no pose.
-
-    """
+    """Return the pose (4, 4) nearest to 12 numbers, row by row; warn if they are no rotation."""
     flat = np.ravel(np.asarray(numbers, np.float64))
-    is_pose = len(flat) == 12 and bool(np.isfinite(flat).all())
-    skew = skew_of(flat.reshape(3, 4)[:, :3]) if is_pose else np.inf
-    if not skew <= MAX_SKEW:
+    poses, skew = rigid_poses(flat[None] if len(flat) == 12 else np.full((1, 12), np.nan))
+    if not (np.isfinite(flat).all() and skew[0] <= MAX_SKEW):
         raise FileFormatError(
             f'{path}: {flat.tolist()}, expected 3 rows of a rotation and a place'
         )
-    pose = np.vstack([flat.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
-    pose[:3, :3] = nearest_rotation(pose[:3, :3])
-    return pose, skew
+    warn_of_skew(path, skew[0])
+    return np.asarray(poses[0], np.float64)
 
 
 def check_number(path: Path, rows: Sized, files: Sequence[Path]) -> None:
@@ -437,19 +412,6 @@ def stamp_in_name(file: Path, unit_ns: int) -> int:
             f'{file}: expected a name that ends with its time, {unit_ns} ns a unit'
         )
     return int(digits) * unit_ns
-
-
-def date_ns(line: str, where: str) -> int:
-    """Return the time of a line 2011-09-26 13:02:25.594360375, ns since 1970."""
-    date, _, fraction = line.strip().partition('.')
-    try:
-        second = datetime.strptime(date, '%Y-%m-%d %H:%M:%S').replace(tzinfo=timezone.utc)
-        stamp_ns = int(second.timestamp()) * 10**9 + int(fraction.ljust(9, '0')[:9])
-    except ValueError as error:
-        raise FileFormatError(f'{where}: {line!r} is no time') from error
-    if not 0 <= stamp_ns < 2**63:
-        raise FileFormatError(f'{where}: {line!r}, expected a time after 1970')
-    return stamp_ns
 
 
 def euler_pose(xyz: npt.ArrayLike, rpy: npt.ArrayLike) -> Floats:
@@ -478,10 +440,12 @@ def oxts_poses(files: Sequence[Path]) -> list[Floats]:
     first: Floats = np.zeros(3)
     poses: list[Floats] = []
     for file in files:
-        where, line = next(lines_of(file), (str(file), ''))
-        numbers = floats(line.split()[:6], where)
+        lines = next(read_lines(file, Budget.of_file(file, FileFormatError)), None)
+        numbers = [] if lines is None else finite(lines.first().split()[:6], lines.where(0))
         if len(numbers) != 6 or not abs(numbers[0]) < 90.0:
-            raise FileFormatError(f'{where}: expected latitude, longitude, altitude, three angles')
+            raise FileFormatError(
+                f'{file}: {numbers}, expected latitude, longitude, altitude, three angles'
+            )
         latitude, longitude, altitude, *angles = numbers
         scale = scale or math.cos(math.radians(latitude)) * EARTH_M
         north = scale * math.log(math.tan(math.pi * (90.0 + latitude) / 360.0))
@@ -491,16 +455,12 @@ def oxts_poses(files: Sequence[Path]) -> list[Floats]:
     return poses
 
 
-def trajectory(path: Path, stamps_ns: Sequence[int], poses: Sequence[Floats]) -> Trajectory:
-    """Return a trajectory of poses (4, 4); raise FileFormatError unless stamps ascend."""
+def trajectory(path: Path, stamps_ns: Sequence[int], poses: Floats) -> Trajectory:
+    """Return a trajectory of poses (S, 4, 4); raise FileFormatError unless stamps ascend."""
     times_ns = np.array(stamps_ns, np.int64)
     back = np.flatnonzero(np.diff(times_ns) <= 0)
     if len(back):
         raise FileFormatError(
             f'{path}: row {back[0] + 2}: time {times_ns[back[0] + 1]} ns is not after that before'
         )
-    return Trajectory(
-        times_ns,
-        np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3),
-        np.array([q_xyzw(pose) for pose in poses]).reshape(-1, 4),
-    )
+    return Trajectory(times_ns, poses[:, :3, 3].copy(), quaternions(poses))

@@ -21,7 +21,7 @@ from surfel_mapper.bags.paths import is_storage, METADATA
 from surfel_mapper.config import Config
 from surfel_mapper.errors import BagError, FileFormatError
 from surfel_mapper.files.scan_files import read_scan, scan_files, SUFFIXES
-from surfel_mapper.files.trajectory import nanoseconds
+from surfel_mapper.files.stamps import nanoseconds
 from surfel_mapper.offline import ouster_pcap
 from surfel_mapper.offline.datasets import find_dataset
 from surfel_mapper.offline.ouster_pcap import OusterPcap

@@ -22,6 +22,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError, MapError
 from surfel_mapper.files import map_state, parquet, ply
+from surfel_mapper.files.obj import read_obj
 from surfel_mapper.files.parquet_tiles import tiles_in
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.files.scan_files import SUFFIXES as CLOUDS
@@ -158,9 +159,7 @@ def contents(path: Path, name: str = '') -> Iterator[Content]:
         moments, empty = parquet.read_moments(path)
         yield ExactMap(name, moments, empty.origin_m)
     elif path.suffix == '.obj':
-        from surfel_mapper.files import model_files  # 0.15 s, with all of the models
-
-        yield ShownMesh(name, model_files.read_obj(path))
+        yield ShownMesh(name, read_obj(path))
     elif path.suffix in ASSETS:
         check_asset(path)
         yield Asset(name, path)

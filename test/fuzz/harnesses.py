@@ -54,6 +54,7 @@ HARNESSES = {
     'ply_structure': Harness(point_files.ply_structure, corpus.noise, 150),
     'pcd_structure': Harness(point_files.pcd_structure, corpus.noise, 150),
     'trajectory_structure': Harness(point_files.trajectory_structure, corpus.noise, 50),
+    'long_table': Harness(point_files.long_table, corpus.noise, 20),
     'tile': Harness(point_files.tile, corpus.tile, 30),
     'shown': Harness(point_files.shown, corpus.shown, 150),
     'packets': Harness(point_files.packets, corpus.noise, 100),

@@ -4,7 +4,8 @@
 Search for inputs that cost too much, each in a process of its own: ``test.fuzz`` starts these.
 
 Not instrumented, so that the times are those of users. Inputs are seeds, those that atheris found,
-and mutations of both. Prints a line of JSON.
+and mutations of both; one in some is enlarged to megabytes, because a reader that takes too long
+for each line is not seen in small files. Prints a line of JSON.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ import numpy as np
 
 from test.fuzz.children import each
 from test.fuzz.harnesses import HARNESSES
-from test.fuzz.mutations import mutations
+from test.fuzz.mutations import enlarged, mutations
 from test.fuzz.oracle import checked_cost, Cost
 
 BATCH = 1000
 """Mutations of a seed of the random numbers."""
+
+LARGE_ONE_IN = 20
+"""Number of mutations of which the last is enlarged, too."""
 
 
 def main(folder: str, seconds: str, *names: str) -> None:
@@ -64,7 +68,11 @@ def endless(inputs: list[bytes], seed: int) -> Iterator[bytes]:
     yield from inputs
     while True:
         seed += 1
-        yield from itertools.islice(mutations(inputs, BATCH, seed), len(inputs), None)
+        mutated = itertools.islice(mutations(inputs, BATCH, seed), len(inputs), None)
+        for number, data in enumerate(mutated, start=1):
+            yield data
+            if number % LARGE_ONE_IN == 0:
+                yield enlarged(data, seed + number)
 
 
 if __name__ == '__main__':

@@ -22,6 +22,7 @@ from surfel_mapper.errors import SurfelMapperError
 from surfel_mapper.files import ply
 from surfel_mapper.files.parquet_tiles import dataset_digest, read_part, split_map, tile_part
 from surfel_mapper.files.scan_files import read_scan
+from surfel_mapper.files.stamps import read_dates, read_times
 from surfel_mapper.files.trajectory import read_trajectory
 from surfel_mapper.viz.contents import contents
 from test.fuzz.files import folder, refused, timed_read
@@ -219,6 +220,66 @@ def trajectory_structure(data: bytes) -> None:
     if not is_changed:
         assert found is not None
         np.testing.assert_array_equal(found.xyz[:, 0], np.arange(number))
+
+
+TABLES = {
+    'a.tum': ('', '{0} 0 0 0 0 0 0 1'),
+    'b.tum': ('', '1 0 0 0 0 1 0 0 0 0 1 0'),
+    'c.tum': ('t,x,y,z,qx,qy,qz,qw\n', '{0},0,0,0,0,0,0,1'),
+    'times': ('', '{0}'),
+    'dates': ('', '2011-09-26 13:02:25.594360375'),
+    'a.obj': ('v 0 0 0\nv 1 0 0\nv 0 1 0\n', 'f 1 2 3'),
+    'b.obj': ('', 'v {0} 0 0'),
+    'a.ply': (
+        'ply\nformat ascii 1.0\nelement vertex {0}\nproperty float x\nproperty float y\n'
+        'property float z\nend_header\n',
+        '{0} 0 0',
+    ),
+    'a.pcd': (
+        'FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {0}\nHEIGHT 1\nPOINTS {0}\n'
+        'DATA ascii\n',
+        '{0} 0 0',
+    ),
+}
+"""Tables in text by the name of their file: the head, with the number of rows, and a row."""
+
+ODD_WORDS = (
+    '',
+    ' ',
+    '#',
+    ',',
+    'x',
+    'nan',
+    '1e999',
+    '0e00001',
+    '-0',
+    '9' * 50,
+    '.9995',
+    '1_0',
+    'é',
+)
+
+
+def long_table(data: bytes) -> None:
+    """Read tables of up to a megabyte whose rows are as short as can be, one word of them odd."""
+    source = Source(data)
+    name = source.pick(sorted(TABLES))
+    head, row = TABLES[name]
+    size = source.pick((1 << 14, 1 << 17, 1 << 20))
+    stamp = source.pick(('{0}', '{0}e0', '{0}.', '+{0}', '{0}.{0:025}', '{0:e}', '0'))
+    words = row.replace('{0}', stamp).split(' ')
+    if source.chance(2):
+        words[source.below(len(words))] = source.pick(ODD_WORDS)
+    line = source.pick((' ', ' ', '  ')).join(words) + source.pick(('\n', '\n', '\r\n', '\n\n'))
+    number = size // max(len(line), 1)
+    lines = [line.format(at) for at in range(number)]
+    for _ in range(source.below(3)):
+        lines[source.below(number)] = source.pick((*ODD_WORDS, f'{row}\n', '# a\n', row[:-1]))
+    content = (head.format(number) + ''.join(lines)).encode()
+    if source.chance(3):
+        content = content[:-1]
+    read = {'times': read_times, 'dates': read_dates}.get(name, lambda path: [*contents(path)])
+    refused(read, name, content)
 
 
 def tile(data: bytes) -> None:
