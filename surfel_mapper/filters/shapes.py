@@ -42,7 +42,7 @@ from surfel_mapper.filters.neighbours import (
     visit_neighbours,
 )
 from surfel_mapper.filters.registry import register
-from surfel_mapper.kernels.symmetric3 import decompose, eigenvectors
+from surfel_mapper.kernels.symmetric3 import decompose, eigenvectors, smallest_vectors
 from surfel_mapper.scan import Scan
 
 PAIRS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -105,7 +105,7 @@ class Moments:
         return np.asarray(density, np.float64)
 
 
-def eigen(matrices: Points) -> tuple[Points, Points]:
+def eigen(matrices: Points, *, smallest_only: bool = False) -> tuple[Points, Points]:
     """
     Return eigenvalues and eigenvectors of symmetric matrices.
 
@@ -113,21 +113,26 @@ def eigen(matrices: Points) -> tuple[Points, Points]:
     ----------
     matrices : (6, M) float64
         Positive semidefinite, rows in the order of PAIRS.
+    smallest_only : bool
+        Whether only the vectors of the smallest values are wanted, in a sixth of the time.
 
     Returns
     -------
     values : (M, 3) float64
         Ascending, none negative.
-    vectors : (M, 3, 3) float64
+    vectors : (M, 3, 3) float64, (M, 1, 3) with ``smallest_only``
         vectors[:, i] are of unit length and belong to values[:, i]; nan if all values are 0.
 
     """
     matrices = np.ascontiguousarray(matrices)
     number = matrices.shape[1]
     values, smallest = np.empty((2, 3, number))
-    vectors = np.empty((number, 3, 3))
     decompose(matrices, number, values, smallest)
-    eigenvectors(matrices, values, smallest, vectors)
+    vectors = np.empty((number, 1 if smallest_only else 3, 3))
+    if smallest_only:
+        smallest_vectors(values, smallest, vectors)
+    else:
+        eigenvectors(matrices, values, smallest, vectors)
     return values.T.copy(), vectors
 
 
@@ -285,7 +290,7 @@ class SurfaceNormal(ShapeFilter):
             threads=self.threads,
         )
         columns: dict[str, npt.NDArray[Any]] = self.shape_columns(
-            *eigen(moments.covariance), moments.count
+            *eigen(moments.covariance, smallest_only=not self.keep_eigen_vectors), moments.count
         )
         if self.keep_densities:
             columns[DENSITIES] = moments.density

@@ -246,6 +246,21 @@ def eigenvectors(matrices, values, smallest, vectors):
         store(vectors, i, 2, lx, ly, lz)
 
 
+@kernel()
+def smallest_vectors(values, smallest, vectors):
+    """
+    Write the eigenvectors of the smallest eigenvalues alone, as ``eigenvectors`` does.
+
+    values, smallest  as of eigenvectors
+    vectors           (M, 1, 3) float64, out
+    """
+    for i in range(len(vectors)):
+        if values[2, i] > 0.0:
+            store(vectors, i, 0, smallest[0, i], smallest[1, i], smallest[2, i])
+        else:
+            vectors[i, :, :] = math.nan
+
+
 @njit(cache=True, nogil=True, inline='always')
 def store(vectors, i, k, x, y, z):
     """Store a vector with its component of largest magnitude, the first of equal ones, > 0."""

@@ -135,6 +135,9 @@ def test_eigenvalues_and_eigenvectors_rebuild_the_matrix(scale):
     matrices[:4], matrices[4:6], matrices[6:8] = np.eye(3), np.diag([1, 1, 0]), np.diag([0, 0, 2])
     matrices *= scale
     values, vectors = eigen(np.stack([matrices[:, i, j] for i, j in PAIRS]))
+    alone = eigen(np.stack([matrices[:, i, j] for i, j in PAIRS]), smallest_only=True)
+    np.testing.assert_array_equal(alone[0], values)
+    np.testing.assert_array_equal(alone[1], vectors[:, :1])
     assert (np.diff(values, axis=1) >= 0.0).all()
     rebuilt = np.einsum('mi,mij,mik->mjk', values / scale, vectors, vectors)
     np.testing.assert_allclose(rebuilt, matrices / scale, rtol=0.0, atol=1e-13)
@@ -146,9 +149,10 @@ def test_eigenvalues_and_eigenvectors_rebuild_the_matrix(scale):
 
 
 def test_no_matrices_have_no_eigenvectors():
-    values, vectors = eigen(np.zeros((6, 1)))
-    assert values.tolist() == [[0.0] * 3]
-    assert np.isnan(vectors).all()
+    for smallest_only in (False, True):
+        values, vectors = eigen(np.zeros((6, 1)), smallest_only=smallest_only)
+        assert values.tolist() == [[0.0] * 3]
+        assert np.isnan(vectors).all()
 
 
 def test_the_shares_of_plane_line_and_ball():
