@@ -19,36 +19,44 @@ from typing import Any
 
 import numpy as np
 
-from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.pointcloud2 import RawCloud
 from surfel_mapper.simulation.recording import POINT
 from test.bench.machine import one_core
-from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW
+from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
 from test.bench.ours import Ours
 from test.bench.peers import PEERS
 from test.bench.peers.run import environment, PeerError, run_peer
+from test.bench.real import drives
 from test.bench.report import Row, spread
 from test.bench.street import Street
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for each package, by voxel size; the first is ours."""
-    street = Street(options)
+    """Return a row for each package, by scan and voxel size; the first is ours."""
+    with one_core():
+        return [
+            {'scan': name, **row}
+            for name, street, size in drives(options)
+            for row in compared(size, street)
+        ]
+
+
+def compared(options: Options, street: Street) -> list[Row]:
+    """Return the rows of one drive."""
     street.prepare(options.untimed + options.scans)
     rows: list[Row] = []
-    with one_core():
-        for size_m in options.voxel_sizes_m:
-            ours, numpy_map = Ours(size_m, options.window), NumpyMap(size_m, options.window)
-            times = timed(options, street, ours.step)
-            reference_ms = float(np.median(times))
-            voxels = ours.map.num_voxels
-            rows.append(row(options, size_m, 'surfel_mapper', times, reference_ms, voxels))
-            times = timed(options, street, partial(numpy_step, numpy_map))
-            check_equal(numpy_map, ours.map)
-            rows.append(row(options, size_m, 'numpy, sorted keys', times, reference_ms, voxels))
-            if options.peers:
-                rows += peer_rows(options, street, size_m, reference_ms)
+    for size_m in options.voxel_sizes_m:
+        ours, numpy_map = Ours(size_m, options.window), NumpyMap(size_m, options.window)
+        times = timed(options, street, ours.step)
+        reference_ms = float(np.median(times))
+        voxels = ours.map.num_voxels
+        rows.append(row(options, size_m, 'surfel_mapper', times, reference_ms, voxels))
+        times = timed(options, street, partial(numpy_step, numpy_map))
+        ours.check_equal(numpy_map)
+        rows.append(row(options, size_m, 'numpy, sorted keys', times, reference_ms, voxels))
+        if options.peers:
+            rows += peer_rows(options, street, size_m, reference_ms)
     return rows
 
 
@@ -68,15 +76,6 @@ def numpy_step(numpy_map: NumpyMap, message: RawCloud, pose: np.ndarray) -> None
     """Map a scan with numpy, from the bytes on."""
     points = np.frombuffer(message.data, POINT)
     numpy_map.step([points[name] for name in 'xyz'], pose)
-
-
-def check_equal(numpy_map: NumpyMap, surfel_map: SurfelMap) -> None:
-    """Raise an error if two maps differ."""
-    key, moments = numpy_map.state()
-    found = (key, *(moments[:, part] for part in (COUNT, SUM, PRODUCT, VIEW)))
-    for ours, theirs in zip(surfel_map.moments().arrays, found, strict=True):
-        if not np.array_equal(ours.ravel(), theirs.ravel()):
-            raise RuntimeError('the maps of numpy and of surfel_mapper differ: one has a bug')
 
 
 def peer_rows(options: Options, street: Street, size_m: float, reference_ms: float) -> list[Row]:

@@ -20,6 +20,7 @@ from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from test.bench.machine import one_core
 from test.bench.options import Options
 from test.bench.ours import Ours
+from test.bench.real import drives
 from test.bench.report import rates, Row, spread
 from test.bench.street import Street
 
@@ -30,16 +31,17 @@ Times = dict[str, list[float]]
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for every stage, by voxel size and way."""
-    street = Street(options)
-    street.prepare(options.untimed + options.scans)
+    """Return a row for every stage, by scan, voxel size and way."""
     rows: list[Row] = []
     with one_core():
-        for size_m in options.voxel_sizes_m:
-            ours = Ours(size_m, options.window)
-            rows += stages(options, size_m, 'calls', by_calls(ours, options, street))
-            rows[-1] = {**rows[-1], **memory(ours)}
-            rows += stages(options, size_m, 'Mapper', by_mapper(size_m, options, street))
+        for name, street, size in drives(options):
+            street.prepare(size.untimed + size.scans)
+            for size_m in options.voxel_sizes_m:
+                ours = Ours(size_m, size.window)
+                found = stages(size, size_m, 'calls', by_calls(ours, size, street))
+                found[-1] = {**found[-1], **memory(ours)}
+                found += stages(size, size_m, 'Mapper', by_mapper(size_m, size, street))
+                rows += [{'scan': name, **row} for row in found]
     return rows
 
 
@@ -95,17 +97,17 @@ def stages(options: Options, size_m: float, way: str, times: Times) -> list[Row]
         {'voxel_m': size_m, 'way': way, 'stage': stage, **spread(values)}
         for stage, values in times.items()
     ]
-    budget = {'budget_ms': BUDGET_MS.get(size_m)}
+    asked = BUDGET_MS.get(size_m) if options.beams > 1 else None
+    budget = {'budget_ms': asked}
     rows[-1] = {**rows[-1], **budget, **rates(rows[-1]['median_ms'], options.num_points)}
     return rows
 
 
 def memory(ours: Ours) -> Row:
     """Return the number of voxels and their bytes."""
-    in_scans = sum(len(moments) for moments in ours.scans)
     return {
         'voxels': ours.map.num_voxels,
         'changed': ours.num_changed,
-        'B_voxel': ours.map.nbytes / ours.map.num_voxels,
-        'B_scan_voxel': sum(moments.nbytes for moments in ours.scans) / in_scans,
+        'B_voxel': ours.bytes_a_voxel,
+        'B_scan_voxel': ours.bytes_a_scan_voxel,
     }

@@ -19,6 +19,7 @@ import numpy.typing as npt
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.messages.pointcloud2 import RawCloud, to_scan
+from test.bench.numpy_map import COUNT, NumpyMap, PRODUCT, SUM, VIEW
 
 STAGES = ('decode', 'reduce', 'insert', 'evict', 'normals')
 
@@ -68,3 +69,23 @@ class Ours:
         times.append(clock())
         self.num_changed = len(changed)
         return times
+
+    def check_equal(self, numpy_map: NumpyMap) -> None:
+        """Raise an error if the map differs from that of numpy."""
+        key, moments = numpy_map.state()
+        expected = (key, *(moments[:, part] for part in (COUNT, SUM, PRODUCT, VIEW)))
+        for ours, theirs in zip(self.map.moments().arrays, expected, strict=True):
+            if not np.array_equal(ours.ravel(), theirs.ravel()):
+                raise RuntimeError('numpy and surfel_mapper have different maps: one has a bug')
+
+    @property
+    def bytes_a_voxel(self) -> float:
+        """Bytes of the map by voxel: rows, also free ones, and hash table."""
+        return self.map.nbytes / self.map.num_voxels
+
+    @property
+    def bytes_a_scan_voxel(self) -> float:
+        """Bytes of the scans in the window by voxel: moments, and the hints of their rows."""
+        arrays = sum(moments.nbytes for moments in self.scans)
+        rows = sum(moments.rows.nbytes for moments in self.scans if moments.rows is not None)
+        return (arrays + rows) / sum(len(moments) for moments in self.scans)

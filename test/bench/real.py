@@ -11,7 +11,8 @@ removed before, as drivers do.
 
 ``numpy`` is the same job in numpy_map.py, run in turns with ours; ``x_numpy`` is the ratio of the
 median processor times, on which other load of the machine has less effect than on clock times.
-The integers of both maps are compared at the end.
+The integers of both maps are compared at the end. ``B_voxel`` are the bytes of a voxel in the
+map, hash table and free rows included, ``B_scan_voxel`` those of a voxel of a scan in the window.
 
 The scans come from SURFEL_MAPPER_TEST_DATA; without it there is only the simulated street, which
 the mean does not include.
@@ -29,13 +30,12 @@ import numpy.typing as npt
 
 from surfel_mapper.files.scan_files import read_scan
 from surfel_mapper.memory import keep_freed_memory
-from test.bench.compare import check_equal
 from test.bench.machine import one_core
 from test.bench.numpy_map import NumpyMap
 from test.bench.options import Options
 from test.bench.ours import Ours
 from test.bench.report import Row
-from test.bench.street import Street
+from test.bench.street import MovedScan, Street
 
 WINDOW = 20
 
@@ -50,6 +50,9 @@ SCANS = {
     'HDL-32 street': 'nuscenes_hdl32_1532402927647951.pcd.bin',
 }
 """Names of rows and files of scans."""
+
+DRIVEN = ('VLS-128 street', '64 beams street', 'OS2-128')
+"""Scans that other benches take beside the simulated street, by their names."""
 
 STAGES = ('reduce', 'insert', 'evict', 'normals')
 
@@ -83,6 +86,15 @@ def real_scans() -> Iterator[tuple[str, npt.NDArray[np.float32]]]:
             yield name, np.asfortranarray(points[valid])
 
 
+def drives(options: Options) -> Iterator[tuple[str, Street, Options]]:
+    """Yield name, scans and size of the simulated street and of the driven real scans."""
+    yield 'simulated street', Street(options), options
+    for name, points in real_scans():
+        if name in DRIVEN:
+            moved = MovedScan(options, points)
+            yield name, moved, moved.options
+
+
 def step_row(name: str, points: npt.NDArray[np.float32], size_m: float, options: Options) -> Row:
     """Return the processor times of a step by stage, and of numpy."""
     ours, numpy_map = Ours(size_m, WINDOW), NumpyMap(size_m, WINDOW)
@@ -100,7 +112,7 @@ def step_row(name: str, points: npt.NDArray[np.float32], size_m: float, options:
         if number >= untimed:
             numpy_ms.append((process_time() - start) * 1e3)
             laps.append(np.diff(times) * 1e3)
-    check_equal(numpy_map, ours.map)
+    ours.check_equal(numpy_map)
     median = np.median(laps, axis=0)
     total = float(np.median(np.sum(laps, axis=1)))
     return {
@@ -114,4 +126,6 @@ def step_row(name: str, points: npt.NDArray[np.float32], size_m: float, options:
         'slowest_ms': float(np.sum(laps, axis=1).max()),
         'numpy_ms': float(np.median(numpy_ms)),
         'x_numpy': float(np.median(numpy_ms)) / total,
+        'B_voxel': ours.bytes_a_voxel,
+        'B_scan_voxel': ours.bytes_a_scan_voxel,
     }

@@ -3,7 +3,8 @@
 """
 The scans of all benchmarks: a lidar of 131,072 points driving through the simulated street.
 
-Simulated once and kept as .npy, a file a scan, in a directory named by a hash of the parameters.
+Or one scan of a real lidar at every pose of that drive. Scans are simulated once
+and kept as .npy, a file a scan, in a directory named by a hash of the parameters.
 Messages have the layout of drivers, 32 bytes a point, 4 MiB each; in a list of them none is still
 in a cache when it is used.
 """
@@ -11,7 +12,7 @@ in a cache when it is used.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 import hashlib
 import json
 from pathlib import Path
@@ -53,6 +54,7 @@ class Street:
         world = World.street(seed=1, length_m=LENGTH_M)
         self.simulation = Simulation(world, lidar)
         self.directory = options.cache / f'street-{self._hash()}'
+        self._rows = options.beams
 
     def pose(self, number: int) -> npt.NDArray[np.float64]:
         """Return T_odom_sensor (4, 4) of a scan."""
@@ -64,7 +66,7 @@ class Street:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
             with replace_file(path) as file:
-                np.save(file, self.simulation.scan(number).points)
+                np.save(file, self._made(number))
         points: npt.NDArray[np.float32] = np.load(path)
         return points
 
@@ -92,7 +94,7 @@ class Street:
         columns = {'intensity': zeros, 'ring': zeros, 'time': times}
         stamp_ns = self.simulation.stamp_ns(number)
         scan = Scan(points=points, stamp_ns=stamp_ns, frame_id=SENSOR, columns=columns)
-        cloud = cloud_bytes(scan, self.simulation.lidar.beams)
+        cloud = cloud_bytes(scan, self._rows)
         return RawCloud(
             header=Header(Stamp(*divmod(stamp_ns, 10**9)), SENSOR),
             height=cloud.height,
@@ -118,8 +120,50 @@ class Street:
         for later, message in enumerate(messages):
             yield untimed + later, message, True
 
+    def _made(self, number: int) -> npt.NDArray[np.float32]:
+        """Return the points of a scan that is not kept yet."""
+        points: npt.NDArray[np.float32] = self.simulation.scan(number).points
+        return points
+
     def _hash(self) -> str:
         """Return a short hash of the parameters of the points."""
         world = self.simulation.world.to_mapping()
         state = [world, asdict(self.simulation.lidar), asdict(self.simulation.drive)]
         return hashlib.sha256(json.dumps(state).encode()).hexdigest()[:12]
+
+
+class MovedScan(Street):
+    """
+    One scan at the poses of the drive, in place of simulated ones.
+
+    Parameters
+    ----------
+    options : Options
+        The cache.
+    points : (N, 3) float32, m
+        The scan, in recorded order.
+
+    Attributes
+    ----------
+    options : Options
+        The same for N points.
+
+    """
+
+    def __init__(self, options: Options, points: npt.NDArray[np.float32]) -> None:
+        super().__init__(options)
+        self.options = replace(options, beams=1, columns=len(points))
+        self._scan, self._rows = points, 1
+        content = hashlib.sha256(points.tobytes()).hexdigest()[:12]
+        self._file = options.cache / f'scan-{content}.npy'
+
+    def path(self, number: int) -> Path:
+        """Return the file of the scan."""
+        return self._file
+
+    def prepare(self, num_scans: int) -> None:
+        """Write the file of the scan."""
+        self.points(0)
+
+    def _made(self, number: int) -> npt.NDArray[np.float32]:
+        return self._scan

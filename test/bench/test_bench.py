@@ -12,6 +12,7 @@ import sys
 import numpy as np
 import pytest
 
+from surfel_mapper.messages.pointcloud2 import to_scan
 from test.bench import __main__ as bench
 from test.bench import accuracy, compare, decode, filters, real, scaling
 from test.bench.machine import one_core
@@ -20,7 +21,7 @@ from test.bench.options import Options
 from test.bench.peers import PeerSpec
 from test.bench.peers.run import PeerError, run_peer
 from test.bench.report import spread, table
-from test.bench.street import Street
+from test.bench.street import MovedScan, Street
 
 SCANS, WINDOW = 3, 4
 
@@ -117,8 +118,17 @@ def test_real_scans_give_rows_with_the_ratio_to_numpy(options, monkeypatch, tmp_
     assert all(row['x_numpy'] > 0.0 for row in rows)
 
 
+@pytest.fixture
+def driven(monkeypatch):
+    """Replace the real scans by a small one; return the names of the drives."""
+    points = np.random.default_rng(2).uniform(-5.0, 5.0, (500, 3)).astype(np.float32)
+    scans = [(name, np.asfortranarray(points)) for name in ('another', real.DRIVEN[0])]
+    monkeypatch.setattr(real, 'real_scans', lambda: scans)
+    return 'simulated street', real.DRIVEN[0]
+
+
 @pytest.mark.parametrize('name', ['mapping', 'scaling', 'compare'])
-def test_every_bench_of_times_gives_rows_of_figures(options, name, capsys):
+def test_every_bench_of_times_gives_rows_of_figures(options, name, driven, capsys):
     rows = bench.run([name], options)
 
     assert {row['voxel_m'] for row in rows} == {0.5, 0.2}
@@ -131,10 +141,13 @@ def test_every_bench_of_times_gives_rows_of_figures(options, name, capsys):
     assert len(printed) == len(rows) + 4
 
 
-def test_two_threads_are_compared_with_one_on_the_same_scans(options):
+def test_two_threads_are_compared_with_one_on_the_same_scans(options, driven):
     rows = bench.run(['threads'], options)
-    assert [(row['voxel_m'], row['way']) for row in rows] == [
-        (size_m, way) for size_m in (0.5, 0.2) for way in ('calls', 'Mapper', 'prepared')
+    assert [(row['scan'], row['voxel_m'], row['way']) for row in rows] == [
+        (scan, size_m, way)
+        for scan in driven
+        for size_m in (0.5, 0.2)
+        for way in ('calls', 'Mapper', 'prepared')
     ]
     for row in rows:
         assert row['turns'] == (options.untimed + SCANS) // SCANS - options.untimed // SCANS
@@ -174,13 +187,27 @@ def test_errors_are_angles_between_axes():
     assert found['mean_deg'] == pytest.approx((90.0 + np.degrees(np.arctan(0.75))) / 4)
 
 
-def test_the_stages_of_mapping_are_all_there(options):
+def test_the_stages_of_mapping_are_all_there(options, driven):
     rows = bench.run(['mapping'], options)
-    found = [(row['way'], row['stage']) for row in rows if row['voxel_m'] == 0.5]
-    assert found == [
+    stages = [
         *(('calls', s) for s in ('decode', 'reduce', 'insert', 'evict', 'normals', 'total')),
         *(('Mapper', s) for s in ('decode', 'reduce', 'insert', 'normals', 'total')),
     ]
+    found = [(row['scan'], row['way'], row['stage']) for row in rows if row['voxel_m'] == 0.5]
+    assert found == [(scan, *stage) for scan in driven for stage in stages]
+    street, moved = (row for row in rows if 'B_voxel' in row and row['voxel_m'] == 0.5)
+    assert min(street['B_voxel'], moved['B_voxel']) > 128.0  # a row, and its share of the table
+    assert moved['B_scan_voxel'] == 82.0  # moments of 78 bytes, and a row
+
+
+def test_a_moved_scan_is_the_same_at_every_pose(options):
+    points = np.random.default_rng(4).uniform(-5.0, 5.0, (77, 3)).astype(np.float32)
+    moved = MovedScan(options, points)
+    moved.prepare(3)
+    np.testing.assert_array_equal(np.load(moved.path(2)), points)
+    np.testing.assert_array_equal(to_scan(moved.message(1)).points, points)
+    assert moved.options.num_points == 77
+    np.testing.assert_array_equal(moved.pose(2), Street(options).pose(2))
 
 
 def test_the_windows_and_maps_compared_are_as_long_and_large_as_asked(options, monkeypatch):

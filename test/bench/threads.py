@@ -31,6 +31,7 @@ from surfel_mapper.simulation.recording import BASE, ODOM, SENSOR
 from surfel_mapper.threads import pool
 from test.bench.options import Options
 from test.bench.ours import Ours
+from test.bench.real import drives
 from test.bench.report import Row
 from test.bench.street import Street, SWEEP_S
 
@@ -120,14 +121,16 @@ class Prepared(ByMapper):
 
 
 def run(options: Options) -> list[Row]:
-    """Return a row for every voxel size and way."""
-    street = Street(options)
-    street.prepare(options.untimed + options.scans)
-    return [
-        compared(street, options, size_m, way)
-        for size_m in options.voxel_sizes_m
-        for way in (ByCalls, ByMapper, Prepared)
-    ]
+    """Return a row for every scan, voxel size and way."""
+    rows: list[Row] = []
+    for name, street, size in drives(options):
+        street.prepare(size.untimed + size.scans)
+        rows += [
+            {'scan': name, **compared(street, size, size_m, way)}
+            for size_m in options.voxel_sizes_m
+            for way in (ByCalls, ByMapper, Prepared)
+        ]
+    return rows
 
 
 def compared(
