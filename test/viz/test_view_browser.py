@@ -57,23 +57,24 @@ def ports_of(address):
 
 
 def drawn(page):
-    """Return the picture of the map, right of the panels and above the time line."""
+    """Return the picture of the map, below the title and above the time line."""
     shot = Image.open(io.BytesIO(page.screenshot())).convert('RGB')
-    return np.asarray(shot.crop((220, 70, 900, 660))) / np.float32(255.0)
+    return np.asarray(shot.crop((0, 70, 450, 320))) / np.float32(255.0)
 
 
 def test_a_map_is_drawn_in_a_browser(browser, served):
-    page = browser.new_page(viewport={'width': 900, 'height': 700})
+    # so small that the viewer leaves out its panels: a pixel costs the processor 20 us
+    page = browser.new_page(viewport={'width': 450, 'height': 350})
     page.set_default_timeout(1000 * WAIT_S)
     page.goto(f'{served}&renderer=webgl')
 
     def is_drawn(image):  # level ground is bluish; grid and text are grey
         colour = image[np.ptp(image, axis=2) > 0.05]
-        return len(colour) > 20_000 and (colour.argmax(axis=1) == 2).mean() > 0.9
+        return len(colour) > 5_000 and (colour.argmax(axis=1) == 2).mean() > 0.9
 
     assert is_drawn(picture_until(is_drawn, lambda: drawn(page)))
     before = drawn(page)
-    page.mouse.move(500, 400)
+    page.mouse.move(250, 200)
     page.mouse.wheel(0, -400)
     nearer = picture_until(lambda image: np.abs(image - before).mean() > 0.01, lambda: drawn(page))
     assert np.abs(nearer - before).mean() > 0.01
