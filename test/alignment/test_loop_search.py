@@ -15,7 +15,7 @@ from surfel_mapper.config import Config
 from surfel_mapper.errors import DependencyError
 from test.alignment.circuit import circuit, drifted, gap, SAME_WAY, THERE_AND_BACK
 
-SETTINGS = {'loops.recognise_distance_m': 10.0}
+SETTINGS = {'loops.recognise_distance_m': 20.0}
 
 
 def search(scans, poses, **changed):

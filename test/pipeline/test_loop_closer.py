@@ -60,7 +60,7 @@ def closure_at(poses):
 def test_the_map_equals_one_made_at_the_corrected_poses():
     seen = circuit(SAME_WAY)
     before = drifted(seen.poses)
-    mapper = mapper_of(**{'loops.recognise_distance_m': 10.0})
+    mapper = mapper_of(**{'loops.recognise_distance_m': 20.0})
     fed(mapper, seen.scans, before)
 
     move = mapper.close_loops()

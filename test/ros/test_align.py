@@ -144,7 +144,7 @@ def test_a_loop_moves_the_map_and_the_odometry_goes_on(start, peer, tmp_path):
     settings = {
         'loops.enabled': True,
         'loops.directory': str(tmp_path),
-        'loops.recognise_distance_m': 10.0,
+        'loops.recognise_distance_m': 20.0,
         'window.max_scans': 0,
         'window.keep_points': False,
     }
