@@ -45,9 +45,10 @@ demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it liv
 
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
 # one, and has a ROS domain of its own. Three keep two cores busy, as tests of nodes wait for each
-# other. TEST_PROCESSES=0 runs all in this process.
+# other. TEST_PROCESSES=0 runs all in this process. A thread of BLAS that waits for work computes:
+# with one in each process the models need a tenth less.
 test: $(STAMP)  ## all tests
-	PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
+	OPENBLAS_NUM_THREADS=1 PYTHONPATH=$(OUSTER)$${PYTHONPATH:+:$$PYTHONPATH} \
 	$(BIN)/python -m pytest -q -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder \
 		--durations=5 $(PYTEST_ARGS)
 

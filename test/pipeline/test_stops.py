@@ -90,9 +90,9 @@ def test_driving_and_braking_are_no_stops():
 def test_the_velocity_alone_is_not_believed_for_long(monkeypatch):
     for name in ('CLEARER', 'CLEARER_IF_ALL_STAYS'):  # the fit never tells
         monkeypatch.setattr(registration, name, np.inf)
-    monkeypatch.setattr(tracking, 'LONGEST_UNTOLD_S', 2.0)
-    mapper, errors_m = mapped(drive(ending(2.0), num_scans=50))
+    monkeypatch.setattr(tracking, 'LONGEST_UNTOLD_S', 1.0)
+    mapper, errors_m = mapped(drive(ending(1.0), num_scans=30))
     summary = mapper.summary()['registration']
     assert summary['tracking']['lost']['scans'] + summary['tracking']['unconfirmed']['scans']
-    assert max(errors_m) < SPEED_M_S * (2.0 + 0.5)
+    assert max(errors_m) < SPEED_M_S * (1.0 + 0.5)
     assert abs(errors_m[-1] - errors_m[-5]) < 0.05  # at rest again
