@@ -119,6 +119,8 @@ def load():
     """Load the modules of the verbs, and compile or load the kernels of a node."""
     from importlib import import_module
 
+    from rclpy.impl.rcutils_logger import CallerId
+
     from surfel_mapper.config import Config
     from surfel_mapper.pipeline import Mapper
 
@@ -130,6 +132,7 @@ def load():
         Mapper(config).warm_up()
         outputs.warm_up(config)
     load_type_supports()
+    CallerId()  # of the first message of a log: finds the files of all modules, .05 s in each node
     if threading.active_count() > 1:
         raise RuntimeError(f'threads do not survive a fork: {threading.enumerate()}')
     gc.collect()
