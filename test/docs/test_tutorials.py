@@ -104,6 +104,7 @@ def stripped(printed):
     return ''.join(f'{line.strip()}\n' for line in printed.splitlines())
 
 
+@pytest.mark.usefixtures('undrawn')
 @pytest.mark.parametrize('name', pages('console'))
 def test_every_command_of_a_tutorial_prints_what_is_shown(name, shell):
     if name == 'many_bags.md':
