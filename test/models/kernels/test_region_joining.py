@@ -11,10 +11,13 @@ from surfel_mapper.models.growth import owner_table, pieces_of
 from surfel_mapper.models.joining import join_patches, layers, single_regions, touching_regions
 from surfel_mapper.models.kernels import region_joining
 from surfel_mapper.models.kernels.region_joining import (
+    chunk_boxes,
     describe_regions,
     join_layers,
     join_pair,
     join_smooth,
+    REACH,
+    rows_near,
 )
 from surfel_mapper.models.thinning import thin
 from test.kernels.modes import both, interpreted
@@ -104,6 +107,24 @@ def test_joined_regions_are_chains_of_their_patches(call):
         assert regions.patches[region] == len(patches)
         assert regions.rows[region] == np.diff(given.starts)[patches].sum()
         assert (regions.root[patches] == region).all()
+
+
+@both
+def test_rows_near_a_small_region_are_all_within_reach(call):
+    given = pieces(*scene(0.005))
+    regions = single_regions(given, VIEW, (0.005, 0.0), SIZE_M)
+    call(join_pair, 7, 6, regions)  # two tiles of the floor, far from the wall
+    call(join_pair, 8, 6, regions)
+    regions.extent[9] = 0.3
+    boxes = call(chunk_boxes, given.means)
+    state = given.means, given.weights, given.starts, boxes, 0.0
+    found = call(rows_near, 6, 9, state, regions)
+    floor = np.arange(given.starts[6], given.starts[9])
+    away = np.linalg.norm(given.means[floor] - regions.mean[9], axis=1)
+    near = floor[away < REACH * 0.3]
+    assert 0 < len(near) < 0.5 * len(floor)
+    assert sorted(found.tolist()) == near.tolist()
+    assert len(call(rows_near, 9, 9, state, regions)) == given.starts[10] - given.starts[9]
 
 
 @both
