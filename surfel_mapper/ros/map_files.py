@@ -19,6 +19,9 @@ from surfel_mapper.files.ply import write_surfels
 from surfel_mapper.pipeline import Mapper
 from surfel_mapper.pipeline.saved_state import layer_files, load_mapper, save_mapper
 
+MAX_PATH = 4096
+"""Characters of a path, as many as Linux takes; resolving one takes 20 us a component."""
+
 
 def save_map(mapper: Mapper) -> str:
     """
@@ -99,6 +102,8 @@ def directory_of(output: OutputConfig) -> Path:
 
 def path_inside(directory: Path, url: str) -> Path:
     """Return the full path of a map in a directory; raise ConfigError if it is outside."""
+    if len(url) > MAX_PATH:
+        raise ConfigError(f'map_url: {len(url)} characters, expected {MAX_PATH} at most')
     try:
         parts = urlsplit(url)
     except ValueError as error:
@@ -118,6 +123,8 @@ def path_inside(directory: Path, url: str) -> Path:
 
 def is_inside(directory: Path, path: Path) -> bool:
     """Return whether a path is inside a directory, after resolving links and ``..``."""
+    if len(str(path)) > MAX_PATH:
+        return False
     try:
         with suppress(FileNotFoundError, NotADirectoryError):
             path.resolve(strict=True)  # fails at a link that leads to itself

@@ -356,6 +356,22 @@ def test_columns_that_are_not_read_are_not_copied():
         tracemalloc.stop()
 
 
+@finding(
+    '`~/load_map` of a path of 1 MB, 350,000 directories',
+    before='stopped mapping for 20 s',
+    now='refused: 4,096 characters',
+)
+def test_a_path_of_hundreds_of_thousands_of_directories_is_not_resolved(tmp_path, monkeypatch):
+    pytest.importorskip('rclpy')
+    from surfel_mapper.ros.map_files import is_inside, path_inside
+
+    monkeypatch.setattr(os, 'lstat', lambda path: pytest.fail('it is resolved'))
+    with pytest.raises(ConfigError, match='map_url: 1048576 characters, expected 4096 at most'):
+        path_inside(tmp_path, ('/oh' * 349_526)[: 1 << 20])
+    long = Path('/oh' * 20_000)
+    assert not is_inside(long, long / 'map.npz')
+
+
 @pytest.mark.parametrize('name', ['/dev/zero', 'pipe', 'large.yaml'])
 @finding('`filters: /dev/zero`, or a pipe', before='ended the node', now='refused: below 10 MB')
 def test_settings_are_read_from_small_regular_files_only(tmp_path, name):
