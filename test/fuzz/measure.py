@@ -30,7 +30,7 @@ from test.fuzz.oracle import checked_cost, Cost
 BATCH = 1000
 """Mutations of a seed of the random numbers."""
 
-LARGE_ONE_IN = 20
+LARGE_ONE_IN = 50
 """Number of mutations of which the last is enlarged, too."""
 
 
