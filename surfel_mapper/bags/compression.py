@@ -33,6 +33,10 @@ FLOOR_BYTES = 1 << 26
 MAX_FILE_RATIO = 100
 """Limit of the compression ratio of a whole file, above FLOOR_BYTES."""
 
+MAX_FRAMES, LEAST_FRAME_BYTES = 1000, 1 << 12
+"""Frames that a file may have, and bytes of it for each more; one takes 12 us to begin, and the
+recorder writes a single one."""
+
 SLOW_FLOOR_BYTES = 1 << 24
 """The same as FLOOR_BYTES for the chunks of a file in bz2, which takes 5 ns a byte; others 1."""
 
@@ -114,10 +118,13 @@ def unpack_file(path: Path, target: Path) -> bool:
     with open_packed(path) as source, open(target, 'wb') as sink:
         size = os.fstat(source.fileno()).st_size
         machine, left = decompressor('zstd'), max_unpacked_file_bytes(size)
+        frames = MAX_FRAMES + size // LEAST_FRAME_BYTES
         packed = source.read(PIECE_BYTES)
         while packed or not (machine.needs_input or machine.eof):
-            if machine.eof:  # the next frame
-                machine = decompressor('zstd')
+            if machine.eof:
+                machine, frames = decompressor('zstd'), frames - 1
+            if frames < 0:
+                raise BagError(f'{path}: more zstd frames than is plausible for its size')
             try:
                 piece = machine.decompress(packed, PIECE_BYTES * 16)
             except Exception as error:

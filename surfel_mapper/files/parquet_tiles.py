@@ -261,8 +261,10 @@ def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArr
         with _opened(path) as (content, _):
             footers[path] = content.metadata
         for group in range(footers[path].num_row_groups):
-            first = footers[path].row_group(group).column(0).statistics.min
-            blocks.setdefault(first >> BLOCK_BITS, []).append((path, group))
+            stated = footers[path].row_group(group).column(0).statistics
+            if stated is None or not isinstance(stated.min, int):
+                raise FileFormatError(f'{path}: row group {group} does not state its smallest i')
+            blocks.setdefault(stated.min >> BLOCK_BITS, []).append((path, group))
     wanted = ('i', *names) if names else INDEX
     for batch in _batches(blocks, footers):
         stacked = np.concatenate(

@@ -79,6 +79,8 @@ def limits() -> list[str]:
         f'(bz2: {compression.SLOW_FLOOR_BYTES >> 20}) or '
         f'{compression.MAX_FILE_RATIO} times the file',
         f'({bag_file.MESSAGE_BYTES} bytes each)',
+        f'{compression.MAX_FRAMES:,} frames of a packed file or one more per '
+        f'{compression.LEAST_FRAME_BYTES >> 10} KiB',
         f'{chunked.MAX_MESSAGES:,} messages or one per {chunked.LEAST_BYTES} bytes',
         f'{chunked.MAX_OTHERS:,} other records or one per {chunked.LEAST_OTHER_BYTES}',
         f'{chunked.MAX_CHUNKS:,} chunks or one per {chunked.LEAST_CHUNK_BYTES}',

@@ -479,6 +479,42 @@ def mcap_of_empty_messages(num_chunks, num_messages):
 
 
 @finding(
+    'mcap.zstd or db3.zstd of 1 MB, 116,000 frames of nothing',
+    before='1.4 s, 12 us a frame',
+    now='refused: 1,000 frames and one per 4 KiB',
+)
+def test_a_packed_file_of_empty_frames_is_refused(tmp_path, monkeypatch):
+    zstd = import_zstd()
+    path, made = tmp_path / 'a.zstd', []
+    begin = bag_compression.decompressor
+    monkeypatch.setattr(
+        bag_compression, 'decompressor', lambda kind: made.append(kind) or begin(kind)
+    )
+    path.write_bytes(zstd.compress(b'') * 116_000)
+    with pytest.raises(BagError, match='more zstd frames than is plausible for its size'):
+        unpack_file(path, tmp_path / 'a')
+    assert len(made) < 2000
+    path.write_bytes(zstd.compress(b'abc') * 900)
+    assert unpack_file(path, tmp_path / 'a')
+    assert (tmp_path / 'a').read_bytes() == b'abc' * 900
+
+
+def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
+    """Statistics without a least value, as damage leaves them, were a TypeError."""
+    parquet = pytest.importorskip('pyarrow.parquet')
+    from surfel_mapper.files.parquet_tiles import dataset_digest, write_tile
+
+    surfel_map = SurfelMap(0.5)
+    surfel_map.add(np.random.default_rng(3).uniform(-1.0, 1.0, (30, 3)))
+    path = tmp_path / 'tile_i=0' / 'tile_j=0' / 'surfels.parquet'
+    path.parent.mkdir(parents=True)
+    write_tile(path, surfel_map)
+    parquet.write_table(parquet.read_table(path, partitioning=None), path, write_statistics=False)
+    with pytest.raises(FileFormatError, match='row group 0 does not state its smallest i'):
+        dataset_digest(tmp_path)
+
+
+@finding(
     'mcap of 46 kB, 8 chunks of 60 MB of empty messages, no index',
     before='3.5 GB, 128 s',
     now='refused: below 300 MB, 5 s',
