@@ -183,6 +183,8 @@ def check_header(path: str | Path) -> None:
         if len(header) >= POINT_FORMAT_AT and header[POINT_FORMAT_AT] & PACKED:
             room = check_packed(path, file, header, size)
     header = header.ljust(HEADER_BYTES, b'\0')
+    if header[24] != 1:  # laspy looks at the second number alone, which selects the counts
+        raise FileFormatError(f'{path}: version {header[24]}.{header[25]}, expected 1.0 to 1.4')
     start, num_records, point_format, point_size, count = struct.unpack_from('<IIBHI', header, 96)
     num_extended = 0
     if header[24:26] >= b'\x01\x04':

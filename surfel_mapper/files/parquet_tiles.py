@@ -261,10 +261,8 @@ def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArr
         with _opened(path) as (content, _):
             footers[path] = content.metadata
         for group in range(footers[path].num_row_groups):
-            stated = footers[path].row_group(group).column(0).statistics
-            if stated is None or not isinstance(stated.min, int):
-                raise FileFormatError(f'{path}: row group {group} does not state its smallest i')
-            blocks.setdefault(stated.min >> BLOCK_BITS, []).append((path, group))
+            first = _least_i(path, footers[path], group)
+            blocks.setdefault(first >> BLOCK_BITS, []).append((path, group))
     wanted = ('i', *names) if names else INDEX
     for batch in _batches(blocks, footers):
         stacked = np.concatenate(
@@ -273,6 +271,16 @@ def _slices(paths: Sequence[Path], names: tuple[str, ...]) -> Iterator[npt.NDArr
         if len(batch) > 1:
             stacked = stacked[np.argsort(stacked[:, 0], kind='stable')]
         yield stacked[:, 1:] if names else pack_keys(stacked)
+
+
+def _least_i(path: Path, footer: Any, group: int) -> int:
+    """Return the least i of a row group as its footer states it."""
+    try:
+        return int(footer.row_group(group).column(0).statistics.min)
+    except Exception as error:  # pyarrow parses it here, and raises RuntimeError too
+        raise FileFormatError(
+            f'{path}: row group {group} does not state its smallest i: {error}'
+        ) from error
 
 
 def _batches(

@@ -514,6 +514,24 @@ def test_a_tile_that_does_not_state_its_voxels_is_refused(tmp_path):
         dataset_digest(tmp_path)
 
 
+@finding('LAZ of version 0.4, 766 bytes', before='1.7 GB', now='refused: below 10 MB')
+def test_las_of_another_version_is_refused(tmp_path):
+    """Laspy takes the count of version 1.4 by the second number, and sizes of layers are read."""
+    laspy = pytest.importorskip('laspy')
+    pytest.importorskip('lazrs')
+    path = tmp_path / 'a.laz'
+    data = laspy.LasData(laspy.LasHeader(point_format=6, version='1.4'))
+    data.x = data.y = data.z = np.arange(5.0)
+    data.write(str(path))
+    assert read_scan(path)[0].shape == (5, 3)
+    content = bytearray(path.read_bytes())
+    content[24] = 0
+    path.write_bytes(content)
+    error, peak = peak_of(lambda: read_scan(path))
+    assert 'a.laz: version 0.4, expected 1.0 to 1.4' in str(error)
+    assert peak < 10_000_000
+
+
 @finding(
     'mcap of 46 kB, 8 chunks of 60 MB of empty messages, no index',
     before='3.5 GB, 128 s',
