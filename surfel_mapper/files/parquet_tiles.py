@@ -10,6 +10,8 @@ can be merged in the order of voxels 32 voxels at a time, which is how the diges
 is computed with little memory.
 
 The file of a shard has a row group for every tile that it touches, with the moments only.
+
+Shards and tiles are one module because they share the schema, the opening and the row groups.
 """
 
 from __future__ import annotations
