@@ -25,8 +25,13 @@ from surfel_mapper.files.text_table import plain
 
 UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
-MOST_SECONDS = 10**11
-"""Limit of stamps without a unit: a larger one is not in seconds (3000 years)."""
+DECIMAL_UNITS_NS = {unit: Decimal(factor) for unit, factor in UNITS_NS.items()}
+
+MOST, MOST_SECONDS = Decimal(2**63), Decimal(10**11)
+"""Limits of stamps; a larger one without a unit is not in seconds (3000 years)."""
+
+SPACES = ' \t\n\r\x0b\x0c'
+"""The characters at which bytes.split splits; str.strip takes others too."""
 
 WIDTHS = 8, 40
 """Characters of numbers that are read all at a time: the time is that of the longest one."""
@@ -44,18 +49,21 @@ DATE, DATE_OF_NONE = b'0000-00-00T00:00:00', b'1970-01-01T00:00:00'
 
 def nanoseconds(text: str, where: str, unit: str = '') -> int:
     """Return a time rounded to nanoseconds; half of one to even."""
+    word = text.strip(SPACES)
     try:
-        number = Decimal(plain(text.strip()))
+        if not word.isprintable():  # Decimal takes the separators of ASCII for spaces
+            raise ValueError(f'{word!r} is no number')
+        number = Decimal(plain(word))
     except (InvalidOperation, ValueError) as error:
         raise FileFormatError(f'{where}: {text!r} is no time') from error
     if unit and unit not in UNITS_NS:
         raise FileFormatError(f'{where}: unit {unit!r}, expected one of {", ".join(UNITS_NS)}')
-    most = 2**63 if unit else MOST_SECONDS
-    if not number.is_finite() or not -most <= number <= most:
+    most = MOST if unit else MOST_SECONDS
+    if not number.is_finite() or not number.copy_abs() <= most:
         raise FileFormatError(
             f'{where}: time {text!r}, expected seconds (or a CSV column stamp_ns, stamp_us)'
         )
-    stamp_ns = int((number * UNITS_NS[unit or 's']).to_integral_value())
+    stamp_ns = int((number * DECIMAL_UNITS_NS[unit or 's']).to_integral_value())
     if not 0 <= stamp_ns <= MOST_NS:
         raise FileFormatError(f'{where}: time {text!r}, expected 0 to 292 years')
     return stamp_ns
@@ -161,8 +169,10 @@ def column_ns(rows: Rows, column: int, unit: str = '') -> npt.NDArray[np.int64]:
             text = padded[:, : lengths[taken].max()]
             unit_ns = UNITS_NS[unit or 's']
             stamps[taken], is_read[taken] = plain_ns(text, lengths[taken], unit_ns)
-    for row in np.flatnonzero(~is_read).tolist():
-        stamps[row] = nanoseconds(words[row].decode(), rows.lines.where(row), unit)
+    others = np.flatnonzero(~is_read)
+    lines = rows.lines.numbers[others].tolist()
+    for row, line in zip(others.tolist(), lines, strict=True):
+        stamps[row] = nanoseconds(words[row].decode(), f'{rows.lines.path}:{line}', unit)
     return stamps
 
 

@@ -180,6 +180,15 @@ def test_times_of_a_table_are_exact_to_the_last_nanosecond(tmp_path):
             nanoseconds(word, 'a')
 
 
+@pytest.mark.parametrize('word', ['7E+1\x1c', '\x1f5', '1e999999999', '-1e999999999', 'nan'])
+def test_times_with_separators_of_ascii_or_of_no_size_are_refused(tmp_path, word):
+    """Decimal takes separators for spaces: 7E+1 with one was read by itself, a line at a time."""
+    path = tmp_path / 'times.txt'
+    path.write_text(f'1\n{word}\n')
+    with pytest.raises(FileFormatError, match=r'times\.txt:2: '):
+        read_times(path)
+
+
 @pytest.mark.parametrize(
     'line',
     ['2011-13-26 13:02:25', '2011-09-26 13:02:25.x', '11-09-26 13:02:25', '1969-12-31 0:0:0'],
