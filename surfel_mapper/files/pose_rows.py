@@ -53,7 +53,7 @@ def quaternion_rows(rows: Rows, columns: list[int] | slice) -> Floats:
     found = rows.numbers(columns)
     with np.errstate(over='ignore'):
         x, y, z, w = np.square(found[:, 3:].T)
-        norm = np.sqrt(((x + y) + z) + w)  # the sum of pose_matrix, which says what is wrong
+        norm = np.sqrt(((x + y) + z) + w)  # in the order of pose_matrix, which refuses the same
     for row in np.flatnonzero(np.abs(norm - 1.0) > MAX_NORM_ERROR)[:1].tolist():
         try:
             pose_matrix(found[row, :3], found[row, 3:].tolist())

@@ -21,7 +21,7 @@ import numpy.typing as npt
 from surfel_mapper.budget import Budget
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.text_lines import read_lines, Rows, table_rows
-from surfel_mapper.files.text_table import plain
+from surfel_mapper.files.text_table import plain, SPACES
 
 UNITS_NS = {'s': 10**9, 'sec': 10**9, 'ms': 10**6, 'us': 10**3, 'ns': 1}
 
@@ -29,9 +29,6 @@ DECIMAL_UNITS_NS = {unit: Decimal(factor) for unit, factor in UNITS_NS.items()}
 
 MOST, MOST_SECONDS = Decimal(2**63), Decimal(10**11)
 """Limits of stamps; a larger one without a unit is not in seconds (3000 years)."""
-
-SPACES = ' \t\n\r\x0b\x0c'
-"""The characters at which bytes.split splits; str.strip takes others too."""
 
 WIDTHS = 8, 40
 """Characters of numbers that are read all at a time: the time is that of the longest one."""
@@ -49,7 +46,7 @@ DATE, DATE_OF_NONE = b'0000-00-00T00:00:00', b'1970-01-01T00:00:00'
 
 def nanoseconds(text: str, where: str, unit: str = '') -> int:
     """Return a time rounded to nanoseconds; half of one to even."""
-    word = text.strip(SPACES)
+    word = text.strip(SPACES.decode())
     try:
         if not word.isprintable():  # Decimal takes the separators of ASCII for spaces
             raise ValueError(f'{word!r} is no number')

@@ -25,7 +25,15 @@ import numpy.typing as npt
 
 from surfel_mapper.budget import Budget, open_regular
 from surfel_mapper.errors import FileFormatError
-from surfel_mapper.files.text_table import MAX_WORD_BYTES, NO_END, pieces_of, plain, real, reals
+from surfel_mapper.files.text_table import (
+    MAX_WORD_BYTES,
+    NO_END,
+    pieces_of,
+    plain,
+    real,
+    reals,
+    SPACES,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -47,8 +55,8 @@ MARK = b'\xef\xbb\xbf'
 
 NEWLINE, POINT, COMMA = (ord(character) for character in '\n.,')
 
-IS_SPACE = np.isin(np.arange(256), [*b' \t\n\r\x0b\x0c'])
-"""The bytes at which bytes.split splits."""
+IS_SPACE = np.isin(np.arange(256), [*SPACES])
+"""The bytes of SPACES."""
 
 IS_COMMENT = np.isin(np.arange(256), [*b'#%'])
 """The bytes that begin a comment."""

@@ -32,7 +32,8 @@ MAX_WORD_BYTES = 1 << 16
 SHORT_BYTES = 6
 """Mean length, with its space, of words that are remembered: few can differ."""
 
-SPACES = b' \n\r\t'
+SPACES = b' \t\n\r\x0b\x0c'
+"""The characters at which bytes.split splits; str.split and Decimal take others too."""
 
 NO_END = (
     'no end of line after the last number, which may be cut off; truncated? If it is complete, '

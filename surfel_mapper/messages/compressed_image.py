@@ -181,8 +181,9 @@ def checked_scans(data: bytes, topic: str) -> int:
 
 def bytes_of(mode: str, num_scans: int) -> int:
     """Return the memory that decoding takes per pixel, of an image in a mode of Pillow."""
-    grey = GREY_BYTES if mode in ENCODINGS else CONVERTED_BYTES
-    return (COLOR_BYTES if mode == 'RGB' else grey) + SCANS_BYTES * (num_scans > 1)
+    known = COLOR_BYTES if mode == 'RGB' else GREY_BYTES
+    decoded = known if mode in ENCODINGS else CONVERTED_BYTES
+    return decoded + SCANS_BYTES * (num_scans > 1)
 
 
 def check_size(
