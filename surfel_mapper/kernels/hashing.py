@@ -102,7 +102,7 @@ def find_row(key, rows, table, depth):
     """
     Return the row of a voxel, or -1 if not found.
 
-    rows  (R, 16) int64, the slab
+    rows  (R, 12) int64, the slab
     """
     directory, buckets, _, _ = table
     hashed = hash_key(key)

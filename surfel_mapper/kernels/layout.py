@@ -4,8 +4,13 @@
 Constants that all kernels of the map share: the lattice, the voxel key, a row of the slab.
 
 A voxel key packs the three indices, each of 21 bits and offset by 2^20, into 63 bits of an
-int64, x highest. A map keeps one row of 16 int64 for each voxel: 128 bytes, two neighbouring cache
-lines, so that a voxel costs one cache miss (separate arrays of each moment would cost thirteen).
+int64, x highest. A map keeps one row of 12 int64 for each voxel. Its 96 bytes lie in two
+neighbouring cache lines, so that a voxel costs one cache miss (separate arrays of each moment
+would cost thirteen); half of the rows of 13 or 14 words would lie in three.
+
+Sums of positions and of views need at most 47 bits. They are kept in the upper 48 bits of a word,
+and the lower 16 bits hold pieces of two other numbers; mapping/kernels/rows.py reads and writes
+them.
 
 Stands alone because files and messages read it too, which need no kernel.
 """
@@ -33,12 +38,22 @@ MAX_MAP_COUNT = 1 << 31
 VIEW_SCALE = 1 << 14
 """Length of the integer vectors that point from a voxel to the sensor."""
 
-# Columns of a row. A free row has COUNT 0 and the next free row in KEY.
+# Columns of a row. A free row has a count of 0 and the next free row in KEY.
 KEY = 0
-COUNT = 1
-VERSION = 2
+VIEW = 1
+"""Sums of the views along x and y; the lower 16 bits are the count, its lower half first."""
 SUM = 3
+"""Sums of x, y, z; the lower 16 bits are the sum of the views along z, its lowest third first."""
 PRODUCT = 6
-VIEW = 12
-ROW = 16
-"""The last column is unused: it pads the row to two cache lines."""
+"""Sums of products, order xx xy xz yy yz zz."""
+ROW = 12
+
+PIECE = 16
+"""Bits of a word of VIEW or SUM that belong to another number."""
+
+# Stamp of a row, kept beside the rows: the last change of its voxel. Bit 0 says that the change
+# emptied it, the 31 upper bits are the lower ones of the version of the map.
+EMPTIED = 1
+STAMPS = (1 << 32) - 1
+"""Mask of a stamp. Versions repeat after 2^31 changes, 1.7 years of a window at 20 scans/s. A row
+that stayed the same for as long counts as changed in a request for changes that old."""

@@ -15,14 +15,19 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VIEW
+from surfel_mapper.kernels.layout import BITS, ROW
+from surfel_mapper.mapping.channels import means
+from surfel_mapper.mapping.kernels.rows import write_rows
 from surfel_mapper.mapping.kernels.voxels import coarse_rows, sum_coarse
 from surfel_mapper.mapping.moments import ScanMoments
+from surfel_mapper.mapping.surfels import derive, Surfels
 
 
-def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
+def coarse_moments(
+    moments: ScanMoments, level: int, chosen: npt.NDArray[np.int64] | None = None
+) -> ScanMoments:
     """
-    Return the moments of voxels 2^level times larger, exactly.
+    Return the moments of voxels 2^level times larger, exactly, in the order of first appearance.
 
     Parameters
     ----------
@@ -30,20 +35,45 @@ def coarse_moments(moments: ScanMoments, level: int) -> ScanMoments:
         Moments of a map, with summed views.
     level : int
         0 or more.
+    chosen : (K,) int64, optional
+        The voxels, of those of the moments; by default all.
 
     """
-    slab, channels = coarse_slab(moments, np.arange(len(moments)), level)
+    chosen = np.arange(len(moments)) if chosen is None else chosen
+    keys, rows = coarse_keys(moments.key[chosen], level)
+    shapes = ((), (3,), (6,), (3,))
+    count, total, product, view = (np.zeros((len(keys), *shape), np.int64) for shape in shapes)
+    sums = count, total, product, view
+    sum_coarse(moments.arrays, chosen, rows, moments.level, level, sums)
+    channels = np.zeros((len(keys), moments.channels.shape[1]), np.int64)
+    if channels.size:
+        np.add.at(channels, rows, moments.channels[chosen])
     return replace(
         moments,
         voxel_size_m=moments.voxel_size_m * 2**level,
         level=moments.level + level,
-        key=slab[:, KEY].copy(),
-        count=slab[:, COUNT].copy(),
-        total=slab[:, SUM : SUM + 3].copy(),
-        product=slab[:, PRODUCT : PRODUCT + 6].copy(),
-        view=slab[:, VIEW : VIEW + 3].copy(),
+        key=keys.copy(),
+        count=count,
+        total=total,
+        product=product,
+        view=view,
         channels=channels,
     )
+
+
+def coarse_surfels(
+    moments: ScanMoments, level: int, chosen: npt.NDArray[np.int64], min_points: int
+) -> Surfels:
+    """Return the surfels of at least min_points points of ``coarse_moments``."""
+    coarse = coarse_moments(moments, level, chosen)
+    coarse = coarse.select(coarse.count >= min_points)
+    slab = np.empty((len(coarse), ROW), np.int64)
+    write_rows(coarse.arrays, slab)
+    surfels = derive(
+        slab, np.arange(len(slab), dtype=np.int32), coarse.voxel_size_m, BITS + coarse.level
+    )
+    channels = means(coarse.channels, coarse.count, coarse.channel_names)
+    return replace(surfels, channels=channels)
 
 
 def coarse_keys(
@@ -54,36 +84,3 @@ def coarse_keys(
     keys, rows = np.empty_like(key), np.empty(len(key), np.int32)
     num = coarse_rows(key, level, table, keys, rows)
     return keys[:num], rows
-
-
-def coarse_slab(
-    moments: ScanMoments, chosen: npt.NDArray[np.int64], level: int
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """
-    Return the exact sums of some voxels in voxels 2^level times larger.
-
-    Parameters
-    ----------
-    moments : ScanMoments
-        Moments of a map, with summed views.
-    chosen : (K,) int64
-        The voxels, of those of the moments.
-    level : int
-        0 or more.
-
-    Returns
-    -------
-    (C, 16) int64
-        Rows in the layout of kernels/layout.py, in the order of first appearance.
-    (C, number of channels) int64
-        Sums of the channels.
-
-    """
-    keys, rows = coarse_keys(moments.key[chosen], level)
-    slab = np.zeros((len(keys), ROW), np.int64)
-    slab[:, KEY] = keys
-    sum_coarse(moments.arrays, chosen, rows, moments.level, level, slab)
-    channels = np.zeros((len(keys), moments.channels.shape[1]), np.int64)
-    if channels.size:
-        np.add.at(channels, rows, moments.channels[chosen])
-    return slab, channels

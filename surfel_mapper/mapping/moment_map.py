@@ -28,6 +28,7 @@ from surfel_mapper.arguments import as_array, as_numbers, as_whole
 from surfel_mapper.errors import MapError, MapLimitError, NotInMapError
 from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.channels import channel_names
+from surfel_mapper.mapping.kernels.rows import read_rows
 from surfel_mapper.mapping.moments import (
     check_arrays,
     check_possible,
@@ -246,7 +247,7 @@ class MomentMap:
 
         """
         if voxel_index is None:
-            chosen = self._table.changed_after(-1, 1)
+            chosen = self._table.occupied()
         else:
             index = as_array('voxel_index', voxel_index)
             if index.dtype.kind not in 'iu' or index.ndim != 2 or index.shape[1] != 3:
@@ -254,19 +255,22 @@ class MomentMap:
                 raise ValueError(f'voxel_index: {kind}, expected integers (K, 3)')
             chosen = self._table.find(np.unique(pack_keys(index)))
             chosen = chosen[chosen >= 0]
-        return self._moments_of(chosen[np.argsort(self._table.values(chosen, layout.KEY))])
+        return self._moments_of(chosen[np.argsort(self._table.keys(chosen))])
 
     def _moments_of(self, chosen: npt.NDArray[Any]) -> ScanMoments:
         """Return the moments of rows, in the given order; a copy."""
-        rows = self._table.rows.array[chosen.astype(np.intp)]  # see VoxelTable.values
+        shapes = ((), (), (3,), (6,), (3,))
+        arrays = tuple(np.empty((len(chosen), *shape), np.int64) for shape in shapes)
+        read_rows(self._table.rows.array, chosen, arrays)
+        key, count, total, product, view = arrays
         return ScanMoments(
             voxel_size_m=self.voxel_size_m,
             level=self.level,
-            key=rows[:, layout.KEY].copy(),
-            count=rows[:, layout.COUNT].copy(),
-            total=rows[:, layout.SUM : layout.SUM + 3].copy(),
-            product=rows[:, layout.PRODUCT : layout.PRODUCT + 6].copy(),
-            view=rows[:, layout.VIEW : layout.VIEW + 3].copy(),
+            key=key,
+            count=count,
+            total=total,
+            product=product,
+            view=view,
             channel_names=self._channel_names,
             channels=self._table.channels(chosen),
         )
@@ -291,8 +295,7 @@ class MomentMap:
 
     def keys(self, min_points: int = 1) -> npt.NDArray[np.int64]:
         """Return the keys (K,) of the voxels of at least min_points points, in any order."""
-        rows = self._table.changed_after(-1, as_whole('min_points', min_points))
-        return self._table.values(rows, layout.KEY)
+        return self._table.keys(self._table.occupied(as_whole('min_points', min_points)))
 
     def find(self, key: npt.NDArray[np.int64]) -> npt.NDArray[np.int32]:
         """Return the row of each voxel key (K,), -1 if not found; valid until the map changes."""
@@ -301,8 +304,7 @@ class MomentMap:
     def keys_of(self, rows: npt.NDArray[np.int32]) -> npt.NDArray[np.int64]:
         """Return the voxel keys of rows (K,), -1 for empty rows."""
         rows = self._table.checked(rows)
-        key = self._table.values(rows, layout.KEY)
-        return np.where(self._table.values(rows, layout.COUNT) > 0, key, -1)
+        return np.where(self._table.counts(rows) > 0, self._table.keys(rows), -1)
 
     def rows_changed(self, since: int) -> npt.NDArray[np.int32]:
         """
@@ -311,8 +313,8 @@ class MomentMap:
         Rows from before the map was cleared (``cleared_at``, a version) are not included.
         """
         since = as_whole('since', since)
-        changed = self._changes.since(since, self._table.rows.array, 0)
-        return self._table.emptied_or_changed_after(since) if changed is None else changed
+        changed = self._changes.since(since, self._table, 0)
+        return self._table.changed_after(since, 0) if changed is None else changed
 
     def clear(self) -> None:
         """Remove all voxels."""
@@ -352,8 +354,7 @@ class MomentMap:
         if self._table.num_points + moments.num_points <= limit:
             return  # usual: even all points in one voxel would be allowed
         found = self._table.find(moments.key)
-        held = np.where(found >= 0, self._table.values(found, layout.COUNT), 0)
-        largest = int((held + moments.count).max(initial=0))
+        largest = int((self._table.counts(found) + moments.count).max(initial=0))
         if largest > limit:
             raise MapLimitError(
                 f'a voxel would hold {largest} points; at most {limit}: use smaller voxels '

@@ -31,22 +31,37 @@ of the time of a merge at 0.2 m."""
 
 class Slab:
     """
-    Rows of int64, zero until written.
+    Rows of integers, zero until written.
+
+    Parameters
+    ----------
+    num_rows : int
+        Number of rows.
+    width : int
+        Number of columns.
+    dtype : type
+        Type of an integer.
 
     Attributes
     ----------
-    array : (R, width) int64, C order
+    array : (R, width), C order
         The rows; replaced when the slab grows, so it must not be kept.
 
     """
 
-    def __init__(self, num_rows: int, width: int) -> None:
-        self._width = width
-        self._memory = _anonymous(num_rows * width * 8)
-        self._array: npt.NDArray[np.int64] | None = None
+    def __init__(self, num_rows: int, width: int, dtype: type[np.integer[Any]] = np.int64) -> None:
+        self._shape = num_rows, width
+        self._dtype = np.dtype(dtype)
+        self._memory = _anonymous(num_rows * self.row_bytes)
+        self._array: npt.NDArray[Any] | None = None
 
     @property
-    def array(self) -> npt.NDArray[np.int64]:
+    def row_bytes(self) -> int:
+        """Size of a row, bytes."""
+        return self._shape[1] * self._dtype.itemsize
+
+    @property
+    def array(self) -> npt.NDArray[Any]:
         """The rows; made again after growing, also if there was no memory for it then."""
         if self._array is None:
             self._array = self._view()
@@ -62,13 +77,14 @@ class Slab:
             If the system refuses the memory.
 
         """
-        num_bytes = num_rows * self._width * 8
+        num_bytes = num_rows * self.row_bytes
         self._array = None  # a view would pin the memory
         try:
             self._memory.resize(num_bytes)
         except (BufferError, SystemError, OSError, ValueError):
             # a view is held elsewhere, the system has no mremap, or memory is exhausted
             self._memory = self._copied(num_bytes)
+        self._shape = num_rows, self._shape[1]
         if num_bytes >= HUGE_FROM and hasattr(mmap, 'MADV_HUGEPAGE'):
             with contextlib.suppress(OSError):  # only a hint
                 self._memory.madvise(mmap.MADV_HUGEPAGE)
@@ -85,8 +101,9 @@ class Slab:
         memory[: len(self._memory)] = self._memory[:]
         return memory
 
-    def _view(self) -> npt.NDArray[np.int64]:
-        return np.frombuffer(self._memory, dtype=np.int64).reshape(-1, self._width)
+    def _view(self) -> npt.NDArray[Any]:
+        num_rows, width = self._shape  # memory may be larger, it has whole pages
+        return np.frombuffer(self._memory, self._dtype, num_rows * width).reshape(self._shape)
 
 
 def _anonymous(num_bytes: int) -> mmap.mmap:

@@ -244,14 +244,14 @@ class SurfelMap(MomentMap):
         """
         min_points = as_whole('min_points', min_points)
         if at_most is None:
-            return self._derive(self._table.changed_after(-1, min_points))
+            return self._derive(self._table.occupied(min_points))
         if as_whole('at_most', at_most) < 0:
             raise ValueError(f'at_most: {at_most}, expected 0 or more')
         return self._derive(self._table.thinned(min_points, at_most))
 
     def num_surfels(self, min_points: int = 1) -> int:
         """Return the number of voxels of at least min_points points."""
-        return len(self._table.changed_after(-1, as_whole('min_points', min_points)))
+        return len(self._table.occupied(as_whole('min_points', min_points)))
 
     def surfels_of(self, rows: npt.NDArray[np.int32]) -> Surfels:
         """Return the surfels of rows (K,) that ``find`` returned; IndexError for others."""
@@ -282,9 +282,10 @@ class SurfelMap(MomentMap):
             since = as_whole('since', since)
         else:
             since, self._reported = max(self._reported, self.cleared_at), self.version
-        changed = self._changes.since(since, self._table.rows.array, max(min_points, 1))
+        least = max(min_points, 1)
+        changed = self._changes.since(since, self._table, least)
         if changed is None:
-            changed = self._table.changed_after(since, min_points)
+            changed = self._table.changed_after(since, least)
         return self._derive(changed)
 
     def index(self, min_points: int = 1) -> SurfelIndex:
@@ -333,7 +334,7 @@ class SurfelMap(MomentMap):
                 raise ValueError(f'within: {within!r:.60}, expected two voxel indices, i j k')
             fine = self._moments_of(self._table.find(self._table.keys_in_box(*within)))
         else:
-            fine = self._moments_of(self._table.changed_after(-1, 1))
+            fine = self._moments_of(self._table.occupied())
         coarse.insert(coarse_moments(fine, level))
         return coarse
 

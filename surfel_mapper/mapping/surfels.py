@@ -258,7 +258,7 @@ def derive(
 
     Parameters
     ----------
-    rows : (R, 16) int64
+    rows : (R, 12) int64
         In the layout of kernels/layout.py.
     chosen : (K,) int32
         Rows that hold points.

@@ -8,7 +8,8 @@ buckets grow without being copied and a full segment of the hash table splits se
 no scan waits while the whole map is rehashed.
 
 ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
-every row of the map. It is bounded; a request for older changes looks at all rows.
+the stamp of every row. It is bounded: where it would hold a quarter of the rows, looking at all
+stamps, one after the other, takes no longer.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ from surfel_mapper.mapping.kernels.queries import (
     rows_changed_at,
     rows_held,
 )
+from surfel_mapper.mapping.kernels.rows import read_counts
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
@@ -50,7 +52,7 @@ LEAST = 1 << 18
 
 class VoxelTable:
     """
-    Rows of voxels in the layout of kernels/layout.py, and the hash table that finds them.
+    Rows of voxels and their stamps (kernels/layout.py), and the hash table that finds them.
 
     Parameters
     ----------
@@ -60,12 +62,14 @@ class VoxelTable:
     Attributes
     ----------
     rows : Slab
-        The rows, 16 int64 each.
+        The rows, 12 int64 each.
 
     """
 
     def __init__(self, num_channels: int = 0) -> None:
         self.rows = Slab(1024, layout.ROW)
+        self._stamps = Slab(1024, 1, np.uint32)
+        self._version = 0
         self._channels = Slab(1024, num_channels) if num_channels else None
         self._hash = HashTable(MAX_DEPTH)
         self._state = self._hash.state
@@ -83,8 +87,9 @@ class VoxelTable:
     @property
     def nbytes(self) -> int:
         """Bytes in use for voxels and their hash table."""
-        width = layout.ROW + (self._channels.array.shape[1] if self._channels else 0)
-        return self._hash.rows_used * width * 8 + self._hash.nbytes
+        slabs = (self.rows, self._stamps, self._channels)
+        row_bytes = sum(slab.row_bytes for slab in slabs if slab)
+        return self._hash.rows_used * row_bytes + self._hash.nbytes
 
     def add(self, moments: ScanMoments, version: int) -> npt.NDArray[np.int32]:
         """
@@ -100,6 +105,7 @@ class VoxelTable:
 
         """
         arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
+        self._version = version
         found = np.full(num, -1, np.int32)
         reserve = np.empty(num * UNDO_BYTES, np.uint8)
         done = 0
@@ -109,9 +115,10 @@ class VoxelTable:
                     arrays,
                     view_is_sum,
                     self.rows.array,
+                    self._stamps.array.reshape(-1),
                     self._hash.arrays,
                     self._state,
-                    version,
+                    stamp_of(version),
                     done,
                     found,
                 )
@@ -155,13 +162,15 @@ class VoxelTable:
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
         fallen = np.empty(num, np.int64)
+        self._version = version
         missing, num_fallen = remove_moments(
             arrays,
             view_is_sum,
             self.rows.array,
+            self._stamps.array.reshape(-1),
             self._hash.arrays,
             self._state,
-            version,
+            stamp_of(version),
             rows,
             max(min_points, 1),
             fallen,
@@ -183,14 +192,20 @@ class VoxelTable:
             )
         return found.astype(np.int32, copy=False)
 
-    def values(self, chosen: npt.NDArray[Any], column: int) -> npt.NDArray[np.int64]:
+    def keys(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
         """
-        Return a column of some rows, (K,).
+        Return the voxel keys of some rows, (K,).
 
         With indices of another width than intp NumPy (2.4) may end the process when memory runs
         out, both in reading and in assigning.
         """
-        found: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), column]
+        found: npt.NDArray[np.int64] = self.rows.array[chosen.astype(np.intp), layout.KEY]
+        return found
+
+    def counts(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
+        """Return the numbers of points of some rows, (K,); 0 for rows of -1."""
+        found = np.empty(len(chosen), np.int64)
+        read_counts(self.rows.array, chosen, found)
         return found
 
     def channels(self, chosen: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
@@ -199,15 +214,27 @@ class VoxelTable:
             return np.empty((len(chosen), 0), np.int64)
         return np.asarray(self._channels.array[chosen.astype(np.intp)])
 
-    def changed_after(self, version: int, min_points: int) -> npt.NDArray[Any]:
-        """Return the rows of at least min_points points that were changed after a version."""
-        used = self._hash.rows_used
-        return np.asarray(rows_changed_after(self.rows.array, used, version, max(min_points, 1)))
+    def changed_after(self, version: int, min_points: int) -> npt.NDArray[np.int32]:
+        """
+        Return the rows of at least min_points points that were changed after a version.
 
-    def emptied_or_changed_after(self, version: int) -> npt.NDArray[Any]:
-        """Return the rows changed after a version, including emptied ones."""
-        used = self._hash.rows_used
-        return np.asarray(rows_changed_after(self.rows.array, used, version, 0))
+        With min_points of 0 emptied rows are included.
+        """
+        stamps, used = self._stamps.array.reshape(-1), self._hash.rows_used
+        stamp, changes = stamp_of(self._version), self._version - version
+        rows = rows_changed_after(self.rows.array, stamps, used, stamp, changes, min_points)
+        return np.asarray(rows)
+
+    def changed_at(
+        self, rows: npt.NDArray[np.int32], version: int, min_points: int
+    ) -> npt.NDArray[np.int32]:
+        """Return those of rows of at least min_points points last changed at a version."""
+        stamps, stamp = self._stamps.array.reshape(-1), stamp_of(version)
+        return np.asarray(rows_changed_at(self.rows.array, stamps, rows, stamp, min_points))
+
+    def occupied(self, min_points: int = 1) -> npt.NDArray[np.int32]:
+        """Return the rows of at least min_points points, one point at least."""
+        return self.changed_after(-1, max(min_points, 1))
 
     def keys_in_box(
         self, low: npt.NDArray[np.int64], high: npt.NDArray[np.int64]
@@ -236,6 +263,7 @@ class VoxelTable:
         """Enlarge the array that had no room for a new voxel."""
         num_rows = len(self.rows.array)
         if self._hash.lacks_row(num_rows):
+            self._stamps.grow(2 * num_rows)  # first: the rows tell how many there are
             self.rows.grow(2 * num_rows)
         else:
             self._hash.grow()
@@ -263,15 +291,15 @@ class ChangeLog:
             return
         self._entries.append((version, rows))
         self._num_rows += len(rows)
-        while self._num_rows > max(LEAST, num_voxels):
+        while self._num_rows > max(LEAST, num_voxels // 4):
             self._start, forgotten = self._entries.popleft()
             self._num_rows -= len(forgotten)
 
     def since(
-        self, version: int, slab: npt.NDArray[np.int64], min_points: int
+        self, version: int, table: VoxelTable, min_points: int
     ) -> npt.NDArray[np.int32] | None:
         """
-        Return the rows of at least min_points points changed after a version, each once.
+        Return the rows of a table of min_points points changed after a version, each once.
 
         With min_points of 0 emptied rows are included. None if the log does not reach back to
         the version.
@@ -279,8 +307,13 @@ class ChangeLog:
         if version < self._start:
             return None
         entries = takewhile(lambda entry: entry[0] > version, reversed(self._entries))
-        parts = [rows_changed_at(slab, rows, at, min_points) for at, rows in entries]
+        parts = [table.changed_at(rows, at, min_points) for at, rows in entries]
         return np.concatenate(parts) if parts else np.empty(0, np.int32)
+
+
+def stamp_of(version: int) -> int:
+    """Return the stamp of rows that a version changed; see kernels/layout.py."""
+    return version << 1 & layout.STAMPS
 
 
 def smallest(mixed: npt.NDArray[np.uint64], number: int) -> npt.NDArray[np.int64]:

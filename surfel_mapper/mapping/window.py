@@ -58,8 +58,8 @@ class WindowedScan:
         return self.moments.nbytes + sum(array.nbytes for array in kept)
 
 
-VOXEL_BYTES = 160
-"""A row of a voxel, 128 bytes, and its share of the hash table, at most 32."""
+VOXEL_BYTES = 128
+"""A row of a voxel with its stamp, 100 bytes, its share of free rows and of the hash table."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -12,17 +12,14 @@ discs together stay within a limit.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import numpy.typing as npt
 
 from surfel_mapper.kernels import layout
-from surfel_mapper.mapping.channels import means
-from surfel_mapper.mapping.coarsening import coarse_keys, coarse_slab
+from surfel_mapper.mapping.coarsening import coarse_keys, coarse_surfels
 from surfel_mapper.mapping.moments import ScanMoments, unpack_keys
 from surfel_mapper.mapping.surfel_map import SurfelMap
-from surfel_mapper.mapping.surfels import concatenated, derive, Surfels
+from surfel_mapper.mapping.surfels import concatenated, Surfels
 from surfel_mapper.threads import share, usable_cores
 
 Array = npt.NDArray[np.float64]
@@ -122,13 +119,7 @@ class DetailedMap:
 
     def surfels(self, tile: int, level: int) -> Surfels:
         """Return the surfels of a tile at a level."""
-        moments = self._moments
-        slab, sums = coarse_slab(moments, self._voxels(tile), level)
-        chosen = np.flatnonzero(slab[:, layout.COUNT] >= self._min_points).astype(np.int32)
-        bits = layout.BITS + moments.level + level
-        surfels = derive(slab, chosen, moments.voxel_size_m * 2**level, bits)
-        channels = means(sums[chosen], surfels.num_points, moments.channel_names)
-        return replace(surfels, channels=channels)
+        return coarse_surfels(self._moments, level, self._voxels(tile), self._min_points)
 
     def all_surfels(
         self, level: npt.NDArray[np.int64], tiles: npt.NDArray[np.int64] | None = None

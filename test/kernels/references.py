@@ -32,6 +32,7 @@ REFERENCES = {
     'layers/dynamic_objects/kernels/free_space.py': 'layers/test_free_space.py',
     'mapping/kernels/queries.py': 'mapping/kernels/test_queries.py',
     'mapping/kernels/reduction.py': 'mapping/kernels/test_reduction.py',
+    'mapping/kernels/rows.py': 'mapping/kernels/test_rows.py',
     'mapping/kernels/surfels.py': 'mapping/kernels/test_surfels.py',
     'mapping/kernels/voxels.py': 'mapping/kernels/test_voxels.py',
     'messages/kernels/attach.py': 'messages/test_scan_normals.py',

@@ -19,16 +19,17 @@ import numpy as np
 from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.grouping import find_key, hash_shift
 from surfel_mapper.kernels.layout import (
-    COUNT,
+    EMPTIED,
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
     KEY,
     ROW,
-    VERSION,
+    STAMPS,
 )
 from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.quantisation import in_range, pack
+from surfel_mapper.mapping.kernels.rows import count_of
 
 AHEAD = 16
 """Number of rows between the prefetch of a row and its use."""
@@ -137,37 +138,70 @@ def keys_in_box(rows, used, low, high):
         ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
         kz = (key & INDEX_MASK) - INDEX_OFFSET
         inside = low[0] <= kx <= high[0] and low[1] <= ky <= high[1] and low[2] <= kz <= high[2]
-        if inside and rows[row, COUNT] > 0:
+        if inside and count_of(rows, row) > 0:
             kept[num] = key
             num += 1
     return kept[:num].copy()
 
 
 @kernel()
-def rows_changed_at(rows, changed, version, min_points):
-    """Return the rows of at least min_points points that were last changed at a version."""
+def rows_changed_at(rows, stamps, changed, stamp, min_points):
+    """
+    Return the rows of at least min_points points whose last change has a stamp.
+
+    rows        (R, 12) int64, the slab
+    stamps      (R,) uint32, the last change of each row
+    changed     (K,) int32, the rows in question
+    stamp       uint32
+    min_points  0: emptied rows too
+
+    Stamps tell which rows are empty, so rows themselves are read only for a higher min_points.
+    """
     kept = np.empty(len(changed), np.int32)
-    flat = rows.ravel()
+    ignored = EMPTIED if min_points < 1 else 0
     num = 0
-    for place in range(len(changed)):
-        if place + AHEAD < len(changed):
-            prefetch(flat, np.int64(changed[place + AHEAD]) * ROW)
-        row = changed[place]
-        if rows[row, VERSION] == version and rows[row, COUNT] >= min_points:
-            kept[num] = row
-            num += 1
-    return kept[:num]
+    for row in changed:
+        kept[num] = row
+        num += (stamps[row] ^ stamp) <= ignored  # a branch would be mispredicted half of the time
+    return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]
+
+
+@njit(cache=True, nogil=True, inline='always')
+def keep_full(rows, kept, num, min_points):
+    """Move the rows of at least min_points points to the front; return their number."""
+    flat = rows.ravel()
+    num_full = 0
+    for place in range(num):
+        if place + AHEAD < num:
+            prefetch(flat, np.int64(kept[place + AHEAD]) * ROW)
+        row = kept[place]
+        kept[num_full] = row
+        num_full += count_of(rows, row) >= min_points
+    return num_full
 
 
 @kernel()
-def rows_changed_after(rows, used, version, min_points):
-    """Return the rows of at least min_points points that were changed after a version."""
+def rows_changed_after(rows, stamps, used, stamp, changes, min_points):
+    """
+    Return the rows of at least min_points points that the latest changes changed.
+
+    rows        (R, 12) int64, the slab
+    stamps      (R,) uint32, the last change of each row
+    used        number of rows ever used
+    stamp       uint32, of the latest change
+    changes     int64, number of changes
+    min_points  0: emptied rows too
+    """
     kept = np.empty(used, np.int32)
+    ignored = EMPTIED if min_points < 1 else 0
     num = 0
     for row in range(used):
-        if rows[row, VERSION] > version and rows[row, COUNT] >= min_points:
-            kept[num] = row
-            num += 1
+        last = np.int64(stamps[row])
+        age = (((stamp | EMPTIED) - last) & STAMPS) >> 1
+        kept[num] = row
+        num += (age < changes) & (last & EMPTIED <= ignored)
+    if min_points > 1:
+        num = keep_full(rows, kept, num, min_points)
     return kept[:num].copy()
 
 
@@ -193,14 +227,14 @@ def rows_held(rows, used, min_points, chosen, mixed):
     """
     List the rows of at least min_points points with their mixed keys; return their number.
 
-    rows    (R, 16) int64, the slab
+    rows    (R, 12) int64, the slab
     used    number of rows ever used
     chosen  (R,) int32, out
     mixed   (R,) uint64, out
     """
     num = 0
     for row in range(used):
-        if rows[row, COUNT] >= min_points:
+        if count_of(rows, row) >= min_points:
             chosen[num] = row
             mixed[num] = mix(rows[row, KEY])
             num += 1

@@ -15,18 +15,14 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.layout import (
-    COUNT,
     INDEX_BITS,
     INDEX_MASK,
     INDEX_OFFSET,
     KEY,
     PRODUCT,
-    ROW,
-    SUM,
-    VIEW,
 )
-from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.symmetric3 import decompose
+from surfel_mapper.mapping.kernels.rows import count_of, prefetch_row, sum_of, view_of
 
 CHUNK = 256
 """Voxels processed at once: their moments stay in the first-level cache."""
@@ -51,7 +47,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     """
     Derive the surfels of some rows of the slab.
 
-    rows        (R, 16) int64
+    rows        (R, 12) int64
     chosen      (K,) int32 or int64, rows to derive; each holds at least one point
     voxel_size  float64, m
     bits        a voxel is 2^bits lattice units wide
@@ -123,19 +119,18 @@ def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     for i in range(num):
         out = start + i
         if out + AHEAD < len(chosen):
-            prefetch(flat, np.int64(chosen[out + AHEAD]) * ROW)
-            prefetch(flat, np.int64(chosen[out + AHEAD]) * ROW + ROW // 2)
+            prefetch_row(flat, np.int64(chosen[out + AHEAD]))
         row = np.int64(chosen[out])
-        key, n = rows[row, KEY], rows[row, COUNT]
+        key, n = rows[row, KEY], count_of(rows, row)
         voxel_index[out, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
         voxel_index[out, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
         voxel_index[out, 2] = (key & INDEX_MASK) - INDEX_OFFSET
         num_points[out] = n
         most = max(most, n)
         moments[N, i] = n
+        moments[V, i], moments[V + 1, i], moments[V + 2, i] = view_of(rows, row)
         for axis in range(3):
-            moments[S + axis, i] = rows[row, SUM + axis]
-            moments[V + axis, i] = rows[row, VIEW + axis]
+            moments[S + axis, i] = sum_of(rows, row, axis)
         for pair in range(6):
             moments[P + pair, i] = rows[row, PRODUCT + pair]
     return most
@@ -174,15 +169,15 @@ def center_exactly(rows, chosen, start, num, scatter):
     """Compute the scatters as ``center`` does, in int64, which is exact for any count."""
     for i in range(num):
         row = np.int64(chosen[start + i])
-        n = rows[row, COUNT]
+        n = count_of(rows, row)
         inverse = 1.0 / n
         pair = 0
         for a in range(3):
-            sa = rows[row, SUM + a]
+            sa = sum_of(rows, row, a)
             ca = np.int64(np.rint(sa * inverse))
             da = sa - n * ca
             for b in range(a, 3):
-                sb = rows[row, SUM + b]
+                sb = sum_of(rows, row, b)
                 cb = np.int64(np.rint(sb * inverse))
                 db = sb - n * cb
                 about = rows[row, PRODUCT + pair] - ca * sb - cb * da

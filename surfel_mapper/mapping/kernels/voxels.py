@@ -7,6 +7,9 @@ All are integer sums by voxel, so that a subtraction undoes an addition to the b
 Rows of the slab are visited in the order of the scan; the hash bucket, the count of its segment
 and the row of later voxels are prefetched, which hides most of the cache misses.
 
+The stamps of rows are written in a loop of their own. Among the accesses to rows they make adding
+1.2 times as long at 10^6 voxels, 4 MB of stamps; afterwards 1.05 times.
+
 A voxel of level L consists of 2^L finer voxels an axis and keeps their lattice unit. A point at q
 about the centre of its fine voxel lies at q + d about the coarse centre, d an integer vector: the
 sum becomes S + n d, the second moment M + d S^T + S d^T + n d d^T.
@@ -41,7 +44,7 @@ from surfel_mapper.kernels.hashing import (
 )
 from surfel_mapper.kernels.layout import (
     BITS,
-    COUNT,
+    EMPTIED,
     HALF,
     INDEX_BITS,
     INDEX_MASK,
@@ -49,12 +52,16 @@ from surfel_mapper.kernels.layout import (
     KEY,
     PRODUCT,
     ROW,
-    SUM,
-    VERSION,
-    VIEW,
     VIEW_SCALE,
 )
 from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.mapping.kernels.rows import (
+    add_to_row,
+    count_of,
+    prefetch_row,
+    sum_of,
+    view_of,
+)
 
 AHEAD = 16
 """Number of voxels between the prefetch of a row and its use."""
@@ -63,7 +70,7 @@ BLOCK = 32
 """Voxels looked up together: prefetch all buckets, then all rows, then use the rows."""
 
 
-LATER = SUM
+LATER = PRODUCT
 """Column of a free row: the row that is taken AHEAD new voxels later, to be prefetched, or -1."""
 
 SLACK = 1.0 + 1e-9
@@ -75,7 +82,7 @@ def look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, lik
     """
     Find the likely rows of num voxels from start on, and prefetch them.
 
-    flat    (R * 16,) int64, the rows
+    flat    (R * 12,) int64, the rows
     hashes  (BLOCK,) int64, out
     likely  (BLOCK,) int64, out: a row with the hash of the voxel, to be confirmed by its key;
             -1 if not found
@@ -90,8 +97,7 @@ def look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, lik
         row = likely_row(hashes[i], directory, buckets, depth)
         likely[i] = row
         if row >= 0:
-            prefetch(flat, row * ROW)
-            prefetch(flat, row * ROW + ROW // 2)
+            prefetch_row(flat, row)
 
 
 @kernel()
@@ -117,13 +123,14 @@ def find_rows(keys, rows, table, state, found):
 
 
 @kernel()
-def add_moments(moments, view_weight, rows, table, state, version, start, found):
+def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, found):
     """
     Add the moments of a scan from voxel start on; return the number of voxels done.
 
     moments      keys (K,) int64, count (K,), total (K, 3), product (K, 6), view (K, 3)
     view_weight  0: the view is multiplied by the count; 1: it is a sum already
-    version      int64, marks the rows as changed
+    stamps       (R,) uint32, out: the last change of each row
+    stamp        uint32, of this change; see kernels/layout.py
     found        (K,) int32, out: row of each voxel
 
     Fewer than K are done if slab, segments or directory have no room for a new voxel: make room
@@ -149,10 +156,12 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
                 full = is_full(hashes[i], directory, held, depth)
                 if full and not makes_room(hashes[i], table, state):
                     state[POINTS] += num_points
+                    set_stamps(stamps, found[start:place], stamp)
                     return place
                 row = take_row(rows, flat, state)
                 if row < 0:
                     state[POINTS] += num_points
+                    set_stamps(stamps, found[start:place], stamp)
                     return place
                 for column in range(ROW):
                     rows[row, column] = 0
@@ -161,11 +170,18 @@ def add_moments(moments, view_weight, rows, table, state, version, start, found)
                 state[VOXELS] += 1
             num_points += np.int64(count[place])
             change_row(moments, view_weight, rows, row, place, 1)
-            rows[row, VERSION] = version
             found[place] = row
         done += num
     state[POINTS] += num_points
+    set_stamps(stamps, found[start:done], stamp)
     return done
+
+
+@njit(cache=True, nogil=True, inline='always')
+def set_stamps(stamps, found, stamp):
+    """Stamp the rows (K,) int32."""
+    for row in found:
+        stamps[row] = stamp
 
 
 @njit(cache=True, nogil=True, inline='always')
@@ -176,8 +192,7 @@ def take_row(rows, flat, state):
         state[FREE_ROW] = rows[row, KEY]
         later = rows[row, LATER]
         if later >= 0:
-            prefetch(flat, later * ROW)
-            prefetch(flat, later * ROW + ROW // 2)
+            prefetch_row(flat, later)
     elif state[ROWS_USED] < len(rows):
         row = state[ROWS_USED]
         state[ROWS_USED] = row + 1
@@ -185,11 +200,14 @@ def take_row(rows, flat, state):
 
 
 @kernel()
-def remove_moments(moments, view_weight, rows, table, state, version, found, min_points, fallen):
+def remove_moments(
+    moments, view_weight, rows, stamps, table, state, stamp, found, min_points, fallen
+):
     """
     Subtract moments, or nothing if a voxel does not hold them; free the rows that become empty.
 
-    version     int64, marks the rows as changed
+    stamps      (R,) uint32, out: the last change of each row
+    stamp       uint32, of this change; see kernels/layout.py
     found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
     fallen      (K,) int64, out: keys of the voxels that held min_points before and hold fewer now
@@ -205,25 +223,23 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
     directory, buckets, num_held, _ = table
     used, depth = state[ROWS_USED], state[DEPTH]
     flat = rows.ravel()
-    emptied, versions = np.empty(len(keys), np.int32), np.empty(len(keys), np.int64)
+    emptied = np.empty(len(keys), np.int32)
     num_emptied = num_fallen = 0
     num_points = np.int64(0)
     for place in range(len(keys)):
         if place + AHEAD < len(keys):
             ahead = np.int64(found[place + AHEAD])
             if 0 <= ahead < used:
-                prefetch(flat, ahead * ROW)
-                prefetch(flat, ahead * ROW + ROW // 2)
+                prefetch_row(flat, ahead)
         key, n = keys[place], np.int64(count[place])
         row = np.int64(found[place])
-        if not (0 <= row < used and rows[row, KEY] == key and rows[row, COUNT] > 0):
+        if not (0 <= row < used and rows[row, KEY] == key and count_of(rows, row) > 0):
             row = find_row(key, rows, table, depth)
             found[place] = row
-        held = rows[row, COUNT] if row >= 0 else np.int64(-1)
+        held = count_of(rows, row) if row >= 0 else np.int64(-1)
         if held < n or (held == n and not holds_exactly(moments, view_weight, rows, row, place)):
             for done in range(place):
                 change_row(moments, view_weight, rows, np.int64(found[done]), done, 1)
-                rows[found[done], VERSION] = versions[done]
             return place, 0
         if held >= min_points > held - n:
             fallen[num_fallen] = key
@@ -232,10 +248,9 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
             emptied[num_emptied] = place
             num_emptied += 1
         change_row(moments, view_weight, rows, row, place, -1)
-        versions[place] = rows[row, VERSION]
-        rows[row, VERSION] = version
         num_points += n
     state[POINTS] -= num_points
+    set_stamps(stamps, found, stamp)
     state[VOXELS] -= num_emptied
     for i in range(num_emptied):
         if i + AHEAD < num_emptied:
@@ -247,6 +262,7 @@ def remove_moments(moments, view_weight, rows, table, state, version, found, min
         place = emptied[i]
         row = np.int64(found[place])
         remove_entry(keys[place], row, directory, buckets, num_held, depth)
+        stamps[row] = stamp | EMPTIED
         rows[row, KEY] = state[FREE_ROW]
         rows[row, LATER] = np.int64(found[emptied[i - AHEAD]]) if i >= AHEAD else np.int64(-1)
         state[FREE_ROW] = row
@@ -259,10 +275,11 @@ def change_row(moments, view_weight, rows, row, place, sign):
     _, count, total, product, view = moments
     n = np.int64(count[place])
     weight = sign * (n if view_weight == 0 else np.int64(1))
-    rows[row, COUNT] += sign * n
-    for axis in range(3):
-        rows[row, SUM + axis] += sign * total[place, axis]
-        rows[row, VIEW + axis] += weight * view[place, axis]
+    sx, sy, sz = total[place, 0], total[place, 1], total[place, 2]
+    vx, vy, vz = view[place, 0], view[place, 1], view[place, 2]
+    sums = sign * np.int64(sx), sign * np.int64(sy), sign * np.int64(sz)
+    views = weight * np.int64(vx), weight * np.int64(vy), weight * np.int64(vz)
+    add_to_row(rows, row, sign * n, sums, views)
     for pair in range(6):
         rows[row, PRODUCT + pair] += sign * product[place, pair]
 
@@ -272,10 +289,12 @@ def holds_exactly(moments, view_weight, rows, row, place):
     """Return whether the sums of a row are the moments of a voxel."""
     _, count, total, product, view = moments
     weight = np.int64(count[place]) if view_weight == 0 else np.int64(1)
-    equal = True
+    x, y, z = view_of(rows, row)
+    equal = x == weight * view[place, 0]
+    equal &= y == weight * view[place, 1]
+    equal &= z == weight * view[place, 2]
     for axis in range(3):
-        equal &= rows[row, SUM + axis] == total[place, axis]
-        equal &= rows[row, VIEW + axis] == weight * view[place, axis]
+        equal &= sum_of(rows, row, axis) == total[place, axis]
     for pair in range(6):
         equal &= rows[row, PRODUCT + pair] == product[place, pair]
     return equal
@@ -316,7 +335,7 @@ def coarse_rows(fine_keys, level, table, keys, rows):
 
 
 @kernel()
-def sum_coarse(moments, chosen, rows, fine_level, level, slab):
+def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
     """
     Sum the moments of voxels in rows of voxels 2^level times larger.
 
@@ -324,9 +343,10 @@ def sum_coarse(moments, chosen, rows, fine_level, level, slab):
     chosen      (K,) int64, the voxels to sum, of the N
     rows        (K,) int32, row of the coarse voxel of each, as coarse_rows finds it
     fine_level  level of the given moments
-    slab        (C, 16) int64, zeros, out; the keys are not written
+    coarse      count (C,) int64, total (C, 3), product (C, 6), view (C, 3), zeros, out
     """
     fine_keys, count, total, product, view = moments
+    counts, sums, products, views = coarse
     fine = np.int64(1) << (BITS + fine_level)
     middle = fine // 2 - (fine << level) // 2
     below = (np.int64(1) << level) - 1
@@ -342,18 +362,18 @@ def sum_coarse(moments, chosen, rows, fine_level, level, slab):
         dy = (y & below) * fine + middle
         dz = (z & below) * fine + middle
         sx, sy, sz = np.int64(total[i, 0]), np.int64(total[i, 1]), np.int64(total[i, 2])
-        slab[row, COUNT] += n
-        slab[row, SUM] += sx + n * dx
-        slab[row, SUM + 1] += sy + n * dy
-        slab[row, SUM + 2] += sz + n * dz
-        slab[row, PRODUCT] += product[i, 0] + dx * sx + dx * sx + n * dx * dx
-        slab[row, PRODUCT + 1] += product[i, 1] + dx * sy + dy * sx + n * dx * dy
-        slab[row, PRODUCT + 2] += product[i, 2] + dx * sz + dz * sx + n * dx * dz
-        slab[row, PRODUCT + 3] += product[i, 3] + dy * sy + dy * sy + n * dy * dy
-        slab[row, PRODUCT + 4] += product[i, 4] + dy * sz + dz * sy + n * dy * dz
-        slab[row, PRODUCT + 5] += product[i, 5] + dz * sz + dz * sz + n * dz * dz
+        counts[row] += n
+        sums[row, 0] += sx + n * dx
+        sums[row, 1] += sy + n * dy
+        sums[row, 2] += sz + n * dz
         for axis in range(3):
-            slab[row, VIEW + axis] += np.int64(view[i, axis])
+            views[row, axis] += np.int64(view[i, axis])
+        products[row, 0] += product[i, 0] + dx * sx + dx * sx + n * dx * dx
+        products[row, 1] += product[i, 1] + dx * sy + dy * sx + n * dx * dy
+        products[row, 2] += product[i, 2] + dx * sz + dz * sx + n * dx * dz
+        products[row, 3] += product[i, 3] + dy * sy + dy * sy + n * dy * dy
+        products[row, 4] += product[i, 4] + dy * sz + dz * sy + n * dy * dz
+        products[row, 5] += product[i, 5] + dz * sz + dz * sz + n * dz * dz
 
 
 @kernel()

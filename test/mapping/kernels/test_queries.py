@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.grouping import build_table
-from surfel_mapper.kernels.layout import BITS, COUNT, KEY, ROW, VERSION
+from surfel_mapper.kernels.layout import BITS, KEY
 from surfel_mapper.mapping.kernels.queries import (
     best_around,
     keys_in_box,
@@ -20,6 +20,7 @@ from surfel_mapper.mapping.kernels.queries import (
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test.kernels.modes import both
+from test.mapping.kernels.packed_rows import slab_of
 
 GOLDEN, WORD = 0x9E3779B97F4A7C15, 2**64
 
@@ -50,13 +51,12 @@ def surfels():
 
 
 def slab(num=200):
-    """Return rows of which some are empty, at a few versions."""
+    """Return rows of which some are empty, their counts, versions and stamps."""
     rng = np.random.default_rng(2)
-    rows = np.zeros((num, ROW), np.int64)
-    rows[:, KEY] = pack_keys(rng.permutation(np.stack([np.arange(num) - 90] * 3, axis=1)))
-    rows[:, COUNT] = rng.integers(0, 5, num)
-    rows[:, VERSION] = rng.integers(1, 6, num)
-    return rows
+    keys = pack_keys(rng.permutation(np.stack([np.arange(num) - 90] * 3, axis=1)))
+    count, version = rng.integers(0, 5, num), rng.integers(1, 6, num)
+    stamps = (2 * version + (count == 0)).astype(np.uint32)
+    return slab_of(keys, [[n, *range(12)] for n in count]), count, version, stamps
 
 
 @both
@@ -101,34 +101,47 @@ def test_the_best_surfels_around_a_point_are_those_of_a_linear_search(
 
 @both
 def test_occupied_voxels_in_a_box_are_listed(call):
-    rows, used = slab(), 150
+    (rows, count, _, _), used = slab(), 150
     low, high = np.array([-20, -90, -15]), np.array([30, 25, 90])
     index = unpack_keys(rows[:used, KEY])
-    inside = ((index >= low) & (index <= high)).all(axis=1) & (rows[:used, COUNT] > 0)
+    inside = ((index >= low) & (index <= high)).all(axis=1) & (count[:used] > 0)
     np.testing.assert_array_equal(
         call(keys_in_box, rows, used, low, high), rows[:used, KEY][inside]
     )
 
 
 @both
-@pytest.mark.parametrize('min_points', [0, 1, 3])
+@pytest.mark.parametrize('min_points', [0, 1, 2, 3])
 def test_changed_rows_are_those_of_the_version(call, min_points):
-    rows, changed = slab(), np.random.default_rng(4).permutation(200)[:120].astype(np.int32)
-    held = rows[:, COUNT] >= min_points
-    at = changed[(rows[changed, VERSION] == 3) & held[changed]]
-    np.testing.assert_array_equal(call(rows_changed_at, rows, changed, 3, min_points), at)
-    after = np.flatnonzero((rows[:, VERSION] > 3) & held)
-    np.testing.assert_array_equal(
-        call(rows_changed_after, rows, 160, 3, min_points), after[after < 160]
-    )
+    rows, count, version, stamps = slab()
+    changed = np.random.default_rng(4).permutation(200)[:120].astype(np.int32)
+    held = count >= min_points
+    at = changed[(version[changed] == 3) & held[changed]]
+    found = call(rows_changed_at, rows, stamps, changed, 2 * 3, min_points)
+    np.testing.assert_array_equal(found, at)
+    for since in (0, 3, 5, 7):
+        after = np.flatnonzero((version > since) & held)
+        found = call(rows_changed_after, rows, stamps, 160, 2 * 5, 5 - since, min_points)
+        np.testing.assert_array_equal(found, after[after < 160])
+    assert len(call(rows_changed_after, rows, stamps, 0, 2 * 5, 5, min_points)) == 0
+
+
+@both
+def test_changes_are_found_across_the_end_of_the_stamps(call):
+    rows, count, version, _ = slab()
+    version += 2**31 - 4  # the last of 1 to 5 becomes 1
+    stamps = (2 * (version % 2**31) + (count == 0)).astype(np.uint32)
+    for since in range(6):
+        found = call(rows_changed_after, rows, stamps, 200, 2 * 1, 5 - since, 0)
+        np.testing.assert_array_equal(found, np.flatnonzero(version > 2**31 - 4 + since))
 
 
 @both
 def test_rows_of_enough_points_are_listed_with_their_mixed_keys(call):
-    rows = slab()
+    rows, count, _, _ = slab()
     chosen, mixed = np.empty(200, np.int32), np.empty(200, np.uint64)
     num = call(rows_held, rows, 180, 2, chosen, mixed)
-    expected = np.flatnonzero(rows[:180, COUNT] >= 2)
+    expected = np.flatnonzero(count[:180] >= 2)
     np.testing.assert_array_equal(chosen[:num], expected)
     assert mixed[:num].tolist() == [mixed_of(int(k)) for k in rows[expected, KEY]]
 

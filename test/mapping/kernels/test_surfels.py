@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-The kernels that derive surfels from rows, against exact fractions; which rows have changed.
+The kernels that derive surfels from rows, against exact fractions.
 
 Rows are filled by hand here. Surfels of whole maps are in test/mapping/test_surfels.py.
 """
@@ -11,12 +11,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION, VIEW
-from surfel_mapper.mapping.kernels.queries import rows_changed_after, rows_changed_at
 from surfel_mapper.mapping.kernels.surfels import CHUNK, derive_surfels, MOMENTS, turn, V
 from surfel_mapper.mapping.moments import pack_keys
 from test import reference
 from test.kernels.modes import both
+from test.mapping.kernels.packed_rows import packed, unpacked
 
 NAMES = ['position', 'normal', 'planarity', 'curvature', 'eigenvalues']
 
@@ -24,18 +23,14 @@ NAMES = ['position', 'normal', 'planarity', 'curvature', 'eigenvalues']
 def row_of(places, voxel=(0, 0, 0), times=1, view=(0, 0, 0)):
     """Return the row of a voxel with repeated lattice places."""
     q = [[int(value) for value in place] for place in places]
-    row = [0] * ROW
-    row[KEY] = int(pack_keys(np.array([voxel]))[0])
-    row[COUNT] = times * len(q)
-    row[SUM : SUM + 3] = [times * sum(p[i] for p in q) for i in range(3)]
-    row[PRODUCT : PRODUCT + 6] = [times * sum(p[i] * p[j] for p in q) for i, j in reference.PAIRS]
-    row[VIEW : VIEW + 3] = view
-    return row
+    total = [times * sum(p[i] for p in q) for i in range(3)]
+    product = [times * sum(p[i] * p[j] for p in q) for i, j in reference.PAIRS]
+    key = pack_keys(np.array([voxel]))[0]
+    return packed(key, [times * len(q), *total, *product, *view])
 
 
 def twin_of(row, voxel, voxel_size_m):
-    columns = [COUNT, *range(SUM, SUM + 3), *range(PRODUCT, PRODUCT + 6), *range(VIEW, VIEW + 3)]
-    return reference.surfel(voxel, [row[column] for column in columns], voxel_size_m)
+    return reference.surfel(voxel, unpacked(row), voxel_size_m)
 
 
 def outputs_for(num):
@@ -111,7 +106,7 @@ def test_eigenvalues_are_exact_to_rounding_for_any_number_of_points(call, times,
         exact = twin_of(row, (0, 0, 0), 1.0)['scatter']
         trace = sum(exact[i][i] for i in range(3))
         norm_sq = sum(exact[i][j] ** 2 for i in range(3) for j in range(3))
-        unit = Fraction(0.5 / 2**bits) ** 2 / max(row[COUNT] - 1, 1)
+        unit = Fraction(0.5 / 2**bits) ** 2 / max(unpacked(row)[0] - 1, 1)
         values = [Fraction(value) / unit for value in outputs[4][0].tolist()]
         # trace and sum of squares are those of the matrix, and of its eigenvalues
         assert abs(sum(values) - trace) <= trace * Fraction(1, 10**14)
@@ -157,17 +152,3 @@ def test_normals_turn_towards_the_sensor(call, normal, view, away):
     normals[:, 0] = normal
     call(turn, normals, 1, moments)
     assert normals[:, 0].tolist() == [(-1.0 if away else 1.0) * value for value in normal]
-
-
-@both
-def test_changed_rows_are_those_of_the_version_with_enough_points(call):
-    rows = np.zeros((6, ROW), np.int64)
-    rows[:, VERSION] = [3, 3, 2, 4, 3, 3]
-    rows[:, COUNT] = [1, 5, 9, 9, 0, 4]
-    changed = np.array([5, 4, 3, 1, 0], np.int32)
-    assert call(rows_changed_at, rows, changed, 3, 1).tolist() == [5, 1, 0]
-    assert call(rows_changed_at, rows, changed, 3, 5).tolist() == [1]
-    assert call(rows_changed_at, rows, changed, 9, 1).tolist() == []
-    assert call(rows_changed_after, rows, 6, 2, 1).tolist() == [0, 1, 3, 5]
-    assert call(rows_changed_after, rows, 4, 2, 2).tolist() == [1, 3]
-    assert call(rows_changed_after, rows, 0, -1, 1).tolist() == []

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels import hashing
-from surfel_mapper.kernels.layout import COUNT, KEY, PRODUCT, ROW, SUM, VERSION, VIEW
+from surfel_mapper.kernels.layout import EMPTIED, KEY, ROW
 from surfel_mapper.mapping.kernels.voxels import (
     add_moments,
     find_rows,
@@ -19,6 +19,7 @@ from surfel_mapper.mapping.kernels.voxels import (
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
 from test.kernels.modes import both
+from test.mapping.kernels.packed_rows import unpacked
 
 
 class Memory:
@@ -29,6 +30,7 @@ class Memory:
         self.rows = np.full(
             (num_rows, ROW), 99, np.int64
         )  # the content of unused rows is irrelevant
+        self.stamps = np.full(num_rows, 99, np.uint32)
         segments = 4
         self.table = (
             np.zeros(1, np.int32),
@@ -45,7 +47,8 @@ class Memory:
         changed = np.full(len(moments[0]), -1, np.int32)
         done = self.call(
             add_moments,
-            *(moments, weight, self.rows, self.table, self.state, version, start, changed),
+            *(moments, weight, self.rows, self.stamps, self.table, self.state),
+            *(2 * version, start, changed),
         )
         return done, changed[start:done].tolist()
 
@@ -60,11 +63,14 @@ class Memory:
         found = self.find(moments[0]) if hints is None else hints
         missing, num = self.call(
             remove_moments,
-            *(moments, weight, self.rows, self.table, self.state, version, found),
-            *(min_points, fallen),
+            *(moments, weight, self.rows, self.stamps, self.table, self.state),
+            *(2 * version, found, min_points, fallen),
         )
         if missing < 0:
-            np.testing.assert_array_equal(self.rows[found, VERSION], version)
+            empty = [unpacked(row)[0] == 0 for row in self.rows[found]]
+            np.testing.assert_array_equal(
+                self.stamps[found], 2 * version + EMPTIED * np.array(empty)
+            )
         return missing, list(map(tuple, unpack_keys(fallen[:num]).tolist()))
 
     def content(self):
@@ -72,13 +78,7 @@ class Memory:
         entries = self.table[1][self.table[1] != 0]
         rows = (entries & 0xFFFFFFFF) - 1
         voxels = map(tuple, unpack_keys(self.rows[rows, KEY]).tolist())
-        columns = [
-            COUNT,
-            *range(SUM, SUM + 3),
-            *range(PRODUCT, PRODUCT + 6),
-            *range(VIEW, VIEW + 3),
-        ]
-        return dict(zip(voxels, self.rows[rows][:, columns].tolist(), strict=True))
+        return dict(zip(voxels, map(unpacked, self.rows[rows]), strict=True))
 
 
 def arrays_of(twin, wide=np.int64):
@@ -111,7 +111,7 @@ def test_moments_are_added_and_subtracted_as_integers(call, wide):
         reference.add_moments(expected, twin)
         assert done == len(twin)
         assert sorted(changed) == sorted(memory.find(arrays_of(twin)[0]).tolist())
-        assert (memory.rows[changed, VERSION] == version).all()
+        assert (memory.stamps[changed] == 2 * version).all()
         assert memory.content() == expected
     assert memory.state[hashing.POINTS] == 6 * 120
     assert memory.state[hashing.VOXELS] == len(expected)
@@ -153,6 +153,7 @@ def test_adding_stops_without_room_and_resumes(call):
     done, _ = memory.add(moments, 2)
     assert done == len(twin) - 40
     memory.rows = np.concatenate([memory.rows, np.full((40, ROW), -5)])
+    memory.stamps = np.concatenate([memory.stamps, np.full(40, 5, np.uint32)])
     done, changed = memory.add(moments, 2, start=done)
 
     reference.add_moments(expected, twin)
@@ -183,7 +184,7 @@ def test_rows_of_voxels_that_left_are_the_first_to_be_used(call):
     memory.add(arrays_of(first), 1)
     used = memory.state[hashing.ROWS_USED]
     memory.remove(arrays_of(first), 2)
-    assert (memory.rows[:used, COUNT] == 0).all()
+    assert all(unpacked(row)[0] == 0 for row in memory.rows[:used])
     _, changed = memory.add(arrays_of(second), 3)
     assert memory.state[hashing.ROWS_USED] == used
     assert max(changed) < used
@@ -201,10 +202,11 @@ def test_a_failed_removal_names_the_voxel_and_changes_nothing(call, column):
     one_off = {v: list(row) for v, row in twin.items()}
     one_off[voxel][column] += 1
     absent = {(50, 50, 50): [1] * 13}
-    rows, state = memory.rows.copy(), memory.state.copy()
+    rows, stamps, state = memory.rows.copy(), memory.stamps.copy(), memory.state.copy()
     assert memory.remove(arrays_of(one_off), 3) == (7, [])
     assert memory.remove(arrays_of({**dict(list(twin.items())[:4]), **absent}), 3) == (4, [])
     np.testing.assert_array_equal(memory.rows, rows)
+    np.testing.assert_array_equal(memory.stamps, stamps)
     np.testing.assert_array_equal(memory.state, state)
 
 
