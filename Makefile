@@ -44,7 +44,7 @@ demo: $(or $(wildcard $(STAMP)),$(DEMO_STAMP))  ## simulate a street, map it liv
 	$(BIN)/python examples/demo.py
 
 # Each process takes the next file of tests, in the order of test/conftest.py, when it is done with
-# one, and has a ROS domain of its own. Three keep two cores busy, as tests of nodes wait for each
+# one, and has a ROS domain of its own. Four keep two cores busy, as tests of nodes wait for each
 # other. TEST_PROCESSES=0 runs all in this process. A thread of BLAS that waits for work computes:
 # with one in each process the models need a tenth less.
 test: $(STAMP)  ## all tests

@@ -9,6 +9,8 @@ interpolate) use only + - * / and sqrt, which IEEE 754 rounds in one way, on Pyt
 fixed order: no BLAS, no fused multiply-add, no sine whose last bit depends on the math library.
 rotation_angle, se3_exp and se3_log need such functions and may differ in that bit.
 
+One module: short functions on the same two representations, which callers use together.
+
 Sources: Shepperd 1978 for the quaternion of a matrix; Eberly 2011 (A Fast and Accurate Algorithm
 for Computing SLERP) for the series of slerp without trigonometry; Barfoot 2017 (State Estimation
 for Robotics) for the exponential map.
@@ -153,22 +155,43 @@ def check_rigid(name: str, T_a_b: npt.ArrayLike) -> None:
     if matrix.shape != (4, 4) or matrix.dtype.kind not in 'fiu':
         raise ValueError(f'{name}: {matrix.dtype} {matrix.shape}, expected float (4, 4)')
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = matrix.tolist()
-    products = (
-        a * a + d * d + g * g - 1.0,
-        b * b + e * e + h * h - 1.0,
-        c * c + f * f + i * i - 1.0,
-        a * b + d * e + g * h,
-        a * c + d * f + g * i,
-        b * c + e * f + h * i,
-    )
-    turn = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
-    is_rotation = all(abs(value) <= MAX_SKEW for value in products) and turn > 0.0
+    products, volume = orthogonality((a, b, c, d, e, f, g, h, i))
+    is_rotation = all(abs(value) <= MAX_SKEW for value in products) and volume > 0.0
     is_near = all(abs(value) < MAX_TRANSLATION_M for value in (x, y, z))
     if not (is_rotation and is_near and last == [0.0, 0.0, 0.0, 1.0]):
         raise ValueError(
             f'{name}: {matrix.tolist()}, expected a rigid transform, rotation and translation '
             f'(below {MAX_TRANSLATION_M:g} m) above a last row 0 0 0 1'
         )
+
+
+def orthogonality(entries: Iterable[Any]) -> tuple[tuple[Any, ...], Any]:
+    """
+    Return how far a matrix R is from a rotation: six entries of R R^T - I, and the determinant.
+
+    Parameters
+    ----------
+    entries : 9 floats or arrays of one shape
+        Row by row, of one matrix or of many.
+
+    Returns
+    -------
+    products : 6 floats or arrays
+        The diagonal, then the upper triangle, of the symmetric R R^T - I.
+    volume : float or array
+        det R, negative if R mirrors.
+
+    """
+    a, b, c, d, e, f, g, h, i = entries
+    products = (
+        a * a + b * b + c * c - 1.0,
+        d * d + e * e + f * f - 1.0,
+        g * g + h * h + i * i - 1.0,
+        a * d + b * e + c * f,
+        a * g + b * h + c * i,
+        d * g + e * h + f * i,
+    )
+    return products, a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
 
 
 def interpolate(T0: Transform, T1: Transform, alpha: float) -> Transform:

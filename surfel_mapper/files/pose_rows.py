@@ -23,7 +23,7 @@ import numpy.typing as npt
 
 from surfel_mapper.errors import FileFormatError
 from surfel_mapper.files.text_lines import Rows
-from surfel_mapper.geometry import MAX_NORM_ERROR, pose_matrix
+from surfel_mapper.geometry import MAX_NORM_ERROR, orthogonality, pose_matrix
 
 logger = logging.getLogger(__name__)
 
@@ -98,19 +98,11 @@ def rigid_poses(numbers: Floats) -> tuple[Floats, Floats]:
 
 def skew_of(matrices: Floats) -> Floats:
     """Return the largest entry of R R^T - I of matrices (R, 3, 3); inf if one is no rotation."""
-    a, b, c, d, e, f, g, h, i = numbers = np.ascontiguousarray(matrices.reshape(-1, 9).T)
+    entries = np.ascontiguousarray(matrices.reshape(-1, 9).T)
     with np.errstate(over='ignore', invalid='ignore'):
-        products = (
-            a * a + b * b + c * c - 1.0,
-            d * d + e * e + f * f - 1.0,
-            g * g + h * h + i * i - 1.0,
-            a * d + b * e + c * f,
-            a * g + b * h + c * i,
-            d * g + e * h + f * i,
-        )
-        volume = a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+        products, volume = orthogonality(entries)
         skew = np.abs(products).max(axis=0)
-    is_near = np.abs(numbers).max(axis=0) <= 2.0  # false for nan
+    is_near = np.abs(entries).max(axis=0) <= 2.0  # false for nan
     return np.where(is_near & (volume > 0.0), skew, np.inf)
 
 

@@ -12,6 +12,7 @@ surfels of a map use it alike: a surfel is one point.
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import Any
 
 import numpy as np
@@ -34,9 +35,11 @@ Owners = npt.NDArray[np.int32]
 Shape = tuple[Array, npt.NDArray[np.bool_]]
 """Normals (K, 3) of patches, and whether each is a curved surface (K,)."""
 
-COARSE_TOLERANCE_VOXELS = 0.04
-"""Tolerance of facets in coarser voxels, at least: at 50 m a road sags more than near patches."""
-
+COARSE_TOLERANCE_VOXELS, MOST_FINEST_VOXELS, MOST_RANGE = 0.04, 0.64, 0.01
+"""
+Tolerance of facets in coarser voxels, at least, and most of that in the finest voxels or as a
+share of the median range of the free points: at 50 m a road sags more than near patches.
+"""
 
 SPARSE_SHARE = 0.05
 """Share of points on no patch from which voxels of other sizes help."""
@@ -142,11 +145,22 @@ def extended(
     if size_m > rules.finest_m:
         extend_planes(coarse, after, curved, (size_m, rules.tolerance_m))
     if facets is not None:
-        facet_m = max(rules.tolerance_m, COARSE_TOLERANCE_VOXELS * size_m)
-        found = add_facets(coarse, after, len(normals), (size_m, facet_m), facets)
+        sizes = size_m, facet_tolerance(coarse, after, size_m, rules)
+        found = add_facets(coarse, after, len(normals), sizes, facets)
         normals = np.concatenate([normals, found])
         curved = np.append(curved, np.zeros(len(found), np.bool_))
     return after, (normals, curved)
+
+
+def facet_tolerance(
+    coarse: VoxelPoints, owner: Owners, size_m: float, rules: CoarseRules
+) -> float:
+    """Return the distance up to which a free point lies on a facet, m."""
+    most_m, free = MOST_FINEST_VOXELS * rules.finest_m, coarse.points[owner < 0]
+    if rules.view is not None and len(free):
+        range_sq = ((free - rules.view) ** 2).sum(axis=1)
+        most_m = max(most_m, MOST_RANGE * math.sqrt(np.median(range_sq)))
+    return max(rules.tolerance_m, min(COARSE_TOLERANCE_VOXELS * size_m, most_m))
 
 
 def beyond(pieces: Pieces, normals: Array) -> Array:

@@ -47,6 +47,12 @@ LEAST_TURN_DEG, LEAST_BEND_VOXELS = 15.0, 0.25
 CURVED_GAIN = 15.0
 """Gain of the criterion by which a curved surface is better than a plane, at least."""
 
+MOST_WORSE, UNRESOLVED_VOXELS = 1.25, 0.2
+"""
+A plane of several patches has at most MOST_WORSE times their residual, or UNRESOLVED_VOXELS. Joins
+are compared near the smaller patch, so a chain of them may be a tree crown.
+"""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pieces:
@@ -116,14 +122,43 @@ def join_patches(
     join_layers(layers(pairs, pieces, regions), *state, regions)
     edges, adjacent = touching_regions(pairs, regions.root)
     join_smooth(edges, adjacent, *state, floor, regions)
+    index, normals, curved, is_worse = described(regions, state, size_m)
+    if is_worse.any():
+        undone = np.append(is_worse, np.True_)[index]  # the last: patches without points
+        regions = separated(regions, single_regions(pieces, view, noise, size_m), undone)
+        index, normals, curved, _ = described(regions, state, size_m)
+    return index, normals, curved
+
+
+def separated(regions: Regions, single: Regions, undone: npt.NDArray[np.bool_]) -> Regions:
+    """Return regions whose undone patches (K,) are single ones."""
+    pairs = zip(single, regions, strict=True)
+    return Regions(*(np.where(undone if a.ndim == 1 else undone[:, None], a, b) for a, b in pairs))
+
+
+def described(
+    regions: Regions, state: tuple[Array, Array, Indices], size_m: float
+) -> tuple[npt.NDArray[np.int32], Array, npt.NDArray[np.bool_], npt.NDArray[np.bool_]]:
+    """
+    Return the result of join_patches, and which regions are worse planes than their patches.
+
+    state: means, weights and starts of the pieces
+    """
     held = regions.rows > 0  # patches without points are in no region
     names = np.flatnonzero(held & (regions.root == np.arange(len(held))))
-    normals, found = np.empty((2, len(names), 3))
+    normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
+    floor = (FLOOR_VOXELS * size_m) ** 2
     limits = CURVED_GAIN, math.radians(LEAST_TURN_DEG), LEAST_BEND_VOXELS * size_m
     describe_regions(names, *state, floor, regions, limits, normals, found)
     index = np.searchsorted(names, regions.root).astype(np.int32)
-    gains, turns, bends = (found > limits).T
-    return index, normals, gains & turns & bends
+    gains, turns, bends = (found[:, :3] > limits).T
+    curved = gains & turns & bends
+    points, every = regions.patch_points, len(names) + 1
+    squares = np.bincount(index, points * regions.patch_sigma**2, every)[:-1]
+    own = np.sqrt(squares / np.bincount(index, points, every)[:-1])
+    is_worse = found[:, 3] > np.maximum(MOST_WORSE * own, UNRESOLVED_VOXELS * size_m)
+    is_worse &= ~curved & (np.bincount(index, minlength=every)[:-1] > 1)
+    return index, normals, curved, is_worse
 
 
 def single_regions(

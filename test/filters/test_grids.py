@@ -158,6 +158,17 @@ def test_voxel_grid_equals_its_slow_twin(anchor, centroid, dtype, number):
     np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
 
 
+@pytest.mark.parametrize('dtype', [np.float32, np.float64])
+def test_voxels_of_points_in_long_runs_are_those_of_the_slow_twin(dtype):
+    scan = random_scan(9000, dtype=dtype)
+    order = np.lexsort(np.floor(scan.points.T / 0.5))
+    scan = scan.select(np.concatenate([order, order[::-1]]))  # each voxel in two runs
+    found = filter_of('voxel_grid', size_x_m=0.5, size_y_m=0.5, size_z_m=0.5).apply(scan)
+    expected = slow(scan, [0.5, 0.5, 0.5], 'origin')
+    tolerance = 4 * np.finfo(dtype).eps * 4.0  # coordinates are below 4 m
+    np.testing.assert_allclose(found.points, expected, rtol=0.0, atol=tolerance)
+
+
 def test_voxels_anchored_at_the_origin_stay_while_points_come_and_go():
     scan = random_scan(300)
     part = scan.select(np.arange(100, 300))

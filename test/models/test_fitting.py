@@ -265,7 +265,8 @@ def test_faces_narrower_than_two_voxels_are_patches():
 def test_a_point_as_far_as_voxels_can_be_numbered_leaves_the_patches():
     points = np.vstack([crates()[0], [0.9 * 2.0**30, 0.0, 0.0]])  # half voxels have 32 bits
     model = fit(points, ModelsConfig(voxel_size_m=0.5))
-    assert np.isin(model.labels, [patch.id for patch in model.patches]).mean() > 0.9
+    assert np.isin(model.labels, [patch.id for patch in model.patches]).mean() > 0.6
+    assert max(patch.rms_m for patch in model.patches) < 0.25  # no plane through all crates
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,10 @@ def test_the_stages_are_parts_of_the_wall_time(bag, tmp_path):
     assert {'read', 'decode', 'reduce', 'insert', 'normals', 'record'} <= set(stages)
     assert 0.0 < sum(stages.values()) <= summary['replay_s']
     line = next(line for line in as_text(summary, []).splitlines() if line.startswith('read '))
-    printed = re.findall(r'(\w+) (-?[\d.]+) ms', line)
+    means, _, mapping = line.partition(' a scan   ')
+    printed = re.findall(r'(\w+) (-?[\d.]+) ms', means)
     assert [name for name, _ in printed][-2:] == ['other', 'total']
     *parts, total = (float(milliseconds) for _, milliseconds in printed)
     assert abs(sum(parts) - total) <= 0.05 * len(printed)  # of rounding
+    times = summary['milliseconds']['total']
+    assert mapping.startswith(f'mapping {times["median"]:.1f} ms, p99 {times["p99"]:.1f}   ')

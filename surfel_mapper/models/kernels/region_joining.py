@@ -86,7 +86,8 @@ def join_layers(pairs, points, weights, starts, regions):
 
     pairs    (R, 2) int64, patch and the larger one, in the order in which they are joined
     points, weights, starts  see above
-    regions  Regions, in place; layers take the normal of the larger patch
+    regions  Regions, in place; layers take the normal of the larger patch, and their distance
+             from it is noise
     """
     for i in range(len(pairs)):
         small, large = pairs[i, 0], regions.root[pairs[i, 1]]
@@ -103,10 +104,12 @@ def join_layers(pairs, points, weights, starts, regions):
                 squares += weights[row] * away * away
                 total += weights[row]
             part = regions.after[part]
-        if math.sqrt(squares / total) < LAYER_SIGMAS * regions.patch_sigma[large]:
+        away = math.sqrt(squares / total)
+        if away < LAYER_SIGMAS * regions.patch_sigma[large]:
             part = small
             while part >= 0:
                 regions.patch_normal[part] = normal
+                regions.patch_sigma[part] = max(regions.patch_sigma[part], away)
                 part = regions.after[part]
             for j in range(3):
                 regions.normal[small, j] = normal[j] * regions.patch_points[small]
@@ -309,8 +312,8 @@ def describe_regions(names, points, weights, starts, floor, regions, limits, nor
     limits   gain, turn and bend from which a region is curved; quartics are fitted only if the
              gain of a quadric alone is less, but its turn and bend are not
     normals  (J, 3) float64, out
-    found    (J, 3) float64, out: gain of the best height field over a plane; turn, rad, and bend,
-             m, of the quadric
+    found    (J, 4) float64, out: gain of the best height field over a plane; turn, rad, and bend,
+             m, of the quadric; rms from a plane, m
     """
     for k in range(len(names)):
         normals[k] = unit(regions.normal[names[k]])
@@ -318,10 +321,10 @@ def describe_regions(names, points, weights, starts, floor, regions, limits, nor
         rows = rows[:: 1 + len(rows) // MOST_ROWS]
         own = np.empty((4, len(rows)))
         gather(rows, points, weights, own)
-        best, plane, _, turn, bend = heights(own, normals[k], False, floor)
+        best, plane, sigma, turn, bend = heights(own, normals[k], False, floor)
         if turn > limits[1] and bend > limits[2] and plane - best <= limits[0]:
-            best, plane, _, turn, bend = heights(own, normals[k], True, floor)
-        found[k, 0], found[k, 1], found[k, 2] = plane - best, turn, bend
+            best, plane, sigma, turn, bend = heights(own, normals[k], True, floor)
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = plane - best, turn, bend, sigma
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -79,11 +79,11 @@ def test_the_table_of_voxels_grows_with_them(number):
     xyz = np.zeros((3, 2 * number))
     xyz[0] = np.concatenate([order + 0.25, order + 0.75])
     ones, zeros, bits = np.ones(3), np.zeros(3), np.array([31, 1, 1])
-    keys, first = np.empty((2, 2 * number), np.int64)
-    sums, rows = np.empty((2 * number, 4)), np.empty(2 * number, np.int32)
+    keys, first = np.empty((2, 2 * number + 2), np.int64)
+    sums, rows = np.empty((2 * number + 1, 4)), np.empty(2 * number, np.int32)
     found = compiled(group_points, xyz, ones, zeros, zeros, bits, keys, sums, first, rows)
     assert found == number
-    np.testing.assert_array_equal(keys[:found], order.astype(np.int64))
+    np.testing.assert_array_equal(keys[1 : found + 1], order.astype(np.int64))
     np.testing.assert_array_equal(first[:found], np.arange(number))
     np.testing.assert_array_equal(rows, np.tile(np.arange(number), 2))
     np.testing.assert_array_equal(sums[:found, 0], 2.0 * order + 1.0)
@@ -96,11 +96,11 @@ def test_points_alone_in_their_voxels_are_the_first_ones(call):
     xyz = np.zeros((3, number))
     xyz[0] = np.arange(number) + 0.5
     ones, zeros, bits = np.ones(3), np.zeros(3), np.array([12, 1, 1])
-    keys, first = np.empty((2, number), np.int64)
-    sums, rows = np.empty((number, 4)), np.empty(0, np.int32)
+    keys, first = np.empty((2, number + 2), np.int64)
+    sums, rows = np.empty((number + 1, 4)), np.empty(0, np.int32)
     assert call(group_points, xyz, ones, zeros, zeros, bits, keys, sums, first, rows) == number
-    np.testing.assert_array_equal(first, np.arange(number))
-    np.testing.assert_array_equal(sums[:, 0], xyz[0])
+    np.testing.assert_array_equal(first[:number], np.arange(number))
+    np.testing.assert_array_equal(sums[:number, 0], xyz[0])
 
 
 @both

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 from surfel_mapper.models.growth import owner_table, pieces_of
-from surfel_mapper.models.joining import join_patches, layers, single_regions, touching_regions
+from surfel_mapper.models.joining import (
+    described,
+    join_patches,
+    layers,
+    separated,
+    single_regions,
+    touching_regions,
+)
 from surfel_mapper.models.kernels import region_joining
 from surfel_mapper.models.kernels.region_joining import (
     chunk_boxes,
@@ -135,7 +142,7 @@ def test_a_cylinder_turns_and_bends_by_its_arc(call):
     state, floor = (given.means, given.weights, given.starts), (0.02 * SIZE_M) ** 2
     call(join_smooth, edges, adjacent, *state, floor, regions)
     names = np.unique(regions.root)
-    normals, found = np.empty((2, len(names), 3))
+    normals, found = np.empty((len(names), 3)), np.empty((len(names), 4))
     call(describe_regions, names, *state, floor, regions, (0.0, 0.0, 0.0), normals, found)
     assert len(names) == 3
     round_one = np.searchsorted(names, regions.root[0])
@@ -146,3 +153,24 @@ def test_a_cylinder_turns_and_bends_by_its_arc(call):
     assert found[round_one, 2] == pytest.approx(np.sqrt(12.0) * heights.std(), rel=0.12)
     others = np.delete(found, round_one, axis=0)
     assert np.abs(others[:, 2]).max() < 0.01  # the noise
+    np.testing.assert_allclose(others[:, 3], 0.01, rtol=0.15)
+
+
+def test_joins_that_are_much_worse_planes_than_their_patches_are_undone():
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(0.0, 8.0, 20_000), rng.uniform(0.0, 1.0, 20_000)
+    owner = np.floor(x).astype(np.int32)
+    steps = np.where((owner < 6) & (owner % 2 == 0), 0.1, 0.0)  # six stairs up and down, a floor
+    z = steps + 0.005 * rng.standard_normal(len(x))
+    given = pieces(np.column_stack([x, y, z]), owner)
+    single, regions = (single_regions(given, VIEW, (0.005, 0.0), SIZE_M) for _ in range(2))
+    for small, large in ((1, 0), (2, 0), (3, 0), (4, 0), (5, 0), (7, 6)):
+        join_pair(small, large, regions)
+    state = given.means, given.weights, given.starts
+    index, _, curved, is_worse = described(regions, state, SIZE_M)
+    assert (curved.tolist(), is_worse.tolist()) == ([False, False], [True, False])
+    regions = separated(regions, single, is_worse[index])
+    index, normals, _, is_worse = described(regions, state, SIZE_M)
+    assert index.tolist() == [0, 1, 2, 3, 4, 5, 6, 6]
+    np.testing.assert_allclose(normals[:6], single.patch_normal[:6], atol=1e-12)
+    assert not is_worse.any()
