@@ -3,11 +3,10 @@
 """
 Group the points of a scan by voxel and sum their coordinates, as libpointmatcher's VoxelGrid.
 
-Runs and table are those of kernels/grouping.py. Three things differ from the reduction of the
-map: coordinates are divided by the edge, not multiplied by its inverse, so that a point on a face
-goes to the same voxel as in libpointmatcher; the table grows while it fills, because a filter
-keeps no memory between scans; and a new voxel is found without a branch. On a real lidar every
-third to eighth point opens a voxel, at random, and mispredicted branches took a third of the time.
+Runs and table are those of kernels/grouping.py. Two things differ from the reduction of the map:
+coordinates are divided by the edge, not multiplied by its inverse, so that a point on a face goes
+to the same voxel as in libpointmatcher; and the table grows while it fills, because a filter keeps
+no memory between scans.
 
 Indices are relative to the lowest voxel, so that a key needs only as many bits as the extent of
 the scan. There is no dense grid.
@@ -17,20 +16,18 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
-from surfel_mapper.kernels.grouping import CHUNK, enlarged_table, find_runs, hash_shift, home
-from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.grouping import (
+    AHEAD,
+    CHUNK,
+    enlarged_table,
+    find_runs,
+    LONG,
+    number_runs,
+    U,
+)
 
 ROWS = 4096
 """Initial number of voxels that the table has room for."""
-
-AHEAD = 16
-"""Number of runs between the prefetch of a table entry and its use."""
-
-LONG = 3
-"""Mean length of the runs of a chunk from which they are summed run by run, not by point."""
-
-U = np.uint64
-"""Unsigned indices: numba tests signed ones for being negative."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -65,9 +62,13 @@ def group_points(xyz, size, shift, base, bits, keys, sums, first, rows):
         num_runs = find_runs(chunk_keys, len(x), starts)
         if 4 * (num_rows + num_runs) > len(table):
             table = enlarged_table(table, keys[1:], num_rows)
-        num_rows = number_runs(
-            chunk_keys, start, starts, num_runs, table, keys, flat, first, num_rows, run_rows
-        )
+        known = num_rows
+        num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
+        sums[known:num_rows] = 0.0
+        for run in range(U(num_runs)):
+            # rows are numbered as they appear; a branch would be mispredicted at new voxels
+            first[known] = start + np.int64(starts[run])
+            known += run_rows[run] == known
         if LONG * num_runs > len(x):
             add_points(x, y, z, chunk_keys, run_rows, flat)
         else:
@@ -89,52 +90,6 @@ def find_keys(x, y, z, size, shift, base, bits, keys):
         iy = np.int64(np.int32(np.floor(np.float64(y[i]) / sy - ty) - by))
         iz = np.int64(np.int32(np.floor(np.float64(z[i]) / sz - tz) - bz))
         keys[i] = ix | (iy << to_y) | (iz << to_z)
-
-
-@part()
-def number_runs(chunk_keys, start, starts, num_runs, table, keys, flat, first, num_rows, run_rows):
-    """
-    Look up the row of each run's voxel, adding rows for new voxels; return their number.
-
-    chunk_keys  (CHUNK + 1,) int64, voxel key of each point of the chunk
-    start       number of the chunk's first point
-    starts      (CHUNK + AHEAD,) int32, first point of each run
-    table       (B,) int32, B a power of two: row of the voxel hashed there, -1 if empty
-    keys        (E,) int64, in and out: keys[row + 1] is that of a voxel
-    flat        (4 E,) float64, in and out: sums, zeros for new voxels
-    first       (E,) int64, in and out: first point of a voxel
-    run_rows    (CHUNK,) int32, out
-
-    keys[0] is set to the key looked for, so that an empty entry, -1, ends the search as a found
-    one does. Row num_rows is written every time; it counts only if the voxel is new. The first
-    step past a foreign entry is taken without a branch: one voxel in ten needs it.
-    """
-    shift = hash_shift(len(table))
-    mask = U(len(table) - 1)
-    number = U(num_rows)
-    for run in range(U(num_runs)):
-        # past the last run these are runs of an earlier chunk: no harm
-        ahead = U(np.uint32(starts[run + U(AHEAD)]))
-        prefetch(table, home(chunk_keys[ahead], shift))
-        point = U(np.uint32(starts[run]))
-        key = chunk_keys[point]
-        keys[U(0)] = key
-        place = U(home(key, shift))
-        place = (place + U(keys[U(table[place] + 1)] != key)) & mask
-        row = np.int64(table[place])
-        while keys[U(row + 1)] != key:
-            place = (place + U(1)) & mask
-            row = np.int64(table[place])
-        is_new = row < 0
-        row = np.int64(number) if is_new else row
-        table[place] = row
-        keys[number + U(1)] = key
-        first[number] = start + np.int64(point)
-        for column in range(U(4)):
-            flat[U(4) * number + column] = 0.0
-        number += U(is_new)
-        run_rows[run] = row
-    return np.int64(number)
 
 
 @part()

@@ -20,7 +20,7 @@ import numpy.typing as npt
 from surfel_mapper.arguments import as_array, as_numbers
 from surfel_mapper.errors import MapLimitError
 from surfel_mapper.geometry import check_rigid
-from surfel_mapper.kernels.grouping import build_table, CHUNK
+from surfel_mapper.kernels.grouping import AHEAD, build_table, CHUNK
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised
 from surfel_mapper.mapping.kernels.reduction import (
@@ -30,6 +30,7 @@ from surfel_mapper.mapping.kernels.reduction import (
     pack_sums,
     reduce_points,
     sum_channels,
+    SUMS,
     TOO_FAR,
     TOO_NEAR,
 )
@@ -61,18 +62,18 @@ class Scratch:
     def __init__(self) -> None:
         self.left_out = np.zeros(4, np.int64)
         self._chunk = (
-            np.empty(CHUNK, np.int64),
+            np.zeros(CHUNK + 1, np.int64),
             np.empty((3, CHUNK)),
-            np.empty(CHUNK + 1, np.int32),
-            np.empty(CHUNK, np.int32),
+            np.zeros(CHUNK + AHEAD, np.int32),
+            np.zeros(CHUNK + AHEAD, np.int32),
         )
         self.reserve(2048)
 
     def reserve(self, num_voxels: int) -> None:
         """Allocate room for num_voxels voxels; previous content is lost."""
         self.table = np.full(ENTRIES * num_voxels, -1, np.int32)
-        self.keys = np.empty(num_voxels, np.int64)
-        self.sums = np.empty((num_voxels, 10))
+        self.keys = np.empty(num_voxels + 2, np.int64)
+        self.sums = np.empty((num_voxels + 1, SUMS))
 
     def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
         """Sum points by voxel, enlarging the memory if needed; return the number of voxels."""
@@ -81,7 +82,7 @@ class Scratch:
             num = reduce_points(xyz, *quantisation, arrays, self.left_out)
             if num >= 0:
                 return int(num)
-            self.reserve(2 * len(self.keys))
+            self.reserve(2 * (len(self.sums) - 1))
 
 
 class Reducer:
@@ -166,7 +167,7 @@ class Reducer:
 
     def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
         """Convert the sums to integers."""
-        key, sums = scratch.keys[:num].copy(), scratch.sums[:num]
+        key, sums = scratch.keys[2 : num + 2].copy(), scratch.sums[1 : num + 1]
         largest = sums[:, 0].max(initial=0.0)
         if largest > MAX_SCAN_COUNT:
             raise MapLimitError(

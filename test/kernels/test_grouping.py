@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.grouping import (
+    AHEAD,
     build_table,
     CHUNK,
     enlarged_table,
     find_key,
-    find_run_rows,
     find_runs,
     hash_shift,
+    number_runs,
 )
 from test.kernels.modes import both
 
 
 def keys_in_runs(num, num_voxels, seed=0):
-    """Return voxel keys (num,) in runs; some are -1, which leaves a point out."""
+    """Return voxel keys (num,) in runs; some are -1, that of points left out."""
     rng = np.random.default_rng(seed)
     voxels = rng.integers(0, 2**62, num_voxels)
     voxels[0] = -1
@@ -29,26 +30,21 @@ def keys_in_runs(num, num_voxels, seed=0):
 
 @both
 @pytest.mark.parametrize('num_voxels', [1, 2, 40, 400])
-@pytest.mark.parametrize('width', [4, 10])
-def test_runs_get_the_row_of_their_voxel_in_the_order_of_first_use(call, num_voxels, width):
-    keys, sums = np.full(900, -7, np.int64), np.full((900, width), np.nan)
-    table = np.full(2048, -1, np.int32)
-    starts, run_rows = np.empty(CHUNK + 1, np.int32), np.empty(CHUNK, np.int32)
+def test_runs_get_the_row_of_their_voxel_in_the_order_of_first_use(call, num_voxels):
+    keys, table = np.full(901, -7, np.int64), np.full(2048, -1, np.int32)
+    starts, run_rows = np.zeros(CHUNK + AHEAD, np.int32), np.empty(CHUNK, np.int32)
     expected: dict[int, int] = {}
     num_rows = 0
     for seed in range(2):  # the second chunk meets voxels of the first
         chunk = keys_in_runs(300, num_voxels, seed=1)[seed:]
         num_runs = find_runs(chunk, len(chunk), starts)
-        num_rows = call(
-            find_run_rows, chunk, starts, num_runs, table, keys, sums, num_rows, run_rows
-        )
-        groups = [key for key, _ in itertools.groupby(chunk.tolist())]
-        rows = [expected.setdefault(k, len(expected)) if k >= 0 else -1 for k in groups]
+        chunk = np.append(chunk, np.zeros(CHUNK + 1 - len(chunk), np.int64))
+        num_rows = call(number_runs, chunk, starts, num_runs, table, keys, num_rows, run_rows)
+        groups = [key for key, _ in itertools.groupby(chunk[: 300 - seed].tolist())]
+        rows = [expected.setdefault(key, len(expected)) for key in groups]
         np.testing.assert_array_equal(run_rows[:num_runs], rows)
     assert num_rows == len(expected)
-    assert keys[:num_rows].tolist() == list(expected)
-    assert not sums[:num_rows].any()
-    assert np.isnan(sums[num_rows:]).all()
+    assert keys[1 : num_rows + 1].tolist() == list(expected)
 
 
 @both

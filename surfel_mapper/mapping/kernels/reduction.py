@@ -6,7 +6,8 @@ Reduce the points of one scan to exact moments by voxel.
 A point is quantised once (kernels/quantisation.py); everything after is sums of integers. They
 are formed in float64, which holds them exactly up to 2^23 points a voxel and is faster than int64
 (0.79 against 1.17 ms for 131,072 points). Each chunk of points is quantised with vector
-instructions, cut into runs of one voxel (kernels/grouping.py), and summed run by run in registers.
+instructions, cut into runs of one voxel (kernels/grouping.py), and summed: long runs in registers,
+short ones point by point.
 Intensity and colour are summed by a second pass over the same runs, which only maps with such
 columns pay for.
 
@@ -21,12 +22,18 @@ from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.grouping import (
     CHUNK,
     find_key,
-    find_run_rows,
     find_runs,
     hash_shift,
+    home,
+    LONG,
+    number_runs,
+    U,
 )
 from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, VIEW_SCALE
 from surfel_mapper.kernels.quantisation import quantise
+
+SUMS = 10
+"""Sums of a voxel: count, places (3), products (6)."""
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
@@ -42,41 +49,53 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     scale     float64, 65536 / voxel size
     range_sq  (2,) float64, m^2: smallest and largest squared distance from the sensor
     scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
-              keys (E,) int64, out: voxel keys in the order of first appearance, E <= B / 2;
-              sums (E, 10) float64, out: count, sum (3), products (6: xx xy xz yy yz zz) of
-              the places in the voxel, in lattice units about its centre;
-              of one chunk: chunk_keys (CHUNK,) int64, places (3, CHUNK) float64,
-              starts (CHUNK + 1,) int32, run_rows (CHUNK,) int32
+              keys (E + 2,) int64, out: from keys[2] on voxel keys in the order of first
+              appearance, E <= B / 2;
+              sums (E + 1, SUMS) float64, out: from sums[1] on count, sum (3), products (6: xx xy
+              xz yy yz zz) of the places in the voxel, in lattice units about its centre;
+              of one chunk: chunk_keys (CHUNK + 1,) int64, places (3, CHUNK) float64,
+              starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
 
-    After -1 the table is clear again: call with larger arrays.
+    Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
+    count. After -1 the table is clear again: call with larger arrays.
     """
     table, keys, sums, chunk_keys, places, starts, run_rows = scratch
+    flat = sums.ravel()
     left_out[:] = 0
-    num_rows = np.int64(0)  # an int here would compile find_run_rows for a literal 0 too
+    keys[1] = -1
+    table[home(np.int64(-1), hash_shift(len(table)))] = 0
+    sums[0] = 0.0
+    num_rows = np.int64(1)
+    num_left_out = 0.0
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
         quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
         num_runs = find_runs(chunk_keys, len(x), starts)
-        if num_rows + num_runs > len(keys):
+        if num_rows + num_runs > len(sums):
             table[:] = -1
             return -1
-        num_rows = find_run_rows(
-            chunk_keys, starts, num_runs, table, keys, sums, num_rows, run_rows
-        )
-        add_runs(places, starts, num_runs, run_rows, sums)
-        for run in range(num_runs):
-            if run_rows[run] < 0:
-                for i in range(starts[run], starts[run + 1]):
-                    left_out[reason(x[i], y[i], z[i], range_sq)] += 1
-    return num_rows
+        known = num_rows
+        num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
+        sums[known:num_rows] = 0.0
+        if LONG * num_runs > len(x):
+            add_points(places, len(x), chunk_keys, run_rows, flat)
+        else:
+            add_runs(places, starts, num_runs, run_rows, flat)
+        if sums[0, 0] > num_left_out:
+            num_left_out = sums[0, 0]
+            for run in range(num_runs):
+                if run_rows[run] == 0:
+                    for i in range(starts[run], starts[run + 1]):
+                        left_out[reason(x[i], y[i], z[i], range_sq)] += 1
+    return num_rows - 1
 
 
 @kernel(fastmath={'contract'})
-def add_runs(places, starts, num_runs, run_rows, sums):
+def add_runs(places, starts, num_runs, run_rows, flat):
     """
     Add count, sums and products of the places of each run to the sums of its voxel.
 
@@ -85,10 +104,8 @@ def add_runs(places, starts, num_runs, run_rows, sums):
     part of its kernel, whose other products have to be rounded.
     """
     all_x, all_y, all_z = places[0], places[1], places[2]
-    for run in range(np.uint32(num_runs)):
-        if run_rows[run] < 0:
-            continue
-        begin, end = np.uint32(starts[run]), np.uint32(starts[run + np.uint32(1)])
+    for run in range(U(num_runs)):
+        begin, end = U(np.uint32(starts[run])), U(np.uint32(starts[run + U(1)]))
         sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
         for i in range(begin, end):
             qx, qy, qz = all_x[i], all_y[i], all_z[i]
@@ -101,17 +118,39 @@ def add_runs(places, starts, num_runs, run_rows, sums):
             yy += qy * qy
             yz += qy * qz
             zz += qz * qz
-        row = np.uint32(run_rows[run])
-        sums[row, 0] += np.float64(end - begin)
-        sums[row, 1] += sx
-        sums[row, 2] += sy
-        sums[row, 3] += sz
-        sums[row, 4] += xx
-        sums[row, 5] += xy
-        sums[row, 6] += xz
-        sums[row, 7] += yy
-        sums[row, 8] += yz
-        sums[row, 9] += zz
+        at = U(SUMS) * U(np.uint32(run_rows[run]))
+        flat[at] += np.float64(end - begin)
+        flat[at + U(1)] += sx
+        flat[at + U(2)] += sy
+        flat[at + U(3)] += sz
+        flat[at + U(4)] += xx
+        flat[at + U(5)] += xy
+        flat[at + U(6)] += xz
+        flat[at + U(7)] += yy
+        flat[at + U(8)] += yz
+        flat[at + U(9)] += zz
+
+
+@kernel(fastmath={'contract'})
+def add_points(places, num, chunk_keys, run_rows, flat):
+    """Add the points of a chunk of short runs, of which branches would be mispredicted."""
+    all_x, all_y, all_z = places[0], places[1], places[2]
+    run, previous = U(0), chunk_keys[0]
+    for i in range(U(num)):
+        run += U(chunk_keys[i] != previous)
+        previous = chunk_keys[i]
+        at = U(SUMS) * U(np.uint32(run_rows[run]))
+        qx, qy, qz = all_x[i], all_y[i], all_z[i]
+        flat[at] += 1.0
+        flat[at + U(1)] += qx
+        flat[at + U(2)] += qy
+        flat[at + U(3)] += qz
+        flat[at + U(4)] += qx * qx
+        flat[at + U(5)] += qx * qy
+        flat[at + U(6)] += qx * qz
+        flat[at + U(7)] += qy * qy
+        flat[at + U(8)] += qy * qz
+        flat[at + U(9)] += qz * qz
 
 
 @part()

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from surfel_mapper.geometry import pose_matrix
-from surfel_mapper.kernels.grouping import CHUNK, find_runs, hash_shift, home
+from surfel_mapper.kernels.grouping import AHEAD, CHUNK, find_runs, hash_shift, home
 from surfel_mapper.kernels.quantisation import quantise
 from surfel_mapper.mapping.kernels.reduction import (
+    add_points,
     add_runs,
     BEYOND,
     look_back,
@@ -22,6 +23,7 @@ from surfel_mapper.mapping.kernels.reduction import (
     pack_sums,
     reason,
     reduce_points,
+    SUMS,
     TOO_FAR,
     TOO_NEAR,
 )
@@ -51,9 +53,10 @@ def some_points(num, dtype=np.float64, seed=0):
 
 def scratch_for(num_voxels):
     size = 1 << (2 * num_voxels - 1).bit_length()
-    keys, sums = np.full(num_voxels, -7, np.int64), np.full((num_voxels, 10), np.nan)
-    chunk_keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
-    starts, run_rows = np.empty(CHUNK + 1, np.int32), np.empty(CHUNK, np.int32)
+    keys = np.full(num_voxels + 2, -7, np.int64)
+    sums = np.full((num_voxels + 1, SUMS), np.nan)
+    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((3, CHUNK))
+    starts, run_rows = np.zeros(CHUNK + AHEAD, np.int32), np.empty(CHUNK, np.int32)
     return np.full(size, -1, np.int32), keys, sums, chunk_keys, places, starts, run_rows
 
 
@@ -98,21 +101,27 @@ def test_runs_are_those_of_groupby(call, keys):
 
 
 @both
-def test_runs_add_count_sums_and_products_to_their_voxels(call):
-    places = np.random.default_rng(1).integers(-32768, 32768, (3, 20)).astype(np.float64)
-    sums = np.zeros((4, 10))
+@pytest.mark.parametrize('by_point', [False, True])
+def test_runs_add_count_sums_and_products_to_their_voxels(call, by_point):
+    places = np.random.default_rng(1).integers(-32768, 32768, (3, 17)).astype(np.float64)
+    sums = np.zeros((4, SUMS))
     sums[1] = 5.0
-    starts = np.array([4, 9, 10, 17, 99], np.int32)  # of which three runs count
-    call(add_runs, places, starts, 3, np.array([1, -1, 2, 0], np.int32), sums)
-    for row, first, last, before in ((1, 4, 9, 5), (2, 10, 17, 0)):
-        x, y, z = places[:, first:last].astype(int).tolist()
+    run_rows = np.array([1, 3, 1, 0], np.int32)  # of which three runs count
+    if by_point:
+        keys = np.repeat([70, 20, 70], [9, 1, 7])
+        call(add_points, places, 17, keys, run_rows, sums.ravel())
+    else:
+        starts = np.array([0, 9, 10, 17, 99], np.int32)
+        call(add_runs, places, starts, 3, run_rows, sums.ravel())
+    for row, of_row, before in ((1, [*range(9), *range(10, 17)], 5), (3, [9], 0)):
+        x, y, z = places[:, of_row].astype(int).tolist()
         products = [
             sum(a * b for a, b in zip(*p, strict=True))
             for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]
         ]
-        found = [last - first, sum(x), sum(y), sum(z), *products]
+        found = [len(of_row), sum(x), sum(y), sum(z), *products]
         assert sums[row].tolist() == [value + before for value in found]
-    assert not sums[[0, 3]].any()
+    assert not sums[[0, 2]].any()
 
 
 @both
@@ -126,9 +135,9 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
     found = call(reduce_points, points.T.copy(), *AS_THEY_ARE, scratch, left_out)
 
     twin = reference.scan_moments(points, 0.5)
-    assert list(map(tuple, unpack_keys(keys[:found]).tolist())) == list(twin)
-    assert sums[:found].astype(int).tolist() == [row[:10] for row in twin.values()]
-    assert sorted(table[table >= 0]) == list(range(found))
+    assert list(map(tuple, unpack_keys(keys[2 : found + 2]).tolist())) == list(twin)
+    assert sums[1 : found + 1].astype(int).tolist() == [row[:10] for row in twin.values()]
+    assert sorted(table[table >= 0]) == list(range(found + 1))
     finite = np.isfinite(points).all(axis=1)
     assert left_out[NOT_FINITE] == (~finite).sum()
     assert left_out.sum() == num - sum(row[0] for row in twin.values())
