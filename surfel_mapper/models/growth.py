@@ -86,6 +86,9 @@ FAR_SIGMAS = 2.0
 SAMPLES = 20_000
 """Points for the tolerances of all patches, about."""
 
+RESOLVED_VOXELS = 0.2
+"""Tolerance of facets in voxels of the cloud, or sigmas: in clutter patches are thicker."""
+
 FLAT_VOXELS = 0.6
 """Thickness of a flat voxel, 6 sigma, at most."""
 
@@ -254,13 +257,15 @@ def grow(
     tolerance = tolerances(voxels, label, tangent, sigma, size_m)
     if len(tolerance):
         median_m = float(np.median(tolerance))
+        resolved_m = max(RESOLVED_VOXELS * size_m, TOLERANCE_SIGMAS * float(np.median(sigma)))
+        facet_m = min(median_m, resolved_m)
     else:
         range_sq = float(np.median(((means - view) ** 2).sum(axis=1)))
-        median_m = 3.0 * (noise[0] + noise[1] * range_sq) + 0.1 * size_m
+        facet_m = median_m = 3.0 * (noise[0] + noise[1] * range_sq) + 0.1 * size_m
     owner = np.repeat(label, np.diff(voxels.starts))
     free = free_surfels(voxels, owner, size_m, median_m)
     extend_patches(voxels, label, (tangent, tolerance), free, owner)
-    num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, median_m), config))
+    num = len(patches) + len(add_facets(voxels, owner, len(patches), (size_m, facet_m), config))
     table = owner_table(voxels, owner)
     index, normals, curved = join_patches(pieces_of(voxels, table, num), view, noise, size_m)
     rename_owners(voxels.starts, group, index, owner)
