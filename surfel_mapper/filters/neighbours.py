@@ -73,9 +73,10 @@ def threads_of_search() -> Any:
 def search_tree(points: Points, threads: int = 1) -> Tree:
     """Return the search tree of points, (N, 3) finite, N > 0."""
     num_leaves = -(-len(points) // LEAF)
-    order, values = np.arange(len(points), dtype=np.int32), np.empty(len(points))
+    order, xyz = np.arange(len(points), dtype=np.int32), np.empty((3, num_leaves * LEAF))
+    xyz[:, len(points) :] = np.inf
     links, boxes = np.full((3, 2 * num_leaves), -1, np.int32), np.empty((2 * num_leaves, 6))
-    arrays = points, order, links, boxes, values
+    arrays = points, order, links, boxes, xyz
     is_shared = threads > 1 and num_leaves >= MANY_LEAVES
     least = num_leaves // (PARTS * threads) if is_shared else 0
     tasks = np.empty((4 * PARTS * threads, 3), np.int64)
@@ -86,8 +87,6 @@ def search_tree(points: Points, threads: int = 1) -> Tree:
             build_nodes(*arrays, node, begin, end, 0, tasks[:0])
 
     share(build, int(num_tasks), threads)
-    xyz = np.full((3, num_leaves * LEAF), np.inf)
-    xyz[:, : len(points)] = points[order].T
     leaves = np.flatnonzero(links[RIGHT, : 2 * num_leaves - 1] < 0).astype(np.int32)
     return xyz, order, links, boxes, leaves
 

@@ -88,14 +88,13 @@ class Moments:
         return cls(count, mean, covariance, radius)
 
     @classmethod
-    def empty(cls, number: int) -> Moments:
-        """Return moments of a number of sets, to be filled."""
+    def of_neighbours(cls, points: Points, ids: Rows) -> Moments:
+        """Return the moments of neighbours, from their rows (M, K), padded by N at the end."""
+        number = len(ids)
         count, mean = np.empty(number, np.int64), np.empty((number, 3))
-        return cls(count, mean, np.empty((6, number)), np.empty(number))
-
-    def fill(self, rows: Rows, points: Points, ids: Rows) -> None:
-        """Fill rows (P,) with the moments of neighbours, ids (P, K) padded by N at the end."""
-        neighbour_moments(points, rows, ids, self.count, self.mean, self.covariance, self.radius)
+        covariance, radius = np.empty((6, number)), np.empty(number)
+        neighbour_moments(points, ids, count, mean, covariance, radius)
+        return cls(count, mean, covariance, radius)
 
     @property
     def density(self) -> Points:
@@ -273,11 +272,16 @@ class SurfaceNormal(ShapeFilter):
         """Return the scan with the columns added."""
         points = coordinates(scan)
         number = min(self.num_neighbours, len(points))
+        none = self.describe(points, np.empty(0, np.int32), np.empty((0, 1), np.int32))
+        columns: dict[str, npt.NDArray[Any]] = {
+            name: np.empty((len(points), *column.shape[1:])) for name, column in none.items()
+        }
         ids = np.empty((len(points), number), np.int32) if self.needs_ids else None
-        moments = Moments.empty(len(points))
 
         def describe(rows: Rows, near: Rows, _: Points) -> None:
-            moments.fill(rows, points, near)
+            # piece by piece, in the cache: the pieces' rows are scattered over the whole scan
+            for name, column in self.describe(points, rows, near).items():
+                columns[name][rows] = column
             if ids is not None:
                 ids[rows] = np.where(near < len(points), near, -1)
 
@@ -289,19 +293,24 @@ class SurfaceNormal(ShapeFilter):
             ordered=self.needs_ids,
             threads=self.threads,
         )
-        columns: dict[str, npt.NDArray[Any]] = self.shape_columns(
-            *eigen(moments.covariance, smallest_only=not self.keep_eigen_vectors), moments.count
-        )
-        if self.keep_densities:
-            columns[DENSITIES] = moments.density
-        if self.keep_mean_distances:
-            columns[MEAN_DISTS] = np.linalg.norm(points - moments.mean, axis=1)
         if self.smooth_normals and self.keep_normals and ids is not None:
             columns[NORMALS] = smoothed(columns[NORMALS], ids)
         columns = {name: column.astype(scan.points.dtype) for name, column in columns.items()}
         if self.keep_matched_ids and ids is not None:
             columns[MATCHED_IDS] = ids
         return with_columns(scan, **columns)
+
+    def describe(self, points: Points, rows: Rows, near: Rows) -> dict[str, npt.NDArray[Any]]:
+        """Return the selected columns of some points, from the rows of their neighbours."""
+        moments = Moments.of_neighbours(points, near)
+        columns = self.shape_columns(
+            *eigen(moments.covariance, smallest_only=not self.keep_eigen_vectors), moments.count
+        )
+        if self.keep_densities:
+            columns[DENSITIES] = moments.density
+        if self.keep_mean_distances:
+            columns[MEAN_DISTS] = np.linalg.norm(points[rows] - moments.mean, axis=1)
+        return columns
 
     @property
     def needs_ids(self) -> bool:

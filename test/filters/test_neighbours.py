@@ -39,6 +39,15 @@ def test_neighbours_are_the_nearest_and_begin_with_the_point_itself(number):
     np.testing.assert_allclose(distances, np.sort(apart, axis=1)[:, :number], atol=1e-15)
 
 
+@pytest.mark.parametrize('size', [1, 15, 16, 17, 33, 49, 81])
+def test_any_number_of_neighbours_is_found_whether_leaves_are_full_or_not(size):
+    points = cloud(size)
+    apart = np.sort(np.linalg.norm(points[:, None] - points[None], axis=2), axis=1)
+    for number in range(1, size + 1):
+        _, distances = all_neighbours(points, number)
+        np.testing.assert_allclose(distances, apart[:, :number], atol=1e-15)
+
+
 def test_points_beyond_the_limit_are_no_neighbours_and_one_at_it_is():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [3.0, 0, 0]])
     ids, distances = all_neighbours(points, 3, 1.0)
@@ -116,8 +125,7 @@ def test_moments_are_those_of_numpy():
     points = cloud(60)
     rows = np.arange(60) % 7
     by_group = Moments.of_groups(points, rows, 7)
-    by_ids = Moments.empty(1)
-    by_ids.fill(np.array([0], np.int32), points, np.flatnonzero(rows == 3)[None].astype(np.int32))
+    by_ids = Moments.of_neighbours(points, np.flatnonzero(rows == 3)[None].astype(np.int32))
     inside = points[rows == 3]
     expected = np.cov(inside.T)
     for found, i in ((by_group, 3), (by_ids, 0)):

@@ -3,12 +3,13 @@
 """
 The nearest neighbours of all points of a scan within it, in the tree of search_tree.py.
 
-All points are asked for, leaf by leaf, which a search for single points cannot exploit. The first
-point of a leaf is searched from its leaf upwards. Its distance to the k-th neighbour bounds those
-of the others by the triangle inequality, so the leaves that can matter to any of them are
-gathered once, and each point compares its bound with their boxes, with vector instructions.
+All points are asked for, leaf by leaf, which a search for single points cannot exploit. The
+smallest node about a leaf that holds k points bounds the distances to the k-th neighbours, so the
+leaves that can matter to any point of the leaf are gathered once, and each point compares its
+bound with their boxes, with vector instructions. That bound follows from the one of the point
+before by the triangle inequality.
 Distances below the bound are appended without a branch, and the k smallest are selected when the
-buffer is full and at the end. 120,000 points of a lidar, k = 10: 0.1 s; scipy's tree takes 0.4 s.
+buffer is full and at the end. 120,000 points of a lidar, k = 10: 0.06 s; scipy's tree takes 0.4 s.
 
 Source: Friedman, Bentley and Finkel 1977 for the search by bounds.
 """
@@ -38,10 +39,10 @@ def square(x, y, z):
 
 
 @part()
-def widened(bound, moved, within_sq):
+def widened(bound, moved, limit):
     """Return the square of sqrt(bound) + sqrt(moved), a little more for rounding."""
     reach = (math.sqrt(bound) + math.sqrt(moved)) * WIDER
-    return min(reach * reach + TINY, within_sq)
+    return min(reach * reach + TINY, limit)
 
 
 @part()
@@ -53,6 +54,7 @@ def outside(low, high, value):
 @part()
 def point_gap(boxes, node, x, y, z):
     """Return the squared distance of a point from the box of a node."""
+    node = U(node)
     dx = outside(boxes[node, 0], boxes[node, 3], x)
     dy = outside(boxes[node, 1], boxes[node, 4], y)
     dz = outside(boxes[node, 2], boxes[node, 5], z)
@@ -62,13 +64,36 @@ def point_gap(boxes, node, x, y, z):
 @part()
 def box_gap(boxes, one, other):
     """Return the squared distance between the boxes of two nodes."""
-    total = 0.0
-    for axis in range(3):
+    total, one, other = 0.0, U(one), U(other)
+    for axis in range(U(3)):
         low = max(boxes[one, axis], boxes[other, axis])
-        high = min(boxes[one, 3 + axis], boxes[other, 3 + axis])
+        high = min(boxes[one, U(3) + axis], boxes[other, U(3) + axis])
         apart = max(low - high, 0.0)
         total += apart * apart
     return total
+
+
+@part()
+def reach_of(links, boxes, leaf, k, num_points):
+    """
+    Return a squared distance within which each point of a leaf has k neighbours.
+
+    It is the largest one between the boxes of the leaf and of its lowest ancestor of k points.
+    """
+    node, first = leaf, np.int64(links[FIRST, leaf]) * LEAF
+    held = min(first + LEAF, num_points) - first
+    while held < k and links[PARENT, node] >= 0:
+        node = np.int64(links[PARENT, node])
+        first = np.int64(links[FIRST, node]) * LEAF
+        # the subtree of the left child, of half of the leaves, ends before the right one
+        held = min(first + (np.int64(links[RIGHT, node]) - node) * LEAF, num_points) - first
+    total = TINY
+    for axis in range(3):
+        below = boxes[leaf, 3 + axis] - boxes[node, axis]
+        above = boxes[node, 3 + axis] - boxes[leaf, axis]
+        far = max(below, above)
+        total += far * far
+    return total * WIDER
 
 
 @part()
@@ -252,10 +277,11 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
         node = np.int64(leaves[leaf])
         start = U(leaf * LEAF)
         num = U(min(LEAF, len(order) - leaf * LEAF))
-        num_near = np.int64(-1)
+        reach = min(reach_of(links, boxes, node, np.int64(k), len(order)), within_sq)
+        num_near = gather(links, boxes, node, reach, stack, near, bases)
         for place in range(start, start + num):
             x, y, z = xs[place], ys[place], zs[place]
-            bound = widened(bound, square(x - last_x, y - last_y, z - last_z), within_sq)
+            bound = widened(bound, square(x - last_x, y - last_y, z - last_z), reach)
             last_x, last_y, last_z = x, y, z
             if num_near < 0:
                 count, bound = search(
@@ -287,12 +313,6 @@ def find_nearest(tree, block, within_sq, ordered, rows, ids, squared):
                 bound = select(squares, found, count, k)
             else:
                 bound = largest(squares, k) if count == k else within_sq
-            if place == start and num > U(1):
-                far = 0.0
-                for i in range(start, start + num):
-                    far = max(far, square(xs[i] - x, ys[i] - y, zs[i] - z))
-                reach = widened(bound, far, within_sq)
-                num_near = gather(links, boxes, node, reach, stack, near, bases)
             count = min(count, k)
             rows[out] = order[place]
             if ordered:

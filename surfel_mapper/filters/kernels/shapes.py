@@ -52,27 +52,27 @@ def group_moments(points, rows, count, mean, covariance, radius):
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def neighbour_moments(points, rows, ids, count, mean, covariance, radius):
+def neighbour_moments(points, ids, count, mean, covariance, radius):
     """
     Compute the moments of the neighbours of points.
 
     points      (N, 3) float64, m
-    rows        (P,) int32, where to write the moments
-    ids         (P, K) int32, rows of the neighbours, padded by N at the end
+    ids         (M, K) int32, rows of the neighbours, padded by N at the end
     count       (M,) int64, out: number of neighbours
     mean        (M, 3) float64, out, m
     covariance  (6, M) float64, out: xx xy xz yy yz zz of scatter / (count - 1), m^2
     radius      (M,) float64, out: from the mean to the farthest, m
     """
     for i in range(np.uint64(len(ids))):
-        number = np.uint64(0)
+        number = np.uint64(ids.shape[1])
+        while number > np.uint64(0) and ids[i, number - np.uint64(1)] == len(points):
+            number -= np.uint64(1)
         sx, sy, sz = 0.0, 0.0, 0.0
-        while number < ids.shape[1] and ids[i, number] < len(points):
-            row = np.uint64(ids[i, number])
+        for k in range(number):
+            row = np.uint64(ids[i, k])
             sx += points[row, 0]
             sy += points[row, 1]
             sz += points[row, 2]
-            number += np.uint64(1)
         held = np.float64(number)
         mx, my, mz = sx / held, sy / held, sz / held
         xx, xy, xz, yy, yz, zz, far_sq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -87,10 +87,9 @@ def neighbour_moments(points, rows, ids, count, mean, covariance, radius):
             zz += z * z
             far_sq = max(far_sq, (x * x + y * y) + z * z)
         free = max(held - 1.0, 1.0)
-        out = np.uint64(rows[i])
-        count[out] = np.int64(number)
-        mean[out, 0], mean[out, 1], mean[out, 2] = mx, my, mz
-        covariance[0, out], covariance[1, out] = xx / free, xy / free
-        covariance[2, out], covariance[3, out] = xz / free, yy / free
-        covariance[4, out], covariance[5, out] = yz / free, zz / free
-        radius[out] = math.sqrt(far_sq)
+        count[i] = np.int64(number)
+        mean[i, 0], mean[i, 1], mean[i, 2] = mx, my, mz
+        covariance[0, i], covariance[1, i] = xx / free, xy / free
+        covariance[2, i], covariance[3, i] = xz / free, yy / free
+        covariance[4, i], covariance[5, i] = yz / free, zz / free
+        radius[i] = math.sqrt(far_sq)
