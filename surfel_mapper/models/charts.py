@@ -20,6 +20,7 @@ from surfel_mapper.models.kernels.surfel_groups import (
     find_doubtful,
     mean_normals,
 )
+from surfel_mapper.models.segmentation import height_fields
 from surfel_mapper.models.surfel_graph import SurfelGraph
 
 Array = npt.NDArray[np.float64]
@@ -70,19 +71,17 @@ def chart_components(
 
 def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> list[Rows]:
     """Return the charts of one component whose rows are sorted by key."""
-    found, waiting, size_m = [], [members], graph.map.voxel_size_m
-    while waiting:
-        part = waiting.pop()
-        if len(part) < least:
-            continue
-        side = np.empty(len(part), np.bool_)
-        normals, points = graph.normal[part], graph.position[part]
-        if bisect_chart(normals, points, limit, STACKED_VOXELS * size_m, size_m, side):
-            for half in (part[side], part[~side]):
-                waiting += connected_parts(graph, half)
-        else:
-            found.append(part)
-    return found
+    size_m = graph.map.voxel_size_m
+
+    def side(part: Rows) -> npt.NDArray[np.bool_] | None:
+        beyond, state = np.empty(len(part), np.bool_), (graph.normal[part], graph.position[part])
+        is_cut = bisect_chart(*state, limit, STACKED_VOXELS * size_m, size_m, beyond)
+        return beyond if is_cut else None
+
+    def components(half: Rows) -> list[Rows]:
+        return [part for part in connected_parts(graph, half) if len(part) >= least]
+
+    return height_fields([members], side, components)
 
 
 def connected_parts(graph: SurfelGraph, rows: Rows) -> list[Rows]:

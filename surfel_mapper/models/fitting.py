@@ -43,6 +43,7 @@ from surfel_mapper.models.growth import (
     owner_table,
     VoxelPoints,
 )
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH
 from surfel_mapper.models.multi_model import Gaussians, MultiModel, Plane, Surface
 from surfel_mapper.models.patches import fit_patches, PatchPoints
 from surfel_mapper.models.seams import with_smooth_seams
@@ -353,9 +354,6 @@ def assembled(
     return model, labels
 
 
-LEAST_WIDTH = 0.04
-"""A surfel with a smaller ratio of the tangential variances is a line: one point."""
-
 ABOVE_EXTENTS = 1.0
 """Height of the virtual viewpoint above a map, in diagonals of the map."""
 
@@ -378,6 +376,7 @@ def surfel_points(surfels: Surfels, voxel_size_m: float) -> Array:
     x, y = across(surfels.normal)
     # surfels do not store their tangential axes: the disc is taken as round
     wide = np.sqrt(3.0 * surfels.eigenvalues[:, 1:].mean(axis=1))
+    # a line is one point
     wide[surfels.eigenvalues[:, 1] < LEAST_WIDTH * surfels.eigenvalues[:, 2]] = 0.0
     half = np.minimum(wide, voxel_size_m * np.sqrt(0.5))[:, None]
     low = surfels.voxel_index * voxel_size_m

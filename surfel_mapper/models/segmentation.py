@@ -10,8 +10,10 @@ becomes at least two.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 import math
+from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -23,6 +25,7 @@ from surfel_mapper.models.kernels.region_merging import merge_regions
 
 Array = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+Rows = TypeVar('Rows', npt.NDArray[np.int32], npt.NDArray[np.int64])
 
 FAR_GAP_VOXELS = 5.0
 NEAR_GAP_VOXELS = 3.0
@@ -119,16 +122,43 @@ def merge_clusters(clusters: Clusters, config: ModelsConfig, viewpoint: Array) -
     """Return the flat clusters of each chart: their rows, (n,) int64, lowest first."""
     flat = np.flatnonzero(clusters.flat)
     scales = thickness(clusters.mean, config, viewpoint) / config.voxel_size_m
-    found: list[Indices] = []
-    waiting = merged(clusters, flat, scales, config)[::-1]
+
+    def components(members: Indices) -> list[Indices]:
+        return merged(clusters, members, scales, config)
+
+    def side(members: Indices) -> npt.NDArray[np.bool_] | None:
+        return folded(clusters, members, config)
+
+    return height_fields(components(flat), side, components)
+
+
+def height_fields(
+    parts: list[Rows],
+    side: Callable[[Rows], npt.NDArray[np.bool_] | None],
+    components: Callable[[Rows], list[Rows]],
+) -> list[Rows]:
+    """
+    Bisect parts of a surface until each is a height field; clusters and surfels of a map alike.
+
+    Parameters
+    ----------
+    parts : list of (n,) int
+        Rows of clusters or surfels.
+    side : callable
+        Returns how to bisect rows, (n,) bool, or None if they are a height field.
+    components : callable
+        Returns the connected components of rows.
+
+    """
+    found, waiting = [], parts[::-1]
     while waiting:
-        members = waiting.pop()
-        side = folded(clusters, members, config)
-        if side is None:
-            found.append(members)
+        part = waiting.pop()
+        beyond = side(part)
+        if beyond is None:
+            found.append(part)
         else:
-            for half in (members[side], members[~side]):
-                waiting += merged(clusters, half, scales, config)[::-1]
+            for half in (part[beyond], part[~beyond]):
+                waiting += components(half)[::-1]
     return found
 
 
@@ -173,23 +203,6 @@ def folded(
     clusters: Clusters, members: Indices, config: ModelsConfig
 ) -> npt.NDArray[np.bool_] | None:
     """Return how to bisect a region (n,) bool, or None if it is a chart."""
-    limit = math.cos(math.radians(config.fold_angle_deg))
-    return bisected(clusters.frames[members, 2], mean_normal(clusters, members), limit)
-
-
-def bisected(normals: Array, mean: Array, limit: float) -> npt.NDArray[np.bool_] | None:
-    """
-    Return how to bisect a region (n,) bool, or None if it is a chart.
-
-    Parameters
-    ----------
-    normals : (n, 3) float64
-        Unit normals of its clusters.
-    mean : (3,) float64
-        Their mean.
-    limit : float
-        Least cosine to the mean, for nearly all clusters.
-
-    """
-    side = np.empty(len(normals), np.bool_)
+    limit, side = math.cos(math.radians(config.fold_angle_deg)), np.empty(len(members), np.bool_)
+    normals, mean = clusters.frames[members, 2], mean_normal(clusters, members)
     return side if bisect_folded(normals, mean, limit, side) else None

@@ -1,13 +1,36 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Moments of a range of points, and the frame of a cluster from its eigenvectors.
+Moments of points, and the frames of clusters, facets and surfels from their eigenvectors.
 
-On its own because bisection and patches share it.
+On its own because bisection, patches, growth and the surfels of a map share it.
 """
 
 from numba import njit
 import numpy as np
+
+from surfel_mapper.kernels.symmetric3 import eigen_frame
+
+LEAST_WIDTH = 0.04
+"""A surfel with a smaller ratio of the tangential variances is a line: no reliable normal."""
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def plane_of(sums, divisor, scatter, value, axes):
+    """
+    Compute the covariance (3, 3) of moments, its eigenvalues (3,), ascending, and axes (3, 3).
+
+    sums     (10,) float64: number, sums of x y z, xx xy xz yy yz zz
+    divisor  of the sums of squared deviations: the number, or one less
+    scatter  (3, 3), value (3,), axes (3, 3) float64, out; axes are rows
+    """
+    n, k = sums[0], 4
+    for a in range(3):
+        for b in range(a, 3):
+            moment = sums[k] - sums[1 + a] * sums[1 + b] / n
+            scatter[a, b] = scatter[b, a] = (max(moment, 0.0) if a == b else moment) / divisor
+            k += 1
+    eigen_frame(scatter, value, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -22,7 +22,7 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 SLOTS = 4
 """Candidates of a voxel, at most: three faces meet in a corner."""
@@ -35,9 +35,6 @@ LEAST_FREE_SHARE = 1.0 / 3.0
 
 LEAST_POINTS = 6
 """Points that determine the plane of a voxel, at least."""
-
-LEAST_WIDTH = 0.04
-"""A voxel with a smaller ratio of the tangential variances is a line."""
 
 FREE = -1
 """Owner of a point on no patch."""
@@ -101,7 +98,7 @@ def classify_free(points, starts, owner, thickness, count, flat, mean, normal):
             for j in range(3):
                 mean[v, j] = points[low, j] + sums[1 + j] / sums[0]
         if count[v] >= LEAST_POINTS:
-            eigen_moments(sums, scatter, value, axes)
+            plane_of(sums, sums[0], scatter, value, axes)
             if 36.0 * value[0] < thickness**2 and value[1] > LEAST_WIDTH * value[2]:
                 flat[v] = True
                 normal[v] = axes[0]
@@ -121,19 +118,6 @@ def add_point(points, i, origin, sums):
     sums[7] += y * y
     sums[8] += y * z
     sums[9] += z * z
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def eigen_moments(sums, scatter, value, axes):
-    """Compute eigenvalues (3,) of the covariance, ascending, and axes (3, 3) as rows."""
-    number, x, y, z = sums[0], sums[1], sums[2], sums[3]
-    scatter[0, 0] = max(sums[4] - x * x / number, 0.0) / number
-    scatter[1, 1] = max(sums[7] - y * y / number, 0.0) / number
-    scatter[2, 2] = max(sums[9] - z * z / number, 0.0) / number
-    scatter[0, 1] = scatter[1, 0] = (sums[5] - x * y / number) / number
-    scatter[0, 2] = scatter[2, 0] = (sums[6] - x * z / number) / number
-    scatter[1, 2] = scatter[2, 1] = (sums[8] - y * z / number) / number
-    eigen_frame(scatter, value, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -273,7 +257,7 @@ def find_facets(points, starts, adjacent, free, rules, owner, planes, num_planes
             if sums[0] < least_points or size < least_voxels:
                 size = 0
                 break
-            eigen_moments(sums, scatter, value, axes)
+            plane_of(sums, sums[0], scatter, value, axes)
             if math.sqrt(12.0 * max(value[1], 0.0)) < least_width:
                 size = 0
                 break
@@ -334,7 +318,7 @@ def grow_facet(
                 add_point(points, i, mean[seed], sums)
         if adapts and sums[0] >= refit:
             refit = 2.0 * sums[0]
-            eigen_moments(sums, scatter, value, axes)
+            plane_of(sums, sums[0], scatter, value, axes)
             if value[1] > 0.5 * LEAST_WIDTH * value[2] and (
                 abs_cosine(normal[seed], axes[0]) > least_cosine
             ):

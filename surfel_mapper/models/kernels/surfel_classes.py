@@ -13,13 +13,10 @@ import math
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.symmetric3 import eigen_frame
+from surfel_mapper.models.kernels.frames import LEAST_WIDTH, plane_of
 
 NONE, YOUNG, FLAT, ROUGH = 0, 1, 2, 3
 """Class of a voxel: empty, too few points, flat surfel, not flat."""
-
-LEAST_WIDTH = 0.04
-"""A surfel with a smaller ratio of the tangential variances is a line: no reliable normal."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
@@ -111,7 +108,7 @@ def classify_sparse(rows, neighbours, own, surfels, rules, kind, normal):
                 add_moments(near[h], origin, count, position, covariance, sums)
         if sums[0] < rules[0]:
             continue
-        plane_of(sums, scatter, value, axes)
+        plane_of(sums, max(sums[0] - 1.0, 1.0), scatter, value, axes)
         n = axes[0]
         away = (n[0] * sums[1] + n[1] * sums[2] + n[2] * sums[3]) / sums[0]
         if not (value[0] < rules[1] and value[1] > LEAST_WIDTH * value[2]):
@@ -149,18 +146,6 @@ def add_moments(row, origin, count, position, covariance, sums):
     sums[7] += n * y * y + less * c[3]
     sums[8] += n * y * z + less * c[4]
     sums[9] += n * z * z + less * c[5]
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def plane_of(sums, scatter, value, axes):
-    """Compute eigenvalues (3,), m^2, and axes (3, 3) of moments (10,), ascending."""
-    n, k = sums[0], 4
-    for a in range(3):
-        for b in range(a, 3):
-            scatter[a, b] = (sums[k] - sums[1 + a] * sums[1 + b] / n) / max(n - 1.0, 1.0)
-            scatter[b, a] = scatter[a, b]
-            k += 1
-    eigen_frame(scatter, value, axes)
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

@@ -9,8 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.kernels.charts import bisect_chart, percentile
-from surfel_mapper.models.segmentation import bisected
+from surfel_mapper.models.kernels.charts import bisect_chart, bisect_folded, percentile
 from test.kernels.modes import both
 
 LIMIT = math.cos(math.radians(60.0))
@@ -27,27 +26,36 @@ def mean_of(normals):
     return mean / np.linalg.norm(mean)
 
 
-def test_fan_of_normals_is_bisected_in_its_middle():
+def bisected(call, normals, mean):
+    """Return one half of folded normals, None for others."""
+    side = np.empty(len(normals), bool)
+    return side if call(bisect_folded, normals, mean, LIMIT, side) else None
+
+
+@both
+def test_fan_of_normals_is_bisected_in_its_middle(call):
     normals = fan(-85.0, 85.0, 40)
-    side = bisected(normals, mean_of(normals), LIMIT)
+    side = bisected(call, normals, mean_of(normals))
     assert side is not None
     assert side.tolist() in ([True] * 20 + [False] * 20, [False] * 20 + [True] * 20)
 
 
-def test_two_bundles_of_normals_are_bisected_at_the_gap():
+@both
+def test_two_bundles_of_normals_are_bisected_at_the_gap(call):
     normals = np.concatenate([fan(-90.0, -70.0, 9), fan(50.0, 90.0, 15)])
-    side = bisected(normals, np.array([0.0, 0.0, 1.0]), LIMIT)
+    side = bisected(call, normals, np.array([0.0, 0.0, 1.0]))
     assert side is not None
     assert len(set(side[:9])) == 1
     assert len(set(side[9:])) == 1
     assert side[0] != side[9]
 
 
+@both
 @pytest.mark.parametrize(
     'normals', [fan(-50.0, 50.0, 30), fan(80.0, 80.0, 1), np.repeat(fan(80.0, 80.0, 1), 5, 0)]
 )
-def test_slightly_bent_or_inseparable_normals_stay_whole(normals):
-    assert bisected(normals, np.array([0.0, 0.0, 1.0]), LIMIT) is None
+def test_slightly_bent_or_inseparable_normals_stay_whole(call, normals):
+    assert bisected(call, normals, np.array([0.0, 0.0, 1.0])) is None
 
 
 def halved(call, normals, points):
