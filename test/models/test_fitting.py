@@ -215,7 +215,8 @@ def test_noisy_round_objects_are_curved_patches(ball, radius_m, whole, size_m):
 def test_a_bent_sheet_is_one_surface_and_a_roof_two_planes():
     x, y = (part.ravel() for part in np.meshgrid(*2 * [np.arange(-0.3, 0.3, 0.004)]))
     noise = 2e-3 * np.random.default_rng(9).standard_normal(len(x))
-    for heights, planes, surfaces in ((-0.5 * x**2 / 0.5, 0, 1), (-0.3 * np.abs(x), 2, 0)):
+    shapes = (-0.5 * x**2 / 0.5, 0, 1), (-0.3 * np.abs(x), 2, 0), (-0.4 * np.abs(x), 2, 0)
+    for heights, planes, surfaces in shapes:
         model = fit(
             np.column_stack([x, y, heights + noise]), ModelsConfig(voxel_size_m=0.02), (0, 0, 2.0)
         )

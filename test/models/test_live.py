@@ -330,6 +330,15 @@ def test_bent_sheet_without_viewpoint_is_one_surface():
     assert surface.rms_m < 3e-3
 
 
+@pytest.mark.parametrize(('slope', 'planes', 'surfaces'), [(0.3, 0, 1), (0.4, 2, 0)])
+def test_roofs_are_two_planes_from_between_33_and_44_degrees_on(slope, planes, surfaces):
+    x, y = (part.ravel() for part in np.meshgrid(*2 * [np.arange(-0.3, 0.3, 0.004)]))
+    z = 2e-3 * np.random.default_rng(9).standard_normal(len(x)) - slope * np.abs(x)
+    points, settings = np.column_stack([x, y, z]), ModelsLayerConfig()
+    _, models = of_points(points, (0.0, 0.0, 2.0), settings, 0.02)
+    assert (len(models.model.planes), len(models.model.surfaces)) == (planes, surfaces)
+
+
 def test_a_ramp_over_itself_is_cut():
     turn, out = np.meshgrid(np.arange(0, 14, 0.004), np.arange(3.0, 5.0, 0.02), indexing='ij')
     ramp = np.stack([out * np.cos(turn), out * np.sin(turn), 0.25 * turn], -1).reshape(-1, 3)
