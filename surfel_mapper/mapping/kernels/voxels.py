@@ -64,10 +64,11 @@ from surfel_mapper.mapping.kernels.rows import (
 )
 
 AHEAD = 16
-"""Voxels between the prefetch of a bucket, that of the row in it, and the use of both."""
+"""Number of voxels between the prefetch of a row and its use."""
 
-RING = 4 * AHEAD
-"""Voxels whose hashes and rows are kept, a power of two above 2 AHEAD."""
+BLOCK = 32
+"""Voxels looked up together: prefetch all buckets, then all rows, then use the rows."""
+
 
 LATER = PRODUCT
 """Column of a free row: the row that is taken AHEAD new voxels later, to be prefetched, or -1."""
@@ -77,22 +78,26 @@ SLACK = 1.0 + 1e-9
 
 
 @njit(cache=True, nogil=True, inline='always')
-def prefetch_bucket(key, directory, buckets, held, depth):
-    """Prefetch the bucket of a voxel and the count of its segment; return its hash."""
-    hashed = hash_key(key)
-    bucket = first_bucket(hashed, directory, depth)
-    prefetch(buckets, bucket)
-    prefetch(held, bucket // SEGMENT)
-    return hashed
+def look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely):
+    """
+    Find the likely rows of num voxels from start on, and prefetch them.
 
-
-@njit(cache=True, nogil=True, inline='always')
-def prefetch_likely(hashed, flat, directory, buckets, depth):
-    """Prefetch the likely row of a voxel, to be confirmed by its key; return it, or -1."""
-    row = likely_row(hashed, directory, buckets, depth)
-    if row >= 0:
-        prefetch_row(flat, row)
-    return row
+    flat    (R * 12,) int64, the rows
+    hashes  (BLOCK,) int64, out
+    likely  (BLOCK,) int64, out: a row with the hash of the voxel, to be confirmed by its key;
+            -1 if not found
+    """
+    for i in range(num):
+        hashed = hash_key(keys[start + i])
+        hashes[i] = hashed
+        bucket = first_bucket(hashed, directory, depth)
+        prefetch(buckets, bucket)
+        prefetch(held, bucket // SEGMENT)
+    for i in range(num):
+        row = likely_row(hashes[i], directory, buckets, depth)
+        likely[i] = row
+        if row >= 0:
+            prefetch_row(flat, row)
 
 
 @kernel()
@@ -106,19 +111,15 @@ def find_rows(keys, rows, table, state, found):
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes = np.empty(RING, np.int64)
-    num = len(keys)
-    for later in range(num + 2 * AHEAD):
-        if later < num:
-            hashes[later % RING] = prefetch_bucket(keys[later], directory, buckets, held, depth)
-        soon = later - AHEAD
-        if 0 <= soon < num:
-            found[soon] = prefetch_likely(hashes[soon % RING], flat, directory, buckets, depth)
-        place = soon - AHEAD
-        if place >= 0:
-            row = found[place]
-            if row >= 0 and rows[row, KEY] != keys[place]:
-                found[place] = find_row(keys[place], rows, table, depth)
+    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    for start in range(0, len(keys), BLOCK):
+        num = min(BLOCK, len(keys) - start)
+        look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely)
+        for i in range(num):
+            row = likely[i]
+            if row >= 0 and rows[row, KEY] != keys[start + i]:
+                row = find_row(keys[start + i], rows, table, depth)
+            found[start + i] = row
 
 
 @kernel()
@@ -139,39 +140,41 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes, likely = np.empty(RING, np.int64), np.empty(RING, np.int64)
-    num, num_points = len(keys), np.int64(0)
-    for later in range(start, num + 2 * AHEAD):
-        if later < num:
-            hashes[later % RING] = prefetch_bucket(keys[later], directory, buckets, held, depth)
-        soon = later - AHEAD
-        if start <= soon < num:
-            hashed = hashes[soon % RING]
-            likely[soon % RING] = prefetch_likely(hashed, flat, directory, buckets, depth)
-        place = soon - AHEAD
-        if place < start:
-            continue
-        key, hashed, row = keys[place], hashes[place % RING], likely[place % RING]
-        if row >= 0 and rows[row, KEY] != key:
-            row = find_row(key, rows, table, depth)
-        if row < 0:
-            full = is_full(hashed, directory, held, depth)
-            if not full or makes_room(hashed, table, state):
-                row = take_row(rows, flat, state)
+    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    num_points = np.int64(0)
+    done = start
+    while done < len(keys):
+        num = min(BLOCK, len(keys) - done)
+        look_up(keys, done, num, flat, directory, buckets, held, depth, hashes, likely)
+        for i in range(num):
+            place = done + i
+            key = keys[place]
+            row = likely[i]
+            if row >= 0 and rows[row, KEY] != key:
+                row = find_row(key, rows, table, depth)
             if row < 0:
-                num = place
-                break
-            for column in range(ROW):
-                rows[row, column] = 0
-            rows[row, KEY] = key
-            insert_entry(hashed, row, directory, buckets, held, depth)
-            state[VOXELS] += 1
-        num_points += np.int64(count[place])
-        change_row(moments, view_weight, rows, row, place, 1)
-        found[place] = row
+                full = is_full(hashes[i], directory, held, depth)
+                if full and not makes_room(hashes[i], table, state):
+                    state[POINTS] += num_points
+                    set_stamps(stamps, found[start:place], stamp)
+                    return place
+                row = take_row(rows, flat, state)
+                if row < 0:
+                    state[POINTS] += num_points
+                    set_stamps(stamps, found[start:place], stamp)
+                    return place
+                for column in range(ROW):
+                    rows[row, column] = 0
+                rows[row, KEY] = key
+                insert_entry(hashes[i], row, directory, buckets, held, depth)
+                state[VOXELS] += 1
+            num_points += np.int64(count[place])
+            change_row(moments, view_weight, rows, row, place, 1)
+            found[place] = row
+        done += num
     state[POINTS] += num_points
-    set_stamps(stamps, found[start:num], stamp)
-    return num
+    set_stamps(stamps, found[start:done], stamp)
+    return done
 
 
 @njit(cache=True, nogil=True, inline='always')
