@@ -11,7 +11,7 @@ longer window the evicted scan shares fewer voxels with the new one, so more vox
 larger maps hold voxels far from the street that no scan touches.
 
 Besides the street, a real scan of an HDL-32 is moved by 0.3 m a step, if SURFEL_MAPPER_TEST_DATA
-leads to it. Its largest map takes 3 GB.
+leads to it. Its largest map takes 2.4 GB.
 """
 
 from __future__ import annotations
