@@ -18,6 +18,7 @@ REFERENCES = {
     'filters/kernels/sampling.py': 'filters/test_sampling.py',
     'filters/kernels/search_tree.py': 'filters/test_neighbours.py',
     'filters/kernels/shapes.py': 'filters/kernels/test_kernels.py',
+    'filters/kernels/smallest.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/tensor_voting.py': 'filters/test_tensor_voting.py',
     'kernels/compiling.py': 'kernels/test_compiling.py',
     'kernels/grouping.py': 'kernels/test_grouping.py',

@@ -22,6 +22,7 @@ from surfel_mapper.filters.kernels.limits import (
 )
 from surfel_mapper.filters.kernels.sampling import choose
 from surfel_mapper.filters.kernels.shapes import group_moments, neighbour_moments
+from surfel_mapper.filters.kernels.smallest import keep_least, VECTORS
 from surfel_mapper.filters.shapes import PAIRS
 from surfel_mapper.kernels.grouping import CHUNK
 from surfel_mapper.kernels.selection import compact
@@ -214,6 +215,35 @@ def test_moments_of_neighbours_equal_numpy(call):
         np.testing.assert_allclose(mean[row], expected[0], atol=1e-12)
         np.testing.assert_allclose(covariance[:, row], expected[1], atol=1e-12)
         np.testing.assert_allclose(radius[row], expected[2].max(), atol=1e-12)
+
+
+def even_squares(rng, number):
+    return rng.uniform(size=number)
+
+
+def equal_squares(rng, number):
+    return np.repeat(rng.uniform(size=4), -(-number // 4))[:number]
+
+
+def crowded_squares(rng, number):
+    return rng.uniform(size=number) ** 40
+
+
+@both
+@pytest.mark.parametrize('draw', [even_squares, equal_squares, crowded_squares])
+@pytest.mark.parametrize(('number', 'k'), [(2, 1), (20, 10), (25, 24), (54, 30), (96, 1)])
+def test_the_smallest_squares_are_kept_with_their_places(call, draw, number, k):
+    rng = np.random.default_rng(number)
+    given = draw(rng, number)
+    for high in (np.inf, given.max()):
+        squares = np.full(-(-number // VECTORS) * VECTORS, np.nan)
+        squares[:number] = given
+        found = np.arange(len(squares), dtype=np.int32)
+        bound = call(keep_least, squares, found, np.uint64(number), np.uint64(k), high)
+        assert bound == np.sort(given)[k - 1]
+        np.testing.assert_array_equal(np.sort(squares[:k]), np.sort(given)[:k])
+        np.testing.assert_array_equal(squares[:k], given[found[:k]])
+        assert len(set(found[:k])) == k
 
 
 @both

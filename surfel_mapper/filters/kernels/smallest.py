@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: 2026 surfel_mapper contributors
+# SPDX-License-Identifier: Apache-2.0
+"""
+The smallest of the squared distances that a search holds, and their order.
+
+A search holds some dozens of squares and the places of their points, and keeps the k smallest each
+time it holds too many. Most of its branches would be mispredicted, so few are left: many squares
+are parted by a limit with k of them below it, few by partitions.
+
+Source: interpolation search, Peterson 1957; selection by partitions, Hoare 1961.
+"""
+
+import math
+
+import numpy as np
+
+from surfel_mapper.filters.kernels.search_tree import U
+from surfel_mapper.kernels.compiling import kernel, part
+
+VECTORS = 32
+"""Squares are counted in steps of this number: four vectors of 512 bits."""
+
+FEW = 24
+"""Number of squares up to which partitions are faster than counting."""
+
+TRIALS = 8
+"""Maximum number of limits tried; three or four are usual."""
+
+
+@kernel(error_model='numpy', fastmath={'nnan'})
+def keep_least(squares, found, count, k, high):
+    """
+    Move the k smallest of the first count squares to the front; return the largest of them.
+
+    squares  (C,) float64, in and out; C a multiple of VECTORS, those past count are overwritten
+    found    (C,) int32, in and out: places, moved with the squares
+    high     float64: none of the squares is larger
+
+    On a surface the number of points within a distance grows with its square, so a limit with k
+    squares below it is found by a few interpolations, and counted with vector instructions. A few
+    squares, or equal ones, which no limit parts, are selected.
+    """
+    if count <= U(FEW) or high == math.inf:
+        return select(squares, found, count, k)
+    end = (count + U(VECTORS - 1)) & ~U(VECTORS - 1)
+    for i in range(count, end):
+        squares[i] = math.inf
+    low, num_low, num_high, wanted = 0.0, np.int64(0), np.int64(count), np.int64(k)
+    for _ in range(TRIALS):
+        share = (np.float64(wanted - num_low) + 0.5) / np.float64(num_high - num_low + 1)
+        limit = low + (high - low) * share
+        below = np.int64(0)
+        for i in range(end):
+            below += np.int64(squares[i] < limit)
+        if below == wanted:
+            kept = U(0)
+            for i in range(count):
+                value, place = squares[i], found[i]
+                squares[kept], found[kept] = value, place
+                kept += U(value < limit)
+            return largest(squares, k)
+        if below < wanted:
+            low, num_low = limit, below
+        else:
+            high, num_high = limit, below
+    return select(squares, found, count, k)
+
+
+@kernel(error_model='numpy', fastmath={'nnan'})
+def select(squares, found, count, k):
+    """
+    Move the k smallest of the first count squares to the front; return the largest of them.
+
+    Partitions without branches: the next one would be mispredicted half of the time.
+    """
+    low, high = U(0), count
+    while True:
+        a, b, c = squares[low], squares[(low + high) >> U(1)], squares[high - U(1)]
+        pivot = max(min(a, b), min(max(a, b), c))
+        less = low
+        for i in range(low, high):
+            value, place = squares[i], found[i]
+            squares[i], found[i] = squares[less], found[less]
+            squares[less], found[less] = value, place
+            less += U(value < pivot)
+        if less == k:
+            return largest(squares, k)
+        if less > k:
+            high = less
+            continue
+        equal = less
+        for i in range(less, high):
+            value, place = squares[i], found[i]
+            squares[i], found[i] = squares[equal], found[equal]
+            squares[equal], found[equal] = value, place
+            equal += U(value <= pivot)
+        if equal >= k:
+            return pivot
+        low = equal
+
+
+@part()
+def largest(squares, count):
+    """Return the largest of the first squares."""
+    found = squares[0]
+    for i in range(U(1), count):
+        found = max(found, squares[i])
+    return found
+
+
+@kernel()
+def sort(squares, found, order, count):
+    """Sort the points held by distance, equal ones by row."""
+    for i in range(U(1), count):
+        value, place, later = squares[i], found[i], i
+        while later > U(0):
+            before = later - U(1)
+            farther = squares[before] > value
+            if squares[before] == value:
+                farther = order[U(found[before])] > order[U(place)]
+            if not farther:
+                break
+            squares[later], found[later] = squares[before], found[before]
+            later = before
+        squares[later], found[later] = value, place
