@@ -568,7 +568,11 @@ class ModelsLayerConfig(Stage):
         1, 'Largest distance of neighbours, in voxels; 2 for lidars of few beams.', low=1, high=2
     )
     min_voxels: int = setting(
-        4, 'Planes and surfaces of fewer voxels become Gaussians.', low=1, high=100_000
+        4,
+        'Planes and surfaces of fewer voxels become Gaussians; curved ones of fewer than 15 '
+        'voxels and 1,000 points, too.',
+        low=1,
+        high=100_000,
     )
     absorb: bool = setting(
         True, 'Patches grow over sparse and rough voxels that lie on them, and join across these.'

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.charts import bisect_chart
+from surfel_mapper.models.kernels.charts import bisect_chart, find_scraps
 from surfel_mapper.models.kernels.surfel_groups import (
     connected_components,
     find_doubtful,
@@ -35,11 +35,11 @@ def chart_components(
     graph: SurfelGraph,
     rows: Rows,
     starts: Indices,
-    fold_angle_deg: float,
+    angles_deg: tuple[float, float],
     least: int,
 ) -> list[Rows]:
     """
-    Return the voxels of every chart.
+    Return the voxels of every chart; small curved ones are dropped.
 
     Parameters
     ----------
@@ -47,8 +47,8 @@ def chart_components(
         The voxels.
     rows, starts : (M,) int32, (K + 1,) int64
         Components: k has rows starts[k] to starts[k + 1] - 1.
-    fold_angle_deg : float
-        Largest angle between a normal and the mean of its chart.
+    angles_deg : (float, float)
+        Largest angle between a normal and the mean of its chart; between normals of a flat one.
     least : int
         Charts of fewer voxels are dropped.
 
@@ -56,7 +56,7 @@ def chart_components(
     means, doubtful = np.empty((len(starts) - 1, 3)), np.empty(len(starts) - 1, np.bool_)
     flat = np.ones(len(graph.key), np.bool_)
     mean_normals(rows, starts, flat, graph.normal, means)
-    rules = (math.cos(math.radians(fold_angle_deg)), STACKED_VOXELS * graph.map.voxel_size_m)
+    rules = (math.cos(math.radians(angles_deg[0])), STACKED_VOXELS * graph.map.voxel_size_m)
     find_doubtful(rows, starts, means, graph.normal, graph.position, rules, doubtful)
     found: list[Rows] = []
     for k in range(len(means)):
@@ -66,7 +66,18 @@ def chart_components(
             found += bisected(graph, ordered, rules[0], least)
         else:
             found.append(members)
-    return found
+    return without_scraps(graph, found, angles_deg[1])
+
+
+def without_scraps(graph: SurfelGraph, charts: list[Rows], max_angle_deg: float) -> list[Rows]:
+    """Return charts without those that are curved and too small to be a surface."""
+    if not charts:
+        return charts
+    starts = np.cumsum([0, *map(len, charts)])
+    is_scrap = np.empty(len(charts), np.bool_)
+    limit = math.cos(math.radians(max_angle_deg))
+    find_scraps(np.concatenate(charts), starts, graph.count, graph.normal, limit, is_scrap)
+    return [chart for chart, scrap in zip(charts, is_scrap, strict=True) if not scrap]
 
 
 def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> list[Rows]:

@@ -198,7 +198,8 @@ class LiveModels:
         large = np.diff(starts) >= least
         ends = np.concatenate([[0], np.cumsum(np.diff(starts)[large])])
         kept = rows[np.repeat(large, np.diff(starts))]
-        for chart in chart_components(graph, kept, ends, self.config.fold_angle_deg, least):
+        angles = self.config.fold_angle_deg, self.config.max_angle_deg
+        for chart in chart_components(graph, kept, ends, angles, least):
             self._charts.setdefault(int(graph.component[chart[0]]), []).append(chart)
 
     def _joined(self, changed: Rows) -> Rows:

@@ -382,6 +382,17 @@ def test_planes_grow_over_gaps_to_the_sparse_voxels_on_them():
     assert plane.id not in {id_at(models, place) for place in above}
 
 
+@pytest.mark.parametrize(
+    ('radius_m', 'spacing', 'patches'), [(0.3, 0.03, 0), (0.3, 0.005, 1), (np.inf, 0.03, 1)]
+)
+def test_small_curved_charts_are_patches_if_they_have_many_points(radius_m, spacing, patches):
+    points = cells((0.02, 0.34), (0.02, 0.34), 0.06, spacing)  # three voxels a side
+    points[:, 2] -= 0.5 * (points[:, 0] - 0.18) ** 2 / radius_m
+    _, models = of_points(points)
+    assert len(models.model.patches) == patches
+    assert len(models.model.gaussians) == 9 * (1 - patches)
+
+
 def test_models_across_blocks_equal_a_batch():
     rng = np.random.default_rng(4)
     settings = ModelsLayerConfig(min_points=4, noise_m=0.005)

@@ -80,4 +80,4 @@ def test_patches_are_of_one_surface(street):
         if len(mine):
             counts = np.unique(mine, return_counts=True)[1]
             wrong, total = wrong + len(mine) - int(counts.max()), total + len(mine)
-    assert wrong < 0.005 * total
+    assert wrong < 0.003 * total

@@ -9,7 +9,12 @@ import math
 import numpy as np
 import pytest
 
-from surfel_mapper.models.kernels.charts import bisect_chart, bisect_folded, percentile
+from surfel_mapper.models.kernels.charts import (
+    bisect_chart,
+    bisect_folded,
+    find_scraps,
+    percentile,
+)
 from test.kernels.modes import both
 
 LIMIT = math.cos(math.radians(60.0))
@@ -96,3 +101,18 @@ def test_percentile_equals_numpy(number):
     values = np.random.default_rng(number).normal(size=number)
     for share in (0.0, 2.0, 50.0, 100.0):
         assert percentile(values, share) == pytest.approx(np.percentile(values, share))
+
+
+@both
+def test_small_curved_charts_of_few_points_are_scraps(call):
+    bent, flat = fan(-10.0, 10.0, 14), fan(-7.0, 7.0, 4)
+    flat[0] *= -1.0  # normals may face either side
+    normal = np.concatenate([bent, fan(-10.0, 10.0, 15), bent, flat])
+    starts = np.cumsum([0, 14, 15, 14, 4])
+    count = np.full(len(normal), 20)
+    count[29:43] = 72  # 1008 points
+    order = np.random.default_rng(7).permutation(len(normal))
+    rows, found = np.argsort(order), np.empty(4, bool)
+    limit = math.cos(math.radians(15.0))
+    call(find_scraps, rows, starts, count[order], normal[order], limit, found)
+    assert found.tolist() == [True, False, False, False]
