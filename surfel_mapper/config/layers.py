@@ -553,7 +553,11 @@ class ModelsLayerConfig(Stage):
         high=10.0,
     )
     noise_m: float = setting(
-        0.0, 'Noise of the sensor, sigma, m, allowed on top of the thickness.', low=0.0, high=1.0
+        0.0,
+        'Noise of the sensor, sigma, m, allowed on top of the thickness; 0: estimated from the '
+        'map, 0.02 at most.',
+        low=0.0,
+        high=1.0,
     )
     max_angle_deg: float = setting(
         15.0, 'Angle between normals of neighbours on one plane, at most, deg.', low=0.1, high=89.0

@@ -5,13 +5,16 @@ LiveModels: planes, B-spline surfaces and Gaussians of a map, kept up to date as
 
 Surfels take the place of the clusters; raw points are not needed. Changes are read from the map
 itself, so scans that are added, removed or moved by an alignment need no special case. The voxels
-of each primitive follow from the present map, to the bit; its history decides the ids, and the
-frames within a tenth of the thickness of a plane.
+of each primitive follow from the present map and the noise of the sensor, to the bit; its history
+decides the ids, the frames within a tenth of the thickness of a plane, and the noise if that is
+not configured: it is estimated while the map grows (surfel_noise.py).
 
 An update reads the changed voxels (surfel_graph.py), recomputes the connected components around
 them, cuts these into charts (charts.py), grows and joins all charts as those of one cloud
 (surfel_joining.py), matches ids (id_matching.py), and refits patches with material changes
 (live_patches.py). Flat voxels without a patch and rough voxels are one Gaussian each.
+
+One module: an update is one sequence of steps on the same arrays.
 
 Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are our own.
 """
@@ -19,6 +22,7 @@ Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import sys
 from time import perf_counter
 from typing import Any
 
@@ -44,8 +48,15 @@ from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
 from surfel_mapper.models.surfel_joining import SurfelJoining
+from surfel_mapper.models.surfel_noise import estimate_noise
 
 __all__ = ['LiveModels', 'ModelUpdate']
+
+LEAST_ESTIMATED, MOST_ESTIMATED = 256, 1 << 17
+"""Voxels of a map at the first estimate of the noise, and at the last, at most."""
+
+OTHER_NOISE = 0.8
+"""Ratio of estimates of the noise from which all voxels are measured anew."""
 
 Rows = npt.NDArray[np.int32]
 Indices = npt.NDArray[np.int64]
@@ -76,7 +87,7 @@ class LiveModels:
         self._graph = SurfelGraph(config, surfel_map)
         self._fitter = PatchFitter(self._graph)
         self._joining = SurfelJoining(self._graph, config)
-        self._next_id = 0
+        self._next_id, self._estimate_at = 0, LEAST_ESTIMATED
         self.clear()
 
     def clear(self) -> None:
@@ -94,6 +105,8 @@ class LiveModels:
         """Follow the changes of the map since the last call."""
         start = perf_counter()
         self._surfels = self._model = None
+        if not self.config.noise_m:
+            self._follow_noise()
         change = self._graph.update()
         self._recut(change)
         members, ends = self._sorted(self._joined(change.rows))
@@ -116,6 +129,11 @@ class LiveModels:
             milliseconds=(perf_counter() - start) * 1e3,
             num_changed=change.num_voxels,
         )
+
+    @property
+    def noise_m(self) -> float:
+        """Noise of the sensor, sigma, m: as configured, or as estimated from the map."""
+        return self._graph.noise_m
 
     @property
     def surfels(self) -> Surfels:
@@ -163,6 +181,7 @@ class LiveModels:
             Shapes().of(models.model, models.versions)
             ellipsoid_corners(models.model.gaussians)
             bisected(models._graph, np.arange(2, dtype=np.int32), 0.5, 1)
+            estimate_noise(surfel_map)
             surfel_map.remove(moments[1])
             models.update()
             surfel_map.remove(moments[0])
@@ -178,6 +197,17 @@ class LiveModels:
             'gaussians': len(model.gaussians),
             'bytes': model.size_bytes,
         }
+
+    def _follow_noise(self) -> None:
+        """Estimate the noise whenever the map has twice as many voxels as at the last estimate."""
+        if not self._estimate_at <= self.map.num_voxels:
+            return
+        self._estimate_at = max(2 * self.map.num_voxels, LEAST_ESTIMATED)
+        if self._estimate_at > MOST_ESTIMATED:
+            self._estimate_at = sys.maxsize
+        noise_m = estimate_noise(self.map)
+        if not OTHER_NOISE * noise_m <= self.noise_m <= noise_m / OTHER_NOISE:
+            self._graph.assume_noise(noise_m)
 
     def _recut(self, change: GraphChange) -> None:
         """Recompute connected components around changes, and cut these into charts."""

@@ -91,6 +91,8 @@ class SurfelGraph:
         Whether its last change is worth reporting.
     places : (R,) int32
         All -1; scratch for kernels.
+    noise_m : float
+        Assumed noise of the sensor.
 
     """
 
@@ -100,8 +102,20 @@ class SurfelGraph:
         self.thickness_m = config.flat_thickness_m or max(
             LEAST_THICKNESS_M, THICKNESS_VOXELS * size_m
         )
-        offset_m = max(self.thickness_m, 3.0 * config.noise_m)
-        self.limit_m = math.hypot(self.thickness_m, 6.0 * config.noise_m)
+        self._config = config
+        self._report_rules = ((MOVED * self.thickness_m) ** 2, TURNED, GREW)
+        self._absorbs = config.absorb
+        steps = half_neighbourhood(config.reach_voxels)
+        self._neighbour_steps = np.concatenate([steps, -steps])
+        self.clear()
+        self.assume_noise(config.noise_m)
+
+    def assume_noise(self, noise_m: float) -> None:
+        """Take another noise of the sensor, sigma, m: the next update measures all voxels anew."""
+        config, size_m = self._config, self.map.voxel_size_m
+        self.noise_m = noise_m
+        offset_m = max(self.thickness_m, 3.0 * noise_m)
+        self.limit_m = math.hypot(self.thickness_m, 6.0 * noise_m)
         variance = (self.limit_m / 6.0) ** 2
         far_sq = 12.5 * (config.reach_voxels * size_m) ** 2  # just over twice the diagonal
         self._class_rules = (float(config.min_points), variance, size_m)
@@ -113,11 +127,8 @@ class SurfelGraph:
             far_sq,
         )
         self._host_rules = (offset_m, variance, far_sq)
-        self._report_rules = ((MOVED * self.thickness_m) ** 2, TURNED, GREW)
-        self._absorbs = config.absorb
-        steps = half_neighbourhood(config.reach_voxels)
-        self._neighbour_steps = np.concatenate([steps, -steps])
-        self.clear()
+        self._is_stale = True
+        self._reported_count[:] = 0
 
     def clear(self) -> None:
         """Remove all voxels; the next update reads the whole map."""
@@ -139,8 +150,8 @@ class SurfelGraph:
     def update(self) -> GraphChange:
         """Read the changes of the map since the last call."""
         forgotten = self._forgotten()
-        changed = self.map.rows_changed(self._version)
-        self._version = self.map.version
+        changed = self.map.rows_changed(-1 if self._is_stale else self._version)
+        self._version, self._is_stale = self.map.version, False
         self._make_room(int(changed.max(initial=-1)) + 1)
         new, old = self.map.keys_of(changed), self.key[changed]
         left, here = changed[(old >= 0) & (old != new)], changed[new >= 0]

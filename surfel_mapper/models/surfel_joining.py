@@ -65,7 +65,6 @@ class SurfelJoining:
 
     def __init__(self, graph: SurfelGraph, config: ModelsLayerConfig) -> None:
         self._graph = graph
-        self._noise_m = config.noise_m
         self._limit = math.cos(math.radians(config.fold_angle_deg))
         self.clear()
 
@@ -181,7 +180,7 @@ class SurfelJoining:
         is_flat = graph.kind == FLAT
         mean_normals(rows[order].astype(np.int32), starts, is_flat, graph.normal, normals)
         points = graph.position[rows]
-        rules = CoarseRules(size_m, graph.thickness_m, (self._noise_m, 0.0))
+        rules = CoarseRules(size_m, graph.thickness_m, (graph.noise_m, 0.0))
         for factor in FACTORS:
             if factor > 1.0 and np.count_nonzero(patch < 0) < SPARSE_SHARE * len(patch):
                 break

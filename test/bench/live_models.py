@@ -75,7 +75,7 @@ def run() -> Iterator[Row]:
 def ids_over_time(seed: int) -> Row:
     """Return the row of ids in one street."""
     surfel_map, held = SurfelMap(STANDING_SIZE_M), deque()
-    models = LiveModels(ModelsLayerConfig(noise_m=STANDING_NOISE_M), surfel_map)
+    models = LiveModels(ModelsLayerConfig(), surfel_map)
     before: dict[tuple[int, ...], int] = {}
     known = kept = merged = 0
     for number, (points, origin) in enumerate(street_scans(METRE, WINDOW + METRES, seed)):
@@ -140,7 +140,7 @@ def case(
 ) -> Row:
     """Return one row."""
     surfel_map = SurfelMap(voxel_size_m)
-    models = LiveModels(ModelsLayerConfig(noise_m=0.01), surfel_map)
+    models = LiveModels(ModelsLayerConfig(), surfel_map)
     models.warm_up()
     times, processor, access, changed = [], [], [], []
     for points, origin in scans:

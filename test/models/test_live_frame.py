@@ -22,7 +22,10 @@ from test.models.scenes import BALL, CYLINDER, room, VIEW
 
 VOXEL_M, MIN_POINTS, MIN_VOXELS, THICKNESS_M = 0.1, 6, 4, 0.03
 SETTINGS = ModelsLayerConfig(
-    min_points=MIN_POINTS, min_voxels=MIN_VOXELS, flat_thickness_m=THICKNESS_M
+    min_points=MIN_POINTS,
+    min_voxels=MIN_VOXELS,
+    flat_thickness_m=THICKNESS_M,
+    noise_m=1e-9,  # stated, so that it is not estimated: the twin knows the thickness alone
 )
 NEAR = [step for step in product((-1, 0, 1), repeat=3) if step != (0, 0, 0)]
 

@@ -25,7 +25,7 @@ def street(request):
     lidar = Lidar(beams=64, columns=1024, range_noise_m=NOISE_M)
     simulation = Simulation(world, lidar)
     surfel_map = SurfelMap(VOXEL_M)
-    models = LiveModels(ModelsLayerConfig(noise_m=NOISE_M), surfel_map)
+    models = LiveModels(ModelsLayerConfig(), surfel_map)
     held = deque()
     for number in range(0, STEP * SCANS, STEP):
         scan = simulation.scan(number)
