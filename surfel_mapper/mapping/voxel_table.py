@@ -8,8 +8,8 @@ buckets grow without being copied and a full segment of the hash table splits se
 no scan waits while the whole map is rehashed.
 
 ChangeLog: the rows that the latest versions changed. Without it, asking for changes would look at
-the stamp of every row. It is bounded: where it would hold a quarter of the rows, looking at all
-stamps, one after the other, takes no longer.
+the stamp of every row. It holds at most a quarter of the rows: beyond that, reading all stamps in
+order is as fast.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from surfel_mapper.models.kernels.charts import bisect_chart, find_scraps
+from surfel_mapper.models.kernels.charts import bisect_chart, find_small_curved
 from surfel_mapper.models.kernels.surfel_groups import (
     connected_components,
     find_doubtful,
@@ -66,18 +66,20 @@ def chart_components(
             found += bisected(graph, ordered, rules[0], least)
         else:
             found.append(members)
-    return without_scraps(graph, found, angles_deg[1])
+    return without_small_curved(graph, found, angles_deg[1])
 
 
-def without_scraps(graph: SurfelGraph, charts: list[Rows], max_angle_deg: float) -> list[Rows]:
+def without_small_curved(
+    graph: SurfelGraph, charts: list[Rows], max_angle_deg: float
+) -> list[Rows]:
     """Return charts without those that are curved and too small to be a surface."""
     if not charts:
         return charts
     starts = np.cumsum([0, *map(len, charts)])
-    is_scrap = np.empty(len(charts), np.bool_)
+    is_small = np.empty(len(charts), np.bool_)
     limit = math.cos(math.radians(max_angle_deg))
-    find_scraps(np.concatenate(charts), starts, graph.count, graph.normal, limit, is_scrap)
-    return [chart for chart, scrap in zip(charts, is_scrap, strict=True) if not scrap]
+    find_small_curved(np.concatenate(charts), starts, graph.count, graph.normal, limit, is_small)
+    return [chart for chart, small in zip(charts, is_small, strict=True) if not small]
 
 
 def bisected(graph: SurfelGraph, members: Rows, limit: float, least: int) -> list[Rows]:

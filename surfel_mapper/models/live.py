@@ -22,7 +22,7 @@ Source: Gao and Dong 2025 for the tests and the models; surfels as clusters are 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-import sys
+import math
 from time import perf_counter
 from typing import Any
 
@@ -48,12 +48,12 @@ from surfel_mapper.models.multi_model import Gaussians, MultiModel, Surface
 from surfel_mapper.models.shapes import ellipsoid_corners, Shapes
 from surfel_mapper.models.surfel_graph import GraphChange, SurfelGraph
 from surfel_mapper.models.surfel_joining import SurfelJoining
-from surfel_mapper.models.surfel_noise import estimate_noise
+from surfel_mapper.models.surfel_noise import estimate_noise, MOST_VOXELS
 
 __all__ = ['LiveModels', 'ModelUpdate']
 
-LEAST_ESTIMATED, MOST_ESTIMATED = 256, 1 << 17
-"""Voxels of a map at the first estimate of the noise, and at the last, at most."""
+LEAST_ESTIMATED = 256
+"""Voxels of a map at the first estimate of the noise, at least."""
 
 OTHER_NOISE = 0.8
 """Ratio of estimates of the noise from which all voxels are measured anew."""
@@ -87,7 +87,8 @@ class LiveModels:
         self._graph = SurfelGraph(config, surfel_map)
         self._fitter = PatchFitter(self._graph)
         self._joining = SurfelJoining(self._graph, config)
-        self._next_id, self._estimate_at = 0, LEAST_ESTIMATED
+        self._next_id = 0
+        self._estimate_at: float = LEAST_ESTIMATED
         self.clear()
 
     def clear(self) -> None:
@@ -200,11 +201,10 @@ class LiveModels:
 
     def _follow_noise(self) -> None:
         """Estimate the noise whenever the map has twice as many voxels as at the last estimate."""
-        if not self._estimate_at <= self.map.num_voxels:
+        number = self.map.num_voxels
+        if number < self._estimate_at:
             return
-        self._estimate_at = max(2 * self.map.num_voxels, LEAST_ESTIMATED)
-        if self._estimate_at > MOST_ESTIMATED:
-            self._estimate_at = sys.maxsize
+        self._estimate_at = 2 * number if 2 * number <= MOST_VOXELS else math.inf
         noise_m = estimate_noise(self.map)
         if not OTHER_NOISE * noise_m <= self.noise_m <= noise_m / OTHER_NOISE:
             self._graph.assume_noise(noise_m)

@@ -92,7 +92,7 @@ class SurfelGraph:
     places : (R,) int32
         All -1; scratch for kernels.
     noise_m : float
-        Assumed noise of the sensor.
+        Assumed noise of the sensor, sigma, m.
 
     """
 
@@ -128,7 +128,7 @@ class SurfelGraph:
         )
         self._host_rules = (offset_m, variance, far_sq)
         self._is_stale = True
-        self._reported_count[:] = 0
+        self._reported_count[:] = 0  # as new, so that all patches are fitted again
 
     def clear(self) -> None:
         """Remove all voxels; the next update reads the whole map."""

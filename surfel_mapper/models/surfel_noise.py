@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from surfel_mapper.kernels import layout
 from surfel_mapper.mapping.coarsening import coarse_surfels
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.models.growth import CLIPPED_VOXELS, CLIPPING, NOISE_QUANTILE
@@ -33,20 +34,27 @@ SPREAD = 1.15
 """Noise over the quantile: voxels of LEAST_POINTS points scatter, and a plane only grazes some."""
 
 MOST_M = 0.02
-"""Largest estimate, m: what is rougher is vegetation or rubble seen in large voxels."""
+"""Largest estimate, m: rougher surfaces are vegetation or rubble in large voxels, not noise."""
+
+MOST_VOXELS = 1 << 17
+"""Voxels that are looked at, those added first: neighbours are mostly added together."""
 
 
 def estimate_noise(surfel_map: SurfelMap) -> float:
     """
     Return the standard deviation of the points about the flat surfaces of a map, m.
 
-    It is at most MOST_M, and 0 if the map has fewer than LEAST_VOXELS voxels that tell.
+    It is at most MOST_M, and 0 if fewer than LEAST_VOXELS voxels have the points and the width for
+    an estimate.
     """
-    moments = surfel_map.moments()
-    every, found = np.arange(len(moments)), 0.0
+    moments = surfel_map.moments().select(slice(MOST_VOXELS))
+    found = 0.0
     for level in range(LEVELS):
         size_m = surfel_map.voxel_size_m * 2**level
-        thin, wide, _ = coarse_surfels(moments, level, every, LEAST_POINTS).eigenvalues.T
+        # 8^level voxels in one have to stay within its limit of points, which 4^level divides
+        most = layout.MAX_MAP_COUNT >> (5 * level + 2 * surfel_map.level)
+        chosen = np.flatnonzero(moments.count <= most)
+        thin, wide, _ = coarse_surfels(moments, level, chosen, LEAST_POINTS).eigenvalues.T
         sigma = np.sqrt(thin[wide > (LEAST_WIDTH * size_m) ** 2])
         if len(sigma) < LEAST_VOXELS:
             continue

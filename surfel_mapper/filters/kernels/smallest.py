@@ -4,8 +4,8 @@
 The smallest of the squared distances that a search holds, and their order.
 
 A search holds some dozens of squares and the places of their points, and keeps the k smallest each
-time it holds too many. Most of its branches would be mispredicted, so few are left: many squares
-are parted by a limit with k of them below it, few by partitions.
+time it holds too many. To avoid mispredicted branches, many squares are split by a limit that k of
+them are below, and a few by partitions.
 
 Source: interpolation search, Peterson 1957; selection by partitions, Hoare 1961.
 """

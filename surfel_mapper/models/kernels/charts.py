@@ -41,7 +41,7 @@ Others are mostly parts of tree crowns, of which one in nine merges within a met
 
 
 @njit(cache=True, nogil=True, error_model='numpy')
-def find_scraps(rows, starts, count, normal, limit, found):
+def find_small_curved(rows, starts, count, normal, limit, found):
     """
     Find curved charts that are too small.
 

@@ -12,7 +12,7 @@ import pytest
 from surfel_mapper.models.kernels.charts import (
     bisect_chart,
     bisect_folded,
-    find_scraps,
+    find_small_curved,
     percentile,
 )
 from test.kernels.modes import both
@@ -104,7 +104,7 @@ def test_percentile_equals_numpy(number):
 
 
 @both
-def test_small_curved_charts_of_few_points_are_scraps(call):
+def test_small_curved_charts_of_few_points_are_dropped(call):
     bent, flat = fan(-10.0, 10.0, 14), fan(-7.0, 7.0, 4)
     flat[0] *= -1.0  # normals may face either side
     normal = np.concatenate([bent, fan(-10.0, 10.0, 15), bent, flat])
@@ -114,5 +114,5 @@ def test_small_curved_charts_of_few_points_are_scraps(call):
     order = np.random.default_rng(7).permutation(len(normal))
     rows, found = np.argsort(order), np.empty(4, bool)
     limit = math.cos(math.radians(15.0))
-    call(find_scraps, rows, starts, count[order], normal[order], limit, found)
+    call(find_small_curved, rows, starts, count[order], normal[order], limit, found)
     assert found.tolist() == [True, False, False, False]
