@@ -14,7 +14,7 @@ import math
 
 import numpy as np
 
-from surfel_mapper.filters.kernels.search_tree import U
+from surfel_mapper.filters.kernels.search_tree import move_below, move_up_to, U
 from surfel_mapper.kernels.compiling import kernel, part
 
 VECTORS = 32
@@ -54,7 +54,7 @@ def keep_least(squares, found, count, k, high):
             below += np.int64(squares[i] < limit)
         if below == wanted:
             kept = U(0)
-            for i in range(count):
+            for i in range(count):  # the others are not needed: no swaps, as move_below has them
                 value, place = squares[i], found[i]
                 squares[kept], found[kept] = value, place
                 kept += U(value < limit)
@@ -68,32 +68,18 @@ def keep_least(squares, found, count, k, high):
 
 @kernel(error_model='numpy', fastmath={'nnan'})
 def select(squares, found, count, k):
-    """
-    Move the k smallest of the first count squares to the front; return the largest of them.
-
-    Partitions without branches: the next one would be mispredicted half of the time.
-    """
+    """Partition the first count squares: the k smallest first; return the largest of these."""
     low, high = U(0), count
     while True:
         a, b, c = squares[low], squares[(low + high) >> U(1)], squares[high - U(1)]
         pivot = max(min(a, b), min(max(a, b), c))
-        less = low
-        for i in range(low, high):
-            value, place = squares[i], found[i]
-            squares[i], found[i] = squares[less], found[less]
-            squares[less], found[less] = value, place
-            less += U(value < pivot)
+        less = move_below(squares, found, low, high, pivot)
         if less == k:
             return largest(squares, k)
         if less > k:
             high = less
             continue
-        equal = less
-        for i in range(less, high):
-            value, place = squares[i], found[i]
-            squares[i], found[i] = squares[equal], found[equal]
-            squares[equal], found[equal] = value, place
-            equal += U(value <= pivot)
+        equal = move_up_to(squares, found, less, high, pivot)
         if equal >= k:
             return pivot
         low = equal
