@@ -34,6 +34,9 @@ NOISE = 1e-15
 
 SIXTH = 1.0 / 6.0
 
+CHUNK = 128
+"""Matrices decomposed together: what is computed of them stays in the first-level cache."""
+
 
 @kernel(error_model='numpy')
 def decompose(scatter, num, eigenvalues, normals):
@@ -46,18 +49,32 @@ def decompose(scatter, num, eigenvalues, normals):
     normals      (3, C) float64, out: unit eigenvectors of the smallest; sign arbitrary. If the
                  two smallest coincide: orthogonal to the third eigenvector; if all coincide: z
     """
-    deviators, sizes = np.empty((6, num)), np.empty((3, num))
-    roots, vectors, planes = np.empty(num), np.empty((3, num)), np.empty((4, num))
-    normalise(scatter, num, deviators, sizes)
-    isolate(deviators, num, roots)
-    cross(deviators, roots, num, vectors)
-    deflate(deviators, roots, vectors, num, planes)
-    write_eigenvalues(sizes, roots, planes, num, eigenvalues)
-    write_normals(roots, vectors, planes, num, normals)
+    work = make_work(min(num, CHUNK))
+    for start in range(0, num, CHUNK):
+        decompose_chunk(scatter, start, min(CHUNK, num - start), work, eigenvalues, normals)
+
+
+@njit(cache=True, nogil=True, inline='always')
+def make_work(size):
+    """Return arrays for what is computed of ``size`` matrices; see ``decompose_chunk``."""
+    deviators, sizes = np.empty((6, size)), np.empty((3, size))
+    return deviators, sizes, np.empty(size), np.empty((3, size)), np.empty((4, size))
 
 
 @part(error_model='numpy')
-def normalise(scatter, num, deviators, sizes):
+def decompose_chunk(scatter, start, num, work, eigenvalues, normals):
+    """Decompose num matrices from start on, as ``decompose`` does, with work for as many."""
+    deviators, sizes, roots, vectors, planes = work
+    normalise(scatter, start, num, deviators, sizes)
+    isolate(deviators, num, roots)
+    cross(deviators, roots, num, vectors)
+    deflate(deviators, roots, vectors, num, planes)
+    write_eigenvalues(sizes, roots, planes, start, num, eigenvalues)
+    write_normals(roots, vectors, planes, start, num, normals)
+
+
+@part(error_model='numpy')
+def normalise(scatter, start, num, deviators, sizes):
     """
     Subtract the mean eigenvalue and scale the deviator.
 
@@ -67,8 +84,9 @@ def normalise(scatter, num, deviators, sizes):
                the scaling of tiny or huge matrices, whose squares and cubes would leave float64
     """
     for i in range(num):
-        axx, axy, axz = scatter[0, i], scatter[1, i], scatter[2, i]
-        ayy, ayz, azz = scatter[3, i], scatter[4, i], scatter[5, i]
+        at = start + i
+        axx, axy, axz = scatter[0, at], scatter[1, at], scatter[2, at]
+        ayy, ayz, azz = scatter[3, at], scatter[4, at], scatter[5, at]
         size = (axx + ayy) + azz
         into = 2.0**700 if size < 2.0**-400 else (2.0**-600 if size > 2.0**400 else 1.0)
         back = 2.0**-700 if size < 2.0**-400 else (2.0**600 if size > 2.0**400 else 1.0)
@@ -167,7 +185,7 @@ def deflate(deviators, roots, vectors, num, planes):
 
 
 @part(error_model='numpy')
-def write_eigenvalues(sizes, roots, planes, num, eigenvalues):
+def write_eigenvalues(sizes, roots, planes, start, num, eigenvalues):
     """Scale the three eigenvalues back, in ascending order."""
     for i in range(num):
         trace, spread, back = sizes[0, i], sizes[1, i], sizes[2, i]
@@ -181,19 +199,22 @@ def write_eigenvalues(sizes, roots, planes, num, eigenvalues):
         e1 = 0.0 if e1 < noise else e1
         e1 = e0 if e1 < e0 else e1
         e2 = e1 if e2 < e1 else e2
-        eigenvalues[0, i], eigenvalues[1, i], eigenvalues[2, i] = e0 * back, e1 * back, e2 * back
+        at = start + i
+        eigenvalues[0, at], eigenvalues[1, at] = e0 * back, e1 * back
+        eigenvalues[2, at] = e2 * back
 
 
 @part(error_model='numpy')
-def write_normals(roots, vectors, planes, num, normals):
+def write_normals(roots, vectors, planes, start, num, normals):
     """Write the unit eigenvectors of the lowest eigenvalues, isolated or not."""
     for i in range(num):
         px, py, pz = planes[1, i], planes[2, i], planes[3, i]
         scale = 1.0 / math.sqrt((px * px + py * py) + pz * pz)
         isolated = roots[i] < 0.0
-        normals[0, i] = vectors[0, i] if isolated else px * scale
-        normals[1, i] = vectors[1, i] if isolated else py * scale
-        normals[2, i] = vectors[2, i] if isolated else pz * scale
+        at = start + i
+        normals[0, at] = vectors[0, i] if isolated else px * scale
+        normals[1, at] = vectors[1, i] if isolated else py * scale
+        normals[2, at] = vectors[2, i] if isolated else pz * scale
 
 
 @kernel(error_model='numpy')

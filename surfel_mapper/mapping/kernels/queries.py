@@ -31,7 +31,7 @@ from surfel_mapper.kernels.prefetch import prefetch
 from surfel_mapper.kernels.quantisation import in_range, pack
 from surfel_mapper.mapping.kernels.rows import count_of
 
-AHEAD = 16
+AHEAD = 64
 """Number of rows between the prefetch of a row and its use."""
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
@@ -160,7 +160,10 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     kept = np.empty(len(changed), np.int32)
     ignored = EMPTIED if min_points < 1 else 0
     num = 0
-    for row in changed:
+    for place in range(len(changed)):
+        if place + AHEAD < len(changed):
+            prefetch(stamps, np.int64(changed[place + AHEAD]))
+        row = changed[place]
         kept[num] = row
         num += (stamps[row] ^ stamp) <= ignored  # a branch would be mispredicted half of the time
     return kept[:num] if min_points <= 1 else kept[: keep_full(rows, kept, num, min_points)]

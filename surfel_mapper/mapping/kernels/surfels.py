@@ -21,14 +21,14 @@ from surfel_mapper.kernels.layout import (
     KEY,
     PRODUCT,
 )
-from surfel_mapper.kernels.symmetric3 import decompose
+from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import count_of, prefetch_row, sum_of, view_of
 
-CHUNK = 256
+CHUNK = 128
 """Voxels processed at once: their moments stay in the first-level cache."""
 
-AHEAD = 16
-"""Number of rows between the prefetch of a row and its use."""
+AHEAD = CHUNK
+"""Number of rows between the prefetch of a row and its use: a chunk is computed meanwhile."""
 
 EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
@@ -60,6 +60,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
     moments = np.empty((MOMENTS, CHUNK))
     scatter = np.empty((6, CHUNK))
     mean, values, normals = np.empty((3, CHUNK)), np.empty((3, CHUNK)), np.empty((3, CHUNK))
+    work = make_work(CHUNK)
     many = 1 << max(EXACT_BITS - 2 * bits, 0)
     for start in range(0, len(chosen), CHUNK):
         num = min(CHUNK, len(chosen) - start)
@@ -68,7 +69,7 @@ def derive_surfels(rows, chosen, voxel_size, bits, outputs):
         if most >= many:
             center_exactly(rows, chosen, start, num, scatter)
         place(mean, start, num, voxel_size, bits, voxel_index, position)
-        decompose(scatter, num, values, normals)
+        decompose_chunk(scatter, 0, num, work, values, normals)
         derive_shape(values, num, moments, voxel_size / (1 << bits), planarity, curvature, start)
         turn(normals, num, moments)
         for i in range(num):
