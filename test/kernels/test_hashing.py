@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from surfel_mapper.kernels.hashing import (
+    BUCKET,
     DEPTH,
     find_row,
     FULLEST,
@@ -84,7 +85,8 @@ class Owner:
                 key = int(self.rows[row, KEY])
                 assert hashed == compiled(hash_key, np.int64(key))
                 assert self.directory[hashed >> (32 - depth)] == segment
-                way = np.arange(hashed, hashed + (place - hashed) % SEGMENT) % SEGMENT
+                home = hashed % SEGMENT // BUCKET * BUCKET
+                way = np.arange(home, home + (place - home) % SEGMENT) % SEGMENT
                 assert full[way].all()  # no gap between home and place
                 seen[key] = row
         assert seen == self.expected
