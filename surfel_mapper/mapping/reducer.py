@@ -168,23 +168,25 @@ class Reducer:
     def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
         """Convert the sums to integers."""
         key, sums = scratch.keys[2 : num + 2].copy(), scratch.sums[1 : num + 1]
-        largest = sums[:, 0].max(initial=0.0)
+        left_out = scratch.left_out
+        moments = ScanMoments(
+            voxel_size_m=self.voxel_size_m,
+            key=key,
+            count=np.empty(num, np.int32),
+            total=np.empty((num, 3), np.int32),
+            product=np.empty((num, 6), np.int64),
+            view=np.empty((num, 3), np.int16),
+            left_out={cause: int(left_out[row]) for cause, row in CAUSES.items() if left_out[row]},
+        )
+        largest = pack_sums(sums, moments.count, moments.total, moments.product)
         if largest > MAX_SCAN_COUNT:
             raise MapLimitError(
                 f'{largest:.0f} points in one voxel of one scan; '
                 f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
             )
-        counts = scratch.left_out
-        moments = ScanMoments(
-            voxel_size_m=self.voxel_size_m,
-            key=key,
-            count=np.empty(num, np.int32),
-            total=np.empty((num, 3), np.int32 if largest < NARROW_COUNT else np.int64),
-            product=np.empty((num, 6), np.int64),
-            view=np.empty((num, 3), np.int16),
-            left_out={cause: int(counts[row]) for cause, row in CAUSES.items() if counts[row]},
-        )
-        pack_sums(sums, moments.count, moments.total, moments.product)
+        if largest >= NARROW_COUNT:
+            moments = replace(moments, total=np.empty((num, 3), np.int64))
+            pack_sums(sums, moments.count, moments.total, moments.product)
         look_back(key, origin, self.voxel_size_m, moments.view)
         return moments
 

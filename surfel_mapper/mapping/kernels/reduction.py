@@ -168,19 +168,22 @@ def reason(x, y, z, range_sq):
 @kernel()
 def pack_sums(sums, count, total, product):
     """
-    Convert the sums of a scan to integers.
+    Convert the sums of a scan to integers; return the largest count.
 
     sums     (K, 10) float64, as reduce_points leaves them
     count    (K,) int32, out
-    total    (K, 3) int32 or int64, out
+    total    (K, 3) int32 or int64, out; int32 holds the sums of counts below 2^16
     product  (K, 6) int64, out
     """
+    largest = 0.0
     for row in range(len(sums)):
+        largest = max(largest, sums[row, 0])
         count[row] = np.int32(sums[row, 0])
         for axis in range(3):
             total[row, axis] = np.int64(sums[row, 1 + axis])
         for pair in range(6):
             product[row, pair] = np.int64(sums[row, 4 + pair])
+    return largest
 
 
 @kernel(error_model='numpy')

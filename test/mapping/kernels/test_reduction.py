@@ -189,8 +189,9 @@ def test_sums_are_converted_to_integers(call, wide):
     num = len(rows)
     count, total = np.empty(num, np.int32), np.empty((num, 3), wide)
     product = np.empty((num, 6), np.int64)
-    call(pack_sums, rows[:, :10].astype(np.float64), count, total, product)
+    largest = call(pack_sums, rows[:, :10].astype(np.float64), count, total, product)
 
+    assert largest == rows[:, 0].max()
     assert (count == rows[:, 0]).all()
     assert (total == rows[:, 1:4]).all()
     assert (product == rows[:, 4:10]).all()
