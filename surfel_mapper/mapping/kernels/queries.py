@@ -27,12 +27,15 @@ from surfel_mapper.kernels.layout import (
     ROW,
     STAMPS,
 )
-from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.kernels.quantisation import in_range, pack
 from surfel_mapper.mapping.kernels.rows import count_of
 
-AHEAD = 64
+AHEAD = 16
 """Number of rows between the prefetch of a row and its use."""
+
+EARLY = 64
+"""Number of rows between the early prefetch of a stamp and its use."""
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
 """2^64 over the golden ratio, odd."""
@@ -161,8 +164,8 @@ def rows_changed_at(rows, stamps, changed, stamp, min_points):
     ignored = EMPTIED if min_points < 1 else 0
     num = 0
     for place in range(len(changed)):
-        if place + AHEAD < len(changed):
-            prefetch(stamps, np.int64(changed[place + AHEAD]))
+        if place + EARLY < len(changed):
+            prefetch_early(stamps, np.int64(changed[place + EARLY]))
         row = changed[place]
         kept[num] = row
         num += (stamps[row] ^ stamp) <= ignored  # a branch would be mispredicted half of the time

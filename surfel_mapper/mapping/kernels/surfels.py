@@ -22,13 +22,22 @@ from surfel_mapper.kernels.layout import (
     PRODUCT,
 )
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
-from surfel_mapper.mapping.kernels.rows import count_of, prefetch_row, sum_of, view_of
+from surfel_mapper.mapping.kernels.rows import (
+    count_of,
+    prefetch_row,
+    prefetch_row_early,
+    sum_of,
+    view_of,
+)
 
 CHUNK = 128
 """Voxels processed at once: their moments stay in the first-level cache."""
 
-AHEAD = CHUNK
-"""Number of rows between the prefetch of a row and its use: a chunk is computed meanwhile."""
+AHEAD = 16
+"""Number of rows between the prefetch of a row and its use."""
+
+EARLY = CHUNK
+"""Number of rows between the early prefetch of a row and its use."""
 
 EXACT_BITS = 54
 """A second moment of n points of b bits is below n 4^(b - 1), so float64 holds it exactly for
@@ -119,6 +128,8 @@ def gather(rows, chosen, start, num, moments, num_points, voxel_index):
     most = np.int64(0)
     for i in range(num):
         out = start + i
+        if out + EARLY < len(chosen):
+            prefetch_row_early(flat, np.int64(chosen[out + EARLY]))
         if out + AHEAD < len(chosen):
             prefetch_row(flat, np.int64(chosen[out + AHEAD]))
         row = np.int64(chosen[out])

@@ -54,21 +54,28 @@ from surfel_mapper.kernels.layout import (
     ROW,
     VIEW_SCALE,
 )
-from surfel_mapper.kernels.prefetch import prefetch
+from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
     count_of,
     prefetch_row,
+    prefetch_row_early,
     sum_of,
     view_of,
 )
 
-AHEAD = 64
+AHEAD = 16
 """Number of voxels between the prefetch of a row and its use."""
 
-BLOCK = 32
-"""Voxels looked up together: prefetch all buckets, then all rows, then use the rows."""
+EARLY = 64
+"""Number of voxels between the early prefetch of a row and its use."""
 
+BLOCK = 32
+"""Voxels looked up together: a block is hashed and its buckets prefetched two blocks before its
+use, its rows are found and prefetched one block before."""
+
+RING = 4 * BLOCK
+"""Voxels whose hashes and rows are kept from one block to the next."""
 
 LATER = PRODUCT
 """Column of a free row: the row that is taken AHEAD new voxels later, to be prefetched, or -1."""
@@ -78,26 +85,34 @@ SLACK = 1.0 + 1e-9
 
 
 @njit(cache=True, nogil=True, inline='always')
-def look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely):
+def look_up(block, start, keys, flat, directory, buckets, held, depth, hashes, likely):
     """
-    Find the likely rows of num voxels from start on, and prefetch them.
+    Prefetch the rows of a block of voxels, find those of the next, hash the one after that.
 
+    block   int64, first voxel of the block, from start - 2 BLOCK on
+    start   int64, first voxel of all
     flat    (R * 12,) int64, the rows
-    hashes  (BLOCK,) int64, out
-    likely  (BLOCK,) int64, out: a row with the hash of the voxel, to be confirmed by its key;
-            -1 if not found
+    hashes  (RING,) int64, out: hash of voxel i at i % RING
+    likely  (RING,) int64, out: a row with this hash, to be confirmed by its key; -1 if not found
     """
-    for i in range(num):
-        hashed = hash_key(keys[start + i])
-        hashes[i] = hashed
+    for i in range(block + 2 * BLOCK, min(block + 3 * BLOCK, len(keys))):
+        hashed = hash_key(keys[i])
+        hashes[i % RING] = hashed
         bucket = first_bucket(hashed, directory, depth)
+        prefetch_early(buckets, bucket)
+    first, last = max(block + BLOCK, start), min(block + 2 * BLOCK, len(keys))
+    for i in range(first, last):
+        bucket = first_bucket(hashes[i % RING], directory, depth)
         prefetch(buckets, bucket)
         prefetch(held, bucket // SEGMENT)
-    for i in range(num):
-        row = likely_row(hashes[i], directory, buckets, depth)
-        likely[i] = row
+    for i in range(first, last):
+        row = likely_row(hashes[i % RING], directory, buckets, depth)
+        likely[i % RING] = row
         if row >= 0:
-            prefetch_row(flat, row)
+            prefetch_row_early(flat, row)
+    for i in range(max(block, start), min(block + BLOCK, len(keys))):
+        if likely[i % RING] >= 0:
+            prefetch_row(flat, likely[i % RING])
 
 
 @kernel()
@@ -111,15 +126,14 @@ def find_rows(keys, rows, table, state, found):
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
-    for start in range(0, len(keys), BLOCK):
-        num = min(BLOCK, len(keys) - start)
-        look_up(keys, start, num, flat, directory, buckets, held, depth, hashes, likely)
-        for i in range(num):
-            row = likely[i]
-            if row >= 0 and rows[row, KEY] != keys[start + i]:
-                row = find_row(keys[start + i], rows, table, depth)
-            found[start + i] = row
+    hashes, likely = np.empty(RING, np.int64), np.empty(RING, np.int64)
+    for block in range(-2 * BLOCK, len(keys), BLOCK):
+        look_up(block, 0, keys, flat, directory, buckets, held, depth, hashes, likely)
+        for i in range(max(block, 0), min(block + BLOCK, len(keys))):
+            row = likely[i % RING]
+            if row >= 0 and rows[row, KEY] != keys[i]:
+                row = find_row(keys[i], rows, table, depth)
+            found[i] = row
 
 
 @kernel()
@@ -140,40 +154,34 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
     directory, buckets, held, _ = table
     flat = rows.ravel()
     depth = state[DEPTH]
-    hashes, likely = np.empty(BLOCK, np.int64), np.empty(BLOCK, np.int64)
+    hashes, likely = np.empty(RING, np.int64), np.empty(RING, np.int64)
     num_points = np.int64(0)
     done = start
-    while done < len(keys):
-        num = min(BLOCK, len(keys) - done)
-        look_up(keys, done, num, flat, directory, buckets, held, depth, hashes, likely)
-        for i in range(num):
-            place = done + i
-            key = keys[place]
-            row = likely[i]
+    for block in range(start - 2 * BLOCK, len(keys), BLOCK):
+        look_up(block, start, keys, flat, directory, buckets, held, depth, hashes, likely)
+        for place in range(max(block, start), min(block + BLOCK, len(keys))):
+            key, hashed, row = keys[place], hashes[place % RING], likely[place % RING]
             if row >= 0 and rows[row, KEY] != key:
                 row = find_row(key, rows, table, depth)
             if row < 0:
-                full = is_full(hashes[i], directory, held, depth)
-                if full and not makes_room(hashes[i], table, state):
-                    state[POINTS] += num_points
-                    set_stamps(stamps, found[start:place], stamp)
-                    return place
-                row = take_row(rows, flat, state)
+                full = is_full(hashed, directory, held, depth)
+                if not full or makes_room(hashed, table, state):
+                    row = take_row(rows, flat, state)
                 if row < 0:
                     state[POINTS] += num_points
-                    set_stamps(stamps, found[start:place], stamp)
-                    return place
+                    set_stamps(stamps, found[start:done], stamp)
+                    return done
                 for column in range(ROW):
                     rows[row, column] = 0
                 rows[row, KEY] = key
-                insert_entry(hashes[i], row, directory, buckets, held, depth)
+                insert_entry(hashed, row, directory, buckets, held, depth)
                 state[VOXELS] += 1
             num_points += np.int64(count[place])
             change_row(moments, view_weight, rows, row, place, 1)
             found[place] = row
-        done += num
+            done += 1
     state[POINTS] += num_points
-    set_stamps(stamps, found[start:done], stamp)
+    set_stamps(stamps, found[start:], stamp)
     return done
 
 
@@ -181,8 +189,8 @@ def add_moments(moments, view_weight, rows, stamps, table, state, stamp, start, 
 def set_stamps(stamps, found, stamp):
     """Stamp the rows (K,) int32."""
     for place in range(len(found)):
-        if place + AHEAD < len(found):
-            prefetch(stamps, np.int64(found[place + AHEAD]))
+        if place + EARLY < len(found):
+            prefetch_early(stamps, np.int64(found[place + EARLY]))
         stamps[found[place]] = stamp
 
 
@@ -229,7 +237,10 @@ def remove_moments(
     num_emptied = num_fallen = 0
     num_points = np.int64(0)
     for place in range(len(keys)):
-        if place + AHEAD < len(keys):
+        if place + EARLY < len(keys):
+            ahead = np.int64(found[place + EARLY])
+            if 0 <= ahead < used:
+                prefetch_row_early(flat, ahead)
             ahead = np.int64(found[place + AHEAD])
             if 0 <= ahead < used:
                 prefetch_row(flat, ahead)
@@ -255,12 +266,12 @@ def remove_moments(
     set_stamps(stamps, found, stamp)
     state[VOXELS] -= num_emptied
     for i in range(num_emptied):
-        if i + AHEAD < num_emptied:
-            ahead = emptied[i + AHEAD]
+        if i + EARLY < num_emptied:
+            ahead = emptied[i + EARLY]
             bucket = first_bucket(hash_key(keys[ahead]), directory, depth)
-            prefetch(buckets, bucket)
-            prefetch(num_held, bucket // SEGMENT)
-            prefetch(flat, np.int64(found[ahead]) * ROW)
+            prefetch_early(buckets, bucket)
+            prefetch_early(num_held, bucket // SEGMENT)
+            prefetch_early(flat, np.int64(found[ahead]) * ROW)
         place = emptied[i]
         row = np.int64(found[place])
         remove_entry(keys[place], row, directory, buckets, num_held, depth)
