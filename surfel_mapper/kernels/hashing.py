@@ -28,6 +28,7 @@ from numba import njit
 import numpy as np
 
 from surfel_mapper.kernels.compiling import part
+from surfel_mapper.kernels.grouping import U
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
@@ -52,9 +53,6 @@ POINTS = 5
 STATE = 6
 
 LOW = np.int64(0xFFFFFFFF)
-
-U = np.uint64
-"""Unsigned indices: numba tests signed ones for being negative."""
 
 
 @njit(cache=True, nogil=True, inline='always')

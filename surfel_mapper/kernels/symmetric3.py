@@ -35,7 +35,7 @@ NOISE = 1e-15
 SIXTH = 1.0 / 6.0
 
 CHUNK = 128
-"""Matrices decomposed together: what is computed of them stays in the first-level cache."""
+"""Matrices decomposed together: their intermediate results stay in the first-level cache."""
 
 
 @kernel(error_model='numpy')
@@ -56,7 +56,11 @@ def decompose(scatter, num, eigenvalues, normals):
 
 @njit(cache=True, nogil=True, inline='always')
 def make_work(size):
-    """Return arrays for what is computed of ``size`` matrices; see ``decompose_chunk``."""
+    """
+    Return arrays for the intermediate results of ``size`` matrices, float64.
+
+    Deviators (6, size), sizes (3, size), roots (size,), vectors (3, size), planes (4, size).
+    """
     deviators, sizes = np.empty((6, size)), np.empty((3, size))
     return deviators, sizes, np.empty(size), np.empty((3, size)), np.empty((4, size))
 
