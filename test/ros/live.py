@@ -85,6 +85,15 @@ class Process:
             assert time.monotonic() < end, f'no {text!r} in: {self.output}'
             time.sleep(0.05)
 
+    @contextmanager
+    def paused(self):
+        """Stop the process within the context; it runs on afterwards and notices nothing."""
+        self._process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self._process.send_signal(signal.SIGCONT)
+
     def stop(self, number=signal.SIGINT):
         self._process.send_signal(number)
         return self.wait()
