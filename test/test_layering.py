@@ -60,7 +60,7 @@ HOMES = {
     'kiss_matcher': ('evaluation/frames',),
     'laspy': ('files/las',),
     'lazrs': ('files/las',),
-    'llvmlite': ('kernels/',),
+    'llvmlite': ('kernels/', 'mapping/kernels/lanes'),
     'lz4': ('bags/',),
     'lzf': ('files/pcd',),
     'PIL': ('messages/compressed_image', 'viz/turning_view'),

@@ -4,12 +4,14 @@
 Reducer: reduces the points of a scan to moments.
 
 The scratch memory is kept from scan to scan; concurrent calls use separate memory, so several
-threads may reduce scans at the same time.
+threads may reduce scans at the same time. A scan with more points of a voxel than the packed sums
+hold is reduced once more in parts, which takes 2.4 times as long: 7.5 instead of 3 ms for 307,200
+points of which 71,000 share a voxel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 import math
 from typing import Any
@@ -23,16 +25,17 @@ from surfel_mapper.geometry import check_rigid
 from surfel_mapper.kernels.grouping import AHEAD, build_table, CHUNK
 from surfel_mapper.kernels.layout import BITS, MAX_SCAN_COUNT
 from surfel_mapper.mapping.channels import channel_names, quantised
+from surfel_mapper.mapping.coarsening import coarse_keys
+from surfel_mapper.mapping.kernels.lanes import FULL, WIDEST, WORDS
 from surfel_mapper.mapping.kernels.reduction import (
     BEYOND,
     look_back,
     NOT_FINITE,
-    pack_sums,
     reduce_points,
     sum_channels,
-    SUMS,
     TOO_FAR,
     TOO_NEAR,
+    unpack_sums,
 )
 from surfel_mapper.mapping.moments import ScanMoments
 
@@ -40,8 +43,8 @@ ENTRIES = 4
 """Table entries for each voxel: real lidars change the voxel with almost every point, and a table
 at most a quarter full instead of half saves 10 % of a reduction."""
 
-NARROW_COUNT = 1 << 16
-"""If every voxel holds fewer points, the sums fit into int32."""
+LINE_BYTES = 64
+"""Bytes of a cache line."""
 
 CAUSES = {
     'not_finite': NOT_FINITE,
@@ -63,7 +66,7 @@ class Scratch:
         self.left_out = np.zeros(4, np.int64)
         self._chunk = (
             np.zeros(CHUNK + 1, np.int64),
-            np.empty((3, CHUNK)),
+            np.empty((3, CHUNK), np.int32),
             np.zeros(CHUNK + AHEAD, np.int32),
             np.zeros(CHUNK + AHEAD, np.int32),
         )
@@ -73,7 +76,9 @@ class Scratch:
         """Allocate room for num_voxels voxels; previous content is lost."""
         self.table = np.full(ENTRIES * num_voxels, -1, np.int32)
         self.keys = np.empty(num_voxels + 2, np.int64)
-        self.sums = np.empty((num_voxels + 1, SUMS))
+        memory = np.empty((num_voxels + 2) * WORDS + LINE_BYTES // 8, np.int64)
+        first = -(memory.ctypes.data // 8) % (LINE_BYTES // 8)  # each voxel in one cache line
+        self.sums = memory[first:][: (num_voxels + 2) * WORDS].reshape(-1, WORDS)
 
     def fill(self, xyz: npt.NDArray[Any], quantisation: Quantisation) -> int:
         """Sum points by voxel, enlarging the memory if needed; return the number of voxels."""
@@ -82,7 +87,7 @@ class Scratch:
             num = reduce_points(xyz, *quantisation, arrays, self.left_out)
             if num >= 0:
                 return int(num)
-            self.reserve(2 * (len(self.sums) - 1))
+            self.reserve(2 * (len(self.sums) - 2))
 
 
 class Reducer:
@@ -152,12 +157,13 @@ class Reducer:
             scratch = self._idle.pop()
         except IndexError:  # all in use by other threads
             scratch = Scratch()
-        num = scratch.fill(points.T, quantisation)
-        scratch.table.fill(-1)  # faster than visiting the scattered entries in use
-        moments = self._pack(scratch, num, np.ascontiguousarray(seen_from))
+        moments = self._moments(points.T, quantisation, scratch)
+        look_back(moments.key, np.ascontiguousarray(seen_from), self.voxel_size_m, moments.view)
         if values is not None:
+            if ENTRIES * len(moments) > len(scratch.table):
+                scratch.reserve(1 << len(moments).bit_length())
             build_table(moments.key, scratch.table)
-            sums = np.empty((num, values.shape[1]), np.int64)
+            sums = np.empty((len(moments), values.shape[1]), np.int64)
             sum_channels(points.T, *quantisation, moments.key, scratch.table, values, sums)
             scratch.table.fill(-1)
             moments = replace(moments, channel_names=channel_names(self._columns), channels=sums)
@@ -165,30 +171,71 @@ class Reducer:
         object.__setattr__(moments, 'is_reduced', True)
         return moments
 
-    def _pack(self, scratch: Scratch, num: int, origin: npt.NDArray[np.float64]) -> ScanMoments:
-        """Convert the sums to integers."""
-        key, sums = scratch.keys[2 : num + 2].copy(), scratch.sums[1 : num + 1]
-        left_out = scratch.left_out
-        moments = ScanMoments(
-            voxel_size_m=self.voxel_size_m,
-            key=key,
-            count=np.empty(num, np.int32),
-            total=np.empty((num, 3), np.int32),
-            product=np.empty((num, 6), np.int64),
-            view=np.empty((num, 3), np.int16),
-            left_out={cause: int(left_out[row]) for cause, row in CAUSES.items() if left_out[row]},
-        )
-        largest = pack_sums(sums, moments.count, moments.total, moments.product)
-        if largest > MAX_SCAN_COUNT:
-            raise MapLimitError(
-                f'{largest:.0f} points in one voxel of one scan; '
-                f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
+    def _moments(
+        self, xyz: npt.NDArray[Any], quantisation: Quantisation, scratch: Scratch
+    ) -> ScanMoments:
+        """Return the moments of points (3, N) without views; see SurfelMap.reduce."""
+        num_points, part = xyz.shape[1], WIDEST
+        if num_points <= WIDEST:
+            num = scratch.fill(xyz, quantisation)
+            scratch.table.fill(-1)  # faster than visiting the scattered entries in use
+            left_out = scratch.left_out
+            moments = ScanMoments(
+                voxel_size_m=self.voxel_size_m,
+                key=scratch.keys[2 : num + 2].copy(),
+                count=np.empty(num, np.int32),
+                total=np.empty((num, 3), np.int32),
+                product=np.empty((num, 6), np.int64),
+                view=np.empty((num, 3), np.int16),
+                left_out={
+                    cause: int(left_out[row]) for cause, row in CAUSES.items() if left_out[row]
+                },
             )
-        if largest >= NARROW_COUNT:
-            moments = replace(moments, total=np.empty((num, 3), np.int64))
-            pack_sums(sums, moments.count, moments.total, moments.product)
-        look_back(key, origin, self.voxel_size_m, moments.view)
-        return moments
+            sums = scratch.sums[1 : num + 1]
+            largest = unpack_sums(sums, moments.count, moments.total, moments.product)
+            if largest <= FULL:
+                return moments
+            part = max(FULL, num_points * FULL // (2 * largest))  # half full on average
+        starts = range(0, num_points, part)
+        parts = [self._moments(xyz[:, i : i + part], quantisation, scratch) for i in starts]
+        return summed_moments(parts)
+
+
+def summed_moments(parts: Sequence[ScanMoments]) -> ScanMoments:
+    """
+    Return the moments of the points of all parts of a scan, without views.
+
+    Raises
+    ------
+    MapLimitError
+        If a voxel gets more than 2^23 points.
+
+    """
+    key, rows = coarse_keys(np.concatenate([part.key for part in parts]), 0)
+
+    def summed(name: str) -> npt.NDArray[np.int64]:
+        values = np.concatenate([getattr(part, name) for part in parts])
+        sums = np.zeros((len(key), *values.shape[1:]), np.int64)
+        np.add.at(sums, rows, values)
+        return sums
+
+    count, total = summed('count'), summed('total')
+    largest = count.max(initial=0)
+    if largest > MAX_SCAN_COUNT:
+        raise MapLimitError(
+            f'{largest} points in one voxel of one scan; '
+            f'at most {MAX_SCAN_COUNT}: use smaller voxels or split the scan'
+        )
+    causes = [cause for cause in CAUSES if any(cause in part.left_out for part in parts)]
+    return replace(
+        parts[0],
+        key=key.copy(),
+        count=count.astype(np.int32),
+        total=total if largest > FULL else total.astype(np.int32),
+        product=summed('product'),
+        view=np.empty((len(key), 3), np.int16),
+        left_out={cause: sum(part.left_out.get(cause, 0) for part in parts) for cause in causes},
+    )
 
 
 def within(

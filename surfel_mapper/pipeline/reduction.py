@@ -22,8 +22,9 @@ import numpy.typing as npt
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
 from surfel_mapper.mapping.channels import CHANNELS
+from surfel_mapper.mapping.kernels.lanes import FULL
 from surfel_mapper.mapping.moments import ScanMoments
-from surfel_mapper.mapping.reducer import NARROW_COUNT, within
+from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap
 from surfel_mapper.mapping.window import WindowedScan
 from surfel_mapper.pipeline.prepared import FilteredScan
@@ -270,6 +271,6 @@ def compile_removing(config: Config, dtype: npt.DTypeLike) -> None:
 def compile_wide_sums(config: Config, dtype: npt.DTypeLike) -> None:
     """Compile adding and removing voxels whose sums need 64 bits."""
     surfel_map = SurfelMap(config.map.voxel_size_m, columns=config.map.columns)
-    columns = {n: np.zeros(NARROW_COUNT) for n in CHANNELS}
-    moments = surfel_map.add(np.zeros((NARROW_COUNT, 3), dtype), columns=columns)
+    columns = {n: np.zeros(FULL + 1) for n in CHANNELS}
+    moments = surfel_map.add(np.zeros((FULL + 1, 3), dtype), columns=columns)
     surfel_map.remove(moments)

@@ -31,6 +31,7 @@ REFERENCES = {
     'kernels/symmetric3.py': 'kernels/test_symmetric3.py',
     'kernels/voxel_grid.py': 'filters/test_grids.py',
     'layers/dynamic_objects/kernels/free_space.py': 'layers/test_free_space.py',
+    'mapping/kernels/lanes.py': 'mapping/kernels/test_lanes.py',
     'mapping/kernels/queries.py': 'mapping/kernels/test_queries.py',
     'mapping/kernels/reduction.py': 'mapping/kernels/test_reduction.py',
     'mapping/kernels/rows.py': 'mapping/kernels/test_rows.py',

@@ -213,6 +213,8 @@ def test_sums_are_exact_up_to_2_to_the_23_points_and_refused_beyond():
     assert moments.product.tolist() == [[2**53] * 6]
     with pytest.raises(MapLimitError, match='8388609 points in one voxel of one scan'):
         reducer.reduce(points)
+    points[:] = math.nan
+    assert reducer.reduce(points).left_out == {'not_finite': len(points)}
 
 
 @pytest.mark.parametrize('num', [65535, 65536, 65537])
@@ -223,6 +225,31 @@ def test_sums_of_many_points_in_one_voxel_do_not_overflow(num):
     assert moments.total.tolist() == [[-num * 2**15] * 3]
     assert moments.product.tolist() == [[num * 2**30] * 6]
     assert as_twin(moments)[0, 0, 0][10:] == [num * 2**14, 0, 0]
+
+
+def test_a_scan_with_a_full_voxel_is_summed_as_any_other():
+    # in 70,000 points of one voxel, some others, in an order that no part of the scan has
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0.0, 0.5, (71_000, 3))
+    points[::71] += rng.integers(0, 3, (1000, 3))
+    points[:3], points[5::9000] = [40.0, 0.1, 0.1], np.nan
+    intensity = np.arange(71_000) % 256
+    origin = np.array([1.0, 2.0, 3.0])
+
+    moments = Reducer(0.5, ('intensity',)).reduce(
+        points, origin=origin, columns={'intensity': intensity}
+    )
+
+    twin = scan_moments(points, 0.5, origin)
+    assert max(row[0] for row in twin.values()) > 65536
+    assert as_twin(moments) == twin
+    assert list(map(tuple, moments.voxel_index.tolist())) == list(twin)
+    assert moments.left_out == {'not_finite': 8}
+    finite = np.isfinite(points).all(axis=1)
+    voxel = np.floor(points[finite] * 2.0)
+    for index, total in zip(moments.voxel_index, moments.channels[:, 0], strict=True):
+        inside = (voxel == index).all(axis=1)
+        assert total == 256 * intensity[finite][inside].sum()
 
 
 @pytest.mark.parametrize('distance_m', [0.0, 1e-160, 1e-3, 1.0, 1e4, 1e9])

@@ -3,11 +3,9 @@
 """
 Reduce the points of one scan to exact moments by voxel.
 
-A point is quantised once (kernels/quantisation.py); everything after is sums of integers. They
-are formed in float64, which holds them exactly up to 2^23 points a voxel and is faster than int64
-(0.79 against 1.17 ms for 131,072 points). Each chunk of points is quantised with vector
-instructions, cut into runs of one voxel (kernels/grouping.py), and summed: long runs in registers,
-short ones point by point.
+A point is quantised once (kernels/quantisation.py); everything after is sums of integers. Each
+chunk of points is quantised with vector instructions, cut into runs of one voxel
+(kernels/grouping.py), and summed in vector registers (lanes.py).
 Intensity and colour are summed by a second pass over the same runs, which only maps with such
 columns pay for.
 
@@ -25,15 +23,20 @@ from surfel_mapper.kernels.grouping import (
     find_runs,
     hash_shift,
     home,
-    LONG,
     number_runs,
     U,
 )
-from surfel_mapper.kernels.layout import INDEX_BITS, INDEX_MASK, INDEX_OFFSET, VIEW_SCALE
+from surfel_mapper.kernels.layout import HALF, INDEX_BITS, INDEX_MASK, INDEX_OFFSET, VIEW_SCALE
 from surfel_mapper.kernels.quantisation import quantise
-
-SUMS = 10
-"""Sums of a voxel: count, places (3), products (6)."""
+from surfel_mapper.mapping.kernels.lanes import (
+    COUNT_BITS,
+    HIGH_BITS,
+    load_sums,
+    masked_sum,
+    plus_place,
+    store_sums,
+    WORDS,
+)
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
@@ -51,40 +54,38 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     scratch   table (B,) int32, B a power of two, all -1; out: row of each key by hash;
               keys (E + 2,) int64, out: from keys[2] on voxel keys in the order of first
               appearance, E <= B / 2;
-              sums (E + 1, SUMS) float64, out: from sums[1] on count, sum (3), products (6: xx xy
-              xz yy yz zz) of the places in the voxel, in lattice units about its centre;
-              of one chunk: chunk_keys (CHUNK + 1,) int64, places (3, CHUNK) float64,
+              sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
+              as lanes.py packs them; those of more than FULL points are wrong;
+              of one chunk: chunk_keys (CHUNK + 1,) int64, places (3, CHUNK) int32,
               starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
 
     Points left out have the key -1, whose row is the first: sums[0] is of no use but for its
-    count. After -1 the table is clear again: call with larger arrays.
+    count. The last row stays zero. After -1 the table is clear again: call with larger arrays.
     """
     table, keys, sums, chunk_keys, places, starts, run_rows = scratch
-    flat = sums.ravel()
+    words = sums.ravel()
     left_out[:] = 0
     keys[1] = -1
     table[home(np.int64(-1), hash_shift(len(table)))] = 0
-    sums[0] = 0.0
+    sums[0] = 0
+    sums[-1] = 0
     num_rows = np.int64(1)
-    num_left_out = 0.0
+    num_left_out = 0
     all_x, all_y, all_z = xyz[0], xyz[1], xyz[2]
     for start in range(0, len(all_x), CHUNK):
         chunk = slice(start, start + CHUNK)
         x, y, z = all_x[chunk], all_y[chunk], all_z[chunk]
         quantise(x, y, z, pose, scale, range_sq, chunk_keys, places)
         num_runs = find_runs(chunk_keys, len(x), starts)
-        if num_rows + num_runs > len(sums):
+        if num_rows + num_runs >= len(sums):
             table[:] = -1
             return -1
         known = num_rows
         num_rows = number_runs(chunk_keys, starts, num_runs, table, keys, num_rows, run_rows)
-        sums[known:num_rows] = 0.0
-        if LONG * num_runs > len(x):
-            add_points(places, len(x), chunk_keys, run_rows, flat)
-        else:
-            add_runs(places, starts, num_runs, run_rows, flat)
+        sums[known:num_rows] = 0
+        add_places(places, len(x), chunk_keys, run_rows, words)
         if sums[0, 0] > num_left_out:
             num_left_out = sums[0, 0]
             for run in range(num_runs):
@@ -94,63 +95,34 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
     return num_rows - 1
 
 
-@kernel(fastmath={'contract'})
-def add_runs(places, starts, num_runs, run_rows, flat):
+@part()
+def add_places(places, num, chunk_keys, run_rows, words):
     """
-    Add count, sums and products of the places of each run to the sums of its voxel.
+    Add the places of a chunk of points to the sums of their voxels.
 
-    One call for all runs, with unsigned indices, takes half the time of a call for each run. All
-    values are integers that float64 holds, so a fused multiply and add gives the same sums. Not a
-    part of its kernel, whose other products have to be rounded.
+    places      (3, CHUNK) int32, of which num count, at least one
+    chunk_keys  (CHUNK + 1,) int64, voxel key of each point
+    run_rows    (CHUNK,) int32, row of the voxel of each run
+    words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
+
+    Without branches, which real lidars would mispredict at every third to eighth point: sums stay
+    in registers and are stored after each point. A new run drops them, by a mask, and takes those
+    of its voxel; a point of the same run takes the zeros at the end, because what was stored just
+    before would arrive too late.
     """
     all_x, all_y, all_z = places[0], places[1], places[2]
-    for run in range(U(num_runs)):
-        begin, end = U(np.uint32(starts[run])), U(np.uint32(starts[run + U(1)]))
-        sx = sy = sz = xx = xy = xz = yy = yz = zz = 0.0
-        for i in range(begin, end):
-            qx, qy, qz = all_x[i], all_y[i], all_z[i]
-            sx += qx
-            sy += qy
-            sz += qz
-            xx += qx * qx
-            xy += qx * qy
-            xz += qx * qz
-            yy += qy * qy
-            yz += qy * qz
-            zz += qz * qz
-        at = U(SUMS) * U(np.uint32(run_rows[run]))
-        flat[at] += np.float64(end - begin)
-        flat[at + U(1)] += sx
-        flat[at + U(2)] += sy
-        flat[at + U(3)] += sz
-        flat[at + U(4)] += xx
-        flat[at + U(5)] += xy
-        flat[at + U(6)] += xz
-        flat[at + U(7)] += yy
-        flat[at + U(8)] += yz
-        flat[at + U(9)] += zz
-
-
-@kernel(fastmath={'contract'})
-def add_points(places, num, chunk_keys, run_rows, flat):
-    """Add the points of a chunk of short runs, of which branches would be mispredicted."""
-    all_x, all_y, all_z = places[0], places[1], places[2]
+    zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
+    sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
     for i in range(U(num)):
-        run += U(chunk_keys[i] != previous)
+        is_new = chunk_keys[i] != previous
         previous = chunk_keys[i]
-        at = U(SUMS) * U(np.uint32(run_rows[run]))
-        qx, qy, qz = all_x[i], all_y[i], all_z[i]
-        flat[at] += 1.0
-        flat[at + U(1)] += qx
-        flat[at + U(2)] += qy
-        flat[at + U(3)] += qz
-        flat[at + U(4)] += qx * qx
-        flat[at + U(5)] += qx * qy
-        flat[at + U(6)] += qx * qz
-        flat[at + U(7)] += qy * qy
-        flat[at + U(8)] += qy * qz
-        flat[at + U(9)] += qz * qz
+        run += U(is_new)
+        at = U(WORDS) * U(np.uint32(run_rows[run]))
+        others = load_sums(words, at if is_new else zeros)
+        others = plus_place(others, all_x[i], all_y[i], all_z[i])
+        sums = masked_sum(sums, np.int64(is_new) - 1, others)
+        store_sums(words, at, sums)
 
 
 @part()
@@ -166,23 +138,34 @@ def reason(x, y, z, range_sq):
 
 
 @kernel()
-def pack_sums(sums, count, total, product):
+def unpack_sums(sums, count, total, product):
     """
-    Convert the sums of a scan to integers; return the largest count.
+    Unpack the sums of a scan, about the centres of the voxels; return the largest count.
 
-    sums     (K, 10) float64, as reduce_points leaves them
+    sums     (K, WORDS) int64, as reduce_points leaves them
     count    (K,) int32, out
-    total    (K, 3) int32 or int64, out; int32 holds the sums of counts below 2^16
+    total    (K, 3) int32, out
     product  (K, 6) int64, out
     """
-    largest = 0.0
+    largest = np.int64(0)
     for row in range(len(sums)):
-        largest = max(largest, sums[row, 0])
-        count[row] = np.int32(sums[row, 0])
-        for axis in range(3):
-            total[row, axis] = np.int64(sums[row, 1 + axis])
-        for pair in range(6):
-            product[row, pair] = np.int64(sums[row, 4 + pair])
+        num = sums[row, 0] >> COUNT_BITS
+        half = HALF * num
+        x = sums[row, 0] & ((1 << COUNT_BITS) - 1)
+        y = sums[row, 1] & ((1 << HIGH_BITS) - 1)
+        z = (sums[row, 1] >> HIGH_BITS) & ((1 << HIGH_BITS) - 1)
+        largest = max(largest, num)
+        count[row] = num
+        total[row, 0] = x - half
+        total[row, 1] = y - half
+        total[row, 2] = z - half
+        # (x - h)(y - h) = xy - h (x + y - h), summed
+        product[row, 0] = sums[row, 2] - HALF * (x + x - half)
+        product[row, 1] = sums[row, 3] - HALF * (x + y - half)
+        product[row, 2] = sums[row, 4] - HALF * (x + z - half)
+        product[row, 3] = sums[row, 5] - HALF * (y + y - half)
+        product[row, 4] = sums[row, 6] - HALF * (y + z - half)
+        product[row, 5] = sums[row, 7] - HALF * (z + z - half)
     return largest
 
 
@@ -232,7 +215,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     sums    (K, C) int64, out
     """
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty((3, CHUNK))
+    places = np.empty((3, CHUNK), np.int32)
     starts = np.empty(CHUNK + 1, np.int32)
     shift = hash_shift(len(table))
     sums[:, :] = 0

@@ -13,19 +13,19 @@ import pytest
 
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.kernels.grouping import AHEAD, CHUNK, find_runs, hash_shift, home
+from surfel_mapper.kernels.layout import HALF
 from surfel_mapper.kernels.quantisation import quantise
+from surfel_mapper.mapping.kernels.lanes import WORDS
 from surfel_mapper.mapping.kernels.reduction import (
-    add_points,
-    add_runs,
+    add_places,
     BEYOND,
     look_back,
     NOT_FINITE,
-    pack_sums,
     reason,
     reduce_points,
-    SUMS,
     TOO_FAR,
     TOO_NEAR,
+    unpack_sums,
 )
 from surfel_mapper.mapping.moments import pack_keys, unpack_keys
 from test import reference
@@ -54,8 +54,8 @@ def some_points(num, dtype=np.float64, seed=0):
 def scratch_for(num_voxels):
     size = 1 << (2 * num_voxels - 1).bit_length()
     keys = np.full(num_voxels + 2, -7, np.int64)
-    sums = np.full((num_voxels + 1, SUMS), np.nan)
-    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((3, CHUNK))
+    sums = np.full((num_voxels + 2, WORDS), -9, np.int64)
+    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((3, CHUNK), np.int32)
     starts, run_rows = np.zeros(CHUNK + AHEAD, np.int32), np.empty(CHUNK, np.int32)
     return np.full(size, -1, np.int32), keys, sums, chunk_keys, places, starts, run_rows
 
@@ -66,7 +66,7 @@ def scratch_for(num_voxels):
 def test_points_are_quantised_as_by_python(call, dtype, turned):
     pose = pose_matrix([3.0, 1e4, -2.0], [0.5, -0.5, 0.1, 0.7]) if turned else np.eye(4)
     points = some_points(300, dtype)
-    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
+    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK), np.int32)
 
     call(quantise, *points.T.copy(), pose[:3], 65536 / 0.2, ANY_RANGE, keys, places)
 
@@ -74,16 +74,17 @@ def test_points_are_quantised_as_by_python(call, dtype, turned):
         expected = reference.quantise(point, 0.2, pose)
         if expected is None:
             assert keys[row] == -1
+            assert not places[:, row].any()
         else:
             voxel, place = expected
             assert keys[row] == pack_keys(np.array([voxel]))[0]
-            assert tuple(places[:, row]) == place
+            assert tuple(places[:, row] - HALF) == place
 
 
 @both
 def test_points_outside_of_the_range_get_no_key(call):
     points = np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, -3.0], [0.9, 0, 0], [0, -3.1, 0]])
-    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK))
+    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK), np.int32)
     limits = np.array([1.0, 9.0])
     call(quantise, *points.T.copy(), IDENTITY, 131072.0, limits, keys, places)
     assert (keys[:5] >= 0).tolist() == [True, True, True, False, False]
@@ -100,28 +101,35 @@ def test_runs_are_those_of_groupby(call, keys):
     assert starts[num] == len(keys)
 
 
+def unpacked(call, sums):
+    """Return rows of count, sums and products of the places about the centre."""
+    num = len(sums)
+    count, total = np.empty(num, np.int32), np.empty((num, 3), np.int32)
+    product = np.empty((num, 6), np.int64)
+    largest = call(unpack_sums, sums, count, total, product)
+    assert largest == count.max(initial=0)
+    return np.column_stack([count, total, product]).tolist()
+
+
 @both
-@pytest.mark.parametrize('by_point', [False, True])
-def test_runs_add_count_sums_and_products_to_their_voxels(call, by_point):
-    places = np.random.default_rng(1).integers(-32768, 32768, (3, 17)).astype(np.float64)
-    sums = np.zeros((4, SUMS))
-    sums[1] = 5.0
-    run_rows = np.array([1, 3, 1, 0], np.int32)  # of which three runs count
-    if by_point:
-        keys = np.repeat([70, 20, 70], [9, 1, 7])
-        call(add_points, places, 17, keys, run_rows, sums.ravel())
-    else:
-        starts = np.array([0, 9, 10, 17, 99], np.int32)
-        call(add_runs, places, starts, 3, run_rows, sums.ravel())
-    for row, of_row, before in ((1, [*range(9), *range(10, 17)], 5), (3, [9], 0)):
-        x, y, z = places[:, of_row].astype(int).tolist()
-        products = [
-            sum(a * b for a, b in zip(*p, strict=True))
-            for p in [(x, x), (x, y), (x, z), (y, y), (y, z), (z, z)]
-        ]
-        found = [len(of_row), sum(x), sum(y), sum(z), *products]
-        assert sums[row].tolist() == [value + before for value in found]
-    assert not sums[[0, 2]].any()
+@pytest.mark.parametrize('lengths', [(9, 1, 7), (1, 1, 15), (17,)])
+def test_runs_add_count_sums_and_products_to_their_voxels(call, lengths):
+    places = np.random.default_rng(1).integers(0, 65536, (3, 17)).astype(np.int32)
+    rows, voxels = [1, 3, 1][: len(lengths)], [70, 20, 70][: len(lengths)]
+    keys = np.append(np.repeat(voxels, lengths), -9)
+    sums = np.zeros((6, WORDS), np.int64)
+    run_rows = np.array([*rows, 4, 4], np.int32)  # those at the end do not count
+    for _ in range(2):  # the second time on top of the first
+        call(add_places, places, 17, keys, run_rows, sums.ravel())
+    found = unpacked(call, sums)
+    for row, voxel in ((1, 70), (3, 20)):
+        of_row = np.flatnonzero(keys == voxel)
+        x, y, z = (places[:, of_row].astype(int) - HALF).tolist()
+        pairs = (x, x), (x, y), (x, z), (y, y), (y, z), (z, z)
+        products = [sum(a * b for a, b in zip(*pair, strict=True)) for pair in pairs]
+        once = [len(of_row), sum(x), sum(y), sum(z), *products]
+        assert found[row] == [2 * value for value in once]
+    assert not sums[[0, 2, 4, 5]].any()
 
 
 @both
@@ -136,7 +144,7 @@ def test_a_scan_is_summed_by_voxel_in_the_order_of_first_appearance(call, num):
 
     twin = reference.scan_moments(points, 0.5)
     assert list(map(tuple, unpack_keys(keys[2 : found + 2]).tolist())) == list(twin)
-    assert sums[1 : found + 1].astype(int).tolist() == [row[:10] for row in twin.values()]
+    assert unpacked(call, sums[1 : found + 1]) == [row[:10] for row in twin.values()]
     assert sorted(table[table >= 0]) == list(range(found + 1))
     finite = np.isfinite(points).all(axis=1)
     assert left_out[NOT_FINITE] == (~finite).sum()
@@ -180,21 +188,6 @@ def test_hashes_stay_within_the_table(call):
 )
 def test_every_point_left_out_has_one_cause(call, point, cause):
     assert call(reason, *np.array(point), np.array([1.0, 25.0])) == cause
-
-
-@both
-@pytest.mark.parametrize('wide', [np.int32, np.int64])
-def test_sums_are_converted_to_integers(call, wide):
-    rows = np.array(list(reference.scan_moments(some_points(200), 0.5, None).values()))
-    num = len(rows)
-    count, total = np.empty(num, np.int32), np.empty((num, 3), wide)
-    product = np.empty((num, 6), np.int64)
-    largest = call(pack_sums, rows[:, :10].astype(np.float64), count, total, product)
-
-    assert largest == rows[:, 0].max()
-    assert (count == rows[:, 0]).all()
-    assert (total == rows[:, 1:4]).all()
-    assert (product == rows[:, 4:10]).all()
 
 
 @both
