@@ -23,9 +23,6 @@ CHUNK = 1024
 AHEAD = 16
 """Number of runs between the prefetch of a table entry and its use."""
 
-LONG = 3
-"""Mean length of the runs of a chunk from which they are summed run by run, not by point."""
-
 U = np.uint64
 """Unsigned indices: numba tests signed ones for being negative."""
 

@@ -21,13 +21,15 @@ from surfel_mapper.kernels.grouping import (
     CHUNK,
     enlarged_table,
     find_runs,
-    LONG,
     number_runs,
     U,
 )
 
 ROWS = 4096
 """Initial number of voxels that the table has room for."""
+
+LONG = 3
+"""Mean length of the runs of a chunk from which they are summed run by run, not by point."""
 
 
 @njit(cache=True, nogil=True, error_model='numpy')

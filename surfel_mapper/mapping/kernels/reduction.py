@@ -107,8 +107,8 @@ def add_places(places, num, chunk_keys, run_rows, words):
 
     Without branches, which real lidars would mispredict at every third to eighth point: sums stay
     in registers and are stored after each point. A new run drops them, by a mask, and takes those
-    of its voxel; a point of the same run takes the zeros at the end, because what was stored just
-    before would arrive too late.
+    of its voxel. A point of the same run takes the zeros at the end instead, because reading
+    the row that the point before it wrote would wait for that write.
     """
     all_x, all_y, all_z = places[0], places[1], places[2]
     zeros = U(len(words) - WORDS)
