@@ -26,23 +26,25 @@ from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 import numpy as np
 
+from surfel_mapper.kernels.layout import HIGH_BITS
+
 WORDS = 8
 """Words of the sums of a voxel."""
 
 FULL = (1 << 16) - 1
 """Number of points of a voxel up to which the sums are exact."""
 
-COUNT_BITS, HIGH_BITS = 40, 32
-"""Bits below the count in word 0, and below the sum of z in word 1."""
-
 WIDEST = (1 << 23) - 1
 """Number of points of a voxel up to which the count is exact."""
 
-_ONE = 1 << (COUNT_BITS - 32)
-"""A count of one in the upper half of word 0."""
+_X, _Y, _Z = (0, 0), (1, 0), (1, HIGH_BITS)
+"""Coordinates of a place: the word that holds it, and the bits below it."""
 
-_FIRST, _SECOND = (0, 0, 0, 2, 2, 3), (0, 2, 3, 2, 3, 3)
-"""Factors of the products among the half words x, _ONE, y, z."""
+_PRODUCTS = (_X, _X), (_X, _Y), (_X, _Z), (_Y, _Y), (_Y, _Z), (_Z, _Z)
+"""Factors of words 2 to 7."""
+
+_HALF = (1 << HIGH_BITS) - 1
+"""Mask of the lower half of a word."""
 
 
 def load_sums(words, at):
@@ -65,12 +67,11 @@ def masked_sum(sums, mask, others):
     return (sums & mask) + others
 
 
-def plus_place(sums, x, y, z):
-    """Return sums with one point more, at a place x, y, z int32 in [0, 65536)."""
-    half_words = np.array([x, _ONE, y, z], np.int64)
-    first, second = half_words[[0, 2]] | half_words[[1, 3]] << 32
-    products = half_words[list(_FIRST)] * half_words[list(_SECOND)]
-    return sums + np.array([first, second, *products])
+def plus_place(sums, first, second):
+    """Return sums with one point more; its place in two int64 words, see kernels/layout.py."""
+    words = int(first), int(second)
+    factors = [[words[word] >> below & _HALF for word, below in pair] for pair in _PRODUCTS]
+    return sums + np.array([*words, *(a * b for a, b in factors)])
 
 
 class Lanes(types.Type):
@@ -108,7 +109,7 @@ def _type_of_masked_sum(context):
 
 @type_callable(plus_place)
 def _type_of_sum(context):
-    return lambda sums, x, y, z: _LANES
+    return lambda sums, first, second: _LANES
 
 
 @lower_builtin(load_sums, types.Array, types.Integer)
@@ -130,23 +131,21 @@ def _emit_masked_sum(context, builder, signature, arguments):
     return builder.add(builder.and_(sums, mask), others)
 
 
-@lower_builtin(plus_place, Lanes, types.int32, types.int32, types.int32)
+@lower_builtin(plus_place, Lanes, types.int64, types.int64)
 def _emit_plus_place(context, builder, signature, arguments):
-    sums, x, y, z = arguments
-    half_words = ir.Constant(ir.VectorType(_HALF_WORD, 4), [0, _ONE, 0, 0])
-    for lane, value in ((0, x), (2, y), (3, z)):
-        half_words = builder.insert_element(half_words, value, _HALF_WORD(lane))
-    first, second = (
-        builder.zext(
-            builder.shuffle_vector(half_words, half_words, _indices((0, 0, *lanes))), _VECTOR
-        )
-        for lanes in (_FIRST, _SECOND)
-    )
-    places = builder.bitcast(half_words, ir.VectorType(_WORD, 2))
-    places = builder.shuffle_vector(places, places, _indices([0, 1] + [0] * 6))
+    sums, first, second = arguments
+    place = ir.Constant(ir.VectorType(_WORD, 2), ir.Undefined)
+    place = builder.insert_element(place, first, _HALF_WORD(0))
+    place = builder.insert_element(place, second, _HALF_WORD(1))
+    lower_halves = _constant([_HALF] * WORDS)
+    factors = []
+    for coordinates in zip(*_PRODUCTS, strict=True):
+        words, below = zip((0, 0), (1, 0), *coordinates, strict=True)
+        spread = builder.shuffle_vector(place, place, _indices(words))
+        factors.append(builder.and_(builder.lshr(spread, _constant(below)), lower_halves))
+    words = builder.shuffle_vector(place, place, _indices([0, 1] * (WORDS // 2)))
     chosen = _indices([0, 1, *range(WORDS + 2, 2 * WORDS)])
-    more = builder.shuffle_vector(places, builder.mul(first, second), chosen)
-    return builder.add(sums, more)
+    return builder.add(sums, builder.shuffle_vector(words, builder.mul(*factors), chosen))
 
 
 def _address(context, builder, signature, arguments):
@@ -162,3 +161,8 @@ def _address(context, builder, signature, arguments):
 def _indices(lanes):
     """Return the constant that selects lanes."""
     return ir.Constant(ir.VectorType(_HALF_WORD, len(lanes)), [_HALF_WORD(lane) for lane in lanes])
+
+
+def _constant(words):
+    """Return constant lanes."""
+    return ir.Constant(_VECTOR, [_WORD(word) for word in words])

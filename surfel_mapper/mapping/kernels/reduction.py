@@ -26,11 +26,17 @@ from surfel_mapper.kernels.grouping import (
     number_runs,
     U,
 )
-from surfel_mapper.kernels.layout import HALF, INDEX_BITS, INDEX_MASK, INDEX_OFFSET, VIEW_SCALE
+from surfel_mapper.kernels.layout import (
+    COUNT_BITS,
+    HALF,
+    HIGH_BITS,
+    INDEX_BITS,
+    INDEX_MASK,
+    INDEX_OFFSET,
+    VIEW_SCALE,
+)
 from surfel_mapper.kernels.quantisation import quantise
 from surfel_mapper.mapping.kernels.lanes import (
-    COUNT_BITS,
-    HIGH_BITS,
     load_sums,
     masked_sum,
     plus_place,
@@ -56,7 +62,7 @@ def reduce_points(xyz, pose, scale, range_sq, scratch, left_out):
               appearance, E <= B / 2;
               sums (E + 2, WORDS) int64, out: from sums[1] on those of the places in the voxel,
               as lanes.py packs them; those of more than FULL points are wrong;
-              of one chunk: chunk_keys (CHUNK + 1,) int64, places (3, CHUNK) int32,
+              of one chunk: chunk_keys (CHUNK + 1,) int64, places (2, CHUNK) int64,
               starts (CHUNK + AHEAD,) int32, run_rows (CHUNK,) int32; zeros before the first use
     left_out  (4,) int64, out: number of points rejected as not finite, too near, too far, beyond
               the voxel indices
@@ -100,7 +106,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
     """
     Add the places of a chunk of points to the sums of their voxels.
 
-    places      (3, CHUNK) int32, of which num count, at least one
+    places      (2, CHUNK) int64, of which num count, at least one; see quantise
     chunk_keys  (CHUNK + 1,) int64, voxel key of each point
     run_rows    (CHUNK,) int32, row of the voxel of each run
     words       (8 M,) int64, in and out: sums of the voxels; the last eight are zero
@@ -110,7 +116,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
     of its voxel. A point of the same run takes the zeros at the end instead, because reading
     the row that the point before it wrote would wait for that write.
     """
-    all_x, all_y, all_z = places[0], places[1], places[2]
+    first, second = places[0], places[1]
     zeros = U(len(words) - WORDS)
     run, previous = U(0), chunk_keys[0]
     sums = load_sums(words, U(WORDS) * U(np.uint32(run_rows[run])))
@@ -120,7 +126,7 @@ def add_places(places, num, chunk_keys, run_rows, words):
         run += U(is_new)
         at = U(WORDS) * U(np.uint32(run_rows[run]))
         others = load_sums(words, at if is_new else zeros)
-        others = plus_place(others, all_x[i], all_y[i], all_z[i])
+        others = plus_place(others, first[i], second[i])
         sums = masked_sum(sums, np.int64(is_new) - 1, others)
         store_sums(words, at, sums)
 
@@ -215,7 +221,7 @@ def sum_channels(xyz, pose, scale, range_sq, keys, table, values, sums):
     sums    (K, C) int64, out
     """
     chunk_keys = np.empty(CHUNK, np.int64)
-    places = np.empty((3, CHUNK), np.int32)
+    places = np.empty((2, CHUNK), np.int64)
     starts = np.empty(CHUNK + 1, np.int32)
     shift = hash_shift(len(table))
     sums[:, :] = 0

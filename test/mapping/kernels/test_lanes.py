@@ -6,10 +6,9 @@ from numba import njit
 import numpy as np
 import pytest
 
+from surfel_mapper.kernels.layout import COUNT_BITS, HIGH_BITS
 from surfel_mapper.mapping.kernels.lanes import (
-    COUNT_BITS,
     FULL,
-    HIGH_BITS,
     load_sums,
     masked_sum,
     plus_place,
@@ -27,9 +26,8 @@ HIGHEST = 65535
 def add_at(words, at, places, mask):
     sums = load_sums(words, at)
     for i in range(len(places)):
-        others = plus_place(
-            load_sums(words, np.uint64(0)), places[i, 0], places[i, 1], places[i, 2]
-        )
+        first, second = (1 << COUNT_BITS) | places[i, 0], (places[i, 2] << HIGH_BITS) | places[i, 1]
+        others = plus_place(load_sums(words, np.uint64(0)), first, second)
         sums = masked_sum(sums, mask, others)
     store_sums(words, at, sums)
 
@@ -47,7 +45,7 @@ def expected(places):
 @both
 @pytest.mark.parametrize('at', [8, 13, 24])
 def test_places_are_added_to_the_words_from_an_index_on(call, at):
-    places = np.random.default_rng(3).integers(0, 1 + HIGHEST, (40, 3)).astype(np.int32)
+    places = np.random.default_rng(3).integers(0, 1 + HIGHEST, (40, 3))
     words = np.arange(40) ** 3
     words[:WORDS] = 0
     before = words.copy()
@@ -59,7 +57,7 @@ def test_places_are_added_to_the_words_from_an_index_on(call, at):
 
 @both
 def test_a_mask_of_zero_drops_the_sums(call):
-    places = np.array([[1, 2, 3], [HIGHEST, 4, HIGHEST]], np.int32)
+    places = np.array([[1, 2, 3], [HIGHEST, 4, HIGHEST]])
     words = np.zeros(3 * WORDS, np.int64)
     words[WORDS:] = -5
     call(add_at, words, np.uint64(WORDS), places, 0)
@@ -70,7 +68,7 @@ def test_a_mask_of_zero_drops_the_sums(call):
 @pytest.mark.parametrize('corner', [(0, 0, 0), (HIGHEST, 0, HIGHEST), (HIGHEST,) * 3])
 def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner):
     words = np.zeros(2 * WORDS, np.int64)
-    places = np.array([corner] * FULL, np.int32)
+    places = np.array([corner] * FULL)
     add_at(words, np.uint64(WORDS), places, -1)
     assert words[WORDS:].tolist() == expected(places)
     x, _, z = corner

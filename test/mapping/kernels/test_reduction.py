@@ -55,7 +55,7 @@ def scratch_for(num_voxels):
     size = 1 << (2 * num_voxels - 1).bit_length()
     keys = np.full(num_voxels + 2, -7, np.int64)
     sums = np.full((num_voxels + 2, WORDS), -9, np.int64)
-    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((3, CHUNK), np.int32)
+    chunk_keys, places = np.zeros(CHUNK + 1, np.int64), np.empty((2, CHUNK), np.int64)
     starts, run_rows = np.zeros(CHUNK + AHEAD, np.int32), np.empty(CHUNK, np.int32)
     return np.full(size, -1, np.int32), keys, sums, chunk_keys, places, starts, run_rows
 
@@ -66,7 +66,7 @@ def scratch_for(num_voxels):
 def test_points_are_quantised_as_by_python(call, dtype, turned):
     pose = pose_matrix([3.0, 1e4, -2.0], [0.5, -0.5, 0.1, 0.7]) if turned else np.eye(4)
     points = some_points(300, dtype)
-    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK), np.int32)
+    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
 
     call(quantise, *points.T.copy(), pose[:3], 65536 / 0.2, ANY_RANGE, keys, places)
 
@@ -74,17 +74,37 @@ def test_points_are_quantised_as_by_python(call, dtype, turned):
         expected = reference.quantise(point, 0.2, pose)
         if expected is None:
             assert keys[row] == -1
-            assert not places[:, row].any()
         else:
             voxel, place = expected
             assert keys[row] == pack_keys(np.array([voxel]))[0]
-            assert tuple(places[:, row] - HALF) == place
+            x, y, z = (coordinate + HALF for coordinate in place)
+            assert places[:, row].tolist() == [2**40 + x, z * 2**32 + y]
+
+
+@both
+@pytest.mark.parametrize('axis', [0, 1, 2])
+def test_points_enter_up_to_the_last_voxel_and_no_farther(call, axis):
+    # in voxels of 0.5 m; beyond 2^35 a sum with BASE leaves the range of 53 bits
+    last, beyond = 2.0**20 - 2.0**-16, [2.0**k for k in (20, 21, 34, 35, 36, 37, 52, 1000)]
+    values = [last, -(2.0**20), -(2.0**20) - 2.0**-16, -np.inf, np.inf, np.nan]
+    values += [sign * value for value in beyond for sign in (1, -1)]
+    points = np.full((len(values), 3), 0.1)
+    points[:, axis] = values
+    points[:, axis] *= 0.5
+    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
+    with np.errstate(all='ignore'):
+        call(quantise, *points.T.copy(), IDENTITY, 131072.0, ANY_RANGE, keys, places)
+    enters = (keys[: len(values)] >= 0).tolist()
+    assert enters == [-(2**20) <= value < 2**20 for value in values]
+    assert [keys[row] >> (42 - 21 * axis) & 0x1FFFFF for row in (0, 1)] == [0x1FFFFF, 0]
+    word, below = [(0, 0), (1, 0), (1, 32)][axis]
+    assert places[word, 0] >> below & 65535 == 65535
 
 
 @both
 def test_points_outside_of_the_range_get_no_key(call):
     points = np.array([[1.0, 0, 0], [0, 2.0, 0], [0, 0, -3.0], [0.9, 0, 0], [0, -3.1, 0]])
-    keys, places = np.empty(CHUNK, np.int64), np.empty((3, CHUNK), np.int32)
+    keys, places = np.empty(CHUNK, np.int64), np.empty((2, CHUNK), np.int64)
     limits = np.array([1.0, 9.0])
     call(quantise, *points.T.copy(), IDENTITY, 131072.0, limits, keys, places)
     assert (keys[:5] >= 0).tolist() == [True, True, True, False, False]
@@ -101,6 +121,12 @@ def test_runs_are_those_of_groupby(call, keys):
     assert starts[num] == len(keys)
 
 
+def packed(places):
+    """Return places (3, C) in words, (2, C) int64."""
+    x, y, z = places
+    return np.array([2**40 + x, z * 2**32 + y])
+
+
 def unpacked(call, sums):
     """Return rows of count, sums and products of the places about the centre."""
     num = len(sums)
@@ -114,13 +140,13 @@ def unpacked(call, sums):
 @both
 @pytest.mark.parametrize('lengths', [(9, 1, 7), (1, 1, 15), (17,)])
 def test_runs_add_count_sums_and_products_to_their_voxels(call, lengths):
-    places = np.random.default_rng(1).integers(0, 65536, (3, 17)).astype(np.int32)
+    places = np.random.default_rng(1).integers(0, 65536, (3, 17))
     rows, voxels = [1, 3, 1][: len(lengths)], [70, 20, 70][: len(lengths)]
     keys = np.append(np.repeat(voxels, lengths), -9)
     sums = np.zeros((6, WORDS), np.int64)
     run_rows = np.array([*rows, 4, 4], np.int32)  # those at the end do not count
     for _ in range(2):  # the second time on top of the first
-        call(add_places, places, 17, keys, run_rows, sums.ravel())
+        call(add_places, packed(places), 17, keys, run_rows, sums.ravel())
     found = unpacked(call, sums)
     for row, voxel in ((1, 70), (3, 20)):
         of_row = np.flatnonzero(keys == voxel)
