@@ -37,6 +37,8 @@ def as_array(name: str, values: npt.ArrayLike) -> npt.NDArray[Any]:
 def as_numbers(name: str, values: npt.ArrayLike) -> npt.NDArray[np.float64]:
     """Return values as float64; raise ValueError, with their name, if they are not numbers."""
     found = as_array(name, values)
+    if found.dtype == np.float64:
+        return found
     try:
         if found.dtype.kind in 'cmMSUV':  # dates would become their number of ticks
             raise TypeError

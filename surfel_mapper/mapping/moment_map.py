@@ -36,7 +36,6 @@ from surfel_mapper.mapping.moments import (
     pack_keys,
     ScanMoments,
     shifted_moments,
-    unpack_keys,
     whole_keys,
 )
 from surfel_mapper.mapping.voxel_table import ChangeLog, VoxelTable
@@ -176,7 +175,7 @@ class MomentMap:
             )
         self.version += 1
         self._changes.add(self.version, rows, self._table.num_voxels)
-        return unpack_keys(fallen)
+        return fallen
 
     def merge(self, other: MomentMap) -> None:
         """

@@ -144,13 +144,12 @@ class Reducer:
             if self._columns
             else None
         )
-        limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m))
-        if limits.shape != (2,) or not (limits >= 0.0).all():  # false for nan
+        limits = as_numbers('min_range_m, max_range_m', (min_range_m, max_range_m)).tolist()
+        if not all(isinstance(limit, float) and limit >= 0.0 for limit in limits):  # also nan
             raise ValueError(
                 f'min_range_m {min_range_m!r}, max_range_m {max_range_m!r}, expected zero or more'
             )
-        with np.errstate(over='ignore'):
-            range_sq = limits * limits
+        range_sq = np.array([limit * limit for limit in limits])
         scale = (1 << BITS) / self.voxel_size_m
         quantisation = (np.ascontiguousarray(pose[:3]), scale, range_sq)
         try:
@@ -266,5 +265,7 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
         raise ValueError(f'points: shape {array.shape}, expected (N, 3)')
     if array.dtype.kind not in 'fiu':
         raise ValueError(f'points: dtype {array.dtype}, expected numbers')
+    if array.dtype in (np.float32, np.float64) and array.flags.farray:
+        return array
     dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
     return np.require(array, dtype, ['F', 'A', 'W'])

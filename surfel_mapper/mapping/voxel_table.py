@@ -142,7 +142,7 @@ class VoxelTable:
 
     def remove(
         self, moments: ScanMoments, version: int, min_points: int = 1
-    ) -> tuple[int, npt.NDArray[np.int32], npt.NDArray[np.int64]]:
+    ) -> tuple[int, npt.NDArray[np.int32], npt.NDArray[np.int32]]:
         """
         Subtract moments from their voxels, or nothing if one does not hold them.
 
@@ -152,8 +152,8 @@ class VoxelTable:
             The first voxel that does not hold its moments, or -1.
         rows : (K,) int32
             The row of each voxel.
-        fallen : (E,) int64
-            The keys of the voxels that fell below min_points.
+        fallen : (E, 3) int32
+            The indices of the voxels that fell below min_points.
 
         """
         arrays, view_is_sum, num = moments.arrays, moments.view_is_sum, len(moments)
@@ -161,7 +161,7 @@ class VoxelTable:
             rows = self.find(moments.key)
         else:
             rows = np.array(moments.rows, np.int32)  # hints, confirmed by the kernel
-        fallen = np.empty(num, np.int64)
+        fallen = np.empty((num, 3), np.int32)
         self._version = version
         missing, num_fallen = remove_moments(
             arrays,

@@ -218,7 +218,7 @@ def remove_moments(
     stamp       uint32, of this change; see kernels/layout.py
     found       (K,) int32, in: row of each voxel, or a hint of it; out: the row
     min_points  smallest number of points of a surfel, at least 1
-    fallen      (K,) int64, out: keys of the voxels that held min_points before and hold fewer now
+    fallen      (K, 3) int32, out: indices of the voxels that held min_points before and hold fewer
 
     Returns the first voxel that does not hold its moments, or -1, and the number of fallen voxels.
 
@@ -253,7 +253,9 @@ def remove_moments(
                 change_row(moments, view_weight, rows, np.int64(found[done]), done, 1)
             return place, 0
         if held >= min_points > held - n:
-            fallen[num_fallen] = key
+            fallen[num_fallen, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+            fallen[num_fallen, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
+            fallen[num_fallen, 2] = (key & INDEX_MASK) - INDEX_OFFSET
             num_fallen += 1
         if held == n:
             emptied[num_emptied] = place

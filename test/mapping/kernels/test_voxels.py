@@ -59,7 +59,7 @@ class Memory:
 
     def remove(self, moments, version, min_points=1, weight=1, hints=None):
         """Return the first voxel that does not hold its moments, and the fallen voxels."""
-        fallen = np.full(len(moments[0]), -1, np.int64)
+        fallen = np.full((len(moments[0]), 3), -1, np.int32)
         found = self.find(moments[0]) if hints is None else hints
         missing, num = self.call(
             remove_moments,
@@ -71,7 +71,7 @@ class Memory:
             np.testing.assert_array_equal(
                 self.stamps[found], 2 * version + EMPTIED * np.array(empty)
             )
-        return missing, list(map(tuple, unpack_keys(fallen[:num]).tolist()))
+        return missing, list(map(tuple, fallen[:num].tolist()))
 
     def content(self):
         """Return the content of the table as a dict."""
