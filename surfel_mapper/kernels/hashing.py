@@ -27,15 +27,13 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after algorithm R of Knu
 from numba import njit
 import numpy as np
 
+from surfel_mapper.kernels.buckets import BUCKET, highest_match
 from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.grouping import U
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
 """Entries of a segment: 4 KiB."""
-
-BUCKET = 8
-"""Entries of a bucket."""
 
 FULLEST = SEGMENT * 3 // 4
 """Maximum number of rows in a segment; see is_full."""
@@ -120,11 +118,7 @@ def likely_row(hashed, directory, buckets, depth):
 @njit(cache=True, nogil=True, inline='always')
 def row_of(hashed, bucket, buckets):
     """Return the highest row with a hash in a bucket, -1 if not found."""
-    found = np.int64(0)
-    for place in range(U(BUCKET)):
-        entry = buckets[U(bucket) + place]
-        found = max(found, (entry & LOW) if (entry >> 32) & LOW == hashed else np.int64(0))
-    return found - 1
+    return highest_match(buckets, bucket, hashed) - 1
 
 
 @njit(cache=True, nogil=True, inline='always')

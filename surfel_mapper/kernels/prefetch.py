@@ -12,7 +12,7 @@ a map of 10^6 takes 4.1 ms, with the second alone 2.6. But processors may ignore
 some milliseconds after other work has used much of the bandwidth of the memory, so the later one
 is needed too.
 
-Stands alone: one of the two places that emit instructions of LLVM.
+Stands alone: one of the places that emit instructions of LLVM.
 """
 
 from llvmlite import ir

@@ -25,7 +25,6 @@ from surfel_mapper.kernels.layout import (
     INDEX_OFFSET,
 )
 
-
 BASE = 3.0 * 2.0**51 + (INDEX_OFFSET << BITS)
 """The sum of BASE and a whole number in [-2^51, 2^51 - 2^36) lies in [2^52, 2^53), where the lower
 52 bits of a float64 are a whole number."""

@@ -26,7 +26,8 @@ HIGHEST = 65535
 def add_at(words, at, places, mask):
     sums = load_sums(words, at)
     for i in range(len(places)):
-        first, second = (1 << COUNT_BITS) | places[i, 0], (places[i, 2] << HIGH_BITS) | places[i, 1]
+        first = (1 << COUNT_BITS) | places[i, 0]
+        second = (places[i, 2] << HIGH_BITS) | places[i, 1]
         others = plus_place(load_sums(words, np.uint64(0)), first, second)
         sums = masked_sum(sums, mask, others)
     store_sums(words, at, sums)
