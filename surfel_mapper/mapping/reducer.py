@@ -265,7 +265,5 @@ def as_points(points: npt.ArrayLike) -> npt.NDArray[Any]:
         raise ValueError(f'points: shape {array.shape}, expected (N, 3)')
     if array.dtype.kind not in 'fiu':
         raise ValueError(f'points: dtype {array.dtype}, expected numbers')
-    if array.dtype in (np.float32, np.float64) and array.flags.farray:
-        return array
     dtype = np.float32 if array.dtype in (np.float32, np.float16) else np.float64
     return np.require(array, dtype, ['F', 'A', 'W'])

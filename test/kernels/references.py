@@ -20,6 +20,7 @@ REFERENCES = {
     'filters/kernels/shapes.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/smallest.py': 'filters/kernels/test_kernels.py',
     'filters/kernels/tensor_voting.py': 'filters/test_tensor_voting.py',
+    'kernels/buckets.py': 'kernels/test_buckets.py',
     'kernels/compiling.py': 'kernels/test_compiling.py',
     'kernels/grouping.py': 'kernels/test_grouping.py',
     'kernels/hashing.py': 'kernels/test_hashing.py',

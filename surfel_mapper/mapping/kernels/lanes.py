@@ -5,8 +5,8 @@ Sums over points in the lanes of a vector register: eight words, one cache line,
 
 A scan needs ten sums of each voxel: count, places (3) and products of places (6). Packed into
 eight words of 64 bits they fill one cache line, which one instruction reads and one writes where
-registers have 512 bits, two or four elsewhere. Ten sums in float64 take two lines and ten
-instructions each, and a reduction takes 1.02 to 1.17 times as long.
+registers have 512 bits, two or four elsewhere. Ten sums in float64 would take two lines and ten
+instructions each.
 
     word 0        count << 40 | sum of x, with x, y, z in [0, 65536)
     word 1        sum of z << 32 | sum of y
@@ -17,7 +17,11 @@ FULL points are noticed.
 
 Interpreted, the functions work on arrays; compiled, on a type of their own. Compilers do not find
 these instructions in loops, so they are spelled in the language of LLVM here, as are those of
-kernels/prefetch.py. Words are halved as on little-endian processors, the only ones of ROS 2.
+kernels/prefetch.py.
+
+A place arrives in two words too, as quantise writes it. Both are spread over all lanes and shifted
+to the factors of the products; taking x, y and z apart and collecting them in a register makes
+adding twice as long.
 """
 
 from llvmlite import ir
@@ -140,12 +144,12 @@ def _emit_plus_place(context, builder, signature, arguments):
     lower_halves = _constant([_HALF] * WORDS)
     factors = []
     for coordinates in zip(*_PRODUCTS, strict=True):
-        words, below = zip((0, 0), (1, 0), *coordinates, strict=True)
+        words, below = zip(_X, _Y, *coordinates, strict=True)  # the first two lanes are not used
         spread = builder.shuffle_vector(place, place, _indices(words))
         factors.append(builder.and_(builder.lshr(spread, _constant(below)), lower_halves))
-    words = builder.shuffle_vector(place, place, _indices([0, 1] * (WORDS // 2)))
+    spread = builder.shuffle_vector(place, place, _indices([0, 1] * (WORDS // 2)))
     chosen = _indices([0, 1, *range(WORDS + 2, 2 * WORDS)])
-    return builder.add(sums, builder.shuffle_vector(words, builder.mul(*factors), chosen))
+    return builder.add(sums, builder.shuffle_vector(spread, builder.mul(*factors), chosen))
 
 
 def _address(context, builder, signature, arguments):
