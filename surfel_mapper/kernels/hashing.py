@@ -27,13 +27,16 @@ Source: Fagin et al. 1979, Extendible hashing; deletion after algorithm R of Knu
 from numba import njit
 import numpy as np
 
-from surfel_mapper.kernels.buckets import BUCKET, highest_match
 from surfel_mapper.kernels.compiling import part
 from surfel_mapper.kernels.grouping import U
+from surfel_mapper.kernels.lanes import highest_match, WORDS
 from surfel_mapper.kernels.layout import KEY
 
 SEGMENT = 512
 """Entries of a segment: 4 KiB."""
+
+BUCKET = WORDS
+"""Entries of a bucket."""
 
 FULLEST = SEGMENT * 3 // 4
 """Maximum number of rows in a segment; see is_full."""

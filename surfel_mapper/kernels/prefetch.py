@@ -12,7 +12,7 @@ a map of 10^6 took 1.6 times as long as with the second alone. But processors ma
 one for some milliseconds after other work has used much of the bandwidth of the memory, so the
 later one is needed too.
 
-Stands alone: one of the places that emit instructions of LLVM.
+Stands alone: one of the two places that emit instructions of LLVM.
 """
 
 from llvmlite import ir

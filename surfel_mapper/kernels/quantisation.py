@@ -22,6 +22,7 @@ from surfel_mapper.kernels.layout import (
     COUNT_BITS,
     HIGH_BITS,
     INDEX_BITS,
+    INDEX_MASK,
     INDEX_OFFSET,
 )
 
@@ -91,3 +92,10 @@ def pack(kx, ky, kz):
         | ((ky + INDEX_OFFSET) << INDEX_BITS)
         | (kz + INDEX_OFFSET)
     )
+
+
+@njit(cache=True, nogil=True, inline='always')
+def unpack(key):
+    """Return the voxel index of a key, i j k int64."""
+    i = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
+    return i, ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET, (key & INDEX_MASK) - INDEX_OFFSET

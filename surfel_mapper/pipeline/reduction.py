@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from surfel_mapper.config import Config
 from surfel_mapper.geometry import Transform
+from surfel_mapper.kernels.lanes import FULL
 from surfel_mapper.mapping.channels import CHANNELS
-from surfel_mapper.mapping.kernels.lanes import FULL
 from surfel_mapper.mapping.moments import ScanMoments
 from surfel_mapper.mapping.reducer import within
 from surfel_mapper.mapping.surfel_map import SurfelMap

@@ -20,15 +20,13 @@ from surfel_mapper.kernels.compiling import kernel
 from surfel_mapper.kernels.grouping import find_key, hash_shift
 from surfel_mapper.kernels.layout import (
     EMPTIED,
-    INDEX_BITS,
-    INDEX_MASK,
     INDEX_OFFSET,
     KEY,
     ROW,
     STAMPS,
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
-from surfel_mapper.kernels.quantisation import in_range, pack
+from surfel_mapper.kernels.quantisation import in_range, pack, unpack
 from surfel_mapper.mapping.kernels.rows import count_of
 
 AHEAD = 16
@@ -137,9 +135,7 @@ def keys_in_box(rows, used, low, high):
     num = 0
     for row in range(used):
         key = rows[row, KEY]
-        kx = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        ky = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        kz = (key & INDEX_MASK) - INDEX_OFFSET
+        kx, ky, kz = unpack(key)
         inside = low[0] <= kx <= high[0] and low[1] <= ky <= high[1] and low[2] <= kz <= high[2]
         if inside and count_of(rows, row) > 0:
             kept[num] = key

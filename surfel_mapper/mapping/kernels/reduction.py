@@ -26,23 +26,20 @@ from surfel_mapper.kernels.grouping import (
     number_runs,
     U,
 )
-from surfel_mapper.kernels.layout import (
-    COUNT_BITS,
-    HALF,
-    HIGH_BITS,
-    INDEX_BITS,
-    INDEX_MASK,
-    INDEX_OFFSET,
-    VIEW_SCALE,
-)
-from surfel_mapper.kernels.quantisation import quantise
-from surfel_mapper.mapping.kernels.lanes import (
+from surfel_mapper.kernels.lanes import (
     load_sums,
     masked_sum,
     plus_place,
     store_sums,
     WORDS,
 )
+from surfel_mapper.kernels.layout import (
+    COUNT_BITS,
+    HALF,
+    HIGH_BITS,
+    VIEW_SCALE,
+)
+from surfel_mapper.kernels.quantisation import quantise, unpack
 
 NOT_FINITE, TOO_NEAR, TOO_FAR, BEYOND = range(4)
 """Rows of ``left_out``: the reason why a point is rejected."""
@@ -193,12 +190,10 @@ def look_back(keys, origin, voxel_size, view):
         num = min(CHUNK, len(keys) - start)
         for i in range(num):
             key = keys[start + i]
-            ix = np.int32((key >> (2 * INDEX_BITS)) - INDEX_OFFSET)
-            iy = np.int32(((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET)
-            iz = np.int32((key & INDEX_MASK) - INDEX_OFFSET)
-            dx = ox - (ix + 0.5) * voxel_size
-            dy = oy - (iy + 0.5) * voxel_size
-            dz = oz - (iz + 0.5) * voxel_size
+            kx, ky, kz = unpack(key)
+            dx = ox - (np.int32(kx) + 0.5) * voxel_size
+            dy = oy - (np.int32(ky) + 0.5) * voxel_size
+            dz = oz - (np.int32(kz) + 0.5) * voxel_size
             length = math.sqrt((dx * dx + dy * dy) + dz * dz)
             known = length > 0.0  # false for nan
             towards[0, i] = np.rint(VIEW_SCALE * (dx / length)) if known else 0.0

@@ -15,12 +15,10 @@ import numpy as np
 
 from surfel_mapper.kernels.compiling import kernel, part
 from surfel_mapper.kernels.layout import (
-    INDEX_BITS,
-    INDEX_MASK,
-    INDEX_OFFSET,
     KEY,
     PRODUCT,
 )
+from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.kernels.symmetric3 import decompose_chunk, make_work
 from surfel_mapper.mapping.kernels.rows import (
     count_of,
@@ -134,9 +132,7 @@ def gather(rows, chosen, start, num, moments, num_points, voxel_index):
             prefetch_row(flat, np.int64(chosen[out + AHEAD]))
         row = np.int64(chosen[out])
         key, n = rows[row, KEY], count_of(rows, row)
-        voxel_index[out, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        voxel_index[out, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        voxel_index[out, 2] = (key & INDEX_MASK) - INDEX_OFFSET
+        voxel_index[out, 0], voxel_index[out, 1], voxel_index[out, 2] = unpack(key)
         num_points[out] = n
         most = max(most, n)
         moments[N, i] = n

@@ -47,7 +47,6 @@ from surfel_mapper.kernels.layout import (
     EMPTIED,
     HALF,
     INDEX_BITS,
-    INDEX_MASK,
     INDEX_OFFSET,
     KEY,
     PRODUCT,
@@ -55,6 +54,7 @@ from surfel_mapper.kernels.layout import (
     VIEW_SCALE,
 )
 from surfel_mapper.kernels.prefetch import prefetch, prefetch_early
+from surfel_mapper.kernels.quantisation import unpack
 from surfel_mapper.mapping.kernels.rows import (
     add_to_row,
     count_of,
@@ -253,9 +253,7 @@ def remove_moments(
                 change_row(moments, view_weight, rows, np.int64(found[done]), done, 1)
             return place, 0
         if held >= min_points > held - n:
-            fallen[num_fallen, 0] = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-            fallen[num_fallen, 1] = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-            fallen[num_fallen, 2] = (key & INDEX_MASK) - INDEX_OFFSET
+            fallen[num_fallen, 0], fallen[num_fallen, 1], fallen[num_fallen, 2] = unpack(key)
             num_fallen += 1
         if held == n:
             emptied[num_emptied] = place
@@ -328,9 +326,7 @@ def coarse_rows(fine_keys, level, table, keys, rows):
     num = 0
     for i in range(len(fine_keys)):
         key = fine_keys[i]
-        x = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        y = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        z = (key & INDEX_MASK) - INDEX_OFFSET
+        x, y, z = unpack(key)
         coarse = ((x >> level) + INDEX_OFFSET) << (2 * INDEX_BITS)
         coarse |= (((y >> level) + INDEX_OFFSET) << INDEX_BITS) | ((z >> level) + INDEX_OFFSET)
         place = home(coarse, shift)
@@ -366,9 +362,7 @@ def sum_coarse(moments, chosen, rows, fine_level, level, coarse):
     for k in range(len(chosen)):
         i, row = chosen[k], np.int64(rows[k])
         key = fine_keys[i]
-        x = (key >> (2 * INDEX_BITS)) - INDEX_OFFSET
-        y = ((key >> INDEX_BITS) & INDEX_MASK) - INDEX_OFFSET
-        z = (key & INDEX_MASK) - INDEX_OFFSET
+        x, y, z = unpack(key)
         # d: from the coarse centre to the fine centre
         n = np.int64(count[i])
         dx = (x & below) * fine + middle

@@ -13,9 +13,9 @@ import pytest
 
 from surfel_mapper.geometry import pose_matrix
 from surfel_mapper.kernels.grouping import AHEAD, CHUNK, find_runs, hash_shift, home
+from surfel_mapper.kernels.lanes import WORDS
 from surfel_mapper.kernels.layout import HALF
 from surfel_mapper.kernels.quantisation import quantise
-from surfel_mapper.mapping.kernels.lanes import WORDS
 from surfel_mapper.mapping.kernels.reduction import (
     add_places,
     BEYOND,

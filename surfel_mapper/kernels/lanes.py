@@ -1,10 +1,10 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
 """
-Sums over points in the lanes of a vector register: eight words, one cache line, for each voxel.
+Eight words of 64 bits, a line of the cache, in vector registers: sums of a voxel, and a bucket.
 
-A scan needs ten sums of each voxel: count, places (3) and products of places (6). Packed into
-eight words of 64 bits they fill one cache line, which one instruction reads and one writes where
+A reduction needs ten sums of each voxel of a scan: count, places (3) and products of places (6).
+Packed into eight words they fill one cache line, which one instruction reads and one writes where
 registers have 512 bits, two or four elsewhere. Ten sums in float64 would take two lines and ten
 instructions each.
 
@@ -13,15 +13,18 @@ instructions each.
     words 2 to 7  sums of xx, xy, xz, yy, yz, zz
 
 All are exact up to FULL points. The count is exact up to WIDEST, so that voxels with more than
-FULL points are noticed.
+FULL points are noticed. A place arrives in two words too, as quantise writes it. Both are spread
+over all lanes and shifted to the factors of the products; taking x, y and z apart and collecting
+them in a register makes adding twice as long.
 
-Interpreted, the functions work on arrays; compiled, on a type of their own. Compilers do not find
-these instructions in loops, so they are spelled in the language of LLVM here, as are those of
-kernels/prefetch.py.
+A bucket of the hash table of a map has eight entries. Compilers turn the loop over them into a
+chain of 16 conditional moves, and a look-up takes 1.2 times as long.
 
-A place arrives in two words too, as quantise writes it. Both are spread over all lanes and shifted
-to the factors of the products; taking x, y and z apart and collecting them in a register makes
-adding twice as long.
+Interpreted, the functions work on arrays; compiled, the sums are a type of their own. Compilers do
+not find these instructions in loops, so they are spelled in the language of LLVM here, as are
+those of prefetch.py.
+
+Stands alone: one of the two places that emit instructions of LLVM.
 """
 
 from llvmlite import ir
@@ -33,7 +36,7 @@ import numpy as np
 from surfel_mapper.kernels.layout import HIGH_BITS
 
 WORDS = 8
-"""Words of the sums of a voxel."""
+"""Words of the sums of a voxel, and entries of a bucket."""
 
 FULL = (1 << 16) - 1
 """Number of points of a voxel up to which the sums are exact."""
@@ -78,6 +81,19 @@ def plus_place(sums, first, second):
     return sums + np.array([*words, *(a * b for a, b in factors)])
 
 
+def highest_match(words, at, upper):
+    """
+    Return the highest lower half among words[at : at + 8] that have an upper half, or 0.
+
+    words  (8 M,) int64; the index is not checked
+    at     int64
+    upper  int64 in [0, 2^32)
+    """
+    chosen = words[int(at) : int(at) + WORDS].view(np.uint64)
+    lower = chosen & np.uint64(_HALF)
+    return np.int64(lower[chosen >> np.uint64(HIGH_BITS) == np.uint64(upper)].max(initial=0))
+
+
 class Lanes(types.Type):
     """Eight words in vector registers; the type that compiled kernels give them."""
 
@@ -116,6 +132,11 @@ def _type_of_sum(context):
     return lambda sums, first, second: _LANES
 
 
+@type_callable(highest_match)
+def _type_of_match(context):
+    return lambda words, at, upper: types.int64
+
+
 @lower_builtin(load_sums, types.Array, types.Integer)
 def _emit_load(context, builder, signature, arguments):
     return builder.load(_address(context, builder, signature, arguments), align=8)
@@ -130,9 +151,7 @@ def _emit_store(context, builder, signature, arguments):
 @lower_builtin(masked_sum, Lanes, types.int64, Lanes)
 def _emit_masked_sum(context, builder, signature, arguments):
     sums, mask, others = arguments
-    mask = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), mask, _HALF_WORD(0))
-    mask = builder.shuffle_vector(mask, mask, _indices([0] * WORDS))
-    return builder.add(builder.and_(sums, mask), others)
+    return builder.add(builder.and_(sums, _spread(builder, mask)), others)
 
 
 @lower_builtin(plus_place, Lanes, types.int64, types.int64)
@@ -152,6 +171,21 @@ def _emit_plus_place(context, builder, signature, arguments):
     return builder.add(sums, builder.shuffle_vector(spread, builder.mul(*factors), chosen))
 
 
+@lower_builtin(highest_match, types.Array, types.Integer, types.Integer)
+def _emit_highest_match(context, builder, signature, arguments):
+    words = _emit_load(context, builder, signature, arguments)
+    upper = builder.shl(arguments[2], _WORD(HIGH_BITS))
+    rest = builder.xor(words, _spread(builder, upper))
+    zeros = _constant([0] * WORDS)
+    differs = builder.lshr(rest, _constant([HIGH_BITS] * WORDS))
+    lower = builder.select(builder.icmp_unsigned('==', differs, zeros), rest, zeros)
+    halves = ir.VectorType(_HALF_WORD, 2 * WORDS)  # processors have maxima of 32 bits
+    takes = ir.FunctionType(_HALF_WORD, [halves])
+    name = 'llvm.vector.reduce.umax.v16i32'
+    highest = cgutils.get_or_insert_function(builder.module, takes, name)
+    return builder.zext(builder.call(highest, [builder.bitcast(lower, halves)]), _WORD)
+
+
 def _address(context, builder, signature, arguments):
     """Return the address of the words from an index on."""
     array_type = signature.args[0]
@@ -160,6 +194,12 @@ def _address(context, builder, signature, arguments):
         context, builder, array_type, struct, [arguments[1]], wraparound=False
     )
     return builder.bitcast(address, _VECTOR.as_pointer())
+
+
+def _spread(builder, word):
+    """Return lanes that all hold a word."""
+    lanes = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), word, _HALF_WORD(0))
+    return builder.shuffle_vector(lanes, lanes, _indices([0] * WORDS))
 
 
 def _indices(lanes):

@@ -1,14 +1,14 @@
 # SPDX-FileCopyrightText: 2026 surfel_mapper contributors
 # SPDX-License-Identifier: Apache-2.0
-"""Sums in lanes against Python integers, compiled and interpreted."""
+"""Sums in lanes and the search of eight words against Python integers."""
 
 from numba import njit
 import numpy as np
 import pytest
 
-from surfel_mapper.kernels.layout import COUNT_BITS, HIGH_BITS
-from surfel_mapper.mapping.kernels.lanes import (
+from surfel_mapper.kernels.lanes import (
     FULL,
+    highest_match,
     load_sums,
     masked_sum,
     plus_place,
@@ -16,6 +16,7 @@ from surfel_mapper.mapping.kernels.lanes import (
     WIDEST,
     WORDS,
 )
+from surfel_mapper.kernels.layout import COUNT_BITS, HIGH_BITS
 from test.kernels.modes import both
 
 HIGHEST = 65535
@@ -79,3 +80,43 @@ def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner)
         add_at(words, np.uint64(WORDS), places, -1)
     add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], -1)
     assert words[WORDS] >> COUNT_BITS == WIDEST
+
+
+@njit
+def search(entries, first, upper):
+    return highest_match(entries, first, upper)
+
+
+def highest_lower_half(entries, first, upper):
+    """Return the highest lower half with an upper half, by Python's integers."""
+    halves = [divmod(entry % 2**64, 2**32) for entry in entries[first : first + WORDS].tolist()]
+    return max([low for high, low in halves if high == upper], default=0)
+
+
+@both
+@pytest.mark.parametrize('first', [0, 8, 24])
+@pytest.mark.parametrize('upper', [0, 1, 7, 2**31 - 1, 2**31, 2**32 - 1])
+def test_the_highest_match_is_that_of_python(call, first, upper):
+    rng = np.random.default_rng(first + upper)
+    found = set()
+    for _ in range(200):
+        highs = rng.choice([0, 1, 7, 2**31 - 1, 2**31, 2**32 - 1], 4 * WORDS).astype(np.uint64)
+        lows = rng.integers(0, 2**31, 4 * WORDS).astype(np.uint64)
+        entries = (highs << np.uint64(32) | lows).view(np.int64)
+        assert call(search, entries, first, upper) == highest_lower_half(entries, first, upper)
+        found.add(highest_lower_half(entries, first, upper) > 0)
+    assert found == {True, False}
+
+
+@both
+@pytest.mark.parametrize('place', range(WORDS))
+def test_every_word_of_the_eight_is_looked_at_and_no_other(call, place):
+    entries = np.zeros(3 * WORDS, np.int64)
+    entries[WORDS + place] = 5 << 32 | 9
+    assert [call(search, entries, first, 5) for first in (0, 8, 16)] == [0, 9, 0]
+    assert call(search, entries, WORDS, 9) == 0
+
+
+@both
+def test_words_of_zero_match_zero_with_zero(call):
+    assert call(search, np.zeros(WORDS, np.int64), 0, 0) == 0
