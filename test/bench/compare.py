@@ -6,13 +6,12 @@ The map beside plain numpy and, with --peers, beside other packages, on one core
 All get the same scans at the same poses; ``x_ours`` is the ratio of their time to ours. Ours and
 numpy read PointCloud2 of 32-byte steps; the peers get packed points, which is less work. The last
 column states the work that a peer leaves out; none of the marked ones is exact. The integers of
-numpy and of the map are compared at the end. A peer that needs more than a second for a scan is
-given fewer scans.
+numpy and of the map are compared at the end. A slow peer is given fewer scans.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from time import perf_counter
 from typing import Any
@@ -32,32 +31,28 @@ from test.bench.report import Row, spread
 from test.bench.street import Street
 
 
-def run(options: Options) -> list[Row]:
-    """Return a row for each package, by scan and voxel size; the first is ours."""
+def run(options: Options) -> Iterator[Row]:
+    """Yield a row for each package, by scan and voxel size; the first is ours."""
     with one_core():
-        return [
-            {'scan': name, **row}
-            for name, street, size in drives(options)
-            for row in compared(size, street)
-        ]
+        for name, street, size in drives(options):
+            for found in compared(size, street):
+                yield {'scan': name, **found}
 
 
-def compared(options: Options, street: Street) -> list[Row]:
-    """Return the rows of one drive."""
+def compared(options: Options, street: Street) -> Iterator[Row]:
+    """Yield the rows of one drive."""
     street.prepare(options.untimed + options.scans)
-    rows: list[Row] = []
     for size_m in options.voxel_sizes_m:
         ours, numpy_map = Ours(size_m, options.window), NumpyMap(size_m, options.window)
         times = timed(options, street, ours.step)
         reference_ms = float(np.median(times))
         voxels = ours.map.num_voxels
-        rows.append(row(options, size_m, 'surfel_mapper', times, reference_ms, voxels))
+        yield row(options, size_m, 'surfel_mapper', times, reference_ms, voxels)
         times = timed(options, street, partial(numpy_step, numpy_map))
         ours.check_equal(numpy_map)
-        rows.append(row(options, size_m, 'numpy, sorted keys', times, reference_ms, voxels))
+        yield row(options, size_m, 'numpy, sorted keys', times, reference_ms, voxels)
         if options.peers:
-            rows += peer_rows(options, street, size_m, reference_ms)
-    return rows
+            yield from peer_rows(options, street, size_m, reference_ms)
 
 
 def timed(options: Options, street: Street, step: Callable[..., Any]) -> list[float]:
@@ -78,19 +73,19 @@ def numpy_step(numpy_map: NumpyMap, message: RawCloud, pose: np.ndarray) -> None
     numpy_map.step([points[name] for name in 'xyz'], pose)
 
 
-def peer_rows(options: Options, street: Street, size_m: float, reference_ms: float) -> list[Row]:
-    """Return a row for each peer; only the reason if it is missing or fails."""
-    rows: list[Row] = []
+def peer_rows(
+    options: Options, street: Street, size_m: float, reference_ms: float
+) -> Iterator[Row]:
+    """Yield a row for each peer; only the reason if it is missing or fails."""
     for peer in PEERS:
         try:
             python = environment(peer, options.cache)
             times, voxels = run_peer(python, peer, options, street, size_m)
         except PeerError as error:
-            rows.append({'voxel_m': size_m, 'who': peer.name, 'less': f'not measured: {error}'})
+            yield {'voxel_m': size_m, 'who': peer.name, 'less': f'not measured: {error}'}
         else:
             found = row(options, size_m, peer.name, times, reference_ms, voxels)
-            rows.append({**found, 'less': peer.less})
-    return rows
+            yield {**found, 'less': peer.less}
 
 
 def row(

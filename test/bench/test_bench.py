@@ -254,6 +254,30 @@ def test_a_peer_is_given_the_same_scans_in_a_process_of_its_own(options):
     assert num_voxels == expected.num_voxels > 0
 
 
+def test_a_peer_may_fill_its_window_without_a_result(options, tmp_path, monkeypatch):
+    module = """class Peer:
+    def __init__(self, voxel_size_m, window):
+        self.calls = []
+    def fill(self, points, T_map_sensor):
+        self.calls.append('f')
+    def step(self, points, T_map_sensor):
+        self.calls.append('s')
+    @property
+    def num_voxels(self):
+        return ''.join(self.calls)
+"""
+    (tmp_path / 'filled.py').write_text(module, encoding='utf-8')
+    monkeypatch.setenv('PYTHONPATH', str(tmp_path))
+    street = Street(options)
+    street.prepare(options.untimed + SCANS)
+
+    peer = PeerSpec(name='filled', module='filled', requires=())
+    milliseconds, calls = run_peer(sys.executable, peer, options, street, 0.5)
+
+    assert len(milliseconds) == SCANS
+    assert calls == 'f' * (options.untimed - 1) + 's' * (1 + SCANS)
+
+
 def test_a_peer_that_fails_says_why(options):
     street = Street(options)
     street.prepare(options.untimed + SCANS)

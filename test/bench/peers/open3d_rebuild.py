@@ -23,12 +23,16 @@ class Peer:
         self._scans = deque(maxlen=window)
         self._cloud = open3d.geometry.PointCloud()
 
-    def step(self, points, T_map_sensor):
-        """Rebuild the cloud and its normals with a new scan."""
+    def fill(self, points, T_map_sensor):
+        """Take a scan into the window."""
         finite = points[np.isfinite(points).all(axis=1)].astype(np.float64)
         scan = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(finite))
         scan = scan.transform(T_map_sensor).voxel_down_sample(self._size_m)
         self._scans.append(np.asarray(scan.points))
+
+    def step(self, points, T_map_sensor):
+        """Rebuild the cloud and its normals with a new scan."""
+        self.fill(points, T_map_sensor)
         together = open3d.utility.Vector3dVector(np.concatenate(self._scans))
         self._cloud = open3d.geometry.PointCloud(together).voxel_down_sample(self._size_m)
         near = open3d.geometry.KDTreeSearchParamHybrid(radius=2.0 * self._size_m, max_nn=30)
