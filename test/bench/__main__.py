@@ -12,6 +12,7 @@ from importlib import import_module
 import json
 from pathlib import Path
 import sys
+from time import perf_counter
 
 from surfel_mapper.memory import keep_freed_memory
 from test.bench.machine import facts, load
@@ -100,13 +101,14 @@ def run(names: Sequence[str], chosen: Options) -> list[Row]:
     """
     found: list[Row] = []
     for name in names:
-        load_before = load()
+        load_before, start = load(), perf_counter()
         rows = []
         for row in import_module(f'test.bench.{name}').run(chosen):
             rows.append(row)
             print(f'{name}: {json.dumps(rounded(row))}', file=sys.stderr, flush=True)
         print(f'{name}: {summary(name)}')
-        print(f'load {load_before} before, {load()} after\n{table(rows)}\n', flush=True)
+        took = f'{perf_counter() - start:.0f} s'
+        print(f'{took}, load {load_before} before, {load()} after\n{table(rows)}\n', flush=True)
         found += [{'bench': name, 'load': load_before, **rounded(row)} for row in rows]
     return found
 
