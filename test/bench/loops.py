@@ -18,7 +18,6 @@ from itertools import pairwise
 import json
 import math
 from pathlib import Path
-import resource
 import sys
 import tempfile
 import time
@@ -27,6 +26,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from surfel_mapper.cluster.shards import peak_bytes
 from surfel_mapper.config import Config
 from surfel_mapper.evaluation.trajectory_errors import absolute_errors
 from surfel_mapper.memory import keep_freed_memory
@@ -220,7 +220,7 @@ def closed(
 
 def peak_mb() -> float:
     """Return the largest memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+    return peak_bytes() / 1e6
 
 
 if __name__ == '__main__':
