@@ -219,7 +219,7 @@ def closed(
 
 
 def peak_mb() -> float:
-    """Return the largest memory of this process so far."""
+    """Return the peak memory of this process, without that of its parent, MB."""
     return peak_bytes() / 1e6
 
 

@@ -80,6 +80,15 @@ def test_progress_that_a_peer_prints_does_not_disturb_its_figures(tmp_path):
     assert poses[:, 0, 3] == pytest.approx([0.0, STEP_M, 2.0 * STEP_M])
 
 
+def test_the_peak_memory_of_a_peer_is_its_own(tmp_path):
+    path = tmp_path / '0.npy'
+    np.save(path, np.full((4, 3), np.nan, np.float32))
+    peer = PeerSpec(name='a peer', module='test.bench.test_drives', requires=())
+    held = np.ones(125_000_000)  # 1 GB
+    times, _ = run_odometry(sys.executable, peer, [path], 1.0)
+    assert 10.0 < times['peak_mb'] < 0.9 * held.nbytes / 1e6
+
+
 def test_scans_between_simulated_ones_lie_on_the_surfaces_of_the_world():
     drive = long_drive.simulation()
     assert drive.num_scans == 20_000

@@ -50,7 +50,7 @@ def main() -> None:
 
 
 def peak_mb() -> float:
-    """Return the peak memory of this program; that of getrusage includes the parent's."""
+    """Return the peak memory of this program, MB; that of getrusage includes the parent's."""
     lines = Path('/proc/self/status').read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith('VmHWM:')) * 1.024e-3
 
