@@ -170,16 +170,13 @@ class Inserter:
         prepare = partial(self.preparation.warm_up, config)
         return WarmUpSteps([prepare, *first_scan, self.layers.warm_up], every_scan, rare)
 
-    def reduces_ahead(self, config: Config) -> bool:
-        """Return whether another thread prepares a scan while the one before is inserted."""
-        return (
-            self._reduction.has_thread
-            and config.map.mode != 'frozen'
-            and self.preparation.runs_ahead()
-        )
+    def scans_ahead(self, config: Config) -> int:
+        """Return how many scans another thread prepares while the one before is inserted."""
+        runs_ahead = config.map.mode != 'frozen' and self.preparation.runs_ahead()
+        return self._reduction.scans_ahead if runs_ahead else 0
 
     def begin(self, scan: Scan, pose: Transform, config: Config) -> None:
-        """Begin to prepare and reduce the scan that is inserted next, in another thread."""
+        """Begin to prepare and reduce a scan that is inserted soon, in another thread."""
         place = self.aligner.to_map(pose)
         self._reduction.begin(scan, place, config, self.preparation.ahead)
 
@@ -202,7 +199,7 @@ class Inserter:
         config : Config
             All settings.
         following : Scan and pose, optional
-            The next scan, which another thread begins to prepare; only if ``reduces_ahead``.
+            The next scan, which another thread begins to prepare; only if it prepares any ahead.
 
         """
         laps = Laps()

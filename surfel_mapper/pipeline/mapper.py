@@ -303,18 +303,19 @@ class Mapper:
         Parameters
         ----------
         more_follows : bool
-            Whether more input comes at once, as from a bag. Then the newest scan may be left for
-            the next call, while another thread (``map.threads``) reduces it. The map is the same
-            to the bit. Call it once with False at the end.
+            Whether more input comes at once, as from a bag. Then the two newest scans may be left
+            for later calls, while another thread (``map.threads``) reduces them. The map is the
+            same to the bit. Call it once with False at the end.
 
         """
-        ahead = self._inserter.reduces_ahead(self.config)
-        keeps = int(more_follows and ahead)
+        ahead = self._inserter.scans_ahead(self.config)
+        keeps = ahead if more_follows else 0
         while self._queue.fill_posed(1 + ahead, self.config.pose) > keeps:
             yield from self._insert(*self._queue.posed.popleft())
         if self._queue.posed:
             start = time.perf_counter()
-            self._inserter.begin(*self._queue.posed[0], self.config)
+            for scan, pose in self._queue.posed:
+                self._inserter.begin(scan, pose, self.config)
             self.counters.add_seconds('reduce', time.perf_counter() - start)
 
     def start_from(self, frame_id: str, xyz: Any, q_xyzw: Any) -> bool:

@@ -3,13 +3,14 @@
 """
 Reduction of scans to the exact moments that enter the map and the window, and that leave it.
 
-With ``map.threads`` another thread deskews, filters and reduces the next scan while the map takes
-the one before it. None of these reads anything of the map, so the order changes no bit. Work that
-was begun is used only for the same scan at the same pose; otherwise it is done again.
+With ``map.threads`` another thread deskews, filters and reduces the next two scans while the map
+takes the one before them. None of these reads anything of the map, so the order changes no bit.
+Work that was begun is used only for the same scan at the same pose; otherwise it is done again.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import replace
@@ -32,6 +33,9 @@ from surfel_mapper.scan import Scan
 from surfel_mapper.threads import pool
 
 Step = Callable[[], object]
+
+AHEAD = 2
+"""Scans that are begun ahead: after the first, the thread has work while the next is decoded."""
 
 
 class WarmUpSteps(NamedTuple):
@@ -89,16 +93,16 @@ class Reduction:
 
     Attributes
     ----------
-    has_thread : bool
-        Whether there is a thread beside the caller's.
+    scans_ahead : int
+        Number of scans that may be begun before they are reduced; 0 without another thread.
 
     """
 
     def __init__(self, surfel_map: SurfelMap, threads: int) -> None:
         self._map = surfel_map
         self._pool = pool(threads)
-        self.has_thread = self._pool is not None
-        self._begun: Begun | None = None
+        self.scans_ahead = AHEAD if self._pool is not None else 0
+        self._begun: deque[Begun] = deque(maxlen=AHEAD)
 
     def begin(
         self,
@@ -110,15 +114,16 @@ class Reduction:
         """
         Begin to prepare and reduce a scan in the other thread, unless that was begun before.
 
-        ``prepare`` is called here, the function that it returns in the other thread.
+        ``prepare`` is called here, the function that it returns in the other thread. The results
+        of the last ``AHEAD`` scans are kept.
         """
         if self._pool is None:
             return
-        if self._begun is not None and self._begun.is_of(scan, T_map_sensor, config):
+        if any(begun.is_of(scan, T_map_sensor, config) for begun in self._begun):
             return
         work = prepare(scan, T_map_sensor)
         result = self._pool.submit(run_ahead, work, T_map_sensor, self._map, config)
-        self._begun = Begun(scan, T_map_sensor, config, result)
+        self._begun.append(Begun(scan, T_map_sensor, config, result))
 
     def begun(
         self, scan: Scan, T_map_sensor: Transform, config: Config
@@ -126,13 +131,14 @@ class Reduction:
         """
         Return a function that waits for the points of a scan that was begun, or None.
 
-        Work that was begun for another scan, pose or settings is forgotten.
+        Work that was begun before it, for another scan, pose or settings, is forgotten.
         """
-        begun = self._begun
-        if begun is None or not begun.is_of(scan, T_map_sensor, config):
-            self._begun = None
+        while self._begun and not self._begun[0].is_of(scan, T_map_sensor, config):
+            self._begun.popleft()
+        if not self._begun:
             return None
-        return lambda: begun.result.result().points
+        result = self._begun[0].result
+        return lambda: result.result().points
 
     def reduce(self, scan: Scan, T_map_sensor: Transform, config: Config) -> WindowedScan:
         """
@@ -144,9 +150,8 @@ class Reduction:
             If a voxel gets more than 2^23 points, or a point is out of the reach of the map.
 
         """
-        begun, self._begun = self._begun, None
-        if begun is not None:
-            ahead = begun.result.result()
+        if self._begun:
+            ahead = self._begun.popleft().result.result()
             if ahead.points.filtered is scan:
                 if isinstance(ahead.windowed, Exception):
                     raise ahead.windowed
