@@ -8,14 +8,13 @@ Packed into eight words they fill one cache line, which one instruction reads an
 registers have 512 bits, two or four elsewhere. Ten sums in float64 would take two lines and ten
 instructions each.
 
-    word 0        count << 40 | sum of x, with x, y, z in [0, 65536)
-    word 1        sum of z << 32 | sum of y
+    word 0        sum of z << 32 | sum of x, with x, y, z in [0, 65536)
+    word 1        count << 32 | sum of y
     words 2 to 7  sums of xx, xy, xz, yy, yz, zz
 
-All are exact up to FULL points. The count is exact up to WIDEST, so that voxels with more than
-FULL points are noticed. A place arrives in two words too, as quantise writes it. Both are spread
-over all lanes and shifted to the factors of the products; taking x, y and z apart and collecting
-them in a register makes adding twice as long.
+All are exact up to FULL points. With more, up to WIDEST, the upper half of word 1 is the count or
+slightly more, so that such voxels are noticed. A place arrives in one word, as quantise writes it.
+It is spread over all lanes and shifted to the factors of the products.
 
 A bucket of the hash table of a map has eight entries. Compilers turn the loop over them into a
 chain of 16 conditional moves, and a look-up takes 1.2 times as long.
@@ -33,7 +32,7 @@ from numba.core import cgutils
 from numba.extending import lower_builtin, models, register_model, type_callable
 import numpy as np
 
-from surfel_mapper.kernels.layout import HIGH_BITS
+from surfel_mapper.kernels.layout import BITS, HIGH_BITS
 
 WORDS = 8
 """Words of the sums of a voxel, and entries of a bucket."""
@@ -42,16 +41,19 @@ FULL = (1 << 16) - 1
 """Number of points of a voxel up to which the sums are exact."""
 
 WIDEST = (1 << 23) - 1
-"""Number of points of a voxel up to which the count is exact."""
+"""Number of points of a voxel up to which the count does not overflow."""
 
-_X, _Y, _Z = (0, 0), (1, 0), (1, HIGH_BITS)
-"""Coordinates of a place: the word that holds it, and the bits below it."""
-
-_PRODUCTS = (_X, _X), (_X, _Y), (_X, _Z), (_Y, _Y), (_Y, _Z), (_Z, _Z)
-"""Factors of words 2 to 7."""
+_PRODUCTS = (0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)
+"""Factors of words 2 to 7, as axes."""
 
 _HALF = (1 << HIGH_BITS) - 1
 """Mask of the lower half of a word."""
+
+_Z_AND_X = ((1 << BITS) - 1) * (1 + (1 << HIGH_BITS))
+"""Mask of the pieces of a place that word 0 sums."""
+
+_ONE_AND_Y = (1 << HIGH_BITS) + (1 << BITS) - 1
+"""Mask of those that word 1 sums, of the place moved by a piece."""
 
 
 def load_sums(words, at):
@@ -74,11 +76,11 @@ def masked_sum(sums, mask, others):
     return (sums & mask) + others
 
 
-def plus_place(sums, first, second):
-    """Return sums with one point more; its place in two int64 words, see kernels/layout.py."""
-    words = int(first), int(second)
-    factors = [[words[word] >> below & _HALF for word, below in pair] for pair in _PRODUCTS]
-    return sums + np.array([*words, *(a * b for a, b in factors)])
+def plus_place(sums, place):
+    """Return sums with one point more; its place as an int64, see kernels/layout.py."""
+    x, y, z, one = (int(place) >> axis * BITS & (1 << BITS) - 1 for axis in range(4))
+    products = [(x, y, z)[a] * (x, y, z)[b] for a, b in _PRODUCTS]
+    return sums + np.array([z << HIGH_BITS | x, one << HIGH_BITS | y, *products])
 
 
 def highest_match(words, at, upper):
@@ -129,7 +131,7 @@ def _type_of_masked_sum(context):
 
 @type_callable(plus_place)
 def _type_of_sum(context):
-    return lambda sums, first, second: _LANES
+    return lambda sums, place: _LANES
 
 
 @type_callable(highest_match)
@@ -154,21 +156,18 @@ def _emit_masked_sum(context, builder, signature, arguments):
     return builder.add(builder.and_(sums, _spread(builder, mask)), others)
 
 
-@lower_builtin(plus_place, Lanes, types.int64, types.int64)
+@lower_builtin(plus_place, Lanes, types.int64)
 def _emit_plus_place(context, builder, signature, arguments):
-    sums, first, second = arguments
-    place = ir.Constant(ir.VectorType(_WORD, 2), ir.Undefined)
-    place = builder.insert_element(place, first, _HALF_WORD(0))
-    place = builder.insert_element(place, second, _HALF_WORD(1))
-    lower_halves = _constant([_HALF] * WORDS)
-    factors = []
-    for coordinates in zip(*_PRODUCTS, strict=True):
-        words, below = zip(_X, _Y, *coordinates, strict=True)  # the first two lanes are not used
-        spread = builder.shuffle_vector(place, place, _indices(words))
-        factors.append(builder.and_(builder.lshr(spread, _constant(below)), lower_halves))
-    spread = builder.shuffle_vector(place, place, _indices([0, 1] * (WORDS // 2)))
-    chosen = _indices([0, 1, *range(WORDS + 2, 2 * WORDS)])
-    return builder.add(sums, builder.shuffle_vector(spread, builder.mul(*factors), chosen))
+    sums, place = arguments
+    spread = _spread(builder, place)
+    first, second = (
+        builder.lshr(spread, _constant([BITS * axis for axis in (0, 1, *axes)]))
+        for axes in zip(*_PRODUCTS, strict=True)
+    )
+    factor = _constant([0, 0, *[(1 << BITS) - 1] * len(_PRODUCTS)])
+    products = builder.mul(builder.and_(first, factor), builder.and_(second, factor))
+    halves = _constant([_Z_AND_X, _ONE_AND_Y, *[0] * len(_PRODUCTS)])
+    return builder.add(sums, builder.or_(products, builder.and_(first, halves)))
 
 
 @lower_builtin(highest_match, types.Array, types.Integer, types.Integer)

@@ -16,7 +16,7 @@ from surfel_mapper.kernels.lanes import (
     WIDEST,
     WORDS,
 )
-from surfel_mapper.kernels.layout import COUNT_BITS, HIGH_BITS
+from surfel_mapper.kernels.layout import BITS, HIGH_BITS
 from test.kernels.modes import both
 
 HIGHEST = 65535
@@ -27,9 +27,8 @@ HIGHEST = 65535
 def add_at(words, at, places, mask):
     sums = load_sums(words, at)
     for i in range(len(places)):
-        first = (1 << COUNT_BITS) | places[i, 0]
-        second = (places[i, 2] << HIGH_BITS) | places[i, 1]
-        others = plus_place(load_sums(words, np.uint64(0)), first, second)
+        place = (places[i, 2] << (2 * BITS)) | (places[i, 1] << BITS) | places[i, 0]
+        others = plus_place(load_sums(words, np.uint64(0)), (1 << (3 * BITS)) | place)
         sums = masked_sum(sums, mask, others)
     store_sums(words, at, sums)
 
@@ -39,7 +38,7 @@ def expected(places):
     x, y, z = (list(map(int, column)) for column in places.T)
     pairs = (x, x), (x, y), (x, z), (y, y), (y, z), (z, z)
     products = [sum(a * b for a, b in zip(*pair, strict=True)) for pair in pairs]
-    first, second = (len(x) << COUNT_BITS) + sum(x), (sum(z) << HIGH_BITS) + sum(y)
+    first, second = (sum(z) << HIGH_BITS) + sum(x), (len(x) << HIGH_BITS) + sum(y)
     # as the bits of signed words
     return [(word + 2**63) % 2**64 - 2**63 for word in (first, second, *products)]
 
@@ -68,18 +67,22 @@ def test_a_mask_of_zero_drops_the_sums(call):
 
 
 @pytest.mark.parametrize('corner', [(0, 0, 0), (HIGHEST, 0, HIGHEST), (HIGHEST,) * 3])
-def test_words_hold_the_sums_of_a_full_voxel_and_the_count_of_the_widest(corner):
+def test_words_hold_the_sums_of_a_full_voxel_and_notice_fuller_ones(corner):
     words = np.zeros(2 * WORDS, np.int64)
     places = np.array([corner] * FULL)
     add_at(words, np.uint64(WORDS), places, -1)
     assert words[WORDS:].tolist() == expected(places)
-    x, _, z = corner
-    assert words[WORDS] & ((1 << COUNT_BITS) - 1) == FULL * x
-    assert words[WORDS + 1] >> HIGH_BITS & ((1 << HIGH_BITS) - 1) == FULL * z
+    low = (1 << HIGH_BITS) - 1
+    x, y, z = corner
+    assert [words[WORDS] & low, words[WORDS + 1] & low] == [FULL * x, FULL * y]
+    assert [words[WORDS] >> HIGH_BITS & low, words[WORDS + 1] >> HIGH_BITS] == [FULL * z, FULL]
+    add_at(words, np.uint64(WORDS), places[:1], -1)
+    assert words[WORDS + 1] >> HIGH_BITS > FULL
+    words[WORDS:] = expected(places)
     for _ in range((WIDEST - FULL) // FULL):
         add_at(words, np.uint64(WORDS), places, -1)
     add_at(words, np.uint64(WORDS), places[: (WIDEST - FULL) % FULL], -1)
-    assert words[WORDS] >> COUNT_BITS == WIDEST
+    assert 0 <= (words[WORDS + 1] >> HIGH_BITS) - WIDEST <= WIDEST >> BITS
 
 
 @njit
